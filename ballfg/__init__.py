@@ -1,0 +1,1 @@
+"""ballfg: from noisy measurements of a flying, bouncing ball to states, predictions and knowledge."""

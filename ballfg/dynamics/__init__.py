@@ -1,0 +1,38 @@
+"""How a ball moves: the contract, physical effects, integration with exact contacts, rollouts, model files."""
+
+from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.dynamics.contact import contact_time, fly_through, fly_through_jacobian, gap
+from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact
+from ballfg.dynamics.effects.registry import EFFECTS
+from ballfg.dynamics.integrate import fly, fly_jacobian
+from ballfg.dynamics.model import BallModel, substitute
+from ballfg.dynamics.model_file import load_model, model_from_dict, model_to_dict, nominal_model, save_model
+from ballfg.dynamics.rollout import advance, rollout
+from ballfg.dynamics.surfaces import Surfaces
+
+__all__ = [
+    "EFFECTS",
+    "AnalyticModel",
+    "BallModel",
+    "BounceEffect",
+    "Coefficient",
+    "Effect",
+    "Flight",
+    "FlightEffect",
+    "Impact",
+    "Surfaces",
+    "advance",
+    "contact_time",
+    "fly",
+    "fly_jacobian",
+    "fly_through",
+    "fly_through_jacobian",
+    "gap",
+    "load_model",
+    "model_from_dict",
+    "model_to_dict",
+    "nominal_model",
+    "rollout",
+    "save_model",
+    "substitute",
+]

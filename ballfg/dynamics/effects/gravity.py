@@ -1,0 +1,21 @@
+"""Gravity: a constant acceleration downwards."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect
+from ballfg.state import STANDARD_GRAVITY
+
+
+class Gravity(FlightEffect):
+    """a = (0, 0, -g). Buoyancy of the air and an error of the time scale look the same."""
+
+    name = "gravity"
+    sentence = "The weight of the ball: a constant downward acceleration."
+    coefficients = (Coefficient("g", STANDARD_GRAVITY, 0.03, "m/s^2", 0.0, 30.0),)
+    g: Tensor
+
+    def acceleration(self, flight: Flight) -> Tensor:
+        """(..., 3) m/s^2, straight down."""
+        return self.g * flight.velocity.new_tensor((0.0, 0.0, -1.0))

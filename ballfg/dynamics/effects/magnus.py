@@ -1,0 +1,21 @@
+"""Magnus force: a spinning ball is pushed across its flight."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect
+
+
+class Magnus(FlightEffect):
+    """a = k (spin x v), k dimensionless: sources differ by 3.6 times (0.0010 to 0.0036)."""
+
+    name = "magnus"
+    sentence = "Lift of a spinning ball, proportional to spin x velocity."
+    coefficients = (Coefficient("k", 0.003, 0.0006, "1", -0.1, 0.1),)
+    k: Tensor
+
+    def acceleration(self, flight: Flight) -> Tensor:
+        """(..., 3) m/s^2, perpendicular to velocity and spin."""
+        return self.k * torch.linalg.cross(flight.spin, flight.velocity)

@@ -1,0 +1,108 @@
+"""The contract that every model of a ball keeps, analytic or learned: how it flies, bounces and rolls."""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Final, TypeVar
+
+import torch
+from torch import Tensor, nn
+
+from ballfg.dynamics.impact import slip_velocity
+from ballfg.state import SPIN, STANDARD_GRAVITY, VELOCITY
+
+THIN_SHELL: Final = 2.0 / 3.0
+"""Moment of inertia of a thin spherical shell divided by m R^2."""
+
+ROLLING_FRICTION: Final = 0.25
+"""Coulomb coefficient that turns a resting ball's slip into rolling."""
+ROLLING_RESISTANCE: Final = 0.01
+"""Deceleration of a rolling ball divided by g."""
+SOFT_SLIP: Final = 0.2
+"""m/s. Slip below which rolling friction falls to zero linearly, so that the equations stay smooth and not stiff."""
+
+Rates = tuple[Tensor, Tensor | None]
+
+M = TypeVar("M", bound=nn.Module)
+
+
+class BallModel(nn.Module, ABC):
+    """A ball of some radius that flies, hits horizontal surfaces and comes to rest on them.
+
+    States are (..., 9) float64 (see `ballfg.state`). Rates are a pair: acceleration (..., 3) m/s^2, and angular
+    acceleration (..., 3) rad/s^2 or None where the spin is constant (a third of a Jacobian's cost is saved then).
+    All methods are batched over leading dimensions and differentiable, in the state and in the parameters.
+    """
+
+    def __init__(self, radius: float, inertia_factor: float = THIN_SHELL) -> None:
+        super().__init__()
+        if not 0.001 <= radius <= 1.0:
+            raise ValueError(f"radius must be 0.001 to 1 m; got {radius:g}. Is it in millimetres?")
+        if not 0.0 < inertia_factor <= 1.0:
+            raise ValueError(
+                f"inertia_factor must lie in (0, 1]; got {inertia_factor:g}. A thin shell has 2/3, a solid ball 0.4."
+            )
+        self.radius = float(radius)
+        self.inertia_factor = float(inertia_factor)
+
+    @abstractmethod
+    def rates(self, state: Tensor) -> Rates:
+        """Acceleration and angular acceleration in free flight."""
+
+    @abstractmethod
+    def bounce(self, state: Tensor) -> Tensor:
+        """(..., 9) state just after an impact on a horizontal plane; the position does not change."""
+
+    def roll(self, state: Tensor) -> Rates:
+        """Rates of a ball that rests on a surface: air forces in the plane, friction until it rolls, resistance.
+
+        The vertical acceleration is zero.
+        """
+        air, air_torque = self.rates(state)
+        velocity, spin = state[..., VELOCITY], state[..., SPIN]
+        slip = slip_velocity(velocity, spin, self.radius)
+        friction = -ROLLING_FRICTION * STANDARD_GRAVITY * _soft_direction(slip)
+        resistance = -ROLLING_RESISTANCE * STANDARD_GRAVITY * _soft_direction(velocity[..., :2])
+        kick = friction / (self.inertia_factor * self.radius)
+        slowing = resistance / self.radius  # keeps a rolling ball rolling
+        torque_x = kick[..., 1] - slowing[..., 1]
+        torque_y = -kick[..., 0] + slowing[..., 0]
+        zero = torch.zeros_like(torque_x)
+        acceleration = torch.cat((air[..., :2] + friction + resistance, zero[..., None]), dim=-1)
+        torque = torch.stack((torque_x, torque_y, zero), dim=-1)
+        return acceleration, torque if air_torque is None else torque + air_torque
+
+
+def _soft_direction(vector: Tensor) -> Tensor:
+    """The direction of (..., 2) vectors, shortened smoothly to zero below `SOFT_SLIP`."""
+    return vector / (vector.square().sum(-1, keepdim=True) + SOFT_SLIP**2).sqrt()
+
+
+def substitute(module: M, values: Mapping[str, Tensor]) -> M:
+    """A copy of a module in which some parameters are the given tensors; everything else is shared.
+
+    Args:
+        module: for instance a `BallModel`.
+        values: tensors by parameter name as in `named_parameters()`. A tensor of shape (n, 1) in place of a scalar
+            gives each of n states in a batch (n, 9) its own value.
+    Raises: KeyError: if the module has no parameter of that name.
+    """
+    clone = copy.copy(module)
+    clone._parameters = dict(module._parameters)
+    clone._modules = dict(module._modules)
+    children: dict[str, dict[str, Tensor]] = {}
+    for name, value in values.items():
+        head, _, rest = name.partition(".")
+        if rest:
+            children.setdefault(head, {})[rest] = value
+        else:
+            del clone._parameters[head]
+            clone.__dict__[head] = value
+    for head, inner in children.items():
+        child = module._modules[head]
+        if child is None:
+            raise KeyError(head)
+        clone._modules[head] = substitute(child, inner)
+    return clone

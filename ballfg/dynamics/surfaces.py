@@ -1,0 +1,67 @@
+"""The horizontal surfaces a ball can meet: a table, and the floor for a ball that falls beside it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from ballfg.state import Z
+
+TABLE_ABOVE_FLOOR: Final = 0.76
+"""m, height of a table-tennis table (ITTF Laws 2.1.1)."""
+
+
+@dataclass(frozen=True)
+class Surfaces:
+    """Table and floor, as heights in the world frame.
+
+    Attributes:
+        table_height: m, z of the table's surface.
+        floor_height: m, z of the floor; None where there is no floor below (a court is its own floor).
+        extent: (x_low, x_high, y_low, y_high) m of the table; None where it is not known: then the table is taken to
+            lie under every ball whose centre is above its surface.
+    """
+
+    table_height: float = 0.0
+    floor_height: float | None = None
+    extent: tuple[float, float, float, float] | None = None
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.table_height):
+            raise ValueError(f"table_height must be finite; got {self.table_height}")
+        if self.floor_height is not None and not self.floor_height < self.table_height:
+            raise ValueError(
+                f"floor_height must lie below table_height {self.table_height:g} m; got {self.floor_height:g} m"
+            )
+        if self.extent is not None and not (self.extent[0] < self.extent[1] and self.extent[2] < self.extent[3]):
+            raise ValueError(f"extent must be (x_low, x_high, y_low, y_high); got {self.extent}")
+
+    @classmethod
+    def table_tennis(cls, table_height: float) -> Surfaces:
+        """A table of unknown place in the room, with the floor 0.76 m below its surface."""
+        return cls(table_height, table_height - TABLE_ABOVE_FLOOR)
+
+    def heights(self) -> tuple[float, ...]:
+        """All surface heights, the table's first."""
+        return (self.table_height,) if self.floor_height is None else (self.table_height, self.floor_height)
+
+    def over_table(self, state: Tensor) -> Tensor:
+        """(...) bool: the ball's x, y lie within the table's extent."""
+        if self.extent is None:
+            return torch.ones(state.shape[:-1], dtype=torch.bool)
+        x, y = state[..., 0], state[..., 1]
+        low_x, high_x, low_y, high_y = self.extent
+        return (x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)
+
+    def height_below(self, state: Tensor) -> Tensor:
+        """(...) m, height of the surface that a ball falling straight down would meet; -inf where there is none.
+
+        A ball whose centre is below the table's surface is beside the table.
+        """
+        floor = -math.inf if self.floor_height is None else self.floor_height
+        on_table = (state[..., Z] > self.table_height) & self.over_table(state)
+        return torch.where(on_table, self.table_height, floor).to(state.dtype)

@@ -1,0 +1,235 @@
+"""What a dataset says about itself: `dataset.yaml`, checked."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from .hints import did_you_mean, nearest
+
+INFO_FILE = "dataset.yaml"
+_REQUIRED = ("name", "frame", "ball")
+_OPTIONAL = ("rate", "position_noise", "spin_noise", "source", "licence")
+_KNOWN = (*_REQUIRED, *_OPTIONAL, "labels")
+
+# The largest values that can be meant in SI units; above them the unit is almost surely another one.
+_MAX_RADIUS = 0.5  # m
+_MAX_MASS = 2.0  # kg
+_MAX_HEIGHT = 50.0  # m
+_MAX_POSITION_NOISE = 1.0  # m
+
+
+@dataclass(frozen=True)
+class Ball:
+    """A homogeneous ball.
+
+    Raises: ValueError: a value that is not a positive number or cannot be in SI units.
+    """
+
+    radius: float
+    """m"""
+
+    mass: float
+    """kg"""
+
+    def __post_init__(self) -> None:
+        _set_number(self, "radius", "ball.radius", "m", above=0.0, limit=_MAX_RADIUS, instead="mm")
+        _set_number(self, "mass", "ball.mass", "kg", above=0.0, limit=_MAX_MASS, instead="g")
+
+
+TABLE_TENNIS = Ball(radius=0.02, mass=0.0027)
+"""ITTF, The Laws of Table Tennis, 2.3: diameter 40 mm, 2.7 g."""
+
+TENNIS = Ball(radius=0.0335, mass=0.058)
+"""ITF Rules of Tennis, Appendix I, type 2: diameter 65.4-68.6 mm, 56.0-59.4 g; the middle of both, rounded."""
+
+
+@dataclass(frozen=True)
+class DatasetInfo:
+    """The content of `dataset.yaml`. The frame's up axis is always z.
+
+    Raises: ValueError, TypeError: a field of a wrong type or range; the message names it.
+    """
+
+    name: str
+    """One line of text."""
+
+    table_height: float
+    """z of the table's surface, m."""
+
+    ball: Ball
+    """Radius (m) and mass (kg)."""
+
+    rate: float | None = None
+    """Nominal sampling rate, Hz. The stamps of the tracks are what counts."""
+
+    position_noise: float | None = None
+    """Standard deviation of one measured coordinate, m."""
+
+    spin_noise: float | None = None
+    """Standard deviation of one component of the spin labels, rad/s."""
+
+    source: str | None = None
+    """Where the data come from."""
+
+    licence: str | None = None
+    """What one may do with them."""
+
+    def __post_init__(self) -> None:
+        for key in ("name", "source", "licence"):
+            _check_text(key, getattr(self, key), optional=key != "name")
+        if not isinstance(self.ball, Ball):
+            raise TypeError(f"ball must be a Ball; got {type(self.ball).__name__}. Pass Ball(radius, mass).")
+        _set_number(self, "table_height", "frame.table_height", "m", limit=_MAX_HEIGHT, instead="mm")
+        if self.rate is not None:
+            _set_number(self, "rate", "rate", "Hz", above=0.0)
+        if self.position_noise is not None:
+            _set_number(
+                self, "position_noise", "position_noise", "m", above=0.0, limit=_MAX_POSITION_NOISE, instead="mm"
+            )
+        if self.spin_noise is not None:
+            _set_number(self, "spin_noise", "spin_noise", "rad/s", above=0.0)
+
+    @classmethod
+    def from_mapping(cls, content: Mapping[str, Any]) -> "DatasetInfo":
+        """The info that a parsed `dataset.yaml` states.
+
+        Args:
+            content: the file's content: `name`, `frame: {up, table_height}`, `ball: {radius, mass}` and the
+                optional fields; keys that are not known are left aside.
+        Raises: ValueError: a missing field, a wrong type or range, an up axis other than z.
+        """
+        frame = _section(content, "frame", ("up", "table_height"))
+        ball = _section(content, "ball", ("radius", "mass"))
+        if frame["up"] != "z":
+            raise ValueError(
+                f"frame.up must be 'z', the only up axis that is supported; got {frame['up']!r}. "
+                "Rotate the positions so that z points up."
+            )
+        _need(content, "name", "")
+        return cls(
+            name=content["name"],
+            table_height=frame["table_height"],
+            ball=Ball(radius=ball["radius"], mass=ball["mass"]),
+            **{key: content.get(key) for key in _OPTIONAL},
+        )
+
+    def to_mapping(self) -> dict[str, Any]:
+        """The content of the `dataset.yaml` that states this; fields that are None are left out."""
+        content: dict[str, Any] = {
+            "name": self.name,
+            "frame": {"up": "z", "table_height": self.table_height},
+            "ball": {field.name: getattr(self.ball, field.name) for field in fields(Ball)},
+        }
+        optional = {key: getattr(self, key) for key in _OPTIONAL}
+        return content | {key: value for key, value in optional.items() if value is not None}
+
+
+def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:
+    """Reads a `dataset.yaml`.
+
+    Returns: the info, and a note for each key that is not known.
+    Raises: ValueError: not readable as YAML, or a bad field; the message names file and field.
+    """
+    try:
+        content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: must be UTF-8 text; {error.reason}. Save it as UTF-8.") from None
+    except yaml.YAMLError as error:
+        raise ValueError(
+            f"{path}{_yaml_place(error)}: must be valid YAML; {_yaml_problem(error)}. Correct it."
+        ) from None
+    if not isinstance(content, dict):
+        raise ValueError(
+            f"{path}: must hold fields such as 'name: my_shots'; got {_kind(content)}. "
+            f"Give at least {', '.join(_REQUIRED)}."
+        )
+    content = {str(key): value for key, value in content.items()}
+    try:
+        info = DatasetInfo.from_mapping(content)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{path}: {error}") from None
+    unknown = [key for key in content if key not in _KNOWN]
+    absent = [key for key in _OPTIONAL if key not in content]
+    return info, [f"{INFO_FILE}: field {key!r} ignored.{did_you_mean(key, absent)}" for key in unknown]
+
+
+def write_info(path: Path, info: DatasetInfo) -> None:
+    """Writes a `dataset.yaml`; floats read back bit for bit."""
+    text = yaml.safe_dump(info.to_mapping(), sort_keys=False, allow_unicode=True)
+    path.write_text(text, encoding="utf-8")
+
+
+def _section(content: Mapping[str, Any], key: str, names: tuple[str, ...]) -> dict[str, Any]:
+    _need(content, key, "")
+    section = content[key]
+    if not isinstance(section, dict):
+        raise ValueError(
+            f"{key} must be a mapping with {' and '.join(names)}; got {section!r}. "
+            f"Write {key}: {{{', '.join(name + ': ...' for name in names)}}}."
+        )
+    for name in names:
+        _need(section, name, f"{key}.")
+    return section
+
+
+def _need(content: Mapping[str, Any], key: str, prefix: str) -> None:
+    if content.get(key) is not None:
+        return
+    present = [str(name) for name in content]
+    found = nearest(key, [name for name in present if name not in _KNOWN])
+    remedy = f"Add it, or rename {found!r}." if found else "Add it."
+    raise ValueError(f"{prefix}{key} is required; got {', '.join(present) or 'nothing'}. {remedy}")
+
+
+def _check_text(key: str, value: object, *, optional: bool) -> None:
+    if value is None and optional:
+        return
+    if not isinstance(value, str):
+        raise TypeError(f"{key} must be text; got {_kind(value)} {value}. Put it in quotes.")
+    if not value.strip():
+        raise ValueError(f"{key} must not be empty; got {value!r}. Give it a text.")
+
+
+def _set_number(
+    owner: object,
+    attribute: str,
+    label: str,
+    unit: str,
+    *,
+    above: float | None = None,
+    limit: float = np.inf,
+    instead: str = "",
+) -> None:
+    """Checks one numeric field of a frozen dataclass and stores it as float."""
+    value = getattr(owner, attribute)
+    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+        raise TypeError(
+            f"{label} must be a number in {unit}; got {_kind(value)} {value!r}. Write it like 0.02 or 2.0e-2."
+        )
+    number = float(value)
+    if not np.isfinite(number) or (above is not None and number <= above):
+        rule = "finite" if above is None else f"finite and above {above:g}"
+        raise ValueError(f"{label} must be {rule}; got {number:g}. Correct it (unit: {unit}).")
+    if abs(number) > limit:
+        raise ValueError(
+            f"{label} must be in {unit}, at most {limit:g}; got {number:g}. It is probably in {instead}: convert it to {unit}."
+        )
+    object.__setattr__(owner, attribute, number)
+
+
+def _kind(value: object) -> str:
+    return "nothing" if value is None else type(value).__name__
+
+
+def _yaml_place(error: yaml.YAMLError) -> str:
+    mark = getattr(error, "problem_mark", None)
+    return "" if mark is None else f", line {mark.line + 1}"
+
+
+def _yaml_problem(error: yaml.YAMLError) -> str:
+    problem = getattr(error, "problem", None) or getattr(error, "reason", None) or str(error)
+    return " ".join(str(problem).split())

@@ -1,0 +1,187 @@
+"""The rows of a track table, block by block: from CSV or from Parquet, with a bounded amount of memory."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+from . import csv_errors
+from .hints import did_you_mean
+from .track import FloatArray
+
+KEY = "trajectory"
+VALUES = ("t", "x", "y", "z")
+SIGMAS = ("sigma_x", "sigma_y", "sigma_z")
+
+_CSV_BLOCK = 1 << 20  # bytes of text a block
+_PARQUET_BLOCK = 1 << 14  # rows a block
+
+
+@dataclass(frozen=True)
+class Block:
+    """Consecutive rows of the file."""
+
+    start: int
+    """Number of the first row, counted from 0 at the first row of data."""
+
+    names: list[str | None]
+    """The distinct trajectory names of the block; None for an empty cell of a Parquet file."""
+
+    codes: NDArray[np.int32]
+    """(n,) index into `names` for each row."""
+
+    values: FloatArray
+    """(n, 4) t, x, y, z in s and m, or (n, 7) with the sigmas in m."""
+
+
+class RowSource(ABC):
+    """A track table that can be read again and again, in blocks."""
+
+    def __init__(self, path: Path, header: Sequence[str]) -> None:
+        self.path = path
+        self.columns = check_columns(path, header)
+        used = {KEY, *self.columns}
+        self.ignored = [name for name in header if name not in used]
+
+    @abstractmethod
+    def blocks(self) -> Iterator[Block]:
+        """Reads the file from its start.
+
+        Raises: ValueError: a cell or a row that cannot be read; the message names line and column.
+        """
+
+    @abstractmethod
+    def where(self, *rows: int) -> str:
+        """The file and the place of these rows (counted from 0) as a reader of the file counts them."""
+
+
+class CsvRows(RowSource):
+    """`tracks.csv`. Empty lines are skipped."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, csv_errors.read_header(path))
+
+    def blocks(self) -> Iterator[Block]:
+        """Reads the file from its start; see RowSource."""
+        convert = pa_csv.ConvertOptions(
+            column_types={KEY: pa.string(), **dict.fromkeys(self.columns, pa.float64())},
+            include_columns=[KEY, *self.columns],
+            null_values=[],
+        )
+        options = pa_csv.ReadOptions(block_size=_CSV_BLOCK, use_threads=False)
+        start = 0
+        try:
+            with pa_csv.open_csv(self.path, read_options=options, convert_options=convert) as reader:
+                for batch in reader:
+                    yield _block(batch, start)
+                    start += batch.num_rows
+        except pa.ArrowInvalid as error:
+            raise csv_errors.explain(self.path, self.columns, str(error)) from None
+
+    def where(self, *rows: int) -> str:
+        """The file and the line numbers of these rows, counted from 1 with the header; see RowSource."""
+        lines = csv_errors.lines_of_rows(self.path, rows)
+        return f"{self.path}, {_counted('line', lines)}"
+
+
+class ParquetRows(RowSource):
+    """`tracks.parquet`."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            schema = pq.read_schema(path)
+        except pa.ArrowInvalid as error:
+            raise ValueError(
+                f"{path}: must be a Parquet file; {csv_errors.one_line(error)}. Write it again."
+            ) from None
+        super().__init__(path, schema.names)
+        for name in self.columns:
+            kind = schema.field(name).type
+            if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_decimal(kind)):
+                raise ValueError(
+                    f"{path}, column {name!r}: must hold numbers; got type {kind}. Convert it to float64 (SI units)."
+                )
+
+    def blocks(self) -> Iterator[Block]:
+        """Reads the file from its start; see RowSource."""
+        names = [KEY, *self.columns]
+        start = 0
+        try:
+            # A small buffer and no pre-buffering: a file with one huge row group must not be held whole.
+            with pq.ParquetFile(self.path, buffer_size=_CSV_BLOCK, pre_buffer=False) as file:
+                for batch in file.iter_batches(_PARQUET_BLOCK, columns=names, use_threads=False):
+                    yield _block(batch.select(names), start)
+                    start += batch.num_rows
+        except (pa.ArrowException, OSError) as error:
+            raise ValueError(
+                f"{self.path}: cannot be read as a table of tracks; {csv_errors.one_line(error)}. Write it again."
+            ) from None
+
+    def where(self, *rows: int) -> str:
+        """The file and the numbers of these rows, counted from 1; see RowSource."""
+        return f"{self.path}, {_counted('row', [row + 1 for row in rows])}"
+
+
+def check_columns(path: Path, header: Sequence[str]) -> list[str]:
+    """The numeric columns to read, in a fixed order, once the header is found to be right.
+
+    Returns: t, x, y, z and, if the file has them, sigma_x, sigma_y, sigma_z.
+    Raises: ValueError: a missing or repeated column.
+    """
+    for name in (KEY, *VALUES):
+        if name not in header:
+            others = [other for other in header if other not in (KEY, *VALUES, *SIGMAS)]
+            raise ValueError(
+                f"{path}: column {name!r} is missing; expected {','.join((KEY, *VALUES))}, got {_shown(header)}. "
+                f"Add or rename the column.{did_you_mean(name, others)}{_separator_hint(header)}"
+            )
+    for name in (KEY, *VALUES, *SIGMAS):
+        if list(header).count(name) > 1:
+            raise ValueError(f"{path}: column {name!r} must appear once; got {_shown(header)}. Rename one of them.")
+    present = [name for name in SIGMAS if name in header]
+    if present and len(present) < len(SIGMAS):
+        absent = ", ".join(name for name in SIGMAS if name not in present)
+        raise ValueError(
+            f"{path}: sigma columns must be all three or none; {absent} missing, got {_shown(header)}. "
+            "Add the missing ones or drop the others."
+        )
+    return [*VALUES, *present]
+
+
+def _block(batch: pa.RecordBatch, start: int) -> Block:
+    keys = batch.column(0)
+    if not pa.types.is_dictionary(keys.type):
+        keys = keys.cast(pa.string()).dictionary_encode(null_encoding="encode")
+    else:
+        keys = keys.cast(pa.string()).dictionary_encode(null_encoding="encode")
+    columns = [
+        column.cast(pa.float64()).to_numpy(zero_copy_only=False) for column in batch.columns[1:]
+    ]
+    return Block(
+        start=start,
+        names=keys.dictionary.to_pylist(),
+        codes=keys.indices.to_numpy(zero_copy_only=False),
+        values=np.stack(columns, axis=1) if batch.num_rows else np.empty((0, len(columns))),
+    )
+
+
+def _shown(header: Sequence[str]) -> str:
+    text = ",".join(header)
+    return repr(text if len(text) <= 120 else text[:117] + "...")
+
+
+def _separator_hint(header: Sequence[str]) -> str:
+    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
+        return " Cells must be separated by commas."
+    return ""
+
+
+def _counted(word: str, numbers: Sequence[int]) -> str:
+    plural = word if len(numbers) == 1 else word + "s"
+    return f"{plural} {' and '.join(map(str, numbers))}"

@@ -1,0 +1,178 @@
+"""One measured track: stamps, positions, their noise, and what is known about the shot."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+SPIN_LABELS = ("spin_x", "spin_y", "spin_z")
+AXES = "xyz"
+
+Label = float | str
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """A ball's measured positions over time.
+
+    The arrays are copied and converted to float64; every field is checked when the track is made.
+    Two tracks are equal only if they are the same object.
+
+    Raises: ValueError: a wrong shape, a value that is not finite, a stamp that does not increase, a sigma that
+        is not positive, or a bad label; the message names the index. TypeError: a name that is not a str.
+    """
+
+    name: str
+    """The trajectory's name, as in the column `trajectory`: "000" stays "000"."""
+
+    times: FloatArray
+    """(n,) s, n >= 1, strictly increasing. The origin is the data's own."""
+
+    positions: FloatArray
+    """(n, 3) m, world frame, z up."""
+
+    sigmas: FloatArray | None = None
+    """(n, 3) m, standard deviation of each coordinate, positive; None where the data states none."""
+
+    labels: Mapping[str, Label] = field(default_factory=dict)
+    """What is known about the shot: spin_x, spin_y, spin_z (rad/s, at the first sample), group, launcher settings."""
+
+    def __post_init__(self) -> None:
+        _check_name(self.name)
+        times = _float_array(self.name, "times", self.times)
+        if times.ndim != 1 or len(times) == 0:
+            raise ValueError(
+                f"track {self.name!r}: times must have shape (n,) with n >= 1; got {times.shape}. Pass one stamp per sample."
+            )
+        _check_increasing(self.name, times)
+        positions = _float_array(self.name, "positions", self.positions, (len(times), 3))
+        sigmas = self.sigmas
+        if sigmas is not None:
+            sigmas = _float_array(self.name, "sigmas", sigmas, (len(times), 3))
+            _check_positive(self.name, sigmas)
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "positions", positions)
+        object.__setattr__(self, "sigmas", sigmas)
+        object.__setattr__(self, "labels", _checked_labels(self.name, self.labels))
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __repr__(self) -> str:
+        return f"Track({self.name!r}, {len(self)} samples, {self.duration:.3f} s)"
+
+    @property
+    def duration(self) -> float:
+        """Time from the first sample to the last, s."""
+        return float(self.times[-1] - self.times[0])
+
+    @property
+    def spin_label(self) -> FloatArray | None:
+        """(3,) rad/s: the labelled spin at the first sample; None unless all three components are labelled."""
+        values = [self.labels.get(key) for key in SPIN_LABELS]
+        if any(value is None for value in values):
+            return None
+        return np.array(values, dtype=np.float64)
+
+    def between(self, start: float, end: float) -> "Track":
+        """The samples with start <= time <= end, as a new track.
+
+        The spin labels hold at the first sample only, so they are left out when that sample is.
+
+        Args:
+            start: s, in the track's own time.
+            end: s, in the track's own time.
+        Raises: ValueError: if no sample lies there.
+        """
+        inside = (self.times >= start) & (self.times <= end)
+        if not inside.any():
+            raise ValueError(
+                f"track {self.name!r}: between(start, end) must hold a sample; got [{start:g}, {end:g}] s while the "
+                f"track covers [{self.times[0]:g}, {self.times[-1]:g}] s. Widen the interval."
+            )
+        labels = dict(self.labels)
+        if not inside[0]:
+            labels = {key: value for key, value in labels.items() if key not in SPIN_LABELS}
+        sigmas = None if self.sigmas is None else self.sigmas[inside]
+        return replace(
+            self, times=self.times[inside], positions=self.positions[inside], sigmas=sigmas, labels=labels
+        )
+
+    def until(self, end: float) -> "Track":
+        """The samples with time <= end (s, in the track's own time), as a new track.
+
+        Raises: ValueError: if the first sample is later than that.
+        """
+        return self.between(-np.inf, end)
+
+
+def _check_name(name: object) -> None:
+    if not isinstance(name, str):
+        raise TypeError(f"track name must be a str; got {type(name).__name__} {name!r}. Pass str({name!r}).")
+    if not name or not name.isprintable():
+        raise ValueError(
+            f"track name must be printable text of one line, not empty; got {name!r}. Rename the trajectory."
+        )
+
+
+def _float_array(
+    track: str, argument: str, value: ArrayLike, shape: tuple[int, ...] | None = None
+) -> FloatArray:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"track {track!r}: {argument} must be an array of numbers; {error}. Pass one row per sample."
+        ) from None
+    if shape is not None and array.shape != shape:
+        raise ValueError(
+            f"track {track!r}: {argument} must have shape {shape}; got {array.shape}. "
+            "Pass one row of x, y, z per stamp."
+        )
+    if not np.isfinite(array).all():
+        index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        place = ", ".join(map(str, index))
+        raise ValueError(
+            f"track {track!r}: {argument} must be finite; {argument}[{place}]={array[index]}. Drop that sample."
+        )
+    return array
+
+
+def _check_increasing(track: str, times: FloatArray) -> None:
+    wrong = np.flatnonzero(np.diff(times) <= 0)
+    if wrong.size:
+        i = int(wrong[0]) + 1
+        raise ValueError(
+            f"track {track!r}: times must be strictly increasing; times[{i}]={times[i]} <= "
+            f"times[{i - 1}]={times[i - 1]}. Sort or drop duplicates."
+        )
+
+
+def _check_positive(track: str, sigmas: FloatArray) -> None:
+    if (sigmas <= 0).any():
+        i, axis = (int(k) for k in np.argwhere(sigmas <= 0)[0])
+        raise ValueError(
+            f"track {track!r}: sigmas must be positive; sigmas[{i}, {axis}]={sigmas[i, axis]}. "
+            "Give a standard deviation in m, or no sigmas at all."
+        )
+
+
+def _checked_labels(track: str, labels: Mapping[str, Label]) -> dict[str, Label]:
+    checked: dict[str, Label] = {}
+    for key, value in labels.items():
+        if not isinstance(key, str) or not key or key == "trajectory":
+            raise ValueError(
+                f"track {track!r}: label names must be non-empty text other than 'trajectory'; got {key!r}. Rename it."
+            )
+        if isinstance(value, str) and key not in SPIN_LABELS:
+            checked[key] = value
+        elif isinstance(value, int | float | np.integer | np.floating) and np.isfinite(value):
+            checked[key] = float(value)
+        else:
+            rule = "a finite number" if key in SPIN_LABELS else "a finite number or text"
+            raise ValueError(
+                f"track {track!r}: label {key!r} must be {rule}; got {value!r}. Leave the label out if it is unknown."
+            )
+    return checked
