@@ -1,7 +1,7 @@
 """How a ball moves: the contract, physical effects, integration with exact contacts, rollouts, model files."""
 
 from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.contact import contact_time, fly_through, fly_through_jacobian, gap
+from ballfg.dynamics.contact import contact_time, fly_through, fly_through_jacobian
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact
 from ballfg.dynamics.effects.registry import EFFECTS
 from ballfg.dynamics.integrate import fly, fly_jacobian
@@ -27,7 +27,6 @@ __all__ = [
     "fly_jacobian",
     "fly_through",
     "fly_through_jacobian",
-    "gap",
     "load_model",
     "model_from_dict",
     "model_to_dict",

@@ -58,6 +58,12 @@ class AnalyticModel(BallModel):
         velocity, spin = apply_impulse(impact, self.radius, self.inertia_factor)
         return torch.cat((state[..., POSITION], velocity, spin), dim=-1)
 
+    def surface_offset(self, state: Tensor) -> Tensor | float:
+        """(...) m by which surfaces lie above the heights declared for them."""
+        offsets = [cast(BounceEffect, effect).surface_offset() for effect in self.contact.values()]
+        total = sum((o for o in offsets if o is not None), start=state.new_zeros(1))
+        return total.squeeze(-1)
+
     def extra_repr(self) -> str:
         """Radius and inertia factor for `print(model)`."""
         return f"radius={self.radius:g} m, inertia_factor={self.inertia_factor:g}"

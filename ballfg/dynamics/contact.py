@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ballfg.dynamics.integrate import batch_jacobian, derivative, fly, fly_jacobian
 from ballfg.dynamics.model import BallModel
-from ballfg.state import STATE_DIM, VZ, Z
+from ballfg.state import VZ, Z
 
 NEWTON_STEPS = 12
 """Upper bound on the search; four are enough from the parabola's guess."""
@@ -25,11 +25,6 @@ MIN_SPEED = 1e-6
 """m/s. Least normal speed that a Newton step divides by; a ball that grazes more gently is at its apex."""
 
 
-def gap(state: Tensor, height: Tensor | float, radius: float) -> Tensor:
-    """(...) m between the ball's lowest point and a surface at `height`; negative below it."""
-    return state[..., Z] - height - radius
-
-
 def contact_time(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
     """Time until the falling ball touches a surface, on the branch on which it moves down.
 
@@ -38,7 +33,7 @@ def contact_time(model: BallModel, state: Tensor, height: Tensor | float) -> Ten
         in free flight, never gets to that height. Differentiable in the state and the parameters.
     """
     with torch.no_grad():
-        tau = _parabola_time(gap(state, height, model.radius), state[..., VZ])
+        tau = _parabola_time(model.gap(state, height), state[..., VZ])
         for _ in range(NEWTON_STEPS):
             move = _newton_step(model, state, height, tau)
             tau = tau + move
@@ -57,7 +52,7 @@ def _parabola_time(height_above: Tensor, vz: Tensor) -> Tensor:
 def _newton_step(model: BallModel, state: Tensor, height: Tensor | float, tau: Tensor) -> Tensor:
     at = fly(model, state, torch.nan_to_num(tau))
     speed = at[..., VZ].clamp_max(-MIN_SPEED)
-    return -gap(at, height, model.radius) / speed + 0.0 * tau  # keeps NaN
+    return -model.gap(at, height) / speed + 0.0 * tau  # keeps NaN
 
 
 def fly_through(
@@ -96,7 +91,7 @@ def fly_through_jacobian(
     Returns: state after dt (n, 9), contact times (n, k) s, Jacobian (n, 9, 9); detached from any graph.
     """
     state = state.detach()
-    jacobian = torch.eye(STATE_DIM, dtype=state.dtype).expand(*state.shape, STATE_DIM)
+    jacobian = torch.eye(state.shape[-1], dtype=state.dtype).expand(*state.shape, -1)
     elapsed = torch.zeros_like(dt)
     elapsed_by_state = torch.zeros_like(state).unsqueeze(-2)  # (n, 1, 9)
     times = []
@@ -106,8 +101,9 @@ def fly_through_jacobian(
         before, flight = fly_jacobian(model, state, tau)
         jacobian = flight @ jacobian
         rate = derivative(model.rates, before).detach()
-        # at the contact z is fixed: dz + vz dtau = 0
-        tau_by_state = -jacobian[..., Z : Z + 1, :] / rate[..., Z : Z + 1].unsqueeze(-1)
+        # at the contact the gap is zero: d gap + vz d tau = 0
+        _, gap_by_state = batch_jacobian(lambda at, height=height: model.gap(at, height).unsqueeze(-1), before)
+        tau_by_state = -(gap_by_state @ jacobian) / rate[..., Z : Z + 1].unsqueeze(-1)
         jacobian = jacobian + rate.unsqueeze(-1) * tau_by_state
         state, impact = batch_jacobian(model.bounce, before)
         jacobian = impact @ jacobian

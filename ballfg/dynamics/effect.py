@@ -6,7 +6,7 @@ An effect of kind `flight` adds to the acceleration or the angular acceleration 
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import ABC
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
@@ -128,10 +128,14 @@ class FlightEffect(Effect):
 
 
 class BounceEffect(Effect):
-    """An effect on the contact with a surface: it sets or changes coefficients of the impact."""
+    """An effect on the contact with a surface: on the coefficients of the impact, or on where the surface is."""
 
     kind: ClassVar[Literal["flight", "bounce"]] = "bounce"
 
-    @abstractmethod
     def adjust(self, impact: Impact) -> Impact:
         """The impact with this effect in it."""
+        return impact
+
+    def surface_offset(self) -> Tensor | None:
+        """(..., 1) or scalar m by which this effect lifts the surfaces, or None."""
+        return None

@@ -23,11 +23,11 @@ RateFunction = Callable[[Tensor], Rates]
 
 
 def derivative(rates: RateFunction, state: Tensor) -> Tensor:
-    """(..., 9) time derivative of the state."""
+    """(..., 9) time derivative of the state; zero for further columns, which hold constant coefficients."""
     acceleration, spin_rate = rates(state)
     if spin_rate is None:
-        spin_rate = torch.zeros_like(acceleration)
-    return torch.cat((state[..., VELOCITY], acceleration, spin_rate), dim=-1)
+        return torch.cat((state[..., VELOCITY], acceleration, torch.zeros_like(state[..., SPIN.start :])), dim=-1)
+    return torch.cat((state[..., VELOCITY], acceleration, spin_rate, torch.zeros_like(state[..., SPIN.stop :])), dim=-1)
 
 
 def rk4_step(rates: RateFunction, state: Tensor, h: Tensor) -> Tensor:
@@ -96,7 +96,7 @@ def _step_jacobian(rates: RateFunction, stages: tuple[Tensor, ...], h: Tensor) -
     k2 = a2 + half * (a2 @ a1)
     k3 = a3 + half * (a3 @ k2)
     k4 = a4 + whole * (a4 @ k3)
-    identity = torch.eye(STATE_DIM, dtype=h.dtype)
+    identity = torch.eye(a1.shape[-1], dtype=h.dtype)
     return identity + (whole / 6) * (a1 + 2 * (k2 + k3) + k4)
 
 
@@ -109,7 +109,7 @@ def rate_jacobian(rates: RateFunction, state: Tensor) -> Tensor:
     leaf = state.detach().requires_grad_(True)
     with torch.enable_grad():
         values = rates(leaf)
-    jacobian = state.new_zeros((*state.shape, STATE_DIM))
+    jacobian = state.new_zeros((*state.shape, state.shape[-1]))
     jacobian[..., POSITION, VELOCITY] = torch.eye(3, dtype=state.dtype)
     for value, first_row in zip(values, (VELOCITY.start, SPIN.start), strict=True):
         if value is None or not value.requires_grad:  # gravity alone does not depend on the state

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.dynamics.impact import slip_velocity
-from ballfg.state import SPIN, STANDARD_GRAVITY, VELOCITY
+from ballfg.state import SPIN, STANDARD_GRAVITY, VELOCITY, Z
 
 THIN_SHELL: Final = 2.0 / 3.0
 """Moment of inertia of a thin spherical shell divided by m R^2."""
@@ -54,6 +54,14 @@ class BallModel(nn.Module, ABC):
     @abstractmethod
     def bounce(self, state: Tensor) -> Tensor:
         """(..., 9) state just after an impact on a horizontal plane; the position does not change."""
+
+    def surface_offset(self, state: Tensor) -> Tensor | float:
+        """(...) m by which surfaces lie above the heights declared for them; none, unless a model says so."""
+        return 0.0
+
+    def gap(self, state: Tensor, height: Tensor | float) -> Tensor:
+        """(...) m between the ball's lowest point and a surface declared at `height`; negative below it."""
+        return state[..., Z] - height - self.surface_offset(state) - self.radius
 
     def roll(self, state: Tensor) -> Rates:
         """Rates of a ball that rests on a surface: air forces in the plane, friction until it rolls, resistance.

@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.contact import contact_time, gap
+from ballfg.dynamics.contact import contact_time
 from ballfg.dynamics.integrate import MAX_STEP, RateFunction, fly, rk4_step, step_count
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
@@ -26,14 +26,14 @@ MAX_CONTACTS_PER_STEP = 8
 """In 20 ms a ball that leaves at `REST_SPEED` or faster bounces at most three times; more is an error."""
 
 
-def is_resting(state: Tensor, height: Tensor | float, radius: float) -> Tensor:
+def is_resting(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
     """(...) bool: the ball lies on the surface at `height`."""
-    return (gap(state, height, radius).abs() <= REST_GAP) & (state[..., VZ].abs() <= REST_SPEED)
+    return (model.gap(state, height).abs() <= REST_GAP) & (state[..., VZ].abs() <= REST_SPEED)
 
 
-def place_on(state: Tensor, height: Tensor | float, radius: float) -> Tensor:
+def place_on(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
     """The state moved onto a surface, its vertical velocity zero."""
-    z = torch.zeros_like(state[..., Z]) + height + radius
+    z = state[..., Z] - model.gap(state, height)
     parts = (
         state[..., :Z],
         z[..., None],
@@ -46,7 +46,7 @@ def place_on(state: Tensor, height: Tensor | float, radius: float) -> Tensor:
 
 def roll(model: BallModel, state: Tensor, dt: Tensor, height: Tensor | float) -> Tensor:
     """The state after `dt` (...) s of resting on the surface at `height` m: sliding until it rolls, then rolling."""
-    state = place_on(state, height, model.radius)
+    state = place_on(model, state, height)
     steps = step_count(dt)
     h = (dt / steps).unsqueeze(-1)
     rates: RateFunction = model.roll
@@ -83,8 +83,8 @@ def _advance_step(model: BallModel, state: Tensor, h: Tensor, surfaces: Surfaces
     active = torch.arange(state.shape[0])
     for _ in range(MAX_CONTACTS_PER_STEP):
         after = fly(model, state, remaining)
-        resting = is_resting(state.detach(), height, model.radius)
-        landing = ~resting & (gap(after.detach(), height, model.radius) < 0) & (after[..., VZ].detach() < 0)
+        resting = is_resting(model, state.detach(), height)
+        landing = ~resting & (model.gap(after.detach(), height) < 0) & (after[..., VZ].detach() < 0)
         landing &= _lands_on_table(model, state, height, surfaces, landing)
         if bool(resting.any()):
             rolled = roll(model, state[resting], remaining[resting], height[resting])
@@ -118,7 +118,7 @@ def _land(model: BallModel, state: Tensor, remaining: Tensor, height: Tensor) ->
     tau = torch.where(lost, torch.zeros_like(tau), tau)
     bounced = model.bounce(fly(model, state, tau))
     rest = (lost | (bounced[..., VZ] < REST_SPEED)).unsqueeze(-1)
-    return torch.where(rest, place_on(bounced, height, model.radius), bounced), remaining - tau
+    return torch.where(rest, place_on(model, bounced, height), bounced), remaining - tau
 
 
 def rollout(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) -> Tensor:

@@ -11,6 +11,8 @@ from ballfg.dynamics.effects.gravity import Gravity
 from ballfg.dynamics.effects.magnus import Magnus
 from ballfg.dynamics.effects.restitution import Restitution
 from ballfg.dynamics.effects.spin_decay import SpinDecay
+from ballfg.dynamics.effects.table_height import TableHeight
+from ballfg.dynamics.effects.tangential_restitution import TangentialRestitution
 
 EFFECTS: Final[dict[str, type[Effect]]] = {
     effect.name: effect
@@ -21,6 +23,8 @@ EFFECTS: Final[dict[str, type[Effect]]] = {
         SpinDecay,
         Restitution,
         Friction,
+        TangentialRestitution,
+        TableHeight,
     )
 }
 

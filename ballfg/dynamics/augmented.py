@@ -1,0 +1,62 @@
+"""A ball whose uncertain coefficients travel with its state, so that one Jacobian serves both.
+
+Augmented states are (..., 9 + p): the state, then p coefficients that do not change in time. Everything that is
+written for a `BallModel` (flight, contacts, rollouts, their Jacobians) works on them unchanged.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ballfg.dynamics.model import BallModel, Rates, substitute
+from ballfg.state import STATE_DIM
+
+
+class AugmentedModel(BallModel):
+    """A model with some of its scalar parameters read from columns 9, 10, ... of the state.
+
+    Args:
+        model: any ball model.
+        names: parameter names as in `model.named_parameters()`, for instance `flight.drag.k`.
+
+    Raises: ValueError: if a name is not a scalar parameter of the model.
+    """
+
+    def __init__(self, model: BallModel, names: Sequence[str]) -> None:
+        super().__init__(model.radius, model.inertia_factor)
+        parameters = dict(model.named_parameters())
+        for name in names:
+            if name not in parameters or parameters[name].dim() != 0:
+                scalars = ", ".join(n for n, p in parameters.items() if p.dim() == 0)
+                raise ValueError(f"'{name}' is not a scalar parameter of the model; there are: {scalars}")
+        self.model = model
+        self.names = tuple(names)
+
+    def bound(self, state: Tensor) -> BallModel:
+        """The model with each state's own coefficients."""
+        columns = state[..., STATE_DIM:].split(1, dim=-1)
+        return substitute(self.model, dict(zip(self.names, columns, strict=True)))
+
+    def rates(self, state: Tensor) -> Rates:
+        """Acceleration and angular acceleration in free flight."""
+        return self.bound(state).rates(state[..., :STATE_DIM])
+
+    def bounce(self, state: Tensor) -> Tensor:
+        """State and coefficients just after an impact."""
+        after = self.bound(state).bounce(state[..., :STATE_DIM])
+        return torch.cat((after, state[..., STATE_DIM:]), dim=-1)
+
+    def surface_offset(self, state: Tensor) -> Tensor | float:
+        """(...) m by which surfaces lie above the heights declared for them."""
+        return self.bound(state).surface_offset(state[..., :STATE_DIM])
+
+    def roll(self, state: Tensor) -> Rates:
+        """Rates of a ball that rests on a surface."""
+        return self.bound(state).roll(state[..., :STATE_DIM])
+
+    def append(self, state: Tensor, coefficients: Tensor) -> Tensor:
+        """Augmented states (n, 9 + p) from states (n, 9) and coefficients (p,) or (n, p)."""
+        return torch.cat((state, coefficients.expand(*state.shape[:-1], len(self.names))), dim=-1)

@@ -1,0 +1,23 @@
+"""Tangential restitution: a gripping ball springs back along the surface."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from ballfg.dynamics.effect import BounceEffect, Coefficient, Impact
+
+
+class TangentialRestitution(BounceEffect):
+    """A ball that grips leaves with the fraction e_t of its slip reversed, instead of rolling (e_t = 0).
+
+    Source: R. Cross, "Grip-slip behavior of a bouncing ball", American Journal of Physics 70, 2002.
+    """
+
+    name = "tangential_restitution"
+    sentence = "Tangential compliance of the contact: slip is partly reversed when the ball grips."
+    coefficients = (Coefficient("e_t", 0.15, 0.1, "1", -1.0, 1.0),)
+    e_t: Tensor
+
+    def adjust(self, impact: Impact) -> Impact:
+        """The impact with e_t as its tangential restitution."""
+        return impact.with_(tangential_restitution=self.e_t)
