@@ -1,1 +1,1 @@
-"""TODO."""
+"""The command `ballfg`: one file a sub-command; they parse, call and print."""

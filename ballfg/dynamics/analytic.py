@@ -46,8 +46,11 @@ class AnalyticModel(BallModel):
                 acceleration = a if acceleration is None else acceleration + a
             if w is not None:
                 spin_rate = w if spin_rate is None else spin_rate + w
-        zero = torch.zeros_like(flight.velocity)
-        return zero if acceleration is None else acceleration.expand_as(zero), spin_rate
+        if acceleration is None:
+            return torch.zeros_like(flight.velocity), spin_rate
+        if acceleration.shape != flight.velocity.shape:  # gravity alone is one vector for all
+            acceleration = acceleration.expand_as(flight.velocity)
+        return acceleration, spin_rate
 
     def bounce(self, state: Tensor) -> Tensor:
         """(..., 9) state just after an impact on a horizontal plane; the position does not change."""
@@ -67,3 +70,20 @@ class AnalyticModel(BallModel):
     def extra_repr(self) -> str:
         """Radius and inertia factor for `print(model)`."""
         return f"radius={self.radius:g} m, inertia_factor={self.inertia_factor:g}"
+
+
+def coefficient_sigmas(model: BallModel) -> dict[str, float]:
+    """Prior standard deviations of a model's uncertain coefficients, by parameter name.
+
+    Args: model: an `AnalyticModel`; another model declares no spread and gives an empty mapping.
+    Returns: for instance {"flight.drag.k": 0.035}. Coefficients that are as good as known are left out.
+    """
+    if not isinstance(model, AnalyticModel):
+        return {}
+    sigmas = {}
+    for section, group in (("flight", model.flight), ("contact", model.contact)):
+        for name, module in group.items():
+            for c in cast(Effect, module).coefficients:
+                if c.sigma > 0.0:
+                    sigmas[f"{section}.{name}.{c.name}"] = c.sigma
+    return sigmas

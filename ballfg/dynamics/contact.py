@@ -1,7 +1,7 @@
 """Contacts with a horizontal surface: when the ball touches it, and the flow through one or more contacts.
 
-The contact time is a function of the state. Newton's iteration finds it without a graph; the last two steps run with
-one. A Newton step from the solution has the solution's exact first derivative, two steps have its derivatives up
+The contact time is a function of the state. A search finds it without a graph; two Newton steps then run with one. A
+Newton step from the solution has the solution's exact first derivative, two steps have its derivatives up
 to the third, so that both the saltation term of a Jacobian and the Hessian of a loss come out of autograd right
 (docs/derivations/contact.md).
 """
@@ -11,16 +11,22 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.integrate import batch_jacobian, derivative, fly, fly_jacobian
+from ballfg.dynamics.integrate import MAX_STEP, batch_jacobian, derivative, fly, fly_jacobian, rk4_step
 from ballfg.dynamics.model import BallModel
 from ballfg.state import VZ, Z
 
-NEWTON_STEPS = 12
-"""Upper bound on the search; four are enough from the parabola's guess."""
+SEARCH_STEPS = 12
+"""Upper bound on the search from a guess; one or two are enough for a contact within 20 ms."""
 TIME_TOLERANCE = 1e-13
-"""s. The search stops when no contact time moves by more."""
-TYPICAL_FALL = 9.81
-"""m/s^2, for the first guess only."""
+"""s. The search stops when the bound on every contact time's error is below."""
+GAP_TOLERANCE = 1e-10
+"""m. A grazing ball whose search stalled this close to the surface has touched it."""
+TYPICAL_JERK = 60.0
+"""m/s^3, in the bound on the search's error."""
+LEAST_FALL = 1.0
+"""m/s^2. The search takes a ball to fall at least as fast as this."""
+LONGEST_FALL = 20.0
+"""s. A contact further away counts as none."""
 MIN_SPEED = 1e-6
 """m/s. Least normal speed that a Newton step divides by; a ball that grazes more gently is at its apex."""
 
@@ -30,23 +36,70 @@ def contact_time(model: BallModel, state: Tensor, height: Tensor | float) -> Ten
 
     Args: model: the ball.  state: (..., 9).  height: m, scalar or (...).
     Returns: (...) s; negative when the ball is already below the surface on its way down. NaN where the ball,
-        in free flight, never gets to that height. Differentiable in the state and the parameters.
+        in free flight, does not come down to that height within `LONGEST_FALL`. Differentiable in the state and the
+        parameters.
     """
     with torch.no_grad():
-        tau = _parabola_time(model.gap(state, height), state[..., VZ])
-        for _ in range(NEWTON_STEPS):
-            move = _newton_step(model, state, height, tau)
-            tau = tau + move
-            if not bool((move.abs() > TIME_TOLERANCE).any()):
-                break
-    for _ in range(2):
-        tau = tau + _newton_step(model, state, height, tau)
+        tau = _search(model, state, height, torch.zeros_like(state[..., Z]))
+        if bool(tau.isnan().any()):  # rare: lift above the weight, near misses, or no contact at all
+            scanned = _search(model, state, height, _scan(model, state, height, tau.isnan()))
+            tau = torch.where(tau.isnan(), scanned, tau)
+    if torch.is_grad_enabled():
+        for _ in range(2):
+            tau = tau + _newton_step(model, state, height, tau)
     return tau
 
 
-def _parabola_time(height_above: Tensor, vz: Tensor) -> Tensor:
-    """(...) s at which a parabola comes down to the surface; NaN where it stays below."""
-    return (vz + (vz.square() + 2 * TYPICAL_FALL * height_above).sqrt()) / TYPICAL_FALL
+def _search(model: BallModel, state: Tensor, height: Tensor | float, start: Tensor) -> Tensor:
+    """Contact times (...) s near the times `start`, each step solving the parabola through the ball's motion there.
+
+    NaN where the search does not arrive, or starts at NaN.
+    """
+    tau, lost = torch.nan_to_num(start), start.isnan()
+    at = state if not bool(tau.any()) else fly(model, state, tau)
+    for _ in range(SEARCH_STEPS):
+        h, vz = model.gap(at, height), at[..., VZ]
+        fall = -model.rates(at)[0][..., Z]
+        used = fall.clamp_min(LEAST_FALL)
+        square = vz.square() + 2 * used * h
+        root = square.clamp_min(0.0).sqrt()
+        falling = vz < 0  # each form of the root where it does not cancel; the apex where the parabola stays below
+        move = torch.where(falling & (square > 0), 2 * h / (root - vz).clamp_min(1e-300), (vz + root) / used)
+        error = (TYPICAL_JERK / 6 * move.abs() + (used - fall).abs() / 2) * move.square()
+        arrived = (falling & (square > 0) & (error < TIME_TOLERANCE * vz.abs())) | (h.abs() < GAP_TOLERANCE) & (
+            move.abs() < MIN_SPEED
+        )
+        tau = tau + move
+        lost |= ~(tau.abs() <= LONGEST_FALL)
+        if bool((arrived | lost).all()):
+            break
+        tau = tau.masked_fill(lost, 0.0)
+        at = fly(model, state, tau)
+    return tau.masked_fill(lost | ~arrived, torch.nan)
+
+
+def _scan(model: BallModel, state: Tensor, height: Tensor | float, wanted: Tensor) -> Tensor:
+    """Times (...) s within one step of the contact: small steps, back in time for a ball that falls below the surface.
+
+    NaN where the ball is not `wanted` or turns before it gets there.
+    """
+    found = torch.full_like(state[..., Z], torch.nan)
+    h = model.gap(state, height)
+    step = torch.where((h < 0) & (state[..., VZ] < 0), -MAX_STEP, MAX_STEP).to(state.dtype)
+    open_ = wanted.clone()
+    for i in range(round(LONGEST_FALL / MAX_STEP)):
+        after = rk4_step(model.rates, state, step.unsqueeze(-1))
+        h_after = model.gap(after, height)
+        forward = step > 0
+        crossed = torch.where(forward, (h >= 0) & (h_after < 0), h_after >= 0)
+        missed = (h_after < 0) & torch.where(forward, after[..., VZ] < 0, after[..., VZ] >= 0) | ~h_after.isfinite()
+        found = torch.where(open_ & crossed, (i + ~forward) * step, found)
+        open_ &= ~(crossed | missed)
+        if not bool(open_.any()):
+            break
+        state = torch.where(open_.unsqueeze(-1), after, state)
+        h = model.gap(state, height)
+    return found
 
 
 def _newton_step(model: BallModel, state: Tensor, height: Tensor | float, tau: Tensor) -> Tensor:
@@ -100,17 +153,30 @@ def fly_through_jacobian(
             tau = contact_time(model, state, height)
         before, flight = fly_jacobian(model, state, tau)
         jacobian = flight @ jacobian
-        rate = derivative(model.rates, before).detach()
+        with torch.no_grad():
+            rate = derivative(model.rates, before)
         # at the contact the gap is zero: d gap + vz d tau = 0
-        _, gap_by_state = batch_jacobian(lambda at, height=height: model.gap(at, height).unsqueeze(-1), before)
-        tau_by_state = -(gap_by_state @ jacobian) / rate[..., Z : Z + 1].unsqueeze(-1)
+        tau_by_state = -(_gap_gradient(model, before, height).unsqueeze(-2) @ jacobian)
+        tau_by_state = tau_by_state / rate[..., Z, None, None].clamp_max(-MIN_SPEED)
         jacobian = jacobian + rate.unsqueeze(-1) * tau_by_state
-        state, impact = batch_jacobian(model.bounce, before)
+        state, impact = batch_jacobian(model.bounce, before, outputs=state.shape[-1])
         jacobian = impact @ jacobian
         elapsed = elapsed + tau
         elapsed_by_state = elapsed_by_state + tau_by_state
         times.append(elapsed)
     after, flight = fly_jacobian(model, state, dt - elapsed)
-    rate = derivative(model.rates, after).detach()
+    if not times:
+        return after, dt.new_zeros((*dt.shape, 0)), flight
+    with torch.no_grad():
+        rate = derivative(model.rates, after)
     jacobian = flight @ jacobian - rate.unsqueeze(-1) * elapsed_by_state
-    return after, torch.stack(times, dim=-1) if times else dt.new_zeros((*dt.shape, 0)), jacobian
+    return after, torch.stack(times, dim=-1), jacobian
+
+
+def _gap_gradient(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
+    """Derivative of the gap by the state, of the state's shape."""
+    leaf = state.detach().requires_grad_(True)
+    with torch.enable_grad():
+        total = model.gap(leaf, height).sum()
+    (gradient,) = torch.autograd.grad(total, leaf)
+    return gradient

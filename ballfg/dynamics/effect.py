@@ -24,7 +24,7 @@ class Coefficient:
     default: float
     """Nominal value for a table-tennis ball."""
     sigma: float
-    """Standard deviation of the prior: how far real balls and tables were seen to stray from the default."""
+    """Standard deviation of the prior: how far real balls and tables were seen to stray. 0: as good as known."""
     unit: str
     """SI unit, `1` where the number has none."""
     low: float
@@ -32,13 +32,16 @@ class Coefficient:
     high: float
     """Largest value accepted."""
 
+TINY_SPEED = 1e-12
+"""m/s. Below it the speed is constant to autograd."""
+
 
 class Flight:
     """A batch of free-flight states, with the quantities that several effects share computed once.
 
     Attributes:
         position: (..., 3) m.  velocity: (..., 3) m/s.  spin: (..., 3) rad/s.
-        speed: (..., 1) m/s, differentiable at rest (its gradient there is zero).
+        speed: (..., 1) m/s, twice differentiable at rest (its gradient there is zero).
     """
 
     __slots__ = ("_speed", "position", "spin", "velocity")
@@ -53,7 +56,11 @@ class Flight:
     def speed(self) -> Tensor:
         """(..., 1) m/s."""
         if self._speed is None:
-            self._speed = torch.linalg.vector_norm(self.velocity, dim=-1, keepdim=True)
+            if torch.is_grad_enabled():  # the norm's own second derivative is NaN at rest
+                square = self.velocity.square().sum(-1, keepdim=True)
+                self._speed = square.clamp_min(TINY_SPEED**2).sqrt()
+            else:
+                self._speed = torch.linalg.vector_norm(self.velocity, dim=-1, keepdim=True)
         return self._speed
 
 
@@ -96,7 +103,7 @@ class Effect(nn.Module, ABC):
     sentence: ClassVar[str]
     coefficients: ClassVar[tuple[Coefficient, ...]]
 
-    def __init__(self, **values: float) -> None:
+    def __init__(self, /, **values: float) -> None:
         super().__init__()
         known = {c.name: c for c in self.coefficients}
         unknown = sorted(set(values) - set(known))

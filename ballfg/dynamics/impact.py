@@ -32,9 +32,10 @@ def apply_impulse(impact: Impact, radius: float, inertia_factor: float) -> tuple
     slip = slip_velocity(impact.velocity, impact.spin, radius)
     speed = slip.square().sum(-1, keepdim=True).clamp_min(TINY_SLIP**2).sqrt()
     normal_speed = impact.normal_speed
+    pressing = normal_speed.clamp_min(0.0)  # no friction on a ball that moves away
     # a tangential impulse J (per mass) changes the slip by J (1 + 1/c): c/(1+c) of the slip stops it
     grip = inertia_factor / (1.0 + inertia_factor) * (1.0 + impact.tangential_restitution)
-    slide = impact.friction * (1.0 + impact.restitution) * normal_speed / speed
+    slide = impact.friction * (1.0 + impact.restitution) * pressing / speed
     impulse = -torch.minimum(slide, grip.expand_as(slide)) * slip
     velocity = torch.cat((impact.velocity[..., :2] + impulse, impact.restitution * normal_speed), dim=-1)
     kick = impulse / (inertia_factor * radius)

@@ -14,12 +14,14 @@ import torch
 from torch import Tensor
 
 from ballfg.dynamics.model import BallModel, Rates
-from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+from ballfg.state import POSITION, SPIN, VELOCITY
 
 MAX_STEP = 0.02
 """s. Longer intervals are cut into equal steps. At 0.02 s and 20 m/s the step's error is below 1e-9 m."""
 
 RateFunction = Callable[[Tensor], Rates]
+
+_EYE3 = torch.eye(3, dtype=torch.float64)
 
 
 def derivative(rates: RateFunction, state: Tensor) -> Tensor:
@@ -38,18 +40,28 @@ def rk4_step(rates: RateFunction, state: Tensor, h: Tensor) -> Tensor:
 def _stages(rates: RateFunction, state: Tensor, h: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
     """The state after a step, and the four states at which the rates were taken."""
     k1 = derivative(rates, state)
-    x2 = state + (h / 2) * k1
+    half = h / 2
+    x2 = torch.addcmul(state, half, k1)
     k2 = derivative(rates, x2)
-    x3 = state + (h / 2) * k2
+    x3 = torch.addcmul(state, half, k2)
     k3 = derivative(rates, x3)
-    x4 = state + h * k3
+    x4 = torch.addcmul(state, h, k3)
     k4 = derivative(rates, x4)
-    return state + (h / 6) * (k1 + 2 * (k2 + k3) + k4), (state, x2, x3, x4)
+    return torch.addcmul(state, h / 6, torch.add(k1 + k4, k2 + k3, alpha=2)), (state, x2, x3, x4)
 
 
 def step_count(dt: Tensor) -> int:
-    """Number of equal steps, each at most `MAX_STEP`, that the longest of some intervals (s) needs."""
+    """Number of equal steps, each at most `MAX_STEP`, that the longest of some intervals (s) needs.
+
+    An interval that is NaN (a contact that never comes) needs none.
+
+    Raises: ValueError: if an interval is infinite.
+    """
     longest = float(dt.detach().abs().max()) if dt.numel() else 0.0
+    if math.isnan(longest):
+        longest = float(dt.detach().abs().nan_to_num(nan=0.0, posinf=math.inf).max())
+    if math.isinf(longest):
+        raise ValueError("dt must be finite; got inf. Check the times.")
     return max(1, math.ceil(longest / MAX_STEP - 1e-9))
 
 
@@ -103,34 +115,39 @@ def _step_jacobian(rates: RateFunction, stages: tuple[Tensor, ...], h: Tensor) -
 def rate_jacobian(rates: RateFunction, state: Tensor) -> Tensor:
     """(..., 9, 9) derivative of `derivative(rates, state)` by the state.
 
-    The batch is evaluated once, then one backward pass gives one row of all states' Jacobians: three passes, six
-    where the spin changes in flight.
+    A batch repeated three times gives all rows of a 3-vector's Jacobian in one backward pass, six times where the spin
+    changes in flight: the number of calls decides, not the size of the batch.
     """
-    leaf = state.detach().requires_grad_(True)
+    width = state.shape[-1]
+    jacobian = state.new_zeros((*state.shape, width))
+    jacobian[..., POSITION, VELOCITY] = _EYE3
+    leaf = state.detach().expand(3, *state.shape).requires_grad_(True)
     with torch.enable_grad():
-        values = rates(leaf)
-    jacobian = state.new_zeros((*state.shape, state.shape[-1]))
-    jacobian[..., POSITION, VELOCITY] = torch.eye(3, dtype=state.dtype)
-    for value, first_row in zip(values, (VELOCITY.start, SPIN.start), strict=True):
+        acceleration, spin_rate = rates(leaf)
+    for value, rows in ((acceleration, VELOCITY), (spin_rate, SPIN)):
         if value is None or not value.requires_grad:  # gravity alone does not depend on the state
             continue
-        for i in range(3):
-            cotangent = torch.zeros_like(value)
-            cotangent[..., i] = 1.0
-            (row,) = torch.autograd.grad(value, leaf, cotangent, retain_graph=True, allow_unused=True)
-            if row is not None:
-                jacobian[..., first_row + i, :] = row
+        cotangent = _EYE3.view(3, *(1,) * (state.dim() - 1), 3).expand_as(value)
+        (by_state,) = torch.autograd.grad(value, leaf, cotangent, retain_graph=True, allow_unused=True)
+        if by_state is not None:
+            jacobian[..., rows, :] = by_state.movedim(0, -2)
     return jacobian
 
 
-def batch_jacobian(function: Callable[[Tensor], Tensor], state: Tensor) -> tuple[Tensor, Tensor]:
+def batch_jacobian(
+    function: Callable[[Tensor], Tensor], state: Tensor, *, outputs: int | None = None
+) -> tuple[Tensor, Tensor]:
     """A row-wise function and its derivative, in one autograd call on the batch repeated once per output.
 
-    Args: function: maps (..., n, 9) to (..., n, m), each row by itself.  state: (n, 9).
+    Args:
+        function: maps (..., n, 9) to (..., n, m), each row by itself.
+        state: (n, 9).
+        outputs: m, where it is known; else one more call finds it.
     Returns: value (n, m) and Jacobian (n, m, 9); both detached.
     """
-    with torch.no_grad():
-        outputs = function(state[:1]).shape[-1]
+    if outputs is None:
+        with torch.no_grad():
+            outputs = function(state).shape[-1]
     leaf = state.detach().expand(outputs, *state.shape).clone().requires_grad_(True)
     with torch.enable_grad():
         value = function(leaf)

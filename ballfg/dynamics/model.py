@@ -27,6 +27,9 @@ Rates = tuple[Tensor, Tensor | None]
 
 M = TypeVar("M", bound=nn.Module)
 
+_SUBSTITUTED = "_substituted"
+"""Attribute of a module that `substitute` made: the names of its own parameters that are given tensors."""
+
 
 class BallModel(nn.Module, ABC):
     """A ball of some radius that flies, hits horizontal surfaces and comes to rest on them.
@@ -97,20 +100,50 @@ def substitute(module: M, values: Mapping[str, Tensor]) -> M:
             gives each of n states in a batch (n, 9) its own value.
     Raises: KeyError: if the module has no parameter of that name.
     """
-    clone = copy.copy(module)
-    clone._parameters = dict(module._parameters)
-    clone._modules = dict(module._modules)
+    clone = _shallow_copy(module)
+    substituted = module.__dict__.get(_SUBSTITUTED, frozenset())
     children: dict[str, dict[str, Tensor]] = {}
     for name, value in values.items():
         head, _, rest = name.partition(".")
         if rest:
             children.setdefault(head, {})[rest] = value
         else:
-            del clone._parameters[head]
+            if head not in substituted:
+                del clone._parameters[head]
             clone.__dict__[head] = value
     for head, inner in children.items():
         child = module._modules[head]
         if child is None:
             raise KeyError(head)
         clone._modules[head] = substitute(child, inner)
+    clone.__dict__[_SUBSTITUTED] = substituted | {name for name in values if "." not in name}
+    return clone
+
+
+def take_rows(module: M, rows: Tensor, count: int) -> M:
+    """The module for some rows of a batch: parameters that `substitute` gave per row are cut to those rows.
+
+    Args:
+        module: for instance a `BallModel`; itself returned where nothing was substituted.
+        rows: boolean mask (n,) or indices.
+        count: n, the size of the whole batch.
+    """
+    names = module.__dict__.get(_SUBSTITUTED)
+    children = {name: child for name, child in module._modules.items() if child is not None}
+    taken = {name: take_rows(child, rows, count) for name, child in children.items()}
+    if names is None and all(taken[name] is child for name, child in children.items()):
+        return module
+    clone = _shallow_copy(module)
+    clone._modules.update(taken)
+    for name in names or ():
+        value = module.__dict__[name]
+        if value.dim() and value.shape[0] == count:
+            clone.__dict__[name] = value[rows]
+    return clone
+
+
+def _shallow_copy(module: M) -> M:
+    clone = copy.copy(module)
+    clone._parameters = dict(module._parameters)
+    clone._modules = dict(module._modules)
     return clone

@@ -19,6 +19,18 @@ from ballfg.dynamics.model import THIN_SHELL
 SECTIONS = ("flight", "bounce", "measurement", "learned")
 
 
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """The safe loader, which takes the last of two equal keys in silence; this one refuses them."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """The mapping. Raises: ConstructorError: if a key comes twice."""
+        keys = [key.value for key, _ in node.value]
+        for key, _ in node.value:
+            if keys.count(key.value) > 1:
+                raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' stands twice", key.start_mark)
+        return super().construct_mapping(node, deep)
+
+
 def nominal_model(radius: float = 0.02) -> AnalyticModel:
     """The table-tennis model that ships with the package."""
     text = resources.files("ballfg").joinpath("models/nominal.yaml").read_text(encoding="utf-8")
@@ -41,7 +53,7 @@ def load_model(path: str | Path, *, radius: float = 0.02, inertia_factor: float 
     if not path.is_file():
         raise FileNotFoundError(f"model file {path} does not exist; a model is one YAML file")
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
+        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         reason = " ".join(str(error).split())
         raise ValueError(f"{path}: not readable as YAML ({reason})") from error
@@ -74,13 +86,15 @@ def model_from_dict(
 
 def _effect(name: str, kind: str, values: Any, where: str) -> Effect:
     values = {} if values is None else values
-    if not isinstance(values, Mapping) or not all(
-        isinstance(v, int | float) and not isinstance(v, bool) for v in values.values()
-    ):
+    if not isinstance(values, Mapping):
         raise ValueError(f"{where}: {kind}.{name} must map coefficients to numbers; got {values!r}")
+    for key, value in values.items():
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            hint = ". YAML reads 3e-3 as text; write 3.0e-3" if isinstance(value, str) else ""
+            raise ValueError(f"{where}: {kind}.{name}.{key} must be a number; got {value!r}{hint}")
     try:
-        return effect_class(name, kind)(**values)
-    except ValueError as error:
+        return effect_class(name, kind)(**{str(key): value for key, value in values.items()})
+    except (ValueError, OverflowError) as error:
         raise ValueError(f"{where}: {error}") from error
 
 

@@ -1,10 +1,14 @@
 """Motion with events: free flight, contacts at their exact times, several in one step, rest and rolling.
 
 What is defined where nature is not asked:
-- A bounce that would rise for less than `REST_SPEED` ends in rest: the ball stays on the surface and rolls.
+- A bounce that would rise for less than `REST_SPEED` ends in rest: the ball stays on the surface and rolls. So does one
+  that meets a surface more than `MAX_CONTACTS` times within one step. A resting ball whose lift exceeds its weight
+  takes off again.
 - A ball that starts a little below a surface (its centre above it) and moves down bounces at the moment at which it
   went through; one that moves up leaves. One that can no longer come up is put on the surface, at rest.
 - A ball whose centre starts below the table's surface is beside the table; the floor is what it falls on.
+- Whether a ball meets the table is decided by its centre's place over it at the moment of contact; edges are not hit. A
+  ball that rolls over the edge falls from the end of the integration step in which it does.
 """
 
 from __future__ import annotations
@@ -13,22 +17,23 @@ import torch
 from torch import Tensor
 
 from ballfg.dynamics.contact import contact_time
-from ballfg.dynamics.integrate import MAX_STEP, RateFunction, fly, rk4_step, step_count
-from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.integrate import RateFunction, fly, rk4_step, step_count
+from ballfg.dynamics.model import BallModel, take_rows
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import VZ, Z
 
 REST_SPEED = 0.05
 """m/s. A ball that leaves a surface more slowly would be back within 10 ms, 0.13 mm high: it rests."""
-REST_GAP = 2e-4
-"""m. A ball this close to a surface and slower than `REST_SPEED` rests on it."""
-MAX_CONTACTS_PER_STEP = 8
-"""In 20 ms a ball that leaves at `REST_SPEED` or faster bounces at most three times; more is an error."""
+REST_GAP = 1e-5
+"""m. A ball this close to a surface and slower than half of `REST_SPEED` rests on it. A ball that left at `REST_SPEED`
+or faster is never both, so that a hop is the same motion however its time is cut."""
+MAX_CONTACTS = 32
+"""In one step of 20 ms a ball that leaves at `REST_SPEED` under its weight alone bounces at most twice."""
 
 
 def is_resting(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
     """(...) bool: the ball lies on the surface at `height`."""
-    return (model.gap(state, height).abs() <= REST_GAP) & (state[..., VZ].abs() <= REST_SPEED)
+    return (model.gap(state, height).abs() <= REST_GAP) & (state[..., VZ].abs() <= REST_SPEED / 2)
 
 
 def place_on(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
@@ -64,10 +69,10 @@ def advance(model: BallModel, state: Tensor, dt: Tensor, surfaces: Surfaces) -> 
         dt: (n,) s, not negative.
         surfaces: table and floor.
     Returns: (n, 9), differentiable in the state and the parameters, through the contact times too.
-    Raises: ValueError: if a dt is negative.
+    Raises: ValueError: if a dt is negative or not a number.
     """
-    if bool((dt < 0).any()):
-        raise ValueError(f"dt must not be negative; got {float(dt.min()):g} s. Sort the times.")
+    if not bool((dt >= 0).all()):
+        raise ValueError(f"dt must be a number, not negative; got {float(dt.min()):g} s. Sort the times.")
     steps = step_count(dt)
     for _ in range(steps):
         state = _advance_step(model, state, dt / steps, surfaces)
@@ -76,48 +81,63 @@ def advance(model: BallModel, state: Tensor, dt: Tensor, surfaces: Surfaces) -> 
 
 def _advance_step(model: BallModel, state: Tensor, h: Tensor, surfaces: Surfaces) -> Tensor:
     """One step of at most `MAX_STEP`."""
-    assert float(h.max()) <= MAX_STEP * (1 + 1e-6)
-    height = surfaces.height_below(state.detach())
+    height = surfaces.level_below(state.detach())
     remaining = h
     done = state
     active = torch.arange(state.shape[0])
-    for _ in range(MAX_CONTACTS_PER_STEP):
+    for contacts in range(MAX_CONTACTS + 1):
         after = fly(model, state, remaining)
-        resting = is_resting(model, state.detach(), height)
-        landing = ~resting & (model.gap(after.detach(), height) < 0) & (after[..., VZ].detach() < 0)
-        landing &= _lands_on_table(model, state, height, surfaces, landing)
+        resting = _stays(model, state.detach(), height, surfaces)
+        height, landing = _next_surface(model, state.detach(), after.detach(), height, ~resting, surfaces)
         if bool(resting.any()):
-            rolled = roll(model, state[resting], remaining[resting], height[resting])
+            part = take_rows(model, resting, len(state))
+            rolled = roll(part, state[resting], remaining[resting], height[resting])
             after = after.index_put((resting.nonzero()[:, 0],), rolled)
         done = done.index_put((active,), after) if len(active) < len(done) else after
         if not bool(landing.any()):
-            return done
-        active, height = active[landing], height[landing]
-        state, remaining = _land(model, state[landing], remaining[landing], height)
-    raise RuntimeError(f"a ball met a surface more than {MAX_CONTACTS_PER_STEP} times in one step")
+            break
+        model, active, height = take_rows(model, landing, len(state)), active[landing], height[landing]
+        state, remaining = _land(model, state[landing], remaining[landing], height, last=contacts == MAX_CONTACTS - 1)
+    return done
 
 
-def _lands_on_table(model: BallModel, state: Tensor, height: Tensor, surfaces: Surfaces, landing: Tensor) -> Tensor:
-    """(n,) bool: False for a ball that comes below the table's height outside the table's extent."""
-    keep = torch.ones_like(landing)
-    if surfaces.extent is None:
-        return keep
-    on_table = landing & (height == surfaces.table_height)
-    if bool(on_table.any()):
+def _stays(model: BallModel, state: Tensor, height: Tensor, surfaces: Surfaces) -> Tensor:
+    """(n,) bool: the ball rests on the surface at `height`, and its weight keeps it there."""
+    resting = is_resting(model, state, height)
+    if bool(resting.any()):
         with torch.no_grad():
-            tau = contact_time(model, state[on_table], height[on_table])
-            touch = fly(model, state[on_table], torch.nan_to_num(tau))
-        keep[on_table] = surfaces.over_table(touch)
-    return keep
+            resting &= model.rates(state)[0][..., Z] <= 0
+        resting &= (height != surfaces.table_height) | surfaces.over_table(state)
+    return resting
 
 
-def _land(model: BallModel, state: Tensor, remaining: Tensor, height: Tensor) -> tuple[Tensor, Tensor]:
+def _next_surface(
+    model: BallModel, state: Tensor, after: Tensor, height: Tensor, flying: Tensor, surfaces: Surfaces
+) -> tuple[Tensor, Tensor]:
+    """Heights (n,) m of the surfaces that count in this step and whether (n,) the flying balls come down on them."""
+    landing = flying & (model.gap(after, height) < 0) & (after[..., VZ] < 0)
+    to_check = landing & (height == surfaces.table_height)
+    if surfaces.extent is None or not bool(to_check.any()):
+        return height, landing
+    part = take_rows(model, to_check, len(state))
+    with torch.no_grad():
+        tau = contact_time(part, state[to_check], height[to_check])
+        touch = fly(part, state[to_check], torch.nan_to_num(tau))
+    beside = torch.zeros_like(landing)
+    beside[to_check] = ~surfaces.over_table(touch)
+    height = torch.where(beside, surfaces.lowest(), height)
+    return height, landing & (model.gap(after, height) < 0)
+
+
+def _land(
+    model: BallModel, state: Tensor, remaining: Tensor, height: Tensor, *, last: bool
+) -> tuple[Tensor, Tensor]:
     """States just after the next contact and the time then left; a bounce too small to rise ends in rest."""
     tau = contact_time(model, state, height)
     lost = tau.isnan()  # below the surface and never up again
     tau = torch.where(lost, torch.zeros_like(tau), tau)
     bounced = model.bounce(fly(model, state, tau))
-    rest = (lost | (bounced[..., VZ] < REST_SPEED)).unsqueeze(-1)
+    rest = (lost | (bounced[..., VZ] < REST_SPEED) | last).unsqueeze(-1)
     return torch.where(rest, place_on(model, bounced, height), bounced), remaining - tau
 
 
@@ -134,7 +154,7 @@ def rollout(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) 
     """
     times = times.expand(state.shape[0], -1) if times.dim() == 1 else times
     steps = torch.diff(times, dim=-1, prepend=torch.zeros_like(times[:, :1]))
-    if bool((steps < 0).any()):
+    if not bool((steps >= 0).all()):
         raise ValueError("times must start at 0 or later and must not decrease. Sort them.")
     states = []
     for dt in steps.unbind(-1):

@@ -62,6 +62,13 @@ class Surfaces:
 
         A ball whose centre is below the table's surface is beside the table.
         """
-        floor = -math.inf if self.floor_height is None else self.floor_height
         on_table = (state[..., Z] > self.table_height) & self.over_table(state)
-        return torch.where(on_table, self.table_height, floor).to(state.dtype)
+        return torch.where(on_table, self.table_height, self.lowest()).to(state.dtype)
+
+    def level_below(self, state: Tensor) -> Tensor:
+        """(...) m, height of the surface whose level a falling ball reaches next, over the table or beside it."""
+        return torch.where(state[..., Z] > self.table_height, self.table_height, self.lowest()).to(state.dtype)
+
+    def lowest(self) -> float:
+        """m, height of the lowest surface under a ball beside the table; -inf where there is none."""
+        return -math.inf if self.floor_height is None else self.floor_height

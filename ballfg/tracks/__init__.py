@@ -1,1 +1,21 @@
-"""TODO."""
+"""Tracks and datasets: reading, checking and writing them; docs/tracks.md describes the files."""
+
+from .dataset import Dataset, read_dataset
+from .info import TABLE_TENNIS, TENNIS, Ball, DatasetInfo
+from .table import TableWriter
+from .track import SPIN_LABELS, Label, Track
+from .writing import write_dataset
+
+__all__ = [
+    "SPIN_LABELS",
+    "TABLE_TENNIS",
+    "TENNIS",
+    "Ball",
+    "Dataset",
+    "DatasetInfo",
+    "Label",
+    "TableWriter",
+    "Track",
+    "read_dataset",
+    "write_dataset",
+]

@@ -5,6 +5,7 @@ is an error to report, so that it can afford to read the file cell by cell.
 """
 
 import csv
+import math
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ _HEADER_LIMIT = 1 << 16  # bytes
 
 def is_number(cell: str) -> bool:
     """Whether a cell holds a finite decimal number with a point, such as 0.02 or 2e-2."""
-    return _NUMBER.fullmatch(cell) is not None
+    return _NUMBER.fullmatch(cell) is not None and math.isfinite(float(cell))
 
 
 def one_line(error: object) -> str:
@@ -30,7 +31,7 @@ def read_header(path: Path) -> list[str]:
     Raises: ValueError: an empty file, or one that is not UTF-8 text.
     """
     with path.open("rb") as file:
-        first = file.readline(_HEADER_LIMIT)
+        first = re.split(rb"[\r\n]", file.read(_HEADER_LIMIT), maxsplit=1)[0]
     if not first.strip():
         raise ValueError(f"{path}: must begin with a line of column names; got an empty file or line. Add the header.")
     try:
@@ -88,6 +89,7 @@ def explain(path: Path, numeric: Sequence[str], reason: str) -> ValueError:
         reason: the fast reader's own words, used if the second look finds nothing.
     """
     header = read_header(path)
+    line = 1
     try:
         for line, cells in records(path):
             problem = _row_problem(header, numeric, cells)
@@ -95,7 +97,14 @@ def explain(path: Path, numeric: Sequence[str], reason: str) -> ValueError:
                 return ValueError(f"{path}, line {line}{problem}")
     except ValueError as error:
         return error
+    if line == 1:
+        return no_rows(path)
     return ValueError(f"{path}: must be a CSV table; {one_line(reason)}. Check quotes and separators.")
+
+
+def no_rows(path: Path) -> ValueError:
+    """The error for a table that has only a header."""
+    return ValueError(f"{path}: must hold tracks; got a header without rows. Add the measurements.")
 
 
 def _row_problem(header: list[str], numeric: Sequence[str], cells: list[str]) -> str | None:
@@ -106,7 +115,7 @@ def _row_problem(header: list[str], numeric: Sequence[str], cells: list[str]) ->
         )
     for name in numeric:
         cell = cells[header.index(name)]
-        if not is_number(cell) and not _NOT_FINITE.fullmatch(cell):
+        if not _NUMBER.fullmatch(cell) and not _NOT_FINITE.fullmatch(cell):
             got = f"got {cell!r}" if cell.strip() else "got an empty cell"
             return f", column {name!r}: must be a number with a decimal point; {got}. Correct it or delete the line."
     return None

@@ -23,7 +23,7 @@ def nearest(name: str, candidates: Iterable[str]) -> str | None:
             for other in group:
                 if other in plain:
                     return plain[other]
-    found = difflib.get_close_matches(wanted, plain, n=1, cutoff=0.6 if len(wanted) > 2 else 1.0)
+    found = difflib.get_close_matches(wanted, plain, n=1, cutoff=0.6)
     return plain[found[0]] if found else None
 
 

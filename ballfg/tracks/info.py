@@ -5,9 +5,9 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import yaml
 
+from .fields import check_text, kind, set_number
 from .hints import did_you_mean, nearest
 
 INFO_FILE = "dataset.yaml"
@@ -36,15 +36,15 @@ class Ball:
     """kg"""
 
     def __post_init__(self) -> None:
-        _set_number(self, "radius", "ball.radius", "m", above=0.0, limit=_MAX_RADIUS, instead="mm")
-        _set_number(self, "mass", "ball.mass", "kg", above=0.0, limit=_MAX_MASS, instead="g")
+        set_number(self, "radius", "ball.radius", "m", above=0.0, limit=_MAX_RADIUS, instead="mm")
+        set_number(self, "mass", "ball.mass", "kg", above=0.0, limit=_MAX_MASS, instead="g")
 
 
 TABLE_TENNIS = Ball(radius=0.02, mass=0.0027)
 """ITTF, The Laws of Table Tennis, 2.3: diameter 40 mm, 2.7 g."""
 
-TENNIS = Ball(radius=0.0335, mass=0.058)
-"""ITF Rules of Tennis, Appendix I, type 2: diameter 65.4-68.6 mm, 56.0-59.4 g; the middle of both, rounded."""
+TENNIS = Ball(radius=0.0335, mass=0.0577)
+"""ITF Rules of Tennis, Appendix I, type 2: diameter 65.4-68.6 mm, 56.0-59.4 g; the middle of both."""
 
 
 @dataclass(frozen=True)
@@ -80,18 +80,18 @@ class DatasetInfo:
 
     def __post_init__(self) -> None:
         for key in ("name", "source", "licence"):
-            _check_text(key, getattr(self, key), optional=key != "name")
+            check_text(key, getattr(self, key), optional=key != "name")
         if not isinstance(self.ball, Ball):
             raise TypeError(f"ball must be a Ball; got {type(self.ball).__name__}. Pass Ball(radius, mass).")
-        _set_number(self, "table_height", "frame.table_height", "m", limit=_MAX_HEIGHT, instead="mm")
+        set_number(self, "table_height", "frame.table_height", "m", limit=_MAX_HEIGHT, instead="mm")
         if self.rate is not None:
-            _set_number(self, "rate", "rate", "Hz", above=0.0)
+            set_number(self, "rate", "rate", "Hz", above=0.0)
         if self.position_noise is not None:
-            _set_number(
+            set_number(
                 self, "position_noise", "position_noise", "m", above=0.0, limit=_MAX_POSITION_NOISE, instead="mm"
             )
         if self.spin_noise is not None:
-            _set_number(self, "spin_noise", "spin_noise", "rad/s", above=0.0)
+            set_number(self, "spin_noise", "spin_noise", "rad/s", above=0.0)
 
     @classmethod
     def from_mapping(cls, content: Mapping[str, Any]) -> "DatasetInfo":
@@ -144,7 +144,7 @@ def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:
         ) from None
     if not isinstance(content, dict):
         raise ValueError(
-            f"{path}: must hold fields such as 'name: my_shots'; got {_kind(content)}. "
+            f"{path}: must hold fields such as 'name: my_shots'; got {kind(content)}. "
             f"Give at least {', '.join(_REQUIRED)}."
         )
     content = {str(key): value for key, value in content.items()}
@@ -154,7 +154,11 @@ def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:
         raise ValueError(f"{path}: {error}") from None
     unknown = [key for key in content if key not in _KNOWN]
     absent = [key for key in _OPTIONAL if key not in content]
-    return info, [f"{INFO_FILE}: field {key!r} ignored.{did_you_mean(key, absent)}" for key in unknown]
+    hints = [did_you_mean(key, absent) for key in unknown]
+    return info, [
+        f"{INFO_FILE}: field {key!r} ignored{'.' + hint if hint else ''}"
+        for key, hint in zip(unknown, hints, strict=True)
+    ]
 
 
 def write_info(path: Path, info: DatasetInfo) -> None:
@@ -183,46 +187,6 @@ def _need(content: Mapping[str, Any], key: str, prefix: str) -> None:
     found = nearest(key, [name for name in present if name not in _KNOWN])
     remedy = f"Add it, or rename {found!r}." if found else "Add it."
     raise ValueError(f"{prefix}{key} is required; got {', '.join(present) or 'nothing'}. {remedy}")
-
-
-def _check_text(key: str, value: object, *, optional: bool) -> None:
-    if value is None and optional:
-        return
-    if not isinstance(value, str):
-        raise TypeError(f"{key} must be text; got {_kind(value)} {value}. Put it in quotes.")
-    if not value.strip():
-        raise ValueError(f"{key} must not be empty; got {value!r}. Give it a text.")
-
-
-def _set_number(
-    owner: object,
-    attribute: str,
-    label: str,
-    unit: str,
-    *,
-    above: float | None = None,
-    limit: float = np.inf,
-    instead: str = "",
-) -> None:
-    """Checks one numeric field of a frozen dataclass and stores it as float."""
-    value = getattr(owner, attribute)
-    if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-        raise TypeError(
-            f"{label} must be a number in {unit}; got {_kind(value)} {value!r}. Write it like 0.02 or 2.0e-2."
-        )
-    number = float(value)
-    if not np.isfinite(number) or (above is not None and number <= above):
-        rule = "finite" if above is None else f"finite and above {above:g}"
-        raise ValueError(f"{label} must be {rule}; got {number:g}. Correct it (unit: {unit}).")
-    if abs(number) > limit:
-        raise ValueError(
-            f"{label} must be in {unit}, at most {limit:g}; got {number:g}. It is probably in {instead}: convert it to {unit}."
-        )
-    object.__setattr__(owner, attribute, number)
-
-
-def _kind(value: object) -> str:
-    return "nothing" if value is None else type(value).__name__
 
 
 def _yaml_place(error: yaml.YAMLError) -> str:

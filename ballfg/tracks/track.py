@@ -44,7 +44,8 @@ class Track:
         times = _float_array(self.name, "times", self.times)
         if times.ndim != 1 or len(times) == 0:
             raise ValueError(
-                f"track {self.name!r}: times must have shape (n,) with n >= 1; got {times.shape}. Pass one stamp per sample."
+                f"track {self.name!r}: times must have shape (n,) with n >= 1; got {times.shape}. "
+                "Pass one stamp per sample."
             )
         _check_increasing(self.name, times)
         positions = _float_array(self.name, "positions", self.positions, (len(times), 3))
@@ -96,9 +97,7 @@ class Track:
         if not inside[0]:
             labels = {key: value for key, value in labels.items() if key not in SPIN_LABELS}
         sigmas = None if self.sigmas is None else self.sigmas[inside]
-        return replace(
-            self, times=self.times[inside], positions=self.positions[inside], sigmas=sigmas, labels=labels
-        )
+        return replace(self, times=self.times[inside], positions=self.positions[inside], sigmas=sigmas, labels=labels)
 
     def until(self, end: float) -> "Track":
         """The samples with time <= end (s, in the track's own time), as a new track.
@@ -117,9 +116,7 @@ def _check_name(name: object) -> None:
         )
 
 
-def _float_array(
-    track: str, argument: str, value: ArrayLike, shape: tuple[int, ...] | None = None
-) -> FloatArray:
+def _float_array(track: str, argument: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> FloatArray:
     try:
         array = np.array(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -162,9 +159,9 @@ def _check_positive(track: str, sigmas: FloatArray) -> None:
 def _checked_labels(track: str, labels: Mapping[str, Label]) -> dict[str, Label]:
     checked: dict[str, Label] = {}
     for key, value in labels.items():
-        if not isinstance(key, str) or not key or key == "trajectory":
+        if not isinstance(key, str) or not key.strip() or not key.isprintable() or key == "trajectory":
             raise ValueError(
-                f"track {track!r}: label names must be non-empty text other than 'trajectory'; got {key!r}. Rename it."
+                f"track {track!r}: label names must be printable text other than 'trajectory'; got {key!r}. Rename it."
             )
         if isinstance(value, str) and key not in SPIN_LABELS:
             checked[key] = value

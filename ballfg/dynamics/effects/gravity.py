@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect
 from ballfg.state import STANDARD_GRAVITY
+
+_DOWN = torch.tensor((0.0, 0.0, -1.0), dtype=torch.float64)
 
 
 class Gravity(FlightEffect):
@@ -13,9 +16,9 @@ class Gravity(FlightEffect):
 
     name = "gravity"
     sentence = "The weight of the ball: a constant downward acceleration."
-    coefficients = (Coefficient("g", STANDARD_GRAVITY, 0.03, "m/s^2", 0.0, 30.0),)
+    coefficients = (Coefficient("g", STANDARD_GRAVITY, 0.0, "m/s^2", 0.0, 30.0),)
     g: Tensor
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2, straight down."""
-        return self.g * flight.velocity.new_tensor((0.0, 0.0, -1.0))
+        return self.g * _DOWN

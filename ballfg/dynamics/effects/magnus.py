@@ -13,7 +13,7 @@ class Magnus(FlightEffect):
 
     name = "magnus"
     sentence = "Lift of a spinning ball, proportional to spin x velocity."
-    coefficients = (Coefficient("k", 0.003, 0.0006, "1", -0.1, 0.1),)
+    coefficients = (Coefficient("k", 0.0028, 0.0008, "1", -0.1, 0.1),)
     k: Tensor
 
     def acceleration(self, flight: Flight) -> Tensor:

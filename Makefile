@@ -1,0 +1,40 @@
+# Two commands do everything on a fresh machine: `make bench` and `make test`.
+PYTHON ?= python3
+DATA   ?= $(or $(BALLFG_DATA),../shared/data)
+VENV   := .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+SOURCES := ballfg factors learning benchmarks tests
+
+export OMP_NUM_THREADS ?= 1
+
+.PHONY: bench test check format clean
+
+bench: $(READY)  ## the estimator comparison: table, results/results.json, pictures; measured tracks too where they are
+	$(BIN)/ballfg-bench estimators --out results
+	@for set in aimy ballgun; do if [ -d "$(DATA)/$$set" ]; then \
+		$(BIN)/ballfg-bench estimators --data "$(DATA)/$$set" --out results/$$set || exit 1; \
+	else echo "no measured tracks at $(DATA)/$$set: skipped"; fi; done
+
+test: $(READY)  ## all tests that need no more than ten minutes on two cores
+	$(BIN)/python -m pytest
+
+check: $(READY)  ## format, lint, types (of the installed package: its folders lie apart in the source tree)
+	$(BIN)/ruff format --check $(SOURCES)
+	$(BIN)/ruff check $(SOURCES)
+	rm -rf build/typed && $(BIN)/pip install --quiet --no-deps --no-build-isolation --target build/typed .
+	$(BIN)/mypy --config-file pyproject.toml --cache-dir .mypy_cache build/typed/ballfg
+
+format: $(READY)
+	$(BIN)/ruff format $(SOURCES)
+	$(BIN)/ruff check --fix $(SOURCES)
+
+$(READY): pyproject.toml constraints.txt
+	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "Python 3.11 or newer is needed; set PYTHON=...")'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip "setuptools>=77" wheel
+	$(BIN)/python -m pip install --quiet --no-build-isolation -c constraints.txt -e ".[dev]"
+	touch $@
+
+clean:
+	rm -rf $(VENV) build results *.egg-info .pytest_cache .mypy_cache .ruff_cache

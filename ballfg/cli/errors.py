@@ -1,0 +1,53 @@
+"""What a user sees when something is wrong: one line on stderr and an exit status."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+
+import typer
+
+BAD_INPUT = 2
+"""Exit status for input that cannot be used."""
+INTERRUPTED = 130
+"""Exit status after Ctrl-C, as shells have it."""
+
+USER_ERRORS = (ValueError, TypeError, FileNotFoundError, FileExistsError, NotADirectoryError, PermissionError)
+"""What a user can mend. Anything else is a fault of the program and keeps its traceback."""
+
+
+def guarded(command: Callable[[], object]) -> int:
+    """Runs a command and turns what a user can mend into one line `ballfg: error: ...` and an exit status.
+
+    Args: command: takes no arguments; may raise.
+    Returns: 0, 2 for bad input, 130 after Ctrl-C, or the status that the command returned.
+    """
+    try:
+        result = command()
+    except typer.Exit as request:
+        return request.exit_code
+    except (KeyboardInterrupt, typer.Abort):
+        return _interrupted()
+    except USER_ERRORS as error:
+        return _bad_input(str(error))
+    except Exception as error:
+        # errors in the use of a command: typer's own base class has moved between versions, their method has not
+        message = getattr(error, "format_message", None)
+        if message is None:
+            raise
+        return _bad_input(message(), getattr(error, "ctx", None))
+    if result == INTERRUPTED:
+        return _interrupted()
+    return result if isinstance(result, int) else 0
+
+
+def _bad_input(message: str, context: typer.Context | None = None) -> int:
+    text = " ".join(message.split())
+    hint = "" if context is None else f" See '{context.command_path} --help'."
+    print(f"ballfg: error: {text}{hint}", file=sys.stderr)
+    return BAD_INPUT
+
+
+def _interrupted() -> int:
+    print("ballfg: interrupted", file=sys.stderr)
+    return INTERRUPTED

@@ -1,0 +1,65 @@
+"""`ballfg estimate`: the states of every track of a dataset."""
+
+from __future__ import annotations
+
+import enum
+from collections import Counter
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ballfg.cli.inputs import default_jobs, open_inputs
+from ballfg.cli.progress import progress
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ballfg.estimate import Estimate
+
+
+class Method(enum.StrEnum):
+    """The estimators, by the name of the option."""
+
+    SMOOTHER = "smoother"
+    ONLINE = "online"
+    EKF = "ekf"
+    SLIDING_WINDOW = "sliding-window"
+
+
+def estimate(
+    dataset: Annotated[Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.")],
+    out: Annotated[Path, typer.Option(help="Table to write; .csv or .parquet.")],
+    method: Annotated[Method, typer.Option(help="The estimator.")] = Method.SMOOTHER,
+    model: Annotated[Path | None, typer.Option(help="Model file; the nominal table-tennis model without it.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.", show_default="one per core")] = default_jobs(),
+) -> None:
+    """Position, velocity and spin with standard deviations, one row per stamp.
+
+    Example: ballfg estimate data/aimy --method smoother --out states.csv
+    """
+    from ballfg.estimate import estimate_tracks
+    from ballfg.tracks import TableWriter
+
+    inputs = open_inputs(dataset, model)
+    count = len(inputs.dataset)
+    statuses: Counter[str] = Counter()
+    rows = hits = 0
+    with TableWriter(out) as table:
+        estimates = estimate_tracks(inputs.estimator(method.value), inputs.dataset, count, jobs)
+        for result in progress(estimates, count, "tracks estimated"):
+            table.write(_columns(result))
+            statuses[result.status.value] += 1
+            rows, hits = rows + len(result.times), hits + len(result.hits)
+    print(f"{out}: {rows} states of {count} tracks by {method.value}; {hits} hits found")
+    for text, number in statuses.items():
+        print(f"  {number} tracks: {text}")
+
+
+def _columns(result: Estimate) -> dict[str, str | np.ndarray]:
+    from ballfg.state import SIGMA_NAMES, STATE_NAMES
+
+    columns: dict[str, str | np.ndarray] = {"trajectory": result.name, "t": result.times}
+    columns |= dict(zip(STATE_NAMES, result.states.T, strict=True))
+    columns |= dict(zip(SIGMA_NAMES, result.sigmas.T, strict=True))
+    return columns

@@ -1,0 +1,53 @@
+"""What estimate and predict share: opening a dataset, a model and an estimator from the command line's words."""
+
+from __future__ import annotations
+
+import os
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from ballfg.dynamics import BallModel
+    from ballfg.dynamics.surfaces import Surfaces
+    from ballfg.estimate import Estimator, Settings
+    from ballfg.tracks import Dataset
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """A dataset and how to look at it."""
+
+    dataset: Dataset
+    model: BallModel
+    surfaces: Surfaces
+    settings: Settings
+
+    def estimator(self, method: str) -> Estimator:
+        """The estimator of a name. Raises: ValueError: if there is none of that name."""
+        from ballfg.estimate import make_estimator
+
+        return make_estimator(method, self.model, self.surfaces, self.settings)
+
+
+def open_inputs(dataset: Path, model: Path | None) -> Inputs:
+    """Open and check everything before any work starts; what was repaired is said on stderr."""
+    import torch
+
+    from ballfg.dynamics import load_model, nominal_model
+    from ballfg.estimate import dataset_settings, dataset_surfaces
+    from ballfg.tracks import read_dataset
+
+    torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
+    data = read_dataset(dataset)
+    for note in data.notes:
+        print(f"note: {note}", file=sys.stderr)
+    radius = data.info.ball.radius
+    ball = nominal_model(radius) if model is None else load_model(model, radius=radius)
+    return Inputs(data, ball, dataset_surfaces(data), dataset_settings(data, ball))
+
+
+def default_jobs() -> int:
+    """One process per core that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,41 @@
+"""The app `ballfg` and its entry point. A new sub-command is a file of its own and one line here.
+
+Command files import what they need inside the command: `ballfg --help` must not wait for torch or GTSAM.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+import typer
+
+from ballfg.cli.errors import guarded
+from ballfg.cli.simulate import simulate
+
+app = typer.Typer(
+    name="ballfg",
+    help="From noisy measurements of a flying, bouncing ball to states, predictions and knowledge.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+)
+
+app.command()(simulate)
+
+
+@app.callback(invoke_without_command=True)
+def _root(context: typer.Context) -> None:
+    """From noisy measurements of a flying, bouncing ball to states, predictions and knowledge."""
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+def run(arguments: Sequence[str] | None = None) -> None:
+    """Runs `ballfg` with the given arguments, by default the command line's, and exits.
+
+    Raises: SystemExit: always; status 0, 2 on bad input, 130 after Ctrl-C.
+    """
+    command = typer.main.get_command(app)
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    sys.exit(guarded(lambda: command.main(given, prog_name="ballfg", standalone_mode=False)))

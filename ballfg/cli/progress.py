@@ -1,0 +1,48 @@
+"""Progress of long work: a bar on a terminal, a plain line now and then elsewhere; nothing for work under two seconds."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterable, Iterator
+from typing import TypeVar
+
+T = TypeVar("T")
+
+QUIET = 2.0
+"""s. Work that is over before that shows nothing."""
+LINE_EVERY = 10.0
+"""s between plain lines."""
+
+
+def progress(items: Iterable[T], total: int, what: str) -> Iterator[T]:
+    """Hands items through and shows on stderr how far it is.
+
+    Args: items: a stream.  total: how many there will be.  what: for instance `tracks estimated`.
+    """
+    return _bar(items, total, what) if sys.stderr.isatty() else _lines(items, total, what)
+
+
+def _bar(items: Iterable[T], total: int, what: str) -> Iterator[T]:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    start = time.monotonic()
+    with Progress(*columns, console=Console(stderr=True), transient=True, disable=False) as bar:
+        task = bar.add_task(what, total=total, visible=False)
+        for item in items:
+            yield item
+            bar.update(task, advance=1, visible=time.monotonic() - start > QUIET)
+
+
+def _lines(items: Iterable[T], total: int, what: str) -> Iterator[T]:
+    start = time.monotonic()
+    due = start + QUIET
+    for done, item in enumerate(items, start=1):
+        yield item
+        now = time.monotonic()
+        if now >= due:
+            left = (now - start) / done * (total - done)
+            print(f"{done} of {total} {what}, {left:.0f} s left", file=sys.stderr, flush=True)
+            due = now + LINE_EVERY

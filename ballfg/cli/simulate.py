@@ -1,0 +1,150 @@
+"""`ballfg simulate`: synthetic tracks, with or without effects that nobody declares."""
+
+from __future__ import annotations
+
+import sys
+import time
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+if TYPE_CHECKING:
+    from ballfg.simulate import BallKind
+
+QUIET = 2.0
+"""s. Shorter work shows no progress; plain lines come no closer to each other than that."""
+
+_NOISE, _BALL, _FILES = "Noise", "Ball and launcher", "Files"
+
+
+def simulate(
+    out: Annotated[Path, typer.Option(help="Folder of the dataset: new or empty.", rich_help_panel=_FILES)],
+    tracks: Annotated[int, typer.Option(help="Number of tracks.")] = 717,
+    seed: Annotated[int, typer.Option(help="Seed: the same one gives the same files, to the byte.")] = 0,
+    rate: Annotated[float, typer.Option(help="Frames per second, Hz.")] = 100.0,
+    noise: Annotated[float, typer.Option(help="Position noise, m.", rich_help_panel=_NOISE)] = 0.003,
+    dropout: Annotated[float, typer.Option(help="Probability of a dropped frame.", rich_help_panel=_NOISE)] = 0.0,
+    jitter: Annotated[float, typer.Option(help="Jitter of the stamps, s.", rich_help_panel=_NOISE)] = 0.0,
+    outliers: Annotated[float, typer.Option(help="Probability of an outlier.", rich_help_panel=_NOISE)] = 0.0,
+    outlier_size: Annotated[
+        float, typer.Option(help="Typical distance of an outlier, m.", rich_help_panel=_NOISE)
+    ] = 0.1,
+    spin_noise: Annotated[float, typer.Option(help="Noise of the spin labels, rad/s.", rich_help_panel=_NOISE)] = 4.0,
+    spin_labels: Annotated[
+        bool, typer.Option(help="Write spin labels; the launcher's settings always are.", rich_help_panel=_NOISE)
+    ] = True,
+    process_noise: Annotated[
+        float, typer.Option(help="White acceleration in flight, m/s^1.5.", rich_help_panel=_NOISE)
+    ] = 0.0,
+    spin_process_noise: Annotated[
+        float, typer.Option(help="White angular acceleration in flight, rad/s^1.5.", rich_help_panel=_NOISE)
+    ] = 0.0,
+    contact_noise: Annotated[
+        float, typer.Option(help="Kick to the velocity after a bounce, m/s.", rich_help_panel=_NOISE)
+    ] = 0.0,
+    contact_spin_noise: Annotated[
+        float, typer.Option(help="Kick to the spin after a bounce, rad/s.", rich_help_panel=_NOISE)
+    ] = 0.0,
+    ball: Annotated[
+        str, typer.Option(help="table-tennis, tennis or a ball file (YAML).", rich_help_panel=_BALL)
+    ] = "table-tennis",
+    model: Annotated[
+        Path | None, typer.Option(help="Model file; by default the ball's own model.", rich_help_panel=_BALL)
+    ] = None,
+    settings: Annotated[
+        str, typer.Option(help="Launcher levels, as topspin=-3,sidespin=-5..5,speed=9.", rich_help_panel=_BALL)
+    ] = "",
+    effect: Annotated[
+        list[str] | None,
+        typer.Option(help="An effect that nobody declares, as wind.x=0.3; may be repeated.", rich_help_panel=_BALL),
+    ] = None,
+    format: Annotated[str, typer.Option(help="csv or parquet.", rich_help_panel=_FILES)] = "csv",
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace a simulated dataset.", rich_help_panel=_FILES)
+    ] = False,
+) -> None:
+    """Write synthetic tracks of a ball launcher as a dataset, with the truth beside them.
+
+    Example: ballfg simulate --out windy --tracks 50 --noise 0.003 --effect wind.x=0.3
+
+    The dataset says what is declared. truth.yaml and truth.csv say what was really done: undeclared effects, and the
+    true state at every stamp. model.yaml is the declared model, for the --model of other commands.
+    """
+    from ballfg.simulate import (
+        MeasurementNoise,
+        ProcessNoise,
+        SimulationConfig,
+        parse_effects,
+        parse_settings,
+        write_simulation,
+    )
+    from ballfg.simulate.writing import check_format
+
+    file_format = check_format(format)
+    config = SimulationConfig(
+        tracks=tracks,
+        rate=rate,
+        seed=seed,
+        ball=_ball(ball, model),
+        settings=parse_settings(settings) if settings else {},
+        noise=MeasurementNoise(noise, dropout, jitter, outliers, outlier_size, spin_noise),
+        process=ProcessNoise(process_noise, spin_process_noise, contact_noise, contact_spin_noise),
+        undeclared=parse_effects(effect or ()),
+        spin_labels=spin_labels,
+    )
+    with ProgressReport("tracks") as report:
+        write_simulation(out, config, file_format, force=force, progress=report)
+    names = ", ".join(e.name for e in config.undeclared) or "none"
+    typer.echo(f"wrote {tracks} tracks to {out}: tracks.{file_format}, labels.csv, dataset.yaml, model.yaml (declared)")
+    typer.echo(f"wrote the truth to {out}: truth.{file_format}, truth.yaml (undeclared effects: {names})")
+
+
+def _ball(name: str, model: Path | None) -> BallKind:
+    """The ball, with the model of a file in place of its own if there is one."""
+    from ballfg.dynamics import load_model
+    from ballfg.simulate import ball_kind, with_model
+
+    kind = ball_kind(name)
+    if model is None:
+        return kind
+    loaded = load_model(model, radius=kind.ball.radius, inertia_factor=kind.model.inertia_factor)
+    return with_model(kind, loaded)
+
+
+class ProgressReport:
+    """Progress on stderr for work that takes longer than `QUIET`: a bar on a terminal, plain lines elsewhere.
+
+    A context manager that is called with the numbers of things done and of all.
+    """
+
+    def __init__(self, things: str) -> None:
+        self._things = things
+        self._console = Console(stderr=True)
+        self._shown = time.monotonic()
+        self._bar: Progress | None = None
+
+    def __enter__(self) -> ProgressReport:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def __call__(self, done: int, total: int) -> None:
+        """Shows that `done` of `total` things are done, if it is time to."""
+        if self._bar is not None:
+            self._bar.update(self._bar.task_ids[0], completed=done)
+        elif time.monotonic() - self._shown > QUIET:
+            if self._console.is_terminal:
+                self._bar = Progress(console=self._console, transient=True)
+                self._bar.add_task(self._things, total=total, completed=done)
+                self._bar.start()
+            else:
+                self._shown = time.monotonic()
+                print(f"{done} of {total} {self._things}", file=sys.stderr, flush=True)

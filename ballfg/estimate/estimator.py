@@ -1,0 +1,36 @@
+"""The one interface of all estimators."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import ClassVar
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimate.result import Estimate
+from ballfg.estimate.settings import Settings
+from ballfg.tracks import Track
+
+
+class Estimator(ABC):
+    """Turns a track into states.
+
+    Args:
+        model: the ball.
+        surfaces: what it may bounce on.
+        settings: noise and priors.
+    """
+
+    name: ClassVar[str]
+
+    def __init__(self, model: BallModel, surfaces: Surfaces, settings: Settings) -> None:
+        self.model = model
+        self.surfaces = surfaces
+        self.settings = settings
+
+    @abstractmethod
+    def estimate(self, track: Track) -> Estimate:
+        """The states of a track, one per stamp.
+
+        Never raises for what the data hold: a track too short or too wild gives a status that says so.
+        """

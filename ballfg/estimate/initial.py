@@ -1,0 +1,60 @@
+"""A first guess of all states from the samples and the events, for the minimisation to start from."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ballfg.dynamics.model import BallModel
+from ballfg.estimate.segmentation import Contact, Quality, Segmentation
+from ballfg.estimate.sliding_window import window_velocities
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
+from ballfg.tracks import Track
+
+Array = NDArray[np.float64]
+
+
+def initial_states(track: Track, contacts: tuple[Contact, ...], segmentation: Segmentation, model: BallModel) -> Array:
+    """(n, 9) states from the sliding window: measured positions, mean velocities of windows that no event cuts.
+
+    The spin is the label's, or zero, up to the first contact; each contact changes it as the model says. A ball that
+    rests is put on its surface.
+    """
+    states = np.zeros((len(track), STATE_DIM))
+    states[:, POSITION] = _bridged_positions(track, segmentation)
+    breaks = np.unique([c.interval for c in contacts] + segmentation.hits.tolist() + segmentation.restarts.tolist())
+    states[:, VELOCITY] = window_velocities(track.times, states[:, POSITION], breaks.astype(np.int64))
+    if track.spin_label is not None:
+        states[:, SPIN] = track.spin_label
+    for contact in sorted(contacts, key=lambda c: c.time):
+        _start_contact(states, contact, model)
+    for rest in segmentation.rests:
+        resting = torch.from_numpy(states[rest.first : rest.last + 2])
+        states[rest.first : rest.last + 2, Z] -= model.gap(resting, rest.height).detach().numpy()
+        states[rest.first : rest.last + 2, VZ] = 0.0
+    return states
+
+
+def _bridged_positions(track: Track, segmentation: Segmentation) -> Array:
+    """Measured positions, those of outliers and shifted runs replaced by a line between their neighbours."""
+    trusted = segmentation.quality <= Quality.WIDE
+    if trusted.all() or not trusted.any():
+        return track.positions.copy()
+    columns = [np.interp(track.times, track.times[trusted], axis[trusted]) for axis in track.positions.T]
+    return np.stack(columns, axis=-1)
+
+
+def _start_contact(states: Array, contact: Contact, model: BallModel) -> None:
+    """Put the state before a contact where the contact can be reached, and give later states the spin after it."""
+    before = torch.from_numpy(states[contact.interval].copy())
+    with torch.no_grad():
+        gap = float(model.gap(before, contact.height))
+        if gap < 0.0:
+            states[contact.interval, Z] -= gap
+        states[contact.interval, VZ] = before[VZ] = min(float(before[VZ]), -LEAST_FALL)
+        states[contact.interval + 1 :, SPIN] = model.bounce(before)[SPIN].numpy()
+
+
+LEAST_FALL = 0.05
+"""m/s, least downward speed that a guess has before a contact."""

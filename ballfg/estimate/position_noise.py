@@ -1,0 +1,94 @@
+"""Position noise of a tracker, read off its tracks: how far a sample lies from a smooth path through its neighbours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import ArrayLike, NDArray
+
+from ballfg.tracks import Track
+
+FloatArray = NDArray[np.float64]
+
+HALF_WINDOW = 5
+"""Samples on each side of the one that is judged."""
+DEGREE = 3
+"""Of the polynomials. Over `LONGEST_WINDOW` what is left of a flight beyond a cubic is below 0.1 mm."""
+LONGEST_WINDOW = 0.3
+"""s. Windows with a gap, or of a slow tracker, are left out."""
+REJECT = 5.0
+"""Windows in which any residual exceeds this many sigma hold a bounce, a hit or an outlier, and are left out."""
+ROUNDS = 4
+"""Repetitions of estimate and rejection; the first one rejects nothing."""
+ENOUGH = 20_000
+"""Windows after which no further track is read: they give sigma to 1 %."""
+FLOOR = 2e-4
+"""m. No tracker of flying balls is better; identical or computed positions would give zero."""
+FALLBACK = 2e-3
+"""m. Assumed where no track has a window: the noise of a camera tracker in a room."""
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of a normal variable divided by the median of its absolute value."""
+
+
+def estimate_position_noise(tracks: Iterable[Track | tuple[ArrayLike, ArrayLike]]) -> FloatArray:
+    """The standard deviation of each coordinate, for data that states none.
+
+    A cubic is fitted to each window of 11 samples, the middle one left out, and predicts that one. The residuals,
+    divided by what such a prediction adds to the noise, have the standard deviation sought; their median absolute
+    value gives it without regard to a few bad ones. Windows with a bounce, a hit or an outlier are rejected.
+
+    Noise with a memory longer than the window (calibration, a shifted tracker) is not seen; stamp jitter is, along
+    the flight.
+
+    Args: tracks: tracks, or pairs of times (n,) s, increasing, and positions (n, 3) m; read until there is enough.
+    Returns: (3,) m, at least `FLOOR`; `FALLBACK` where every track is shorter than a window.
+    """
+    blocks: list[FloatArray] = []
+    count = 0
+    for track in tracks:
+        times, positions = (track.times, track.positions) if isinstance(track, Track) else track
+        block = _window_residuals(np.asarray(times, dtype=np.float64), np.asarray(positions, dtype=np.float64))
+        blocks.append(block)
+        count += len(block)
+        if count >= ENOUGH:
+            break
+    if count == 0:
+        return np.full(3, FALLBACK)
+    return np.maximum(_robust_sigma(np.concatenate(blocks)), FLOOR)
+
+
+def _window_residuals(times: FloatArray, positions: FloatArray) -> FloatArray:
+    """(w, 11, 3) m, residuals of the cubic through each window, scaled to the standard deviation of one sample.
+
+    A residual of least squares has variance sigma^2 (1 - h) with h the leverage; predicted with its own sample left
+    out it is larger by 1 / (1 - h), so that r / sqrt(1 - h) is either of them, standardised.
+    """
+    size = 2 * HALF_WINDOW + 1
+    if len(times) < size:
+        return np.empty((0, size, 3))
+    stamps = sliding_window_view(times, size)
+    short = stamps[:, -1] - stamps[:, 0] <= LONGEST_WINDOW
+    stamps = stamps[short]
+    values = sliding_window_view(positions, size, axis=0)[short].transpose(0, 2, 1)
+    centre = stamps[:, HALF_WINDOW, None]
+    scaled = (stamps - centre) / (stamps[:, -1:] - stamps[:, :1])
+    basis, _ = np.linalg.qr(scaled[..., None] ** np.arange(DEGREE + 1))
+    leverage = np.einsum("wij,wij->wi", basis, basis)
+    residuals = values - basis @ (basis.transpose(0, 2, 1) @ values)
+    scaled_residuals: FloatArray = residuals / np.sqrt(1.0 - leverage)[..., None].clip(min=1e-3)
+    return scaled_residuals
+
+
+def _robust_sigma(residuals: FloatArray) -> FloatArray:
+    """(3,) m from window residuals (w, 11, 3): MAD of the middle ones, over windows without large residuals."""
+    middle = residuals[:, HALF_WINDOW]
+    largest = np.abs(residuals).max(axis=1)
+    sigma = MAD_TO_SIGMA * np.median(np.abs(middle), axis=0)
+    for _ in range(ROUNDS - 1):
+        clean = (largest <= REJECT * np.maximum(sigma, FLOOR)).all(axis=1)
+        if not clean.any():
+            break
+        sigma = MAD_TO_SIGMA * np.median(np.abs(middle[clean]), axis=0)
+    return np.asarray(sigma)

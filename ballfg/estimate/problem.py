@@ -1,0 +1,173 @@
+"""From a track and the events in it to a factor graph.
+
+Every interval between two samples gets one dynamics factor: free flight, flight through the contacts found in it, or rest
+on a surface; a hit adds its jump to the process noise. An interval that nothing links (a long gap with a hit in it)
+gets none. Every sample gets a position factor, the first state of each linked piece a prior.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.integrate import MAX_STEP
+from ballfg.dynamics.model import BallModel
+from ballfg.estimate.segmentation import Contact, Quality, Segmentation
+from ballfg.estimate.settings import Settings, sample_sigmas
+from ballfg.factors.dynamics import ContactFactors, FlightFactors, RestFactors
+from ballfg.factors.graph import BallGraph
+from ballfg.factors.kind import FactorKind, Values
+from ballfg.factors.position import PositionFactors
+from ballfg.factors.prior import coefficient_prior, spin_prior, state_prior
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+from ballfg.tracks import Track
+
+Array = NDArray[np.float64]
+
+START_POSITION_SIGMA = 5.0
+"""m, prior of the first position about its measurement: wide enough to say nothing."""
+QUALITY_SIGMA = {Quality.WIDE: 4.0, Quality.SHIFTED: 20.0, Quality.OUTLIER: 200.0}
+"""Standard deviation of a sample that is not good, in multiples of a good one's."""
+
+
+@dataclass(frozen=True)
+class Events:
+    """What happens in a track: its segmentation, with the contacts as refined so far."""
+
+    contacts: tuple[Contact, ...]
+    segmentation: Segmentation
+
+
+def trackwise_model(model: BallModel, settings: Settings) -> BallModel:
+    """The model, augmented by the coefficients that are estimated for each track."""
+    return AugmentedModel(model, tuple(settings.coefficients)) if settings.coefficients else model
+
+
+def coefficient_means(model: BallModel, settings: Settings) -> Array:
+    """(p,) the model's own values of the coefficients that are estimated."""
+    parameters = dict(model.named_parameters())
+    return np.array([float(parameters[name].detach()) for name in settings.coefficients])
+
+
+def effective_sigmas(track: Track, segmentation: Segmentation, settings: Settings) -> Array:
+    """(n, 3) m: standard deviations of the samples, larger for those that are wide, shifted or outliers."""
+    sigma = sample_sigmas(settings, len(track), track.sigmas)
+    for quality, factor in QUALITY_SIGMA.items():
+        sigma[segmentation.quality == quality] *= factor
+    return sigma
+
+
+def build_graph(track: Track, model: BallModel, events: Events, sigma: Array, settings: Settings) -> BallGraph:
+    """The factor graph of one track.
+
+    Args:
+        track: stamps, positions, labels.
+        model: the ball, from `trackwise_model`.
+        events: contacts, hits, rests.
+        sigma: (n, 3) m, of the positions.
+        settings: noise and priors.
+    """
+    kinds: list[FactorKind] = [PositionFactors(np.arange(len(track)), track.positions, sigma, settings.loss)]
+    kinds += _dynamics(track.times, model, events, settings)
+    kinds += _priors(track, events.segmentation, settings)
+    if isinstance(model, AugmentedModel):
+        kinds.append(
+            coefficient_prior(coefficient_means(model.model, settings), np.array(list(settings.coefficients.values())))
+        )
+    return BallGraph(tuple(kinds))
+
+
+def contact_kinds(graph: BallGraph) -> list[ContactFactors]:
+    """The graph's contact factors."""
+    return [kind for kind in graph.kinds if isinstance(kind, ContactFactors)]
+
+
+def _dynamics(times: Array, model: BallModel, events: Events, settings: Settings) -> list[FactorKind]:
+    """One factor per linked interval, in batches that share a motion and a number of integration steps."""
+    dt = np.diff(times)
+    covariance = _process_covariance(times, dt, events, settings)
+    in_interval = contacts_by_interval(events.contacts)
+    resting = _rest_heights(events.segmentation, len(dt))
+    linked = np.ones(len(dt), dtype=bool)
+    linked[events.segmentation.restarts] = False
+    groups: defaultdict[tuple[str, int], list[int]] = defaultdict(list)
+    for i in np.flatnonzero(linked).tolist():
+        if i in in_interval:
+            groups["contact", len(in_interval[i])].append(i)
+        elif np.isfinite(resting[i]):
+            groups["rest", 0].append(i)
+        else:
+            groups["flight", int(np.ceil(dt[i] / MAX_STEP - 1e-9))].append(i)
+    kinds: list[FactorKind] = []
+    for (motion, _), members in groups.items():
+        rows = np.array(members)
+        if motion == "contact":
+            heights = np.array([[c.height for c in in_interval[i]] for i in members])
+            kinds.append(ContactFactors(model, rows, dt[rows], covariance[rows], heights))
+        elif motion == "rest":
+            kinds.append(RestFactors(model, rows, dt[rows], covariance[rows], resting[rows]))
+        else:
+            kinds.append(FlightFactors(model, rows, dt[rows], covariance[rows]))
+    return kinds
+
+
+def contacts_by_interval(contacts: tuple[Contact, ...]) -> dict[int, list[Contact]]:
+    """Contacts of each interval, in time order."""
+    found: dict[int, list[Contact]] = {}
+    for contact in sorted(contacts, key=lambda c: (c.interval, c.time)):
+        found.setdefault(contact.interval, []).append(contact)
+    return found
+
+
+def _rest_heights(segmentation: Segmentation, intervals: int) -> Array:
+    heights = np.full(intervals, np.nan)
+    for rest in segmentation.rests:
+        heights[rest.first : rest.last + 1] = rest.height
+    return heights
+
+
+def _process_covariance(times: Array, dt: Array, events: Events, settings: Settings) -> Array:
+    """(n - 1, 9, 9): free flight, plus a kick for each contact, plus a jump at an unknown time for a hit."""
+    noise = settings.process
+    covariance = noise.flight(dt)
+    for contact in events.contacts:
+        i = slice(contact.interval, contact.interval + 1)
+        time = np.array([contact.time]) - times[i]
+        covariance[i] += noise.kick(dt[i], time, noise.contact_velocity, noise.contact_spin)
+    hits = events.segmentation.hits
+    for time in (np.zeros_like(dt[hits]), dt[hits]):
+        covariance[hits] += 0.5 * noise.kick(dt[hits], time, noise.hit_velocity, noise.hit_spin)
+    return covariance
+
+
+def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> list[FactorKind]:
+    """Wide priors on the first state of each piece; the label, where there is one, on the very first spin."""
+    starts = [0, *(int(i) + 1 for i in segmentation.restarts)]
+    label = track.spin_label
+    kinds: list[FactorKind] = []
+    for start in starts:
+        mean, sigma = np.zeros(STATE_DIM), np.empty(STATE_DIM)
+        mean[POSITION] = track.positions[start]
+        sigma[POSITION], sigma[VELOCITY] = START_POSITION_SIGMA, settings.velocity_prior
+        labelled = start == 0 and label is not None
+        sigma[SPIN] = UNINFORMATIVE_SPIN if labelled else settings.spin_prior
+        kinds.append(state_prior(start, mean, sigma))
+    if label is not None:
+        spread = np.full((1, 3), settings.spin_label_noise)
+        kinds.append(spin_prior(np.array([0]), label[None], spread, settings.label_loss))
+    return kinds
+
+
+UNINFORMATIVE_SPIN = 2000.0
+"""rad/s, prior about zero that stays beside a spin label, should the label's robust loss set it aside."""
+
+
+def initial_values(states: Array, model: BallModel, settings: Settings) -> Values:
+    """A start for the minimisation from states (n, 9)."""
+    if isinstance(model, AugmentedModel):
+        return Values(states, coefficient_means(model.model, settings))
+    return Values(states, np.zeros(0))

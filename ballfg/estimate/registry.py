@@ -1,0 +1,25 @@
+"""The estimators by name."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimate.ekf import ExtendedKalmanFilter
+from ballfg.estimate.estimator import Estimator
+from ballfg.estimate.online import Online
+from ballfg.estimate.settings import Settings
+from ballfg.estimate.sliding_window import SlidingWindow
+from ballfg.estimate.smoother import Smoother
+
+ESTIMATORS: Final[dict[str, type[Estimator]]] = {
+    estimator.name: estimator for estimator in (Smoother, Online, ExtendedKalmanFilter, SlidingWindow)
+}
+
+
+def make_estimator(name: str, model: BallModel, surfaces: Surfaces, settings: Settings) -> Estimator:
+    """The estimator of a name. Raises: ValueError: if there is none; the message lists those there are."""
+    if name not in ESTIMATORS:
+        raise ValueError(f"method must be one of {', '.join(ESTIMATORS)}; got '{name}'")
+    return ESTIMATORS[name](model, surfaces, settings)

@@ -1,0 +1,114 @@
+"""What every estimator returns: states with covariances, and how far to trust them."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.estimate.segmentation import Contact
+from ballfg.state import POSITION
+
+Array = NDArray[np.float64]
+
+LEAST_INFORMATION = 1e-6
+"""Share of the posterior's information that the other samples are given at least."""
+
+
+class Status(enum.Enum):
+    """How an estimation ended; the value is a sentence that says what to do."""
+
+    OK = "converged"
+    NOT_CONVERGED = (
+        "the minimisation did not converge; the states are the best point reached. Check the table height and the "
+        "noise settings, or look at the track for events that the model cannot explain"
+    )
+    NO_VELOCITY = (
+        "there are too few samples to tell a velocity: the states are the measured positions and the priors. "
+        "Observe at least three samples of each flight"
+    )
+    FAILED = (
+        "the objective is not finite at the start; the states are the measured positions and the priors. Check the "
+        "table height: the ball seems to be far below a surface that it bounces on"
+    )
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """The states of one track.
+
+    Attributes:
+        name: of the track.
+        times: (n,) s, the track's stamps.
+        states: (n, 9) position m, velocity m/s, spin rad/s.
+        covariances: (n, 9, 9).
+        status: how the estimation ended.
+        whitened: (n, 3) whitened innovations. For a filter: measured minus predicted position; for a smoother:
+            measured position minus its prediction from all other samples. Each divided by its standard deviation:
+            standard normal where model and noise are right. NaN where a method has none.
+        coefficient_names: of the p model parameters that were estimated with the track.
+        coefficients: (p,).  coefficient_covariance: (p, p).
+        cross_covariances: (n, 9, p) between each state and the coefficients.
+        contacts: with a surface, in order.
+        hits: intervals (between samples i and i+1) in which something hit the ball.
+        quality: (n,) `segmentation.Quality` of each sample.
+        error: objective at the minimum; NaN for methods without one.
+        iterations: linearisations of a minimisation, 0 for methods without one.
+    """
+
+    name: str
+    times: Array
+    states: Array
+    covariances: Array
+    status: Status
+    whitened: Array
+    coefficient_names: tuple[str, ...] = ()
+    coefficients: Array = field(default_factory=lambda: np.zeros(0))
+    coefficient_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    cross_covariances: Array = field(default_factory=lambda: np.zeros((0, 9, 0)))
+    contacts: tuple[Contact, ...] = ()
+    hits: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    quality: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
+    error: float = np.nan
+    iterations: int = 0
+
+    @property
+    def sigmas(self) -> Array:
+        """(n, 9) standard deviations of the states."""
+        return np.sqrt(np.diagonal(self.covariances, axis1=-2, axis2=-1))
+
+    @property
+    def nis(self) -> Array:
+        """(n,) squared length of the whitened innovations: chi-square with 3 degrees of freedom."""
+        return np.asarray((self.whitened**2).sum(axis=-1))
+
+
+def whiten_innovation(innovation: Array, covariance: Array) -> Array:
+    """(n, 3) innovations divided by the root of their covariances (n, 3, 3)."""
+    root = np.linalg.cholesky(covariance)
+    return np.asarray(np.linalg.solve(root, innovation[..., None])[..., 0])
+
+
+def leave_one_out(states: Array, covariances: Array, measured: Array, sigma: Array, weight: Array) -> Array:
+    """(n, 3) whitened innovations of a smoother: each sample against its prediction from all others.
+
+    With the sample's information w/R taken out of the posterior P, the prediction from the others has covariance
+    C = (P^-1 - w R^-1)^-1 and lies C P^-1 (z - x) from the measurement; that distance has covariance R + C.
+
+    Args:
+        states: (n, 9).  covariances: (n, 9, 9).
+        measured: (n, 3) m.  sigma: (n, 3) m.
+        weight: (n,) in [0, 1], the robust loss's weight with which each sample took part.
+    """
+    information = np.linalg.inv(covariances[:, POSITION, POSITION])
+    axes = np.arange(3)
+    others = information.copy()
+    others[:, axes, axes] -= weight[:, None] / sigma**2
+    # a sample that alone decides its position leaves nothing: bound C, the whitened distance goes to zero
+    others[:, axes, axes] += LEAST_INFORMATION * information[:, axes, axes]
+    covariance = np.linalg.inv(others)
+    distance = covariance @ information @ (measured - states[:, POSITION])[..., None]
+    covariance[:, axes, axes] += sigma**2
+    return whiten_innovation(distance[..., 0], covariance)

@@ -1,0 +1,92 @@
+"""The record of a filter's run over a track, and the Rauch-Tung-Striebel pass that smooths it.
+
+Source: H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems", AIAA Journal
+3(8), 1965, equations 3.30 and 3.31; the covariance in the form that stays positive definite under rounding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.estimate.segmentation import Contact, Quality
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class FilterRecord:
+    """What a filter knew at each of n samples; states of dimension d = 9 + p, coefficients of the model at the end.
+
+    Attributes:
+        start: first sample that the filter knows something of.
+        prior_mean: (n, d) and prior_covariance: (n, d, d), before the sample.
+        mean: (n, d) and covariance: (n, d, d), after it.
+        transition: (n, d, d), Jacobian of the motion from the sample before.
+        noise: (n, d, d), process noise gathered since the sample before.
+        whitened: (n, 3), innovations divided by their standard deviations; NaN where there is none.
+        quality: (n,) `Quality`.
+        contacts: for each interval that has any.
+        hits: intervals.
+    """
+
+    prior_mean: Array
+    prior_covariance: Array
+    mean: Array
+    covariance: Array
+    transition: Array
+    noise: Array
+    whitened: Array
+    quality: NDArray[np.int8]
+    start: int = 0
+    contacts: dict[int, tuple[Contact, ...]] = field(default_factory=dict)
+    hits: list[int] = field(default_factory=list)
+
+    @classmethod
+    def empty(cls, n: int, d: int) -> FilterRecord:
+        """A record of n samples with nothing in it yet."""
+        square = (n, d, d)
+        return cls(
+            prior_mean=np.zeros((n, d)),
+            prior_covariance=np.zeros(square),
+            mean=np.zeros((n, d)),
+            covariance=np.zeros(square),
+            transition=np.zeros(square),
+            noise=np.zeros(square),
+            whitened=np.full((n, 3), np.nan),
+            quality=np.full(n, Quality.GOOD, dtype=np.int8),
+        )
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """(n,) samples that took part."""
+        return self.quality != Quality.OUTLIER
+
+
+def rts_smooth(record: FilterRecord) -> tuple[Array, Array]:
+    """Means (n, d) and covariances (n, d, d) given all samples; those before `record.start` are left as they are.
+
+    With C = P_k F^T (P-_{k+1})^-1, from the last sample to the first:
+    x^s_k = x_k + C (x^s_{k+1} - x-_{k+1}) and P^s_k = (I - C F) P_k (I - C F)^T + C (P^s_{k+1} + Q) C^T.
+
+    At a hit P- holds the hit's wide jump, so that C is small there and little is carried across.
+    """
+    mean, covariance = record.mean.copy(), record.covariance.copy()
+    identity = np.eye(mean.shape[1])
+    for k in range(len(mean) - 2, record.start - 1, -1):
+        F, P = record.transition[k + 1], record.covariance[k]
+        C = _gain(P @ F.T, record.prior_covariance[k + 1])
+        mean[k] = record.mean[k] + C @ (mean[k + 1] - record.prior_mean[k + 1])
+        rest = identity - C @ F
+        smoothed = rest @ P @ rest.T + C @ (covariance[k + 1] + record.noise[k + 1]) @ C.T
+        covariance[k] = (smoothed + smoothed.T) / 2
+    return mean, covariance
+
+
+def _gain(cross: Array, covariance: Array) -> Array:
+    """cross @ covariance^-1, with the covariance scaled to a correlation: its entries span eight decades."""
+    scale = 1.0 / np.sqrt(np.diagonal(covariance))
+    correlation = covariance * np.outer(scale, scale)
+    return np.asarray(np.linalg.solve(correlation, (cross * scale).T).T * scale)

@@ -1,0 +1,88 @@
+"""Events, and the chains of them that hypotheses share.
+
+Each hypothesis ends in a node; nodes link back to the event before. Hypotheses that differ only recently share all
+older nodes, so that a copy of a hypothesis costs one pointer.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import Enum, auto
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class EventKind(Enum):
+    """What can happen in an interval, or to a sample."""
+
+    CONTACT = auto()
+    """Between two samples: the ball meets a surface."""
+    HIT = auto()
+    """Between two samples: the velocity is forgotten."""
+    RESTART = auto()
+    """Between two samples: a gap too long to bridge; everything is forgotten."""
+    SHIFT = auto()
+    """Between two samples: the measurements jump, the velocity stays."""
+    REST = auto()
+    """Between two samples: the ball stays down on a surface."""
+    LEAVE = auto()
+    """Between two samples: a resting ball gets into the air, for instance over an edge."""
+    WIDE = auto()
+    """At a sample: its noise is larger than stated."""
+    OUTLIER = auto()
+    """At a sample: it says nothing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Event:
+    """One event of an explanation.
+
+    Attributes:
+        kind: what happened.
+        index: the interval it lies in (-1: before the first sample), or the sample.
+        time: s, on the track's clock.
+        height: m, declared height of the surface, where one is involved.
+        offset: (3,) m, by which measurements jumped, for a shift.
+    """
+
+    kind: EventKind
+    index: int
+    time: float
+    height: float | None = None
+    offset: NDArray[np.float64] | None = None
+
+
+class Node:
+    """An event and the one before it; `final` once every living hypothesis contains it."""
+
+    __slots__ = ("event", "final", "parent")
+
+    def __init__(self, event: Event, parent: Node | None) -> None:
+        self.event = event
+        self.parent = parent
+        self.final = False
+
+
+def open_nodes(node: Node | None) -> list[Node]:
+    """The nodes of a chain that are not final, oldest first."""
+    chain: list[Node] = []
+    while node is not None and not node.final:
+        chain.append(node)
+        node = node.parent
+    return chain[::-1]
+
+
+def contains(tip: Node | None, node: Node) -> bool:
+    """Whether the chain that ends in `tip` goes through `node`."""
+    while tip is not None and tip is not node:
+        tip = tip.parent
+    return tip is node
+
+
+def make_final(nodes: list[Node]) -> tuple[Event, ...]:
+    """Marks the oldest nodes of a chain as final and cuts the chain there, so that memory does not grow."""
+    for node in nodes:
+        node.final = True
+        node.parent = None
+    return tuple(node.event for node in nodes)

@@ -1,0 +1,50 @@
+"""Everything that stays the same during a segmentation: the ball, the surfaces, the settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimate.segmentation.bank import FloatArray
+from ballfg.estimate.segmentation.physics import SegmentationPhysics
+from ballfg.estimate.segmentation.settings import SegmentationSettings
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Ball, surfaces and settings.
+
+    Attributes:
+        centres: (s,) m, height of the ball's centre when it touches each surface, table first.
+        restitution_sigmas: (s,).
+    """
+
+    physics: SegmentationPhysics
+    surfaces: Surfaces
+    settings: SegmentationSettings
+    centres: FloatArray = field(init=False)
+    restitution_sigmas: FloatArray = field(init=False)
+
+    def __post_init__(self) -> None:
+        heights = np.array(self.surfaces.heights())
+        object.__setattr__(self, "centres", heights + self.physics.surface_offset + self.physics.radius)
+        sigmas = np.full(len(heights), self.settings.floor_restitution_sigma)
+        sigmas[0] = self.settings.restitution_sigma
+        object.__setattr__(self, "restitution_sigmas", sigmas)
+
+    def height(self, surface: int) -> float:
+        """m, declared height of a surface."""
+        return self.surfaces.heights()[surface]
+
+    def reaches(self, surface: int, mean: FloatArray) -> NDArray[np.bool_]:
+        """(h,) whether a ball with these means (h, 3, 3) at a surface's height is over it, as far as is known."""
+        extent = self.surfaces.extent
+        if surface != 0 or extent is None:
+            return np.ones(len(mean), dtype=bool)
+        margin = self.settings.extent_margin
+        x, y = mean[:, 0, 0], mean[:, 1, 0]
+        inside = (x >= extent[0] - margin) & (x <= extent[1] + margin)
+        return inside & (y >= extent[2] - margin) & (y <= extent[3] + margin)

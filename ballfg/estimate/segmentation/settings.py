@@ -1,0 +1,102 @@
+"""The numbers of the segmentation: noise, prior spreads, prices of events, bounds of the search."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class SegmentationSettings:
+    """What the segmentation takes for granted; docs/derivations/segmentation.md says why each number is what it is."""
+
+    # measurements
+    sigma_floor: float = 1.5e-3
+    """m. Smaller stated noise is raised to this: what a smooth local fit sees of a tracker leaves out its slow errors,
+    and with less, bends of the path are taken for hits (docs/derivations/segmentation.md has the counts)."""
+    stamp_jitter: float = 3e-4
+    """s. Error of the stamps; adds speed times this to the noise along each axis."""
+    wide_factor: float = 4.0
+    """Noise of a wide sample divided by the stated one."""
+    wide_share: float = 0.05
+    """Prior share of wide samples."""
+    outlier_spread: float = 0.3
+    """m. Standard deviation of outliers about the ball."""
+    outlier_share: float = 0.01
+    """Prior share of outliers."""
+
+    # flight, apart from gravity and drag: spin, wind and a wrong drag act as a slowly drifting acceleration
+    slack: float = 4.0
+    """m/s^2. Spread of that acceleration at the start of a segment."""
+    slack_drift: float = 6.0
+    """m/s^2 per sqrt(s). Its random walk."""
+    velocity_drift: float = 0.05
+    """m/s per sqrt(s). Random walk of the velocity."""
+    velocity_spread: float = 5.0
+    """m/s. Spread, per axis, of the velocity of which nothing is known; faster balls pay a few nats."""
+
+    # contacts
+    contact_cost: float = 1.0
+    """nats."""
+    surface_sigma: float = 0.004
+    """m. Error of the height at which the ball bounces: declared height, calibration, compression of the ball."""
+    restitution_sigma: float = 0.06
+    """Spread of the restitution on the table."""
+    floor_restitution_sigma: float = 0.15
+    """The same on the floor, of which a model of the table says little."""
+    tangential_keep: float = 0.85
+    """Share of the tangential velocity that a bounce of unknown spin keeps."""
+    tangential_sigma: float = 0.25
+    """m/s of tangential change per m/s of normal speed: friction that is not known."""
+    slack_at_contact: float = 3.0
+    """m/s^2. A bounce changes the spin, and so the slack acceleration."""
+    contact_window: float = 0.012
+    """s. How far outside an interval a contact may be predicted and still be tried."""
+    extent_margin: float = 0.05
+    """m. Contacts this far outside a known table are still tried."""
+
+    # rest
+    rest_speed: float = 0.35
+    """m/s. A ball that lands more slowly may stay down."""
+    rest_cost: float = 1.2
+    """nats."""
+    rest_range: float = 0.02
+    """m. A first sample, or one after a hit, this close to a surface may be that of a resting ball."""
+    leave_speed: float = 0.15
+    """m/s. Spread of the vertical velocity with which a resting ball gets into the air."""
+
+    # hits, tracker shifts, gaps
+    hit_rate: float = 1.0
+    """1/s. Prior rate of hits, and of a resting ball leaving."""
+    hit_cost: float = 10.0
+    """nats on top of the prior rate; fades in gaps, where a hit needs no witness."""
+    hit_spread: float = 0.03
+    """m. How far from the prediction a ball may reappear after a hit, apart from its unknown velocity."""
+    shift_rate: float = 1.0
+    """1/s. Prior rate of tracker shifts."""
+    shift_cost: float = 4.0
+    """nats on top of the prior rate."""
+    shift_spread: float = 0.03
+    """m. Spread of a shift, per axis."""
+    shift_level: float = 0.02
+    """m. Samples whose offset differs by more from that of most of their segment are marked `SHIFTED`."""
+    short_gap: float = 0.1
+    """s. Over longer gaps no shift is tried, and a hit is judged without the prediction."""
+    longest_gap: float = 0.5
+    """s. Nothing links the two sides of a longer gap: the slack alone moves the ball by half a metre."""
+    friction_limit: float = 0.35
+    """Coulomb coefficient beyond which a contact's tangential jump needs a hit beside it."""
+
+    # search
+    surprise: float = 6.0
+    """Squared whitened innovation (3 degrees of freedom) from which hits and shifts are tried: one good sample in
+    nine exceeds it, and no event worth its price stays below it for two samples."""
+    longest_step: float = 0.04
+    """s. Longer intervals are cut, so that several bounces fit into them."""
+    mature: int = 25
+    """Samples after its last event after which a hypothesis forgets what it was; of several only the best stays."""
+    most: int = 40
+    """Hypotheses kept."""
+    margin: float = 60.0
+    """nats. Hypotheses this far behind the best are dropped: more than a hit's price twice."""
+    lag: int = 64
+    """Samples after which an event is final."""

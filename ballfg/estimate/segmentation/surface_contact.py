@@ -1,0 +1,133 @@
+"""Contacts: where a hypothesis may meet a surface it branches into one that did not, one that bounced, one that stayed."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.estimate.segmentation.bank import FLYING, Bank, FloatArray, IntArray, concatenate
+from ballfg.estimate.segmentation.events import Event, EventKind
+from ballfg.estimate.segmentation.motion import carry, fly, put_down
+from ballfg.estimate.segmentation.scene import Scene
+
+LEAST_FALL = 0.05
+"""m/s. A path that meets a surface more slowly grazes it: no contact."""
+SLOWEST_CLOSING = 0.2
+"""m/s. Bounds the time margin of a slow contact."""
+POSITION_JITTER = 1e-3
+"""m, by which the horizontal position is less certain after a contact."""
+BOUNCE_JITTER = 0.03
+"""m/s, of the normal velocity after a bounce, whatever its speed."""
+SLIDE_JITTER = 0.05
+"""m/s, of the tangential velocity, likewise."""
+WEAKEST_FALL = 0.2
+"""Share of gravity below which the slack is not believed to hold the ball up."""
+
+
+def step(bank: Bank, dt: float, scene: Scene, interval: int, start: float, *, strict: bool) -> Bank:
+    """All hypotheses after dt s, branched at the contacts that may have happened.
+
+    Args:
+        bank: hypotheses at time `start`.
+        dt: s.
+        scene: ball, surfaces, settings.
+        interval: index of the interval that this step is, or is a part of.
+        start: s, on the track's clock.
+        strict: only contacts inside the step; otherwise also such as the uncertainty of the path lets in. Parts of an
+            interval are strict, or each contact would be tried by two of them.
+    """
+    free = carry(bank, dt, scene)
+    branches = [free]
+    for surface in _near(free, scene):
+        times, speeds, ok = _meetings(bank, surface, dt, scene, strict=strict)
+        rows = np.flatnonzero(ok)
+        if len(rows):
+            landed, times = _touch(bank.take(rows), times[rows], surface, scene, interval, start)
+            slow = np.flatnonzero(speeds[rows] < scene.settings.rest_speed)
+            if len(slow):
+                branches.append(_stay(landed.take(slow), dt - times[slow], surface, scene, interval, start + dt))
+            branches.append(_bounce(landed, dt - times, surface, scene))
+    return concatenate(branches)
+
+
+def _near(after: Bank, scene: Scene) -> NDArray[np.intp]:
+    """The surfaces that some hypothesis, flown on without contact, would have met by now or within the window."""
+    mean = after.mean[:, 2]
+    low = mean[:, 0] + scene.settings.contact_window * np.minimum(mean[:, 1], -SLOWEST_CLOSING)
+    return np.flatnonzero(low.min() < scene.centres)
+
+
+def _meetings(
+    bank: Bank, surface: int, dt: float, scene: Scene, *, strict: bool
+) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+    """Time (h,) s and speed (h,) m/s at which each mean path comes down to a surface, and whether it is to be tried."""
+    height = bank.mean[:, 2, 0] - scene.centres[surface]
+    rise = bank.mean[:, 2, 1]
+    gravity = scene.physics.gravity
+    velocity = bank.mean[:, :, 1]
+    drag = scene.physics.drag * np.sqrt(np.einsum("ha,ha->h", velocity, velocity))
+    pull = np.maximum(gravity - bank.mean[:, 2, 2] + drag * rise, WEAKEST_FALL * gravity)
+    speed = np.sqrt(np.maximum(rise * rise + 2.0 * pull * height, 0.0))  # zero where the path stays below
+    time = (rise + speed) / pull
+    ok = (bank.surface == FLYING) & (speed > LEAST_FALL)
+    if strict:
+        ok &= (time >= 0.0) & (time < dt)
+    else:
+        reach = 3.0 * np.sqrt(bank.cov[:, 2, 0, 0]) + 2.0 * scene.settings.surface_sigma
+        margin = np.minimum(reach / np.maximum(speed, SLOWEST_CLOSING), scene.settings.contact_window)
+        # one sample between two contacts, or one contact would be tried in two intervals running
+        ok &= (time > -margin) & (time < dt + margin) & (bank.age >= 1)
+    return time, speed, ok
+
+
+def _touch(
+    bank: Bank, times: FloatArray, surface: int, scene: Scene, interval: int, start: float
+) -> tuple[Bank, FloatArray]:
+    """The hypotheses just before their contacts, priced and with the event, without those that miss the table."""
+    bank.mean, bank.cov = fly(bank.mean, bank.cov, times, scene)
+    over = scene.reaches(surface, bank.mean)
+    if not over.all():
+        bank, times = bank.take(np.flatnonzero(over)), times[over]
+    bank.score = bank.score - scene.settings.contact_cost
+    bank.age = np.zeros(len(bank), dtype=np.int64)
+    for row, time in enumerate(times.tolist()):
+        bank.add_event(row, Event(EventKind.CONTACT, interval, start + time, scene.height(surface)))
+    return bank, times
+
+
+def _bounce(bank: Bank, rest_of_step: FloatArray, surface: int, scene: Scene) -> Bank:
+    """Hypotheses at a contact, bounced and flown on: mirrored in z, slowed by the friction of an unknown spin."""
+    settings = scene.settings
+    e, keep = scene.physics.restitution, settings.tangential_keep
+    mean, cov = bank.mean, bank.cov
+    speed = np.abs(mean[:, 2, 1])
+    mean[:, :2, 1] *= keep
+    mean[:, 2, 1] = e * speed
+    mean[:, 2, 0] = scene.centres[surface]
+    # J = diag(1, keep, 1) along the surface, diag(-e, -e, 1) along its normal: the path is mirrored, late or early
+    scale = np.array([[1.0, keep, 1.0], [1.0, keep, 1.0], [-e, -e, 1.0]])
+    cov *= scale[:, :, None] * scale[:, None, :]
+    cov[:, :2, 0, 0] += POSITION_JITTER**2
+    cov[:, :2, 1, 1] += (SLIDE_JITTER + settings.tangential_sigma * speed[:, None]) ** 2
+    cov[:, 2, 0, 0] += ((1.0 + e) * settings.surface_sigma) ** 2
+    cov[:, 2, 1, 1] += (BOUNCE_JITTER + scene.restitution_sigmas[surface] * speed) ** 2
+    cov[:, :, 2, 2] += settings.slack_at_contact**2
+    bank.mean, bank.cov = fly(mean, cov, rest_of_step, scene)
+    return bank
+
+
+def _stay(bank: Bank, rest_of_step: FloatArray, surface: int, scene: Scene, interval: int, time: float) -> Bank:
+    """Hypotheses at a contact that stay down for the rest of the step."""
+    put_down(bank, np.full(len(bank), surface), scene)
+    height_mean, height_cov = bank.mean[:, 2].copy(), bank.cov[:, 2].copy()
+    bank.mean, bank.cov = fly(bank.mean, bank.cov, rest_of_step, scene)
+    bank.mean[:, 2], bank.cov[:, 2] = height_mean, height_cov
+    bank.score = bank.score - scene.settings.rest_cost
+    for row in range(len(bank)):
+        bank.add_event(row, Event(EventKind.REST, interval, time, scene.height(surface)))
+    return bank
+
+
+def resting_rows(bank: Bank) -> IntArray:
+    """Rows of the hypotheses that rest on a surface."""
+    return (bank.surface != FLYING).nonzero()[0]

@@ -1,0 +1,73 @@
+"""What every estimator is told about the noise: of the measurements, of the motion, of what is not measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.model import BallModel
+from ballfg.factors.loss import Loss
+from ballfg.factors.noise import ProcessNoise
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Noise and priors, the same for all estimators, so that a comparison compares the estimators."""
+
+    position_noise: tuple[float, float, float] = (0.0015, 0.0015, 0.0015)
+    """m, standard deviation of a measured x, y, z, where a track does not bring its own."""
+
+    process: ProcessNoise = field(default_factory=ProcessNoise)
+    """How far the ball strays from its model, per root second, per impact, per hit."""
+
+    spin_prior: float = 60.0
+    """rad/s, standard deviation per axis of the spin of a ball without a spin label, about zero."""
+
+    spin_label_noise: float = 20.0
+    """rad/s, standard deviation per axis of a spin label."""
+
+    velocity_prior: float = 20.0
+    """m/s, standard deviation per axis of the velocity at the start of a track, about zero."""
+
+    coefficients: Mapping[str, float] = field(default_factory=dict)
+    """Model parameters estimated for each track: prior standard deviation by parameter name. Empty: the model is
+    taken to be exact."""
+
+    loss: Loss = field(default_factory=lambda: Loss("cauchy", 3.0))
+    """Loss on each measured position. `Loss("squared")` where there are no outliers."""
+
+    label_loss: Loss = field(default_factory=lambda: Loss("cauchy", 3.0))
+    """Loss on a spin label."""
+
+    find_events: bool = True
+    """Look for hits, outliers and tracker shifts. False: the track is one undisturbed flight with contacts that the
+    model explains."""
+
+    def __post_init__(self) -> None:
+        if len(self.position_noise) != 3 or not all(np.isfinite(s) and s > 0 for s in self.position_noise):
+            raise ValueError(f"position_noise must be three positive numbers in m; got {self.position_noise}")
+        for name in ("spin_prior", "spin_label_noise", "velocity_prior"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise ValueError(f"{name} must be positive and finite; got {getattr(self, name)}")
+        for name, sigma in self.coefficients.items():
+            if not (np.isfinite(sigma) and sigma > 0):
+                raise ValueError(f"coefficients['{name}'] must be a positive standard deviation; got {sigma}")
+
+
+def uncertain(model: BallModel, **changes: object) -> Settings:
+    """Settings for measured tracks: the model's coefficients are known as well as their priors say.
+
+    Args:
+        model: gives the coefficients and their prior standard deviations.
+        changes: other fields of `Settings`.
+    """
+    return Settings(coefficients=coefficient_sigmas(model), **changes)  # type: ignore[arg-type]
+
+
+def sample_sigmas(settings: Settings, count: int, own: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """(n, 3) m: a track's own sigmas where it has them, else the settings'."""
+    return np.broadcast_to(np.array(settings.position_noise), (count, 3)).copy() if own is None else own

@@ -1,0 +1,189 @@
+"""The sliding-window mean: the plainest estimate of a velocity, and where the better ones start.
+
+Source: Q. Xiao, Z. Wu, M. Gombolay, "Learning Dynamics of a Ball with Differentiable Factor Graph and
+Roto-Translational Invariant Representations", section IV: the average velocity within a sliding window of size 5.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from ballfg.dynamics.integrate import rate_jacobian
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimate.estimator import Estimator
+from ballfg.estimate.result import Array, Estimate, Status
+from ballfg.estimate.settings import Settings, sample_sigmas
+from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
+from ballfg.tracks import Track
+
+WINDOW = 5
+"""Samples in a window."""
+FRICTION_SHARE = 0.5
+"""Largest change of tangential speed in a bounce, as a share of the normal speed's change: Coulomb's mu."""
+
+
+class SlidingWindow(Estimator):
+    """The mean velocity over a causal window of five samples; a baseline, not corrected for what it neglects.
+
+    - Position: as measured. Velocity: (p_k - p_j) / (t_k - t_j) with j = max(k - 4, 0); at the first sample, zero with
+      the prior's covariance. Spin: the label, or zero.
+    - The mean velocity is that of the window's middle, so it lags by half a window times the acceleration. The
+      covariance is the matrix of mean squared errors: measurement noise (and its correlation with the position),
+      plus the outer product of the lag that the model gives, plus the part of it that an unknown spin makes.
+    - The window does average over a bounce. Where it may hold one - the ball was within one interval's travel of a
+      surface - the variance gets a third of the squared jump (the mean square over a bounce anywhere in the window),
+      and from there on the spin's variance that of an unlabelled spin as well.
+    - It has no innovations, and finds neither contacts, hits nor outliers: its quality is empty.
+    """
+
+    name = "sliding-window"
+
+    def estimate(self, track: Track) -> Estimate:
+        """The states of a track; a single sample has no velocity and the status says so."""
+        n = len(track)
+        sigma = sample_sigmas(self.settings, n, track.sigmas)
+        first = np.maximum(np.arange(n) - WINDOW + 1, 0)
+        span = track.times - track.times[first]
+        span[0] = 1.0  # the first sample's difference is zero; its velocity is the prior's
+        states = np.zeros((n, STATE_DIM))
+        states[:, POSITION] = track.positions
+        states[:, VELOCITY] = (track.positions - track.positions[first]) / span[:, None]
+        label = track.spin_label
+        states[:, SPIN] = 0.0 if label is None else label
+        bounced = may_touch(track.times, track.positions, self.surfaces, self.model.radius)
+        covariances = _measurement_covariance(sigma, first, span)
+        covariances[:, SPIN, SPIN] = self._spin_covariance(track, bounced)
+        covariances[:, VELOCITY, VELOCITY] += _lag_covariance(self.model, states, covariances[:, SPIN, SPIN], span)
+        covariances[:, VELOCITY, VELOCITY] += _bounce_covariance(track, first, bounced)
+        covariances[0, VELOCITY] = covariances[0, :, VELOCITY] = 0.0
+        covariances[0, VELOCITY, VELOCITY] = self.settings.velocity_prior**2 * np.eye(3)
+        return Estimate(
+            name=track.name,
+            times=track.times,
+            states=states,
+            covariances=covariances,
+            status=Status.OK if n > 1 else Status.NO_VELOCITY,
+            whitened=np.full((n, 3), np.nan),
+            cross_covariances=np.zeros((n, STATE_DIM, 0)),
+        )
+
+    def _spin_covariance(self, track: Track, bounced: NDArray[np.bool_]) -> Array:
+        """(n, 3, 3): prior or label, the random walk since, and an unknown change once the ball may have bounced."""
+        mean_sigma = spin_start(track, self.settings)[1]
+        variance = mean_sigma**2 + self.settings.process.spin**2 * (track.times - track.times[0])
+        variance = variance + self.settings.spin_prior**2 * np.logical_or.accumulate(bounced)
+        return np.asarray(variance[:, None, None] * np.eye(3))
+
+
+def spin_start(track: Track, settings: Settings) -> tuple[Array, float]:
+    """Mean (3,) and standard deviation per axis of the spin at a track's first sample, rad/s: its label or the prior."""
+    label = track.spin_label
+    return (np.zeros(3), settings.spin_prior) if label is None else (label, settings.spin_label_noise)
+
+
+def may_touch(times: Array, positions: Array, surfaces: Surfaces, radius: float) -> NDArray[np.bool_]:
+    """(n,) bool: the ball may have touched a surface since the sample before.
+
+    It is so where one of the two samples lies closer to a surface than the ball moves in one interval.
+    """
+    n = len(times)
+    gap = np.abs(positions[:, Z, None] - radius - np.array(surfaces.heights())).min(axis=-1)
+    travel = np.abs(np.diff(positions[:, Z]))
+    reach = np.zeros(n)  # the vertical travel of the neighbouring intervals: the one with the bounce hides it
+    reach[1:] = travel
+    reach[2:] = np.maximum(reach[2:], travel[:-1])
+    reach[1:-1] = np.maximum(reach[1:-1], travel[1:])
+    touching = np.zeros(n, dtype=bool)
+    touching[1:] = np.minimum(gap[1:], gap[:-1]) < reach[1:]
+    return touching
+
+
+def _measurement_covariance(sigma: Array, first: NDArray[np.int64], span: Array) -> Array:
+    """(n, 9, 9) of position p_k and velocity (p_k - p_j) / span, from the noise of p_k and p_j."""
+    covariance = np.zeros((len(sigma), STATE_DIM, STATE_DIM))
+    at, axes = sigma**2, np.arange(3)
+    covariance[:, axes, axes] = at
+    covariance[:, axes, 3 + axes] = covariance[:, 3 + axes, axes] = at / span[:, None]
+    covariance[:, 3 + axes, 3 + axes] = (at + at[first]) / span[:, None] ** 2
+    return covariance
+
+
+def _lag_covariance(model: BallModel, states: Array, spin_covariance: Array, span: Array) -> Array:
+    """(n, 3, 3): mean squared error of a velocity that is half a window old, by the model's acceleration."""
+    state = torch.from_numpy(states)
+    with torch.no_grad():
+        acceleration = model.rates(state)[0].numpy()
+    by_spin = rate_jacobian(model.rates, state)[:, VELOCITY, SPIN].numpy()
+    half = span[:, None, None] / 2
+    lag = acceleration[:, :, None] * half
+    by_spin = by_spin * half
+    return np.asarray(lag @ lag.swapaxes(-1, -2) + by_spin @ spin_covariance @ by_spin.swapaxes(-1, -2))
+
+
+def _bounce_covariance(track: Track, first: NDArray[np.int64], bounced: NDArray[np.bool_]) -> Array:
+    """(n, 3, 3): a third of the squared jump of velocity where the window of samples first_k..k may hold a bounce."""
+    n = len(track)
+    fall = np.zeros(n)
+    fall[1:] = np.abs(np.diff(track.positions[:, Z]) / np.diff(track.times))
+    window = np.maximum(np.arange(n)[:, None] - np.arange(WINDOW - 1), first[:, None] + 1)
+    window = np.minimum(window, n - 1)
+    held = bounced[window].any(axis=-1)
+    jump = 2.0 * fall[window].max(axis=-1) * held
+    shares = np.array([FRICTION_SHARE, FRICTION_SHARE, 1.0])
+    return np.asarray((jump[:, None, None] * np.diag(shares)) ** 2 / 3.0)
+
+
+def window_velocities(times: Array, positions: Array, breaks: ArrayLike = ()) -> Array:
+    """Velocities at all samples, by line fits over five samples that end at the breaks of the motion.
+
+    Least squares over p(t) = p_0 + v t - g t^2/2 e_z, with t counted from the sample, so that v is the velocity there.
+    A window is centred on its sample, shifted where a break or an end of the track is near, shorter where there are
+    fewer than five samples between two breaks. A sample alone between breaks gets the mean slope to its neighbours.
+
+    Args:
+        times: (n,) s, increasing.
+        positions: (n, 3) m.
+        breaks: intervals (between samples i and i+1) in which a contact or a hit broke the motion.
+    Returns: (n, 3) m/s, always finite; zero for a track of one sample.
+    """
+    n = len(times)
+    if n == 1:
+        return np.zeros((1, 3))
+    begin, end = _segment_bounds(n, np.asarray(breaks, dtype=np.int64))
+    at = np.arange(n)
+    low = np.maximum(np.minimum(at - WINDOW // 2, end - WINDOW), begin)
+    window = low[:, None] + np.arange(WINDOW)
+    weight = (window < end[:, None]).astype(np.float64)  # (n, 5)
+    window = np.minimum(window, n - 1)
+    t = times[window] - times[:, None]
+    p = positions[window]  # (n, 5, 3)
+    p[:, :, Z] += 0.5 * STANDARD_GRAVITY * t**2
+    count = weight.sum(axis=-1, keepdims=True)
+    centred = weight * (t - (weight * t).sum(axis=-1, keepdims=True) / count)
+    scatter = (centred * t).sum(axis=-1)
+    alone = count[:, 0] == 1
+    velocities = np.einsum("nk,nkd->nd", centred, p) / np.where(alone, 1.0, scatter)[:, None]
+    if alone.any():
+        velocities[alone] = _neighbour_slopes(times, positions)[alone]
+    return np.asarray(velocities)
+
+
+def _segment_bounds(n: int, breaks: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(n,) first sample of each sample's segment, and (n,) the one after its last."""
+    edges = np.zeros(n + 1, dtype=np.int64)
+    edges[breaks + 1] = breaks + 1
+    begin = np.maximum.accumulate(edges[:-1])
+    edges = np.full(n + 1, n)
+    edges[breaks + 1] = breaks + 1
+    end = np.minimum.accumulate(edges[:0:-1])[::-1]
+    return begin, end
+
+
+def _neighbour_slopes(times: Array, positions: Array) -> Array:
+    """(n, 3) mean of the slopes to the samples before and after; at the ends the one there is."""
+    slopes = np.diff(positions, axis=0) / np.diff(times)[:, None]
+    padded = np.concatenate((slopes[:1], slopes, slopes[-1:]))
+    return np.asarray((padded[1:] + padded[:-1]) / 2)

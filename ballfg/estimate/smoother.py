@@ -1,0 +1,181 @@
+"""The smoother: the most probable states of a whole track, by Levenberg-Marquardt on its factor graph."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimate.estimator import Estimator
+from ballfg.estimate.initial import initial_states
+from ballfg.estimate.problem import (
+    START_POSITION_SIGMA,
+    Events,
+    build_graph,
+    contact_kinds,
+    contacts_by_interval,
+    effective_sigmas,
+    initial_values,
+    trackwise_model,
+)
+from ballfg.estimate.result import Estimate, Status, leave_one_out
+from ballfg.estimate.segmentation import Contact, Segmentation, physics_of, segment
+from ballfg.estimate.settings import Settings, sample_sigmas
+from ballfg.factors.covariance import Covariances, marginal_covariances
+from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+from ballfg.tracks import Track
+
+Array = NDArray[np.float64]
+
+MAX_REFINEMENTS = 6
+"""How often contacts may move to a neighbouring interval; two were the most seen on measured tracks."""
+
+
+@dataclass(frozen=True)
+class Solution:
+    """A minimised graph and the events it was built on."""
+
+    events: Events
+    graph: BallGraph
+    minimum: Minimum
+
+
+class Smoother(Estimator):
+    """Maximum a posteriori estimate of all states of a track.
+
+    Contacts, hits, outliers are found by the segmentation; contacts are then refined by the estimate: one whose
+    estimated time lies outside its interval moves to where it belongs, and the graph is solved again.
+
+    Args:
+        model: the ball.  surfaces: what it may bounce on.  settings: noise and priors.
+        optimizer: settings of the minimisation.
+    """
+
+    name = "smoother"
+
+    def __init__(
+        self,
+        model: BallModel,
+        surfaces: Surfaces,
+        settings: Settings,
+        optimizer: LevenbergMarquardt | None = None,
+    ) -> None:
+        super().__init__(model, surfaces, settings)
+        self.trackwise = trackwise_model(model, settings)
+        self.optimizer = optimizer or LevenbergMarquardt()
+        self.physics = physics_of(model)
+
+    def estimate(self, track: Track) -> Estimate:
+        """The states of a track, one per stamp, with the covariances of the Laplace approximation."""
+        segmentation = self.segment(track)
+        sigma = effective_sigmas(track, segmentation, self.settings)
+        solution = self.solve(track, segmentation, sigma)
+        return self._result(track, sigma, solution)
+
+    def segment(self, track: Track) -> Segmentation:
+        """The events in a track."""
+        sigma = sample_sigmas(self.settings, len(track), track.sigmas)
+        found = segment(track.times, track.positions, sigma, surfaces=self.surfaces, physics=self.physics)
+        return found if self.settings.find_events else found.only_contacts()
+
+    def solve(self, track: Track, segmentation: Segmentation, sigma: Array) -> Solution:
+        """Minimise, move contacts to where the estimate says they are, and minimise again until they stay."""
+        events = Events(segmentation.contacts, segmentation)
+        states = initial_states(track, events.contacts, segmentation, self.model)
+        values = initial_values(states, self.trackwise, self.settings)
+        seen: dict[tuple[tuple[int, float], ...], Solution] = {}
+        for _ in range(MAX_REFINEMENTS):
+            graph = build_graph(track, self.trackwise, events, sigma, self.settings)
+            solution = Solution(events, graph, self.optimizer.minimize(graph, values))
+            seen[_places(events.contacts)] = solution
+            refined = _refined(track.times, solution)
+            if _places(refined) in seen:
+                break
+            values = solution.minimum.values
+            events = Events(refined, segmentation)
+        return min(seen.values(), key=lambda s: s.minimum.error)
+
+    def _result(self, track: Track, sigma: Array, solution: Solution) -> Estimate:
+        minimum, segmentation = solution.minimum, solution.events.segmentation
+        n, p = len(track), len(minimum.values.coefficients)
+        if minimum.step is None:
+            covariances = _prior_covariances(n, p, sigma, self.settings)
+        else:
+            covariances = marginal_covariances(minimum.step.bayes_net, n, p)
+        rows = solution.graph.kinds[0].linearize(minimum.values)
+        weight = rows.loss.weight(np.linalg.norm(rows.residual, axis=-1))
+        states = minimum.values.states
+        return Estimate(
+            name=track.name,
+            times=track.times,
+            states=states,
+            covariances=covariances.states,
+            status=_status(minimum, n),
+            whitened=leave_one_out(states, covariances.states, track.positions, sigma, weight),
+            coefficient_names=self.trackwise.names if isinstance(self.trackwise, AugmentedModel) else (),
+            coefficients=minimum.values.coefficients,
+            coefficient_covariance=covariances.coefficients,
+            cross_covariances=covariances.cross,
+            contacts=_timed(track.times, solution),
+            hits=segmentation.hits,
+            quality=segmentation.quality,
+            error=minimum.error,
+            iterations=minimum.iterations,
+        )
+
+
+def _places(contacts: tuple[Contact, ...]) -> tuple[tuple[int, float], ...]:
+    return tuple((c.interval, c.height) for c in contacts)
+
+
+def _timed(times: Array, solution: Solution) -> tuple[Contact, ...]:
+    """The contacts with the times that the estimate gives them; unchanged where it gives none."""
+    grouped = contacts_by_interval(solution.events.contacts)
+    timed: list[Contact] = []
+    for kind in contact_kinds(solution.graph):
+        for interval, elapsed in zip(
+            kind.variables[:, 0].tolist(), kind.contact_times(solution.minimum.values), strict=True
+        ):
+            for contact, tau in zip(grouped[interval], elapsed.tolist(), strict=True):
+                time = float(times[interval] + tau) if np.isfinite(tau) else contact.time
+                timed.append(Contact(interval, time, contact.height))
+    return tuple(sorted(timed, key=lambda c: c.time))
+
+
+def _refined(times: Array, solution: Solution) -> tuple[Contact, ...]:
+    """The contacts, each in the interval that its estimated time lies in; those outside the track are dropped."""
+    refined = []
+    for contact in _timed(times, solution):
+        if not times[0] <= contact.time <= times[-1]:
+            continue
+        interval = int(np.clip(np.searchsorted(times, contact.time, side="right") - 1, 0, len(times) - 2))
+        step = np.clip(interval - contact.interval, -1, 1)  # one interval at a time: the estimate moves along
+        refined.append(Contact(contact.interval + int(step), contact.time, contact.height))
+    return tuple(refined)
+
+
+def _status(minimum: Minimum, samples: int) -> Status:
+    if minimum.convergence is Convergence.NOT_FINITE or minimum.step is None:
+        return Status.FAILED
+    if samples < 2:
+        return Status.NO_VELOCITY
+    return Status.OK if minimum.convergence is Convergence.CONVERGED else Status.NOT_CONVERGED
+
+
+def _prior_covariances(n: int, p: int, sigma: Array, settings: Settings) -> Covariances:
+    """What is known of each state by itself, where the graph could not be solved."""
+    states = np.zeros((n, STATE_DIM, STATE_DIM))
+    for block, spread in ((POSITION, np.maximum(sigma, START_POSITION_SIGMA * 0.01)), (VELOCITY, None), (SPIN, None)):
+        width = settings.velocity_prior if block == VELOCITY else settings.spin_prior
+        diagonal = spread if spread is not None else np.full((n, 3), width)
+        axes = np.arange(block.start, block.stop)
+        states[:, axes, axes] = diagonal**2
+    return Covariances(states, np.diag([s**2 for s in settings.coefficients.values()]).reshape(p, p), np.zeros((n, 9, p)))
+
+
+

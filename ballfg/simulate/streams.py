@@ -1,0 +1,30 @@
+"""Streams of random numbers: one for each purpose and each block of tracks, all from one seed.
+
+Separate streams keep what is not changed the same: with the same seed, a simulation with wind has the launches and the
+measurement noise of the one without.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+
+
+class Purpose(IntEnum):
+    """What a stream is for. The numbers are part of what a seed means: never renumber."""
+
+    SETTINGS = 0
+    LAUNCH = 1
+    PROCESS = 2
+    CONTACT = 3
+    POSITION = 4
+    DROPOUT = 5
+    JITTER = 6
+    OUTLIER = 7
+    LABEL = 8
+
+
+def generator(seed: int, purpose: Purpose, block: int) -> np.random.Generator:
+    """The generator of one stream; `block` counts blocks of tracks, or passes through the settings."""
+    return np.random.default_rng([seed, int(purpose), block])

@@ -1,0 +1,32 @@
+"""Pull: a force toward one place in the room. No catalogue of ball physics holds it; it tests for the unknown."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect
+
+
+class Pull(FlightEffect):
+    """a = strength d / sqrt(|d|^2 + soft^2), with d from the ball to the place: of constant size away from it."""
+
+    name = "pull"
+    sentence = "A force toward one place in the room."
+    coefficients = (
+        Coefficient("strength", 0.0, 0.3, "m/s^2", -20.0, 20.0),
+        Coefficient("x", 1.4, 1.0, "m", -100.0, 100.0),
+        Coefficient("y", 0.5, 0.5, "m", -100.0, 100.0),
+        Coefficient("z", 1.5, 0.5, "m", -100.0, 100.0),
+        Coefficient("soft", 0.3, 0.1, "m", 0.01, 100.0),
+    )
+    strength: Tensor
+    x: Tensor
+    y: Tensor
+    z: Tensor
+    soft: Tensor
+
+    def acceleration(self, flight: Flight) -> Tensor:
+        """(..., 3) m/s^2 toward the place; zero in it."""
+        way = torch.stack((self.x, self.y, self.z), dim=-1) - flight.position
+        return self.strength * way / (way.square().sum(-1, keepdim=True) + self.soft.square()).sqrt()

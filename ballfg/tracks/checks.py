@@ -1,0 +1,211 @@
+"""The rules that a whole trajectory must keep, and the two repairs that are made openly.
+
+Repairs: rows out of time order are sorted, exact repeats are dropped. Two different rows at one stamp that lie
+close together are one measurement with a stamp that is off (rounded or late): their mean takes their place.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from .grouping import RowGroup
+from .track import FloatArray
+
+MERGE_DISTANCE = 0.1
+"""m: two rows at one stamp farther apart than this are refused; one frame of a ball at 15 m/s and 150 Hz."""
+
+MAX_COORDINATE = 1000.0
+"""m: positions farther from the origin are refused."""
+
+MAX_EXTENT = 250.0
+"""m: a longer track is refused; no struck ball flies farther."""
+
+MAX_SPEED = 343.0
+"""m/s: a track whose median speed is above that of sound is refused."""
+
+MAX_MEDIAN_SIGMA = 1.0
+"""m: a track whose samples are less certain than this is refused."""
+
+MAX_STEP = 1.0
+"""s: a track whose median time step is longer is refused; no bounce could be seen in it."""
+
+MIN_STEP = 1e-6
+"""s: a track whose median time step is shorter is refused; no camera is that fast."""
+
+MAX_RATE_RATIO = 100.0
+"""A median time step that misses the declared rate by more than this factor is refused."""
+
+_NAMED = 3  # trajectories that a note names before it only counts
+
+Where = Callable[..., str]
+
+
+@dataclass
+class Findings:
+    """What was repaired while a dataset was checked."""
+
+    repeats: int = 0
+    sorted_tracks: list[str] = field(default_factory=list)
+    merged: list[str] = field(default_factory=list)
+    merged_distance: float = 0.0
+
+    def notes(self) -> list[str]:
+        """One sentence for each kind of repair that was made."""
+        notes = []
+        if self.repeats:
+            notes.append(f"{_count(self.repeats, 'exact repeat')} dropped")
+        if self.sorted_tracks:
+            count = _count(len(self.sorted_tracks), "trajectory", "trajectories")
+            notes.append(f"rows of {count} were not in time order: sorted ({_some(self.sorted_tracks)})")
+        if self.merged:
+            count = _count(len(self.merged), "stamp")
+            notes.append(
+                f"{count} with different rows, up to {self.merged_distance * 100:.1f} cm apart: "
+                f"averaged ({_some(self.merged)})"
+            )
+        return notes
+
+
+def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> FloatArray:
+    """The samples of one trajectory, one for each stamp, in time order.
+
+    Args:
+        group: its rows; finite.
+        where: tells the place of rows of the file, for an error.
+        findings: what is repaired is added to them.
+    Returns: (n, 4) or (n, 7), columns as in Block.
+    Raises: ValueError: fewer than two stamps, or two rows at one stamp more than MERGE_DISTANCE apart.
+    """
+    findings = Findings() if findings is None else findings
+    values, rows = group.values, group.rows
+    steps = np.diff(values[:, 0])
+    if (steps < 0).any():
+        findings.sorted_tracks.append(repr(group.name))
+        order = np.argsort(values[:, 0], kind="stable")
+        values, rows = values[order], rows[order]
+        steps = np.diff(values[:, 0])
+    if (steps == 0).any():
+        values = _one_per_stamp(RowGroup(group.name, rows, values), where, findings)
+    if len(values) < 2:
+        raise ValueError(
+            f"{where(int(rows[0]))}: trajectory {group.name!r} must have at least two samples at different times; "
+            "got one. Delete it."
+        )
+    return values
+
+
+def fuse(values: FloatArray) -> FloatArray:
+    """The mean of different measurements of one position at one stamp.
+
+    With sigmas it is weighted by 1 / sigma^2, and sigma becomes that of the weighted mean times a factor >= 1,
+    where the measurements disagree by more than their sigmas allow.
+
+    Args:
+        values: (k, 4) or (k, 7), k >= 2, one stamp.
+    Returns: (4,) or (7,).
+    Source: Particle Data Group, Review of Particle Physics, Introduction, unconstrained averaging (scale factor S).
+    """
+    if values.shape[1] == 4:
+        return np.concatenate([values[0, :1], values[:, 1:].mean(axis=0)])
+    positions, weights = values[:, 1:4], values[:, 4:] ** -2.0
+    total = weights.sum(axis=0)
+    mean = (weights * positions).sum(axis=0) / total
+    chi2 = (weights * (positions - mean) ** 2).sum(axis=0)
+    scale = np.sqrt(np.maximum(1.0, chi2 / (len(values) - 1)))
+    return np.concatenate([values[0, :1], mean, scale / np.sqrt(total)])
+
+
+def check_scale(
+    label: str, times: FloatArray, positions: FloatArray, sigmas: FloatArray | None, rate: float | None
+) -> None:
+    """Refuses a track whose numbers cannot be metres and seconds.
+
+    Args:
+        label: what the message calls the track.
+        times: (n,) s, n >= 2, strictly increasing.
+        positions: (n, 3) m.
+        sigmas: (n, 3) m, or None.
+        rate: the dataset's declared rate, Hz, if any.
+    Raises: ValueError: naming the likely unit.
+    """
+    steps = np.diff(times)
+    step = float(np.median(steps))
+    low, high = positions.min(axis=0), positions.max(axis=0)
+    farthest = float(max(high.max(), -low.min()))
+    extent = float(np.linalg.norm(high - low))
+    if extent > MAX_EXTENT:
+        raise ValueError(
+            f"{label}: x, y, z must be in m, and a track at most {MAX_EXTENT:g} m long; got {extent:.4g}. "
+            "The unit is probably mm: divide by 1000."
+        )
+    if farthest > MAX_COORDINATE:
+        raise ValueError(
+            f"{label}: x, y, z must be in m and within {MAX_COORDINATE:g} m of the origin; got {farthest:.4g}. "
+            "The unit is probably mm (divide by 1000), or the origin is far away (move it to the table)."
+        )
+    if step > MAX_STEP or step < MIN_STEP or _misses_rate(step, rate):
+        expected = f"{MIN_STEP:g} to {MAX_STEP:g} s apart" + (f", near 1/{rate:g} s (rate)" if rate else "")
+        raise ValueError(
+            f"{label}: t must be in s, its stamps {expected}; got a median step of {step:.4g}. "
+            f"{_time_remedy(step, rate)}"
+        )
+    with np.errstate(over="ignore"):  # a single step may be next to nothing
+        speed = float(np.median(np.linalg.norm(np.diff(positions, axis=0), axis=1) / steps))
+    if speed > MAX_SPEED:
+        raise ValueError(
+            f"{label}: x, y, z must be in m and t in s; got a median speed of {speed:.4g} m/s, above that of sound. "
+            "The unit of x, y, z is probably mm or cm: convert it to m."
+        )
+    if sigmas is not None and np.median(sigmas) > MAX_MEDIAN_SIGMA:
+        raise ValueError(
+            f"{label}: sigmas must be in m, their median at most {MAX_MEDIAN_SIGMA:g}; got {np.median(sigmas):.4g}. "
+            "The unit is probably mm: divide by 1000."
+        )
+
+
+def _one_per_stamp(group: RowGroup, where: Where, findings: Findings) -> FloatArray:
+    values = group.values
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(values[:, 0]) != 0]))
+    kept = values[starts].copy()
+    ends = np.append(starts[1:], len(values))
+    for i in np.flatnonzero(ends - starts > 1):
+        same = values[starts[i] : ends[i]]
+        distinct = np.unique(same, axis=0)
+        findings.repeats += len(same) - len(distinct)
+        if len(distinct) == 1:
+            continue
+        distances = np.linalg.norm(same[:, 1:4] - same[0, 1:4], axis=1)
+        farthest = int(np.argmax(distances))
+        if distances[farthest] > MERGE_DISTANCE:
+            first, second = int(group.rows[starts[i]]), int(group.rows[starts[i] + farthest])
+            raise ValueError(
+                f"{where(first, second)}: trajectory {group.name!r} must have one position for each time; got two, "
+                f"{distances[farthest]:.3g} m apart, at t={same[0, 0]}. Delete one, or give the two balls two names."
+            )
+        kept[i] = fuse(distinct)
+        findings.merged.append(f"{group.name!r} at t={same[0, 0]}")
+        findings.merged_distance = max(findings.merged_distance, float(distances[farthest]))
+    return kept
+
+
+def _misses_rate(step: float, rate: float | None) -> bool:
+    return rate is not None and not 1 / MAX_RATE_RATIO <= step * rate <= MAX_RATE_RATIO
+
+
+def _time_remedy(step: float, rate: float | None) -> str:
+    true_step = 1 / rate if rate else 0.01
+    if step < true_step:
+        return "Convert it to s" + (", or correct rate in dataset.yaml." if rate else ".")
+    units = {"ms": 1e3, "us": 1e6, "ns": 1e9}
+    unit = min(units, key=lambda name: abs(np.log(step / (true_step * units[name]))))
+    return f"The unit is probably {unit}: divide by {units[unit]:g}."
+
+
+def _count(number: int, one: str, many: str | None = None) -> str:
+    return f"{number} {one if number == 1 else many or one + 's'}"
+
+
+def _some(names: list[str]) -> str:
+    more = len(names) - _NAMED
+    return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")

@@ -1,0 +1,145 @@
+"""A dataset: a folder of tracks, checked once, then streamed as often as one likes."""
+
+from collections.abc import Iterator
+from os import PathLike
+from pathlib import Path
+
+from .checks import Findings, check_scale, tidy
+from .grouping import Index, RowGroup, groups, scan
+from .info import INFO_FILE, DatasetInfo, read_info
+from .labels import LABELS_FILE, LabelTable, read_labels
+from .rows import CsvRows, ParquetRows, RowSource
+from .track import FloatArray, Label, Track
+
+TRACK_FILES = ("tracks.csv", "tracks.parquet")
+
+
+class Dataset:
+    """The tracks of a folder; made by `read_dataset`.
+
+    Iterating streams the file, so that one track at a time is in memory; each `for` loop starts again at the first.
+    The tracks come in the order in which their names first appear.
+    """
+
+    def __init__(
+        self, path: Path, info: DatasetInfo, source: RowSource, index: Index, labels: LabelTable, notes: list[str]
+    ) -> None:
+        self.path = path
+        """The folder."""
+        self.info = info
+        """What `dataset.yaml` states."""
+        self.notes = notes
+        """What was ignored or repaired, one sentence each."""
+        self._source = source
+        self._index = index
+        self._labels = labels
+
+    def __len__(self) -> int:
+        return len(self._index.names)
+
+    def __iter__(self) -> Iterator[Track]:
+        for group in groups(self._source, self._index):
+            yield _track(group.name, tidy(group, self._source.where), self._labels.of(group.name))
+
+    def __repr__(self) -> str:
+        return f"Dataset({self.info.name!r}, {len(self)} tracks, {str(self.path)!r})"
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the trajectories, in the order of the tracks."""
+        return list(self._index.names)
+
+    @property
+    def label_names(self) -> list[str]:
+        """The names of the labels, in the order of `labels.csv`; empty without such a file."""
+        return self._labels.names
+
+    @property
+    def has_sigmas(self) -> bool:
+        """Whether every sample has its own standard deviations."""
+        return len(self._source.columns) > 4
+
+    def track(self, name: str) -> Track:
+        """One track by its name; reads the file up to it.
+
+        Raises: ValueError: if there is no track of that name.
+        """
+        if name in self._index.names:
+            for track in self:
+                if track.name == name:
+                    return track
+        raise ValueError(f"name must be one of the {len(self)} trajectories of {self.path}; got {name!r}. See names.")
+
+
+def read_dataset(folder: str | PathLike[str]) -> Dataset:
+    """Opens a dataset and checks all of it, so that no error waits in the middle of the file.
+
+    The table is read twice in blocks (cells first, then whole trajectories); memory does not grow with the number
+    of tracks, apart from their names and labels.
+
+    Args:
+        folder: holds `dataset.yaml`, `tracks.csv` or `tracks.parquet`, and optionally `labels.csv`; docs/tracks.md.
+    Returns: the dataset; its `notes` tell what was ignored or repaired.
+    Raises:
+        FileNotFoundError: the folder or one of its files is missing.
+        ValueError: the content breaks a rule; the message names file, line, column and remedy.
+    """
+    path = Path(folder)
+    source = _open_source(path)
+    info, notes = read_info(path / INFO_FILE)
+    notes += [f"{source.path.name}: column {name!r} ignored" for name in source.ignored]
+    index = scan(source)
+    labels = LabelTable({}, {})
+    if (path / LABELS_FILE).is_file():
+        labels = read_labels(path / LABELS_FILE, index.names)
+        if len(labels) < len(index.names):
+            notes.append(
+                f"{LABELS_FILE}: {len(index.names) - len(labels)} of {len(index.names)} trajectories unlabelled"
+            )
+    findings = Findings()
+    for group in groups(source, index):
+        _check_group(source, group, info, findings)
+    if not index.contiguous:
+        notes.append(f"{source.path.name}: the rows of different trajectories interleave: regrouped at each pass")
+    return Dataset(path, info, source, index, labels, notes + findings.notes())
+
+
+def _open_source(folder: Path) -> RowSource:
+    if not folder.exists():
+        raise FileNotFoundError(f"folder must exist; {folder} does not. Give the folder of a dataset.")
+    if not folder.is_dir():
+        raise ValueError(f"folder must be a folder; {folder} is a file. Give the folder that holds {INFO_FILE}.")
+    if not (folder / INFO_FILE).is_file():
+        raise FileNotFoundError(
+            f"{folder} must hold {INFO_FILE}; got {_listing(folder)}. Add it: name, frame and ball (docs/tracks.md)."
+        )
+    present = [name for name in TRACK_FILES if (folder / name).is_file()]
+    if len(present) > 1:
+        raise ValueError(f"{folder} must hold one table of tracks; got {' and '.join(present)}. Delete one of them.")
+    if not present:
+        raise FileNotFoundError(
+            f"{folder} must hold {' or '.join(TRACK_FILES)}; got {_listing(folder)}. "
+            "Add it: trajectory,t,x,y,z (docs/tracks.md)."
+        )
+    source = CsvRows if present[0].endswith(".csv") else ParquetRows
+    return source(folder / present[0])
+
+
+def _listing(folder: Path) -> str:
+    names = sorted(entry.name for entry in folder.iterdir())
+    shown = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+    return shown or "an empty folder"
+
+
+def _check_group(source: RowSource, group: RowGroup, info: DatasetInfo, findings: Findings) -> None:
+    values = tidy(group, source.where, findings)
+    sigmas = values[:, 4:] if values.shape[1] > 4 else None
+    try:
+        check_scale(f"trajectory {group.name!r}", values[:, 0], values[:, 1:4], sigmas, info.rate)
+    except ValueError as error:
+        raise ValueError(f"{source.where(int(group.rows[0]))}: {error}") from None
+
+
+def _track(name: str, values: FloatArray, labels: dict[str, Label]) -> Track:
+    sigmas = values[:, 4:] if values.shape[1] > 4 else None
+    return Track(name, values[:, 0], values[:, 1:4], sigmas, labels)

@@ -1,0 +1,190 @@
+"""From rows to trajectories, one at a time, whatever the order of the rows.
+
+Where the rows of each trajectory stand together, the file is streamed: one block and one trajectory are in memory.
+Where the trajectories interleave, each pass first puts the rows in order in a temporary file (8 bytes a value,
+40 to 64 bytes a row, in the system's temporary folder): a counting sort, because the scan has counted the rows of
+each trajectory. Either way, memory grows with the longest trajectory, not with their number.
+"""
+
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import IO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .csv_errors import no_rows
+from .rows import Block, RowSource
+from .track import FloatArray
+
+LARGEST = 1e100
+"""Any number beyond this is refused at once, so that no later step overflows."""
+
+MIN_SIGMA, MAX_SIGMA = 1e-9, 1e6
+"""m: the standard deviations that a sample may have; a large one marks a sample that should hardly count."""
+
+
+@dataclass(frozen=True)
+class RowGroup:
+    """All rows of one trajectory, in the order of the file."""
+
+    name: str
+
+    rows: NDArray[np.int64]
+    """(n,) number of each row in the file, from 0."""
+
+    values: FloatArray
+    """(n, 4) or (n, 7), as in Block."""
+
+
+@dataclass(frozen=True)
+class Index:
+    """What one scan of the file finds."""
+
+    names: list[str]
+    """The trajectories in the order in which they first appear."""
+
+    counts: NDArray[np.int64]
+    """(number of trajectories,) rows of each."""
+
+    contiguous: bool
+    """Whether the rows of each trajectory stand together."""
+
+    stamp: tuple[int, int]
+    """Size (bytes) and time of change (ns) of the file that was scanned."""
+
+
+def scan(source: RowSource) -> Index:
+    """Reads the file once, checks every cell and counts the rows of each trajectory.
+
+    Raises: ValueError: no rows, a nameless trajectory, a value that is not finite, a sigma that is none.
+    """
+    stamp = file_stamp(source)
+    codes_of: dict[str, int] = {}
+    counts: list[int] = []
+    contiguous = True
+    last = -1
+    for block in source.blocks():
+        check_cells(source, block)
+        known = len(counts)
+        codes = _global_codes(block, codes_of)
+        counts.extend([0] * (len(codes_of) - known))
+        starts = run_starts(codes)
+        # A run may only continue the last trajectory or begin the next new one.
+        for start, end in zip(starts, [*starts[1:], len(codes)], strict=True):
+            code = int(codes[start])
+            contiguous &= code == last or counts[code] == 0
+            counts[code] += end - start
+            last = code
+    if not counts:
+        raise no_rows(source.path)
+    return Index(list(codes_of), np.array(counts, dtype=np.int64), contiguous, stamp)
+
+
+def groups(source: RowSource, index: Index) -> Iterator[RowGroup]:
+    """Yields the trajectories in the order of their first rows.
+
+    Raises: ValueError: if the file is no longer the one that was scanned.
+    """
+    if file_stamp(source) != index.stamp:
+        raise ValueError(f"{source.path}: must not change while it is in use; it did. Call read_dataset again.")
+    return _stream(source) if index.contiguous else _regroup(source, index)
+
+
+def file_stamp(source: RowSource) -> tuple[int, int]:
+    """Size (bytes) and time of the last change (ns) of the file."""
+    status = source.path.stat()
+    return status.st_size, status.st_mtime_ns
+
+
+def check_cells(source: RowSource, block: Block) -> None:
+    """Refuses a block with a nameless row, a value that is not finite, or a sigma that is none."""
+    for code, name in enumerate(block.names):
+        if not name or not name.isprintable():
+            row = block.start + int(np.argmax(block.codes == code))
+            raise ValueError(
+                f"{source.where(row)}, column 'trajectory': must name the trajectory in printable text; "
+                f"got {name or ''!r}. Fill in a name."
+            )
+    bad = ~(np.abs(block.values) <= LARGEST)
+    sigmas = block.values[:, 4:]
+    bad[:, 4:] |= (sigmas < MIN_SIGMA) | (sigmas > MAX_SIGMA)
+    if bad.any():
+        row, column = (int(i) for i in np.argwhere(bad)[0])
+        place = f"{source.where(block.start + row)}, column {source.columns[column]!r}"
+        raise ValueError(f"{place}: {_cell_problem(column, float(block.values[row, column]))}")
+
+
+def run_starts(codes: NDArray[np.int32]) -> list[int]:
+    """Where each run of equal codes begins; empty for no codes."""
+    if len(codes) == 0:
+        return []
+    return [0, *(np.flatnonzero(np.diff(codes)) + 1).tolist()]
+
+
+def _cell_problem(column: int, value: float) -> str:
+    if column >= 4:
+        return (
+            f"must be a standard deviation of {MIN_SIGMA:g} to {MAX_SIGMA:g} m; got {value:g}. "
+            "Correct it, or drop the sigma columns."
+        )
+    rule = "finite" if not np.isfinite(value) else f"at most {LARGEST:g} in size"
+    return f"must be {rule}; got {value:g}. Delete the line: a missing sample needs no row."
+
+
+def _global_codes(block: Block, codes_of: dict[str, int]) -> NDArray[np.int32]:
+    """(n,) the trajectory's number for each row; new trajectories are numbered on."""
+    numbers = [codes_of.setdefault(str(name), len(codes_of)) for name in block.names]
+    return np.array(numbers, dtype=np.int32)[block.codes]
+
+
+def _stream(source: RowSource) -> Iterator[RowGroup]:
+    name: str | None = None
+    pieces: list[tuple[int, FloatArray]] = []
+    for block in source.blocks():
+        starts = run_starts(block.codes)
+        for start, end in zip(starts, [*starts[1:], len(block.codes)], strict=True):
+            run_name = block.names[block.codes[start]]
+            if run_name != name:
+                if name is not None:
+                    yield _joined(name, pieces)
+                name, pieces = run_name, []
+            pieces.append((block.start + start, block.values[start:end]))
+    if name is not None:
+        yield _joined(name, pieces)
+
+
+def _joined(name: str, pieces: list[tuple[int, FloatArray]]) -> RowGroup:
+    rows = [np.arange(start, start + len(values), dtype=np.int64) for start, values in pieces]
+    return RowGroup(name, np.concatenate(rows), np.concatenate([values for _, values in pieces]))
+
+
+def _regroup(source: RowSource, index: Index) -> Iterator[RowGroup]:
+    width = 1 + len(source.columns)
+    with tempfile.TemporaryFile(prefix="ballfg-") as file:
+        _write_ordered(file, source, index, width)
+        file.seek(0)
+        for name, count in zip(index.names, index.counts, strict=True):
+            table = np.frombuffer(file.read(int(count) * width * 8), dtype=np.float64).reshape(-1, width)
+            # A row number is exact in float64 up to 2**53.
+            yield RowGroup(name, table[:, 0].astype(np.int64), table[:, 1:])
+
+
+def _write_ordered(file: IO[bytes], source: RowSource, index: Index, width: int) -> None:
+    """Writes each row (its number, its values) to its trajectory's place in the file."""
+    codes_of = {name: code for code, name in enumerate(index.names)}
+    ends = np.cumsum(index.counts)
+    position = (ends - index.counts).tolist()
+    for block in source.blocks():
+        codes = _global_codes(block, codes_of)
+        order = np.argsort(codes, kind="stable")
+        codes = codes[order]
+        numbers = (block.start + order).astype(np.float64)
+        table = np.column_stack([numbers, block.values[order]])
+        starts = run_starts(codes)
+        for start, end in zip(starts, [*starts[1:], len(codes)], strict=True):
+            code = int(codes[start])
+            file.seek(position[code] * width * 8)
+            file.write(table[start:end].tobytes())
+            position[code] += end - start

@@ -1,0 +1,118 @@
+"""`labels.csv`: what is known about each shot, one row per trajectory."""
+
+from collections.abc import Collection
+from pathlib import Path
+
+from . import csv_errors
+from .hints import did_you_mean
+from .rows import KEY
+from .track import SPIN_LABELS, Label
+
+LABELS_FILE = "labels.csv"
+NUMERIC_LABELS = (*SPIN_LABELS, "topspin", "sidespin", "speed")
+TEXT_LABELS = ("group", "split")
+
+
+class LabelTable:
+    """The labels of all trajectories.
+
+    A column is numeric if each of its non-empty cells is a number; `group` and `split` are always text, the spin
+    and the launcher settings always numbers. An empty cell is a label that this trajectory does not have.
+    """
+
+    def __init__(self, columns: dict[str, list[Label | None]], rows: dict[str, int]) -> None:
+        self._columns = columns
+        self._rows = rows
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the labels, in the order of the file."""
+        return list(self._columns)
+
+    def of(self, trajectory: str) -> dict[str, Label]:
+        """The labels of one trajectory; empty if it has no row."""
+        row = self._rows.get(trajectory)
+        if row is None:
+            return {}
+        cells = {name: column[row] for name, column in self._columns.items()}
+        return {name: value for name, value in cells.items() if value is not None}
+
+
+def read_labels(path: Path, trajectories: Collection[str]) -> LabelTable:
+    """Reads a `labels.csv`.
+
+    Args:
+        path: the file.
+        trajectories: the names of the tracks.
+    Raises: ValueError: a missing or repeated column, a ragged line, a row without a track, a second row for a
+        track, or a cell that must be a number and is not; the message names line and column.
+    """
+    header = csv_errors.read_header(path)
+    _check_header(path, header)
+    rows, lines, cells = _read_rows(path, header, set(trajectories))
+    columns = {
+        name: _column(path, name, [row[i] for row in cells], lines) for i, name in enumerate(header) if name != KEY
+    }
+    return LabelTable(columns, rows)
+
+
+def _check_header(path: Path, header: list[str]) -> None:
+    shown = repr(",".join(header))
+    if KEY not in header:
+        raise ValueError(
+            f"{path}: column {KEY!r} is missing; got {shown}. Add or rename the column.{did_you_mean(KEY, header)}"
+        )
+    for name in header:
+        if not name.strip() or not name.isprintable():
+            raise ValueError(f"{path}: each column must have a printable name; got {shown}. Name it or delete it.")
+        if header.count(name) > 1:
+            raise ValueError(f"{path}: column {name!r} must appear once; got {shown}. Rename one of them.")
+
+
+def _read_rows(
+    path: Path, header: list[str], trajectories: set[str]
+) -> tuple[dict[str, int], list[int], list[list[str]]]:
+    """The row number of each trajectory, the line of each row, the cells of each row."""
+    key = header.index(KEY)
+    rows: dict[str, int] = {}
+    lines: list[int] = []
+    cells: list[list[str]] = []
+    for line, row in csv_errors.records(path):
+        if len(row) != len(header):
+            raise ValueError(
+                f"{path}, line {line}: must have {len(header)} cells, one for each column of the header; "
+                f"got {len(row)}. Complete the line or delete it."
+            )
+        name = row[key]
+        if name in rows:
+            raise ValueError(
+                f"{path}, line {line}: trajectory {name!r} must have one row; line {lines[rows[name]]} is another. "
+                "Delete one of them."
+            )
+        if name not in trajectories:
+            raise ValueError(
+                f"{path}, line {line}: trajectory {name!r} must have a track; there is none of that name. "
+                f"Names are compared as text, zeros included.{did_you_mean(name, trajectories)}"
+            )
+        rows[name] = len(cells)
+        lines.append(line)
+        cells.append(row)
+    return rows, lines, cells
+
+
+def _column(path: Path, name: str, cells: list[str], lines: list[int]) -> list[Label | None]:
+    text: list[Label | None] = [cell or None for cell in cells]
+    if name in TEXT_LABELS:
+        return text
+    for cell, line in zip(cells, lines, strict=True):
+        if cell.strip() and not csv_errors.is_number(cell):
+            if name not in NUMERIC_LABELS:
+                return text
+            raise ValueError(
+                f"{path}, line {line}, column {name!r}: must be a number; got {cell!r}. "
+                "Correct it, or leave the cell empty if it is unknown."
+            )
+    return [float(cell) if cell.strip() else None for cell in cells]

@@ -1,0 +1,188 @@
+"""Writing a result table as a stream: CSV or Parquet, and never half a file under the final name."""
+
+import csv
+import io
+import os
+import uuid
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import BinaryIO
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.csv as pa_csv
+import pyarrow.parquet as pq
+from numpy.typing import ArrayLike
+
+ENDINGS = (".csv", ".parquet")
+_BLOCK_ROWS = 1 << 16  # rows held back before they are written; also the row group of a Parquet file
+
+
+class TableWriter:
+    """Writes a table block by block; the file takes its name only when the `with` block ends without an exception.
+
+    Floats are written with as many digits as bring back the same float64. Memory is bounded by a block.
+
+    Example:
+        with TableWriter("states.csv") as table:
+            for track in dataset:
+                table.write({"trajectory": track.name, "t": track.times, "x": track.positions[:, 0]})
+
+    Raises: ValueError: another ending than .csv or .parquet, or a path that is a folder. FileNotFoundError: the
+        folder of the path does not exist.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        if self.path.suffix.lower() not in ENDINGS:
+            raise ValueError(
+                f"path must end in {' or '.join(ENDINGS)}; got {str(path)!r}. Choose the format by the ending."
+            )
+        if not self.path.parent.is_dir():
+            raise FileNotFoundError(f"path must be in an existing folder; {self.path.parent} is none. Create it first.")
+        if self.path.is_dir():
+            raise ValueError(f"path must be a file; {self.path} is a folder. Give the name of a file in it.")
+        self._temporary = self.path.with_name(f".{self.path.name}.{uuid.uuid4().hex[:8]}.tmp")
+        self._file: BinaryIO | None = None
+        self._parquet: pq.ParquetWriter | None = None
+        self._has_header = False
+        self._schema: pa.Schema | None = None
+        self._pending: list[pa.RecordBatch] = []
+        self._pending_rows = 0
+
+    def __enter__(self) -> "TableWriter":
+        self._file = self._temporary.open("xb")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            if kind is None:
+                self._finish()
+        finally:
+            self._discard()
+
+    def write(self, columns: Mapping[str, ArrayLike]) -> None:
+        """Appends a block of rows.
+
+        Args:
+            columns: name -> (n,) numbers or text, the same n for all; a single number or text is repeated. The
+                first block fixes the names, their order and their types.
+        Raises: ValueError: columns of different lengths, other names than in the first block, or values of another
+            type. RuntimeError: outside a `with` block.
+        """
+        if self._file is None:
+            raise RuntimeError("write must be called inside `with TableWriter(path) as table:`; it was not.")
+        batch = _batch(columns)
+        if self._schema is None:
+            self._schema = batch.schema
+        self._pending.append(_conformed(batch, self._schema))
+        self._pending_rows += batch.num_rows
+        if self._pending_rows >= _BLOCK_ROWS:
+            self._flush()
+
+    def _flush(self) -> None:
+        assert self._schema is not None
+        assert self._file is not None
+        table = pa.Table.from_batches(self._pending, self._schema).combine_chunks()
+        if self.path.suffix.lower() == ".csv":
+            self._write_csv(self._file, table)
+        else:
+            if self._parquet is None:
+                self._parquet = pq.ParquetWriter(self._file, self._schema)
+            self._parquet.write_table(table)
+        self._pending, self._pending_rows = [], 0
+
+    def _write_csv(self, file: BinaryIO, table: pa.Table) -> None:
+        # The library quotes the header and, where a text needs quotes, all texts; simple readers expect neither.
+        if not self._has_header:
+            header = io.StringIO()
+            csv.writer(header, lineterminator="\n").writerow(table.column_names)
+            file.write(header.getvalue().encode())
+            self._has_header = True
+        style = "needed" if _needs_quotes(table) else "none"
+        pa_csv.write_csv(table, file, pa_csv.WriteOptions(include_header=False, quoting_style=style))
+
+    def _finish(self) -> None:
+        if self._schema is None:
+            raise ValueError(f"{self.path}: a table must have columns; nothing was written. Write at least one block.")
+        self._flush()
+        assert self._file is not None
+        if self._parquet is not None:
+            self._parquet.close()
+            self._parquet = None
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+        os.replace(self._temporary, self.path)
+
+    def _discard(self) -> None:
+        """Closes everything and removes the temporary file if it is still there."""
+        try:
+            if self._parquet is not None:
+                self._parquet.close()
+        finally:
+            self._parquet, self._pending = None, []
+            if self._file is not None:
+                self._file.close()
+            self._file = None
+            self._temporary.unlink(missing_ok=True)
+
+
+def _batch(columns: Mapping[str, ArrayLike]) -> pa.RecordBatch:
+    """One block; names, lengths and shapes are checked."""
+    if not columns:
+        raise ValueError("columns must name at least one column; got none. Pass name -> values.")
+    arrays = {name: np.asarray(values) for name, values in columns.items()}
+    for name, array in arrays.items():
+        if array.ndim > 1:
+            raise ValueError(f"columns[{name!r}] must have shape (n,); got {array.shape}. Pass one column at a time.")
+    lengths = {name: len(array) for name, array in arrays.items() if array.ndim == 1}
+    if len(set(lengths.values())) > 1:
+        raise ValueError(f"columns must have one length; got {lengths}. Pass one value per row.")
+    count = next(iter(lengths.values()), 1)
+    return pa.RecordBatch.from_arrays(
+        [_arrow(name, array, count) for name, array in arrays.items()], names=list(arrays)
+    )
+
+
+def _arrow(name: str, array: np.ndarray, count: int) -> pa.Array:
+    if array.dtype.kind == "f":
+        array = array.astype(np.float64)
+    elif array.dtype.kind in "iu":
+        array = array.astype(np.int64)
+    elif array.dtype.kind in "OU":
+        wrong = [value for value in array.ravel().tolist() if not isinstance(value, str)]
+        if wrong:
+            raise ValueError(f"columns[{name!r}] must hold numbers or text; got {wrong[0]!r}. Convert it.")
+        array = array.astype(object)
+    elif array.dtype.kind != "b":
+        raise ValueError(f"columns[{name!r}] must hold numbers or text; got dtype {array.dtype}. Convert it.")
+    kind = pa.string() if array.dtype.kind == "O" else None
+    if array.ndim == 0:
+        return pa.repeat(pa.scalar(array.item(), type=kind or pa.from_numpy_dtype(array.dtype)), count)
+    return pa.array(array, type=kind)
+
+
+def _needs_quotes(table: pa.Table) -> bool:
+    texts = [column for column in table.columns if pa.types.is_string(column.type)]
+    return any(pc.any(pc.match_substring_regex(column, '[,"\r\n]')).as_py() for column in texts)
+
+
+def _conformed(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
+    """The block with the first block's types; whole numbers may stand in a column of floats."""
+    if batch.schema.names != schema.names:
+        raise ValueError(
+            f"columns must be those of the first block, {schema.names}; got {batch.schema.names}. "
+            "Write the same columns in each block."
+        )
+    for name, got, want in zip(schema.names, batch.schema.types, schema.types, strict=True):
+        if got != want and not (pa.types.is_integer(got) and pa.types.is_floating(want)):
+            raise ValueError(
+                f"columns[{name!r}] must be {want} as in the first block; got {got}. Convert it, or write floats from "
+                "the start."
+            )
+    return batch if batch.schema == schema else batch.cast(schema)

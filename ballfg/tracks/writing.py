@@ -1,0 +1,139 @@
+"""Writing a dataset as a stream: either all of it appears, or none."""
+
+import csv
+import json
+import os
+import shutil
+import uuid
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from os import PathLike
+from pathlib import Path
+from typing import Literal, TextIO
+
+from .checks import check_scale
+from .dataset import TRACK_FILES
+from .grouping import MAX_SIGMA, MIN_SIGMA
+from .info import INFO_FILE, DatasetInfo, write_info
+from .labels import LABELS_FILE
+from .rows import KEY, SIGMAS, VALUES
+from .table import TableWriter
+from .track import FloatArray, Track
+
+_SPOOL = "labels.jsonl"
+
+
+def write_dataset(
+    folder: str | PathLike[str],
+    info: DatasetInfo,
+    tracks: Iterable[Track],
+    file_format: Literal["csv", "parquet"] = "csv",
+) -> None:
+    """Writes `dataset.yaml`, the table of tracks and, if any track carries labels, `labels.csv`.
+
+    The files are written in a hidden folder inside `folder` and moved to their names when all are complete; after
+    an exception or Ctrl-C, what was there before is untouched. A dataset that is there already is replaced, other
+    files stay. Tracks are consumed one by one. What is written can be read: the rules of `read_dataset` hold here.
+
+    Args:
+        folder: made if it does not exist; its parent must.
+        info: the content of `dataset.yaml`.
+        tracks: at least one; each with at least two samples and a name of its own; sigmas for all or for none.
+        file_format: "csv" (floats keep all their digits) or "parquet".
+    Raises:
+        ValueError: another format, no tracks, or a track that breaks a rule; the message names it.
+        FileNotFoundError: the folder's parent does not exist.
+    """
+    if file_format not in ("csv", "parquet"):
+        raise ValueError(f"file_format must be 'csv' or 'parquet'; got {file_format!r}. Choose one of them.")
+    path = Path(folder)
+    with _staging(path) as stage:
+        write_info(stage / INFO_FILE, info)
+        with (stage / _SPOOL).open("x", encoding="utf-8") as spool:
+            label_names = _write_tracks(stage / f"tracks.{file_format}", info, tracks, spool)
+        if label_names:
+            _write_labels(stage / LABELS_FILE, stage / _SPOOL, label_names)
+        (stage / _SPOOL).unlink()
+        _publish(stage, path)
+
+
+@contextmanager
+def _staging(folder: Path) -> Iterator[Path]:
+    """A hidden folder inside `folder`; gone afterwards, as is `folder` itself if it was made here for nothing."""
+    if not folder.parent.is_dir():
+        raise FileNotFoundError(f"folder must be in an existing folder; {folder.parent} is none. Create it first.")
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"folder must be a folder; {folder} is a file. Choose another name.")
+    made = not folder.exists()
+    stage = folder / f".writing-{uuid.uuid4().hex[:8]}"
+    try:
+        stage.mkdir(parents=True)
+        yield stage
+    finally:
+        shutil.rmtree(stage, ignore_errors=True)
+        if made and folder.is_dir() and not any(folder.iterdir()):
+            folder.rmdir()
+
+
+def _publish(stage: Path, folder: Path) -> None:
+    """Moves the complete files to their names; what an older dataset leaves over is removed."""
+    new = {entry.name for entry in stage.iterdir()}
+    for name in (*TRACK_FILES, LABELS_FILE):
+        if name not in new:
+            (folder / name).unlink(missing_ok=True)
+    for name in sorted(new):
+        os.replace(stage / name, folder / name)
+
+
+def _write_tracks(path: Path, info: DatasetInfo, tracks: Iterable[Track], spool: TextIO) -> list[str]:
+    """Writes the table, and each track's labels as one line of JSON; returns the names of all labels."""
+    names: set[str] = set()
+    label_names: dict[str, None] = {}
+    has_sigmas: bool | None = None
+    with TableWriter(path) as table:
+        for track in tracks:
+            if has_sigmas is None:
+                has_sigmas = track.sigmas is not None
+            _check_track(track, names, info, has_sigmas)
+            names.add(track.name)
+            table.write(_columns(track))
+            if track.labels:
+                label_names.update(dict.fromkeys(track.labels))
+                spool.write(json.dumps({KEY: track.name, **track.labels}) + "\n")
+        if not names:
+            raise ValueError("tracks must hold at least one track; got none. Pass the tracks to write.")
+    return list(label_names)
+
+
+def _check_track(track: Track, names: set[str], info: DatasetInfo, has_sigmas: bool) -> None:
+    if track.name in names:
+        raise ValueError(f"track names must be unique; got {track.name!r} twice. Rename one of them.")
+    if len(track) < 2:
+        raise ValueError(f"track {track.name!r} must have at least two samples; got one. Leave it out.")
+    if (track.sigmas is not None) != has_sigmas:
+        raise ValueError(
+            f"tracks must have sigmas all or none; {track.name!r} differs from the first. "
+            "Set sigmas=None in all of them, or give them all."
+        )
+    if track.sigmas is not None and not (MIN_SIGMA <= track.sigmas.min() <= track.sigmas.max() <= MAX_SIGMA):
+        raise ValueError(
+            f"track {track.name!r}: sigmas must be {MIN_SIGMA:g} to {MAX_SIGMA:g} m; "
+            f"got {track.sigmas.min():g} to {track.sigmas.max():g}. Correct them or set sigmas=None."
+        )
+    check_scale(f"track {track.name!r}", track.times, track.positions, track.sigmas, info.rate)
+
+
+def _columns(track: Track) -> dict[str, FloatArray | str]:
+    columns: dict[str, FloatArray | str] = {KEY: track.name, VALUES[0]: track.times}
+    columns |= {name: track.positions[:, axis] for axis, name in enumerate(VALUES[1:])}
+    if track.sigmas is not None:
+        columns |= {name: track.sigmas[:, axis] for axis, name in enumerate(SIGMAS)}
+    return columns
+
+
+def _write_labels(path: Path, spool: Path, label_names: list[str]) -> None:
+    with path.open("x", encoding="utf-8", newline="") as file, spool.open(encoding="utf-8") as lines:
+        writer = csv.DictWriter(file, [KEY, *label_names], restval="", lineterminator="\n")
+        writer.writeheader()
+        for line in lines:
+            writer.writerow(json.loads(line))

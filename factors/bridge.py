@@ -1,0 +1,204 @@
+"""The bridge to GTSAM's own solvers: every row of a kind as a CustomFactor, answered from a batch.
+
+GTSAM asks for one factor at a time, in C++ order; torch is quick only on batches. A `Bridge` keeps the last residual
+and Jacobians of every row together with the very bytes of the inputs they belong to. A question about the same inputs is
+answered from there; any other question is a miss. docs/custom_factors.md is the contract.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import gtsam
+import numpy as np
+
+from ballfg.factors.graph import BallGraph
+from ballfg.factors.kind import COEFFICIENTS, Array, FactorKind, Index, Values
+
+OnMiss = Literal["changed", "row"]
+
+STATE_KEY = int(gtsam.symbol("x", 0))
+COEFFICIENT_KEY = int(gtsam.symbol("c", 0))
+
+Callback = Callable[[gtsam.CustomFactor, gtsam.Values, "gtsam.JacobianVector | None"], Array]
+
+
+def key_of(variable: int) -> int:
+    """GTSAM's key of a variable number: x0, x1, ... for states, c0 for the coefficients."""
+    return COEFFICIENT_KEY if variable == COEFFICIENTS else STATE_KEY + variable
+
+
+class Bridge:
+    """Answers GTSAM's questions about one kind of factors.
+
+    A bridge never refers to the factors that it made: a factor holds its callback, the callback the bridge, the bridge
+    the kind. With a reference back the chain would be a cycle through C++, which Python's collector cannot see.
+
+    Args:
+        kind: whitens its residuals itself; its loss goes into the factors' noise model.
+        on_miss: `changed` evaluates all rows whose inputs differ from what is cached, in one call: right for solvers
+            that move all variables at once. `row` evaluates the asked row alone: for iSAM2, where the caller
+            prepares the rows that will be asked and a miss is a row that it did not foresee.
+
+    Attributes:
+        calls: how often the kind was evaluated.
+        misses: how often a callback found nothing prepared.
+    """
+
+    def __init__(self, kind: FactorKind, on_miss: OnMiss = "changed") -> None:
+        if on_miss not in ("changed", "row"):
+            raise ValueError(f"on_miss must be 'changed' or 'row'; got '{on_miss}'")
+        self.kind = kind
+        self.on_miss = on_miss
+        self.calls = 0
+        self.misses = 0
+        self._inputs: list[tuple[bytes, ...] | None] = [None] * len(kind)
+        self._answers: list[tuple[Array, tuple[Array, ...]] | None] = [None] * len(kind)
+
+    def factor(self, row: int, variables: Sequence[int] | None = None) -> gtsam.CustomFactor:
+        """The CustomFactor of one row; its noise model has unit sigmas and the kind's loss.
+
+        Args:
+            row: of the kind.
+            variables: variable numbers to use in place of the kind's own.
+        """
+        numbers = self.kind.variables[row].tolist() if variables is None else variables
+        keys = [key_of(v) for v in numbers]
+        return gtsam.CustomFactor(self.kind.loss.noise_model(self.kind.dim), keys, _callback(self, row, keys))
+
+    def factors(self) -> list[gtsam.CustomFactor]:
+        """One factor a row."""
+        return [self.factor(row) for row in range(len(self.kind))]
+
+    def prepare(self, rows: Index, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+        """Evaluate rows in one call, check what comes back and keep it for the callbacks.
+
+        Args: rows: (k,) which rows.  inputs: for each variable of a factor the values (k, d).
+        Returns: whitened residuals (k, r) and Jacobians (k, r, d), as kept.
+        Raises: ValueError: if the kind returns a wrong shape, another type than float64, or a value that is not finite.
+        """
+        inputs = tuple(np.ascontiguousarray(block, dtype=np.float64) for block in inputs)
+        self.calls += 1
+        residual, jacobians = checked(self.kind, rows, inputs, *self.kind.compute(rows, inputs))
+        for k, row in enumerate(rows.tolist()):
+            self._inputs[row] = tuple(block[k].tobytes() for block in inputs)
+            self._answers[row] = residual[k], tuple(j[k] for j in jacobians)
+        return residual, jacobians
+
+    def forget(self, row: int) -> None:
+        """Drop what is kept of a row, because the kind's data for it changed."""
+        self._inputs[row] = self._answers[row] = None
+
+    def answer(self, row: int, keys: Sequence[int], values: gtsam.Values) -> tuple[Array, tuple[Array, ...]]:
+        """Residual (r,) and Jacobians (r, d) of a row at GTSAM's values."""
+        asked = tuple([values.atVector(key).tobytes() for key in keys])
+        if asked != self._inputs[row]:
+            self.misses += 1
+            self._evaluate(row, keys, values)
+        found = self._answers[row]
+        assert found is not None
+        return found
+
+    def _evaluate(self, row: int, keys: Sequence[int], values: gtsam.Values) -> None:
+        if self.on_miss == "row":
+            self.prepare(np.array([row]), tuple(values.atVector(key)[None] for key in keys))
+            return
+        vectors: dict[int, Array] = {}
+        rows, columns = [], []
+        for r, variables in enumerate(self.kind.variables.tolist()):
+            point = [_vector(values, v, vectors) for v in variables]
+            if any(p is None for p in point):
+                continue  # a graph of some of the rows only
+            if r == row or tuple(p.tobytes() for p in point if p is not None) != self._inputs[r]:
+                rows.append(r)
+                columns.append(point)
+        self.prepare(np.array(rows), tuple(np.stack(column) for column in zip(*columns, strict=True)))
+
+
+def _vector(values: gtsam.Values, variable: int, known: dict[int, Array]) -> Array | None:
+    """A variable's vector, read from GTSAM once; None where it has none."""
+    if variable not in known:
+        key = key_of(variable)
+        if not values.exists(key):
+            return None
+        known[variable] = values.atVector(key)
+    return known[variable]
+
+
+def _callback(bridge: Bridge, row: int, keys: Sequence[int]) -> Callback:
+    """The error function of one factor. `values` and `jacobians` are GTSAM's: valid inside the call only."""
+
+    def error(_: gtsam.CustomFactor, values: gtsam.Values, jacobians: gtsam.JacobianVector | None) -> Array:
+        residual, blocks = bridge.answer(row, keys, values)
+        if jacobians is not None:
+            for i, block in enumerate(blocks):
+                jacobians[i] = block
+        return residual
+
+    return error
+
+
+def checked(
+    kind: FactorKind, rows: Index | slice, inputs: tuple[Array, ...], residual: Array, jacobians: tuple[Array, ...]
+) -> tuple[Array, tuple[Array, ...]]:
+    """What a kind returned, contiguous, after checks; GTSAM would end the interpreter, or compute with it silently.
+
+    Raises: ValueError: names the kind, the array, the row and the rule.
+    """
+    name, count = type(kind).__name__, len(inputs[0])
+    if len(jacobians) != len(inputs):
+        raise ValueError(
+            f"{name}.compute must return one Jacobian per variable, {len(inputs)}; got {len(jacobians)}. "
+            "A block left out would end the interpreter."
+        )
+    expected = [("residual", residual, (count, kind.dim))]
+    expected += [
+        (f"Jacobian {i}", block, (count, kind.dim, inputs[i].shape[-1])) for i, block in enumerate(jacobians)
+    ]
+    for label, array, shape in expected:
+        _check_array(f"{name}.compute: {label}", array, shape, rows)
+    return np.ascontiguousarray(residual), tuple(np.ascontiguousarray(block) for block in jacobians)
+
+
+def _check_array(what: str, array: Array, shape: tuple[int, ...], rows: Index | slice) -> None:
+    if not isinstance(array, np.ndarray):
+        raise ValueError(f"{what} must be a numpy array of shape {shape}; got {type(array).__name__}")
+    if array.shape != shape:
+        raise ValueError(f"{what} must have shape {shape}; got {array.shape}")
+    if array.dtype != np.float64:
+        raise ValueError(f"{what} must be float64; got {array.dtype}. Convert the model with .double().")
+    if not np.isfinite(array).all():
+        k = int(np.argwhere(~np.isfinite(array))[0][0])
+        row = k if isinstance(rows, slice) else int(rows[k])
+        raise ValueError(
+            f"{what} must be finite; row {row} is not. Look at the start values and at the heights of surfaces "
+            "that its contacts name."
+        )
+
+
+def nonlinear_graph(graph: BallGraph) -> tuple[gtsam.NonlinearFactorGraph, list[Bridge]]:
+    """A graph for GTSAM's own optimizers, with the bridges that answer for it (they count the calls)."""
+    bridges = [Bridge(kind) for kind in graph.kinds if len(kind)]
+    result = gtsam.NonlinearFactorGraph()
+    for bridge in bridges:
+        for factor in bridge.factors():
+            result.push_back(factor)
+    return result, bridges
+
+
+def to_gtsam(values: Values) -> gtsam.Values:
+    """States as vectors x0, x1, ...; coefficients, where there are any, as the vector c0."""
+    result = gtsam.Values()
+    for i, state in enumerate(values.states):
+        result.insert(STATE_KEY + i, state)
+    if len(values.coefficients):
+        result.insert(COEFFICIENT_KEY, values.coefficients)
+    return result
+
+
+def from_gtsam(values: gtsam.Values) -> Values:
+    """The way back from `to_gtsam`."""
+    states = np.array(gtsam.utilities.extractVectors(values, "x"))
+    has_coefficients = values.exists(COEFFICIENT_KEY)
+    return Values(states, np.array(values.atVector(COEFFICIENT_KEY)) if has_coefficients else np.zeros(0))

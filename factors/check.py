@@ -1,0 +1,96 @@
+"""Central differences of every Jacobian block of any kind of factors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ballfg.factors.kind import COEFFICIENTS, Array, FactorKind, Values
+
+STEP = 1e-4
+"""Step of the differences, relative to a number's size, absolute below 1. The five-point rule's own error is of order
+step^4, rounding of order 1e-16 / step: both stay near 1e-12 relative."""
+
+
+@dataclass(frozen=True)
+class BlockError:
+    """How far one Jacobian block is from differences of the residual.
+
+    Attributes:
+        row: of the kind.  column: which variable of the factor.  variable: its number.
+        entry: (i, j) of the worst element.
+        given: what `compute` says there.  difference: what differences say.
+        relative: their distance over the block's largest element.
+    """
+
+    row: int
+    column: int
+    variable: int
+    entry: tuple[int, int]
+    given: float
+    difference: float
+    relative: float
+
+    def __str__(self) -> str:
+        name = "c" if self.variable == COEFFICIENTS else f"x{self.variable}"
+        return (
+            f"row {self.row}, block {self.column} (by {name}), entry {self.entry}: compute gives {self.given:.9g}, "
+            f"central differences {self.difference:.9g}, {self.relative:.1e} of the block's largest element"
+        )
+
+
+def jacobian_errors(kind: FactorKind, values: Values, step: float = STEP) -> list[BlockError]:
+    """One entry per row and block: `compute`'s Jacobians against five-point central differences of its residuals.
+
+    Args: kind: any.  values: the point, best one at which residuals are not zero.  step: see `STEP`.
+    """
+    inputs = tuple(np.array(values.gather(column)) for column in kind.variables.T)
+    _, jacobians = kind.compute(slice(None), inputs)
+    errors = []
+    for column, given in enumerate(jacobians):
+        difference = _differences(kind, inputs, column, step)
+        scale = np.maximum(np.abs(difference).max(axis=(1, 2)), np.finfo(float).tiny)
+        off = np.abs(given - difference) / scale[:, None, None]
+        off = np.where(np.isfinite(off), off, np.inf)
+        for row in range(len(kind)):
+            i, j = np.unravel_index(int(off[row].argmax()), off[row].shape)
+            errors.append(
+                BlockError(
+                    row,
+                    column,
+                    int(kind.variables[row, column]),
+                    (int(i), int(j)),
+                    float(given[row, i, j]),
+                    float(difference[row, i, j]),
+                    float(off[row, i, j]),
+                )
+            )
+    return errors
+
+
+def check_factor(kind: FactorKind, values: Values, tolerance: float = 1e-6, step: float = STEP) -> float:
+    """The worst relative error of a kind's Jacobians.
+
+    Args: kind: any.  values: the point.  tolerance: relative to a block's largest element.  step: see `STEP`.
+    Raises: AssertionError: if a block is further off than that; the message names the worst.
+    """
+    worst = max(jacobian_errors(kind, values, step), key=lambda error: error.relative)
+    if not worst.relative <= tolerance:
+        raise AssertionError(f"{type(kind).__name__}: {worst}; allowed {tolerance:.1e}")
+    return worst.relative
+
+
+def _differences(kind: FactorKind, inputs: tuple[Array, ...], column: int, step: float) -> Array:
+    """(m, r, d) derivative of the residuals by one variable, (8 (f1 - f-1) - (f2 - f-2)) / 12h."""
+    block = inputs[column]
+    result = np.empty((len(block), kind.dim, block.shape[-1]))
+    for j in range(block.shape[-1]):
+        h = step * np.maximum(np.abs(block[:, j]), 1.0)
+        at = {}
+        for shift in (-2, -1, 1, 2):
+            moved = block.copy()
+            moved[:, j] += shift * h
+            at[shift] = kind.compute(slice(None), (*inputs[:column], moved, *inputs[column + 1 :]))[0]
+        result[:, :, j] = (8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * h[:, None])
+    return result

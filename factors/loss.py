@@ -1,0 +1,55 @@
+"""Robust losses on the norm of a whitened residual, vectorised; the same functions as GTSAM's m-estimators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Loss:
+    """rho(d) of the norm d of a whitened residual; `squared` is d^2/2.
+
+    Attributes:
+        name: `squared`, `huber` (linear beyond `scale`) or `cauchy` (logarithmic: a far outlier pulls less and less).
+        scale: in standard deviations.
+    """
+
+    name: Literal["squared", "huber", "cauchy"] = "squared"
+    scale: float = 3.0
+
+    def __post_init__(self) -> None:
+        if self.name not in ("squared", "huber", "cauchy"):
+            raise ValueError(f"loss must be 'squared', 'huber' or 'cauchy'; got '{self.name}'")
+        if not self.scale > 0.0:
+            raise ValueError(f"scale must be positive; got {self.scale}")
+
+    def value(self, norm: Array) -> Array:
+        """(n,) rho of norms (n,)."""
+        if self.name == "huber":
+            return np.where(norm <= self.scale, 0.5 * norm**2, self.scale * (norm - 0.5 * self.scale))
+        if self.name == "cauchy":
+            return np.asarray(0.5 * self.scale**2 * np.log1p((norm / self.scale) ** 2))
+        return np.asarray(0.5 * norm**2)
+
+    def weight(self, norm: Array) -> Array:
+        """(n,) factor on the squared residual in iteratively reweighted least squares: rho'(d) / d."""
+        if self.name == "huber":
+            return np.asarray(self.scale / np.maximum(norm, self.scale))
+        if self.name == "cauchy":
+            return np.asarray(1.0 / (1.0 + (norm / self.scale) ** 2))
+        return np.ones_like(norm)
+
+    def noise_model(self, dim: int) -> gtsam.noiseModel.Base:
+        """GTSAM's model of this loss on a residual that is whitened already."""
+        unit = gtsam.noiseModel.Unit.Create(dim)
+        if self.name == "squared":
+            return unit
+        estimator = {"huber": gtsam.noiseModel.mEstimator.Huber, "cauchy": gtsam.noiseModel.mEstimator.Cauchy}
+        return gtsam.noiseModel.Robust.Create(estimator[self.name].Create(self.scale), unit)

@@ -1,0 +1,38 @@
+"""Position factor: a measured position is the state's position plus noise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ballfg.factors.kind import Array, FactorKind, Index
+from ballfg.factors.loss import Loss
+from ballfg.state import POSITION, STATE_DIM
+
+
+class PositionFactors(FactorKind):
+    """r = (p_i - z_i) / sigma_i.
+
+    Args:
+        states: (m,) indices of the observed states.
+        measured: (m, 3) m.
+        sigma: (m, 3) m, standard deviation per axis.
+        loss: a robust one where tracks carry outliers.
+    """
+
+    def __init__(self, states: Index, measured: Array, sigma: Array, loss: Loss | None = None) -> None:
+        super().__init__(np.asarray(states)[:, None], 3, loss)
+        if measured.shape != (len(self), 3) or sigma.shape != (len(self), 3):
+            raise ValueError(
+                f"measured and sigma must have shape ({len(self)}, 3); got {measured.shape} and {sigma.shape}"
+            )
+        if not (np.isfinite(measured).all() and (sigma > 0).all()):
+            raise ValueError("measured must be finite and sigma positive; remove the samples that are not")
+        self.measured = measured
+        self.information_root = 1.0 / sigma
+        self._jacobian = np.zeros((len(self), 3, STATE_DIM))
+        self._jacobian[:, [0, 1, 2], [0, 1, 2]] = self.information_root
+
+    def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+        """Whitened residuals (k, 3) and Jacobians (k, 3, 9)."""
+        residual = (inputs[0][:, POSITION] - self.measured[rows]) * self.information_root[rows]
+        return residual, (self._jacobian[rows],)

@@ -1,0 +1,106 @@
+import pytest
+
+from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball, DatasetInfo, read_dataset
+
+GOOD = {
+    "name": "name: small",
+    "frame": "frame: {up: z, table_height: 0.76}",
+    "ball": "ball: {radius: 0.02, mass: 0.0027}",
+}
+
+
+def _yaml(**changes: str) -> str:
+    return "\n".join(line for line in (GOOD | changes).values() if line) + "\n"
+
+
+def test_presets_are_si():
+    assert (TABLE_TENNIS.radius, TABLE_TENNIS.mass) == (0.02, 0.0027)
+    assert (TENNIS.radius, TENNIS.mass) == (0.0335, 0.0577)
+
+
+def test_optional_fields_default_to_none(make_folder):
+    info = read_dataset(make_folder(yaml=_yaml())).info
+    assert info == DatasetInfo("small", 0.76, TABLE_TENNIS)
+    assert info.rate is info.position_noise is info.spin_noise is info.source is info.licence is None
+
+
+def test_all_fields_are_read(make_folder):
+    text = _yaml(rest="rate: 100\nposition_noise: 0.002\nspin_noise: 5\nsource: lab\nlicence: MIT\nlabels: {a: b}")
+    dataset = read_dataset(make_folder(yaml=text))
+    assert dataset.info == DatasetInfo("small", 0.76, TABLE_TENNIS, 100.0, 0.002, 5.0, "lab", "MIT")
+    assert dataset.notes == []
+
+
+def test_unknown_fields_are_noted_with_the_nearest_name(make_folder):
+    dataset = read_dataset(make_folder(yaml=_yaml(rest="position_nois: 0.002\ncolour: white")))
+    assert dataset.info.position_noise is None
+    assert dataset.notes == [
+        "dataset.yaml: field 'position_nois' ignored. Did you mean 'position_noise'?",
+        "dataset.yaml: field 'colour' ignored",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (_yaml(name=""), "name is required; got frame, ball. Add it."),
+        (_yaml(name="names: a"), "name is required; got names, frame, ball. Add it, or rename 'names'."),
+        (_yaml(name="name: 17"), "name must be text; got int 17. Put it in quotes."),
+        (_yaml(name="name: ' '"), "name must not be empty; got ' '."),
+        (_yaml(frame=""), "frame is required; got name, ball."),
+        (_yaml(frame="frame: z"), "frame must be a mapping with up and table_height; got 'z'. Write frame: {up: ..."),
+        (_yaml(frame="frame: {up: y, table_height: 0}"), "frame.up must be 'z', the only up axis that is supported"),
+        (
+            _yaml(frame="frame: {up: z, tabel_height: 0}"),
+            "frame.table_height is required; got up, tabel_height. Add it",
+        ),
+        (
+            _yaml(frame="frame: {up: z, table_height: 760}"),
+            "frame.table_height must be in m, at most 50; got 760. It is",
+        ),
+        (
+            _yaml(frame="frame: {up: z, table_height: high}"),
+            "frame.table_height must be a number in m; got str 'high'.",
+        ),
+        (
+            _yaml(ball="ball: {radius: 20, mass: 0.0027}"),
+            "ball.radius must be in m, at most 0.5; got 20. It is probably",
+        ),
+        (
+            _yaml(ball="ball: {radius: 0.02, mass: 2.7}"),
+            "ball.mass must be in kg, at most 2; got 2.7. It is probably in g",
+        ),
+        (_yaml(ball="ball: {radius: 0, mass: 1}"), "ball.radius must be finite and above 0; got 0."),
+        (_yaml(ball="ball: {radius: .nan, mass: 1}"), "ball.radius must be finite and above 0; got nan."),
+        (_yaml(ball="ball: {radius: true, mass: 1}"), "ball.radius must be a number in m; got bool True."),
+        (_yaml(ball="ball: {radius: 2e-2, mass: 1}"), "got str '2e-2'. Write it like 0.02 or 2.0e-2."),
+        (_yaml(ball="ball: {radius: 0.02}"), "ball.mass is required; got radius. Add it."),
+        (_yaml(rest="rate: -1"), "rate must be finite and above 0; got -1. Correct it (unit: Hz)."),
+        (_yaml(rest="position_noise: 2"), "position_noise must be in m, at most 1; got 2. It is probably in mm"),
+        (_yaml(rest="spin_noise: 0"), "spin_noise must be finite and above 0; got 0."),
+        (_yaml(rest="source: 2024-01-01"), "source must be text; got date 2024-01-01. Put it in quotes."),
+        ("", "must hold fields such as 'name: my_shots'; got nothing. Give at least name, frame, ball."),
+        ("- a\n- b\n", "must hold fields such as 'name: my_shots'; got list."),
+        ("name: [a\nframe: 1\n", ", line 2: must be valid YAML;"),
+        ("name: a\n\tball: 1\n", ", line 2: must be valid YAML;"),
+        ("a: !!python/object:os.system x\n", "must be valid YAML; could not determine a constructor"),
+        (b"name: caf\xe9\n", "must be UTF-8 text;"),
+        ("name: a\x01b\n", "must be valid YAML; special characters are not allowed"),
+    ],
+)
+def test_a_bad_yaml_is_named(make_folder, text, message):
+    folder = make_folder(yaml=text)
+    with pytest.raises(ValueError, match=r".") as caught:
+        read_dataset(folder)
+    assert str(caught.value).startswith(str(folder / "dataset.yaml"))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_info_is_checked_without_a_file_too():
+    with pytest.raises(TypeError, match="ball must be a Ball; got dict"):
+        DatasetInfo("a", 0.0, {"radius": 0.02})
+    with pytest.raises(TypeError, match="name must be text; got nothing None"):
+        DatasetInfo(None, 0.0, TABLE_TENNIS)
+    with pytest.raises(ValueError, match=r"ball\.radius must be finite and above 0; got -1"):
+        Ball(-1, 0.1)

@@ -1,0 +1,90 @@
+import pickle
+
+import numpy as np
+import pytest
+
+from ballfg.tracks import Track
+
+T = np.array([0.0, 0.1, 0.3])
+P = np.arange(9.0).reshape(3, 3)
+SPIN = {"spin_x": 1.0, "spin_y": 2.0, "spin_z": 3.0}
+
+
+def test_fields_are_copied_to_float64():
+    positions = P.astype(np.float32)
+    track = Track("a", [0, 1, 2], positions, labels={"speed": 3})
+    positions[0, 0] = 99
+    assert track.times.dtype == track.positions.dtype == np.float64
+    assert track.positions[0, 0] == 0
+    assert track.labels == {"speed": 3.0}
+    assert (len(track), track.duration) == (3, 2.0)
+
+
+def test_spin_label_needs_all_three():
+    assert np.array_equal(Track("a", T, P, labels=SPIN).spin_label, [1, 2, 3])
+    assert Track("a", T, P, labels={"spin_x": 1.0}).spin_label is None
+    assert Track("a", T, P).spin_label is None
+
+
+def test_until_keeps_the_first_sample_and_its_spin():
+    part = Track("a", T, P, P + 1, {**SPIN, "group": "g"}).until(0.1)
+    assert np.array_equal(part.times, [0.0, 0.1])
+    assert np.array_equal(part.positions, P[:2])
+    assert np.array_equal(part.sigmas, P[:2] + 1)
+    assert np.array_equal(part.spin_label, [1, 2, 3])
+
+
+def test_between_without_the_first_sample_leaves_the_spin_out():
+    part = Track("a", T, P, labels={**SPIN, "group": "g"}).between(0.1, 0.3)
+    assert np.array_equal(part.times, [0.1, 0.3])
+    assert part.labels == {"group": "g"}
+
+
+def test_track_survives_pickling():
+    copy = pickle.loads(pickle.dumps(Track("a", T, P, P + 1, SPIN)))
+    assert np.array_equal(copy.positions, P)
+    assert copy.labels == SPIN
+
+
+NAN = np.where(np.arange(9).reshape(3, 3) == 5, np.nan, P)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"name": ""}, "track name must be printable text of one line, not empty; got ''"),
+        ({"name": "a\nb"}, "got 'a\\nb'. Rename the trajectory."),
+        ({"times": []}, "times must have shape (n,) with n >= 1; got (0,)"),
+        ({"times": P}, "times must have shape (n,) with n >= 1; got (3, 3)"),
+        ({"times": [0.0, 0.2, 0.2]}, "times must be strictly increasing; times[2]=0.2 <= times[1]=0.2. Sort or drop"),
+        ({"times": [0.0, np.nan, 1.0]}, "times must be finite; times[1]=nan"),
+        ({"positions": P[:2]}, "positions must have shape (3, 3); got (2, 3)"),
+        ({"positions": P[:, :2]}, "positions must have shape (3, 3); got (3, 2)"),
+        ({"positions": NAN}, "positions must be finite; positions[1, 2]=nan. Drop that sample."),
+        ({"positions": [[0, 0, 0], [1, 1], [2, 2, 2]]}, "positions must be an array of numbers;"),
+        ({"positions": [["a"] * 3] * 3}, "positions must be an array of numbers; could not convert"),
+        ({"sigmas": P[0]}, "sigmas must have shape (3, 3); got (3,)"),
+        ({"sigmas": P}, "sigmas must be positive; sigmas[0, 0]=0.0. Give a standard deviation in m"),
+        ({"labels": {"trajectory": "a"}}, "label names must be printable text other than 'trajectory'"),
+        ({"labels": {"speed": np.inf}}, "label 'speed' must be a finite number or text; got inf"),
+        ({"labels": {"speed": None}}, "label 'speed' must be a finite number or text; got None"),
+        ({"labels": {"spin_x": "fast"}}, "label 'spin_x' must be a finite number; got 'fast'"),
+    ],
+)
+def test_bad_fields_are_named(arguments, message):
+    with pytest.raises(ValueError, match=r".") as caught:
+        Track(**({"name": "a", "times": T, "positions": P} | arguments))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_name_must_be_text():
+    with pytest.raises(TypeError, match=r"track name must be a str; got int 3\. Pass str\(3\)"):
+        Track(3, T, P)
+
+
+def test_an_empty_interval_is_refused():
+    with pytest.raises(ValueError, match=r"must hold a sample; got \[1, 2\] s while the track covers \[0, 0\.3\] s"):
+        Track("a", T, P).between(1, 2)
+    with pytest.raises(ValueError, match="Widen the interval"):
+        Track("a", T, P).until(-0.1)
