@@ -1,1 +1,1 @@
-"""TODO."""
+"""Benchmarks: the estimators against each other, and what an estimate costs; `ballfg-bench` runs them."""

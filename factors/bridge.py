@@ -86,9 +86,17 @@ class Bridge:
             self._answers[row] = residual[k], tuple(j[k] for j in jacobians)
         return residual, jacobians
 
-    def forget(self, row: int) -> None:
-        """Drop what is kept of a row, because the kind's data for it changed."""
-        self._inputs[row] = self._answers[row] = None
+    def keep(self, row: int, inputs: tuple[Array, ...], residual: Array, jacobians: tuple[Array, ...]) -> None:
+        """Keep an answer that the caller computed itself, checked like any other.
+
+        Args: row: which.  inputs: vectors (d,).  residual: (r,), whitened.  jacobians: (r, d) each.
+        Raises: ValueError: as `prepare`.
+        """
+        batch = checked(
+            self.kind, np.array([row]), tuple(x[None] for x in inputs), residual[None], tuple(j[None] for j in jacobians)
+        )
+        self._inputs[row] = tuple([x.tobytes() for x in inputs])
+        self._answers[row] = batch[0][0], tuple([j[0] for j in batch[1]])
 
     def answer(self, row: int, keys: Sequence[int], values: gtsam.Values) -> tuple[Array, tuple[Array, ...]]:
         """Residual (r,) and Jacobians (r, d) of a row at GTSAM's values."""

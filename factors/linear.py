@@ -28,11 +28,18 @@ class Step:
 
 
 def weighted(rows: Rows) -> tuple[Array, tuple[Array, ...]]:
-    """Residuals and Jacobians scaled by the root of the loss's weight."""
+    """Residuals and Jacobians such that J^T r is the gradient of the losses and J^T J close to their Hessian.
+
+    The weight w = rho'/d scales both; along the residual the Jacobian shrinks further, by the root of the loss's
+    `stretch`, and the residual grows by as much (B. Triggs et al., "Bundle adjustment - a modern synthesis", 2000, 4.3).
+    """
     if rows.loss.name == "squared":
         return rows.residual, rows.jacobians
-    root = np.sqrt(rows.loss.weight(np.linalg.norm(rows.residual, axis=-1)))
-    return rows.residual * root[:, None], tuple(j * root[:, None, None] for j in rows.jacobians)
+    norm = np.linalg.norm(rows.residual, axis=-1)
+    root, along = np.sqrt(rows.loss.weight(norm)), np.sqrt(rows.loss.stretch(norm))
+    unit = rows.residual / np.maximum(norm, np.finfo(float).tiny)[:, None]
+    turn = root[:, None, None] * (np.eye(unit.shape[-1]) - ((1.0 - along)[:, None] * unit)[..., None] * unit[:, None, :])
+    return rows.residual * (root / along)[:, None], tuple(turn @ j for j in rows.jacobians)
 
 
 def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> Step:

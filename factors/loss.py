@@ -12,6 +12,10 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 
+LEAST_STRETCH = 0.05
+"""Where the loss is straight or concave along the residual, this much curvature keeps the step finite."""
+
+
 @dataclass(frozen=True)
 class Loss:
     """rho(d) of the norm d of a whitened residual; `squared` is d^2/2.
@@ -45,6 +49,19 @@ class Loss:
         if self.name == "cauchy":
             return np.asarray(1.0 / (1.0 + (norm / self.scale) ** 2))
         return np.ones_like(norm)
+
+    def stretch(self, norm: Array) -> Array:
+        """(n,) curvature along the residual divided by that across it, rho''(d) d / rho'(d), at least `LEAST_STRETCH`.
+
+        Reweighting alone takes it for 1 and creeps up to a minimum at which some residuals are in the loss's tail.
+        """
+        if self.name == "huber":
+            ratio = (norm <= self.scale).astype(np.float64)
+        elif self.name == "cauchy":
+            ratio = (1.0 - (norm / self.scale) ** 2) / (1.0 + (norm / self.scale) ** 2)
+        else:
+            ratio = np.ones_like(norm)
+        return np.maximum(ratio, LEAST_STRETCH)
 
     def noise_model(self, dim: int) -> gtsam.noiseModel.Base:
         """GTSAM's model of this loss on a residual that is whitened already."""

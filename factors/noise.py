@@ -25,21 +25,23 @@ class ProcessNoise:
         spin: rad/s/sqrt(s), density of the spin's random walk. Must be positive: the square-root information of a
             chain of exactly equal spins is singular to working precision.
         contact_velocity: m/s, standard deviation per axis of an impact's outgoing velocity.
+        contact_tangential: m/s, what its two components along the surface have on top: friction, which no track tells.
         contact_spin: rad/s, the same of its spin.
         hit_velocity: m/s, of the velocity after a hit (racket, arm, net).
         hit_spin: rad/s, of the spin after a hit.
     """
 
-    acceleration: float = 0.09
+    acceleration: float = 0.1
     spin: float = 1.0
     contact_velocity: float = 0.02
+    contact_tangential: float = 0.0
     contact_spin: float = 5.0
     hit_velocity: float = 10.0
     hit_spin: float = 100.0
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not (np.isfinite(value) and value > 0.0):
+            if not (np.isfinite(value) and (value > 0.0 or (value == 0.0 and name == "contact_tangential"))):
                 raise ValueError(
                     f"{name} must be positive and finite; got {value}. Use a small number for a nearly exact model."
                 )
@@ -48,16 +50,27 @@ class ProcessNoise:
         """(n, 9, 9) covariance gathered in free flight over dt (n,) s."""
         return _white_acceleration(dt, self.acceleration, self.spin)
 
-    def kick(self, dt: Array, time: Array, velocity: float, spin: float) -> Array:
+    def contact(self, dt: Array, time: Array) -> Array:
+        """(n, 9, 9) covariance at the end of intervals dt (n,) s of an impact at `time` (n,) s."""
+        tangential = np.hypot(self.contact_velocity, self.contact_tangential)
+        return self.kick(dt, time, (tangential, tangential, self.contact_velocity), self.contact_spin)
+
+    def hit(self, dt: Array) -> Array:
+        """(n, 9, 9) covariance at the end of intervals dt (n,) s of a hit at an unknown time in them."""
+        ends = (np.zeros_like(dt), dt)
+        return np.asarray(sum(0.5 * self.kick(dt, t, (self.hit_velocity,) * 3, self.hit_spin) for t in ends))
+
+    @staticmethod
+    def kick(dt: Array, time: Array, velocity: tuple[float, float, float], spin: float) -> Array:
         """(n, 9, 9) covariance at the end of intervals dt (n,) s of a jump in velocity and spin at `time` (n,) s.
 
-        The velocity's jump has moved the ball by then; for a jump of unknown time pass half the interval.
+        The velocity's jump (standard deviation per axis) has moved the ball by then.
         """
         reach = np.zeros((len(dt), STATE_DIM, 6))
         left = np.clip(dt - time, 0.0, dt)
         for i in range(3):
-            reach[:, i, i] = left * velocity
-            reach[:, 3 + i, i] = velocity
+            reach[:, i, i] = left * velocity[i]
+            reach[:, 3 + i, i] = velocity[i]
             reach[:, 6 + i, 3 + i] = spin
         return reach @ reach.swapaxes(-1, -2)
 

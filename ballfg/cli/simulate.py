@@ -2,21 +2,15 @@
 
 from __future__ import annotations
 
-import sys
-import time
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
-from rich.progress import Progress
+
+from ballfg.cli.progress import progress
 
 if TYPE_CHECKING:
     from ballfg.simulate import BallKind
-
-QUIET = 2.0
-"""s. Shorter work shows no progress; plain lines come no closer to each other than that."""
 
 _NOISE, _BALL, _FILES = "Noise", "Ball and launcher", "Files"
 
@@ -96,8 +90,9 @@ def simulate(
         undeclared=parse_effects(effect or ()),
         spin_labels=spin_labels,
     )
-    with ProgressReport("tracks") as report:
-        write_simulation(out, config, file_format, force=force, progress=report)
+    write_simulation(
+        out, config, file_format, force=force, watch=lambda made: progress(made, tracks, "tracks simulated")
+    )
     names = ", ".join(e.name for e in config.undeclared) or "none"
     typer.echo(f"wrote {tracks} tracks to {out}: tracks.{file_format}, labels.csv, dataset.yaml, model.yaml (declared)")
     typer.echo(f"wrote the truth to {out}: truth.{file_format}, truth.yaml (undeclared effects: {names})")
@@ -113,38 +108,3 @@ def _ball(name: str, model: Path | None) -> BallKind:
         return kind
     loaded = load_model(model, radius=kind.ball.radius, inertia_factor=kind.model.inertia_factor)
     return with_model(kind, loaded)
-
-
-class ProgressReport:
-    """Progress on stderr for work that takes longer than `QUIET`: a bar on a terminal, plain lines elsewhere.
-
-    A context manager that is called with the numbers of things done and of all.
-    """
-
-    def __init__(self, things: str) -> None:
-        self._things = things
-        self._console = Console(stderr=True)
-        self._shown = time.monotonic()
-        self._bar: Progress | None = None
-
-    def __enter__(self) -> ProgressReport:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._bar is not None:
-            self._bar.stop()
-
-    def __call__(self, done: int, total: int) -> None:
-        """Shows that `done` of `total` things are done, if it is time to."""
-        if self._bar is not None:
-            self._bar.update(self._bar.task_ids[0], completed=done)
-        elif time.monotonic() - self._shown > QUIET:
-            if self._console.is_terminal:
-                self._bar = Progress(console=self._console, transient=True)
-                self._bar.add_task(self._things, total=total, completed=done)
-                self._bar.start()
-            else:
-                self._shown = time.monotonic()
-                print(f"{done} of {total} {self._things}", file=sys.stderr, flush=True)

@@ -13,6 +13,8 @@ from ballfg.dynamics.impact import apply_impulse
 from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
 from ballfg.state import POSITION, SPIN, VELOCITY
 
+_ONE, _ZERO = torch.tensor(1.0, dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64)
+
 
 class AnalyticModel(BallModel):
     """Free flight as the sum of flight effects; a bounce as an impulse whose coefficients bounce effects set.
@@ -54,8 +56,7 @@ class AnalyticModel(BallModel):
 
     def bounce(self, state: Tensor) -> Tensor:
         """(..., 9) state just after an impact on a horizontal plane; the position does not change."""
-        one, zero = state.new_tensor(1.0), state.new_tensor(0.0)
-        impact = Impact(state[..., VELOCITY], state[..., SPIN], one, zero, zero)
+        impact = Impact(state[..., VELOCITY], state[..., SPIN], _ONE, _ZERO, _ZERO)
         for module in self.contact.values():
             impact = cast(BounceEffect, module).adjust(impact)
         velocity, spin = apply_impulse(impact, self.radius, self.inertia_factor)
@@ -63,9 +64,14 @@ class AnalyticModel(BallModel):
 
     def surface_offset(self, state: Tensor) -> Tensor | float:
         """(...) m by which surfaces lie above the heights declared for them."""
-        offsets = [cast(BounceEffect, effect).surface_offset() for effect in self.contact.values()]
-        total = sum((o for o in offsets if o is not None), start=state.new_zeros(1))
-        return total.squeeze(-1)
+        total: Tensor | None = None
+        for module in self.contact.values():
+            offset = cast(BounceEffect, module).surface_offset()
+            if offset is not None:
+                total = offset if total is None else total + offset
+        if total is None:
+            return 0.0
+        return total.squeeze(-1) if total.dim() else total
 
     def extra_repr(self) -> str:
         """Radius and inertia factor for `print(model)`."""
@@ -73,10 +79,10 @@ class AnalyticModel(BallModel):
 
 
 def coefficient_sigmas(model: BallModel) -> dict[str, float]:
-    """Prior standard deviations of a model's uncertain coefficients, by parameter name.
+    """Prior standard deviations of the coefficients that are estimated with each track, by parameter name.
 
     Args: model: an `AnalyticModel`; another model declares no spread and gives an empty mapping.
-    Returns: for instance {"flight.drag.k": 0.035}. Coefficients that are as good as known are left out.
+    Returns: for instance {"flight.drag.k": 0.035}; coefficients that do not vary are left out.
     """
     if not isinstance(model, AnalyticModel):
         return {}
@@ -84,6 +90,6 @@ def coefficient_sigmas(model: BallModel) -> dict[str, float]:
     for section, group in (("flight", model.flight), ("contact", model.contact)):
         for name, module in group.items():
             for c in cast(Effect, module).coefficients:
-                if c.sigma > 0.0:
+                if c.varies:
                     sigmas[f"{section}.{name}.{c.name}"] = c.sigma
     return sigmas

@@ -122,16 +122,22 @@ def fly_through(
         state: (n, 9).
         dt: (n,) s.
         heights: for each contact, in order, the surface's height in m, scalar or (n,).
-    Returns: state after dt (n, 9), contact times since the start (n, len(heights)) s.
+    Returns: state after dt (n, 9), contact times since the start (n, len(heights)) s. NaN in rows in which a contact
+        never comes; they have no part in any gradient.
     """
     elapsed = torch.zeros_like(dt)
+    lost = torch.zeros_like(dt, dtype=torch.bool)
     times = []
     for height in heights:
         tau = contact_time(model, state, height)
+        lost = lost | tau.isnan()
+        tau = tau.masked_fill(lost, 0.0)
         state = model.bounce(fly(model, state, tau))
         elapsed = elapsed + tau
-        times.append(elapsed)
+        times.append(elapsed.masked_fill(lost, torch.nan))
     after = fly(model, state, dt - elapsed)
+    if bool(lost.any()):
+        after = after.masked_fill(lost.unsqueeze(-1), torch.nan)
     return after, torch.stack(times, dim=-1) if times else dt.new_zeros((*dt.shape, 0))
 
 

@@ -31,6 +31,9 @@ class Coefficient:
     """Smallest value accepted."""
     high: float
     """Largest value accepted."""
+    varies: bool = False
+    """Differs from ball to ball or day to day by more than one track needs to tell: estimated with each track."""
+
 
 TINY_SPEED = 1e-12
 """m/s. Below it the speed is constant to autograd."""

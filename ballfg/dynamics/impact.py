@@ -14,10 +14,17 @@ from ballfg.dynamics.effect import Impact
 TINY_SLIP = 1e-12
 """m/s. Below it the direction of slip is not defined and the friction impulse is zero to rounding anyway."""
 
+BLEND = 0.1
+"""Half width of the transition between sliding and gripping, as a share of the gripping impulse. A hard minimum has a
+kink in which an estimate gets caught: friction and slip then settle exactly on it, where no gradient is zero. Real
+contacts pass from slip to grip gradually (R. Cross 2002). Where both are equal the impulse is BLEND / 4 smaller."""
+
+_QUARTER_TURN = torch.tensor((-1.0, 1.0), dtype=torch.float64)  # times the flipped (x, y): z x (x, y)
+
 
 def slip_velocity(velocity: Tensor, spin: Tensor, radius: float) -> Tensor:
     """(..., 2) m/s, velocity over the plane of the ball's lowest point: v_t + R (n x w)_t with n = z."""
-    return torch.stack((velocity[..., 0] - radius * spin[..., 1], velocity[..., 1] + radius * spin[..., 0]), dim=-1)
+    return velocity[..., :2] + radius * (_QUARTER_TURN * spin[..., :2].flip(-1))
 
 
 def apply_impulse(impact: Impact, radius: float, inertia_factor: float) -> tuple[Tensor, Tensor]:
@@ -36,8 +43,15 @@ def apply_impulse(impact: Impact, radius: float, inertia_factor: float) -> tuple
     # a tangential impulse J (per mass) changes the slip by J (1 + 1/c): c/(1+c) of the slip stops it
     grip = inertia_factor / (1.0 + inertia_factor) * (1.0 + impact.tangential_restitution)
     slide = impact.friction * (1.0 + impact.restitution) * pressing / speed
-    impulse = -torch.minimum(slide, grip.expand_as(slide)) * slip
+    impulse = -_smooth_minimum(slide, grip) * slip
     velocity = torch.cat((impact.velocity[..., :2] + impulse, impact.restitution * normal_speed), dim=-1)
-    kick = impulse / (inertia_factor * radius)
-    spin = impact.spin + torch.stack((kick[..., 1], -kick[..., 0], torch.zeros_like(kick[..., 0])), dim=-1)
+    kick = (_QUARTER_TURN / (-inertia_factor * radius)) * impulse.flip(-1)
+    spin = torch.cat((impact.spin[..., :2] + kick, impact.spin[..., 2:]), dim=-1)
     return velocity, spin
+
+
+def _smooth_minimum(slide: Tensor, grip: Tensor) -> Tensor:
+    """min(slide, grip), rounded off by a parabola where they differ by less than `BLEND` of grip."""
+    width = (BLEND * grip).clamp_min(TINY_SLIP)  # e_t = -1 leaves no grip at all
+    rounding = (width - (slide - grip).abs()).clamp_min(0.0).square() / (4.0 * width)
+    return torch.minimum(slide, grip.expand_as(slide)) - rounding

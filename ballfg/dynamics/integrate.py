@@ -17,7 +17,8 @@ from ballfg.dynamics.model import BallModel, Rates
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 MAX_STEP = 0.02
-"""s. Longer intervals are cut into equal steps. At 0.02 s and 20 m/s the step's error is below 1e-9 m."""
+"""s. Longer intervals are cut into equal steps. The error of a step of 0.02 s is 2e-9 m at 6 m/s, 2e-7 m at
+20 m/s."""
 
 RateFunction = Callable[[Tensor], Rates]
 

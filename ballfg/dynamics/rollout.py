@@ -129,9 +129,7 @@ def _next_surface(
     return height, landing & (model.gap(after, height) < 0)
 
 
-def _land(
-    model: BallModel, state: Tensor, remaining: Tensor, height: Tensor, *, last: bool
-) -> tuple[Tensor, Tensor]:
+def _land(model: BallModel, state: Tensor, remaining: Tensor, height: Tensor, *, last: bool) -> tuple[Tensor, Tensor]:
     """States just after the next contact and the time then left; a bounce too small to rise ends in rest."""
     tau = contact_time(model, state, height)
     lost = tau.isnan()  # below the surface and never up again

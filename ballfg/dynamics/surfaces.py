@@ -63,11 +63,12 @@ class Surfaces:
         A ball whose centre is below the table's surface is beside the table.
         """
         on_table = (state[..., Z] > self.table_height) & self.over_table(state)
-        return torch.where(on_table, self.table_height, self.lowest()).to(state.dtype)
+        return torch.where(on_table, state.new_tensor(self.table_height), state.new_tensor(self.lowest()))
 
     def level_below(self, state: Tensor) -> Tensor:
         """(...) m, height of the surface whose level a falling ball reaches next, over the table or beside it."""
-        return torch.where(state[..., Z] > self.table_height, self.table_height, self.lowest()).to(state.dtype)
+        above = state[..., Z] > self.table_height
+        return torch.where(above, state.new_tensor(self.table_height), state.new_tensor(self.lowest()))
 
     def lowest(self) -> float:
         """m, height of the lowest surface under a ball beside the table; -inf where there is none."""

@@ -5,8 +5,7 @@ docs/estimators_ekf.md has the equations, what the filter does at contacts, hits
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
 
@@ -16,11 +15,10 @@ from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF
 from scipy.stats import chi2
 from torch import Tensor
 
-from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.contact import contact_time, fly_through_jacobian
 from ballfg.dynamics.integrate import batch_jacobian, fly, fly_jacobian, step_count
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.rollout import MAX_CONTACTS_PER_STEP, REST_SPEED, is_resting, roll
+from ballfg.dynamics.rollout import MAX_CONTACTS, REST_SPEED, is_resting, place_on, roll
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
 from ballfg.estimate.problem import coefficient_means, trackwise_model
@@ -29,7 +27,9 @@ from ballfg.estimate.rts import FilterRecord, rts_smooth
 from ballfg.estimate.segmentation import Contact, Quality
 from ballfg.estimate.settings import Settings, sample_sigmas
 from ballfg.estimate.sliding_window import WINDOW, SlidingWindow, spin_start
-from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
+from ballfg.factors.kind import Rows
+from ballfg.factors.loss import Loss
+from ballfg.state import POSITION, STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
 from ballfg.tracks import Track
 
 GATE = float(chi2.isf(1e-6, 3))
@@ -46,8 +46,6 @@ START_ACCELERATION = 20.0
 """m/s^2, standard deviation of what bends three samples beside gravity: twice a fast ball's drag."""
 NEAR_SURFACE = 0.05
 """m. Three samples, one of them this close to a surface, need not lie on one parabola: there may be a bounce."""
-
-_OBSERVE = np.eye(3, STATE_DIM)
 
 
 @dataclass(frozen=True)
@@ -79,28 +77,45 @@ def advance_jacobian(model: BallModel, state: Tensor, dt: float, surfaces: Surfa
 
 
 def _advance_step(model: BallModel, state: Tensor, h: float, surfaces: Surfaces) -> Motion:
-    """One step of at most `integrate.MAX_STEP`, cut at its contacts."""
-    height = float(surfaces.height_below(state))
+    """One step of at most `integrate.MAX_STEP`, cut at its contacts, by the rules of `rollout`."""
+    height = float(surfaces.level_below(state))
     jacobian: Tensor | None = None
     contacts: list[tuple[float, float]] = []
-    elapsed = 0.0
+    elapsed, resting = 0.0, _stays(model, state, height, surfaces)
     while True:
-        if bool(is_resting(model, state, height)):
-            after, step = _rolled(model, state, h - elapsed, height)
-        else:
-            after, step = _flown(model, state, h - elapsed)
-            if len(contacts) < MAX_CONTACTS_PER_STEP and _lands(model, state, after, height, surfaces):
-                state, step, tau, rests = _bounced(model, state, height)
-                contacts.append((elapsed + tau, height))
-                elapsed += tau
-                jacobian = step if jacobian is None else step @ jacobian
-                if not rests:
-                    continue
-                after, step = _rolled(model, state, h - elapsed, height)
-        return Motion(after, step if jacobian is None else step @ jacobian, tuple(contacts))
+        after, step = (_rolled if resting else _flown)(model, state, h - elapsed, height)
+        landing = None if resting else _landing(model, state, after, height, surfaces)
+        if landing is None:
+            return Motion(after, step if jacobian is None else step @ jacobian, tuple(contacts))
+        height = landing
+        state, step, tau = _bounced(model, state, height)
+        jacobian = step if jacobian is None else step @ jacobian
+        elapsed += tau
+        contacts.append((elapsed, height))
+        resting = float(state[0, VZ]) < REST_SPEED or len(contacts) == MAX_CONTACTS
 
 
-def _flown(model: BallModel, state: Tensor, dt: float) -> tuple[Tensor, Tensor]:
+def _stays(model: BallModel, state: Tensor, height: float, surfaces: Surfaces) -> bool:
+    """Whether the ball rests on the surface, and its weight keeps it there."""
+    if abs(float(state[0, VZ])) > REST_SPEED or not bool(is_resting(model, state, height)):
+        return False  # the first test spares most states the second
+    if float(model.rates(state)[0][0, Z]) > 0.0:
+        return False
+    return height != surfaces.table_height or bool(surfaces.over_table(state))
+
+
+def _landing(model: BallModel, state: Tensor, after: Tensor, height: float, surfaces: Surfaces) -> float | None:
+    """The surface that a flight from `state` to `after` comes down on; None where it meets none."""
+    if not (float(after[0, VZ]) < 0.0 and float(model.gap(after, height)) < 0.0):
+        return None
+    if surfaces.extent is not None and height == surfaces.table_height:
+        touch = fly(model, state, torch.nan_to_num(contact_time(model, state, height)))
+        if not bool(surfaces.over_table(touch)):
+            height = surfaces.lowest()
+    return height if float(model.gap(after, height)) < 0.0 else None
+
+
+def _flown(model: BallModel, state: Tensor, dt: float, height: float) -> tuple[Tensor, Tensor]:
     after, jacobian = fly_jacobian(model, state, state.new_tensor([dt]))
     return after, jacobian[0]
 
@@ -113,27 +128,17 @@ def _rolled(model: BallModel, state: Tensor, dt: float, height: float) -> tuple[
     return after, jacobian[0]
 
 
-def _lands(model: BallModel, state: Tensor, after: Tensor, height: float, surfaces: Surfaces) -> bool:
-    """Whether a flight that ends at `after` went through the surface, and not past the table's edge."""
-    if not (float(model.gap(after, height)) < 0.0 and float(after[0, VZ]) < 0.0):
-        return False
-    if surfaces.extent is None or height != surfaces.table_height:
-        return True
-    tau = torch.nan_to_num(contact_time(model, state, height))
-    return bool(surfaces.over_table(fly(model, state, tau)))
+def _bounced(model: BallModel, state: Tensor, height: float) -> tuple[Tensor, Tensor, float]:
+    """State just after the next contact, Jacobian at that fixed time, the time since the start, s.
 
-
-def _bounced(model: BallModel, state: Tensor, height: float) -> tuple[Tensor, Tensor, float, bool]:
-    """State just after the next contact, Jacobian at that fixed time, the time, whether the ball now rests.
-
-    As in `rollout`: a ball below the surface that never comes up again (its contact time is NaN) is put on it.
+    A ball below the surface that never comes up again (its contact time is NaN) is there already, with no speed left.
     """
     tau = contact_time(model, state, height)
     if bool(tau.isnan()):
         after, impact = batch_jacobian(model.bounce, state)
-        return after, impact[0], 0.0, True
+        return place_on(model, after, height), impact[0], 0.0
     after, _, jacobian = fly_through_jacobian(model, state, tau, (height,))
-    return after, jacobian[0], float(tau), float(after[0, VZ]) < REST_SPEED
+    return after, jacobian[0], float(tau)
 
 
 class _BallFilter(FilterpyEKF):
@@ -184,7 +189,7 @@ class _BallFilter(FilterpyEKF):
         return np.asarray(np.linalg.solve(root, measured - self.x[POSITION]))
 
     def correct(self, measured: Array) -> None:
-        """filterpy's update with a measured position."""
+        """The update of filterpy with a measured position."""
         self.update(measured, lambda _: self.H, lambda x: x[POSITION])
 
 
@@ -240,7 +245,9 @@ class ExtendedKalmanFilter(Estimator):
             run.fly_back(mean, covariance)
         whitened = record.whitened
         if self.smooth:
-            whitened = leave_one_out(mean, covariance, track.positions, run.sigma, record.used.astype(np.float64))
+            samples = run.position_rows(mean)
+            states = mean[:, :STATE_DIM], covariance[:, :STATE_DIM, :STATE_DIM]
+            whitened = leave_one_out(*states, track.positions, run.sigma, samples)
         return self._result(track, run, mean, covariance, whitened)
 
     def _result(self, track: Track, run: _Run, mean: Array, covariance: Array, whitened: Array) -> Estimate:
@@ -266,3 +273,178 @@ class ExtendedKalmanFilter(Estimator):
         mean, covariance = (np.stack(part) for part in zip(*pairs, strict=True))
         result = self._result(track, run, mean, covariance, np.full((len(track), 3), np.nan))
         return replace(result, status=Status.FAILED)
+
+
+class _Run:
+    """One pass of the filter over one track; `record` is what comes out."""
+
+    def __init__(self, owner: ExtendedKalmanFilter, track: Track) -> None:
+        self.owner = owner
+        self.track = track
+        self.settings = owner.settings
+        self.sigma = sample_sigmas(owner.settings, len(track), track.sigmas)
+        self.flight_noise = owner.settings.process.flight(np.diff(track.times))
+        self.means = coefficient_means(owner.model, owner.settings)
+        self.skipped: set[int] = set()
+        self.record = FilterRecord.empty(len(track), STATE_DIM + len(self.means))
+        with np.errstate(over="ignore", invalid="ignore"):  # ends in Status.FAILED
+            self._filter()
+
+    def finite(self) -> bool:
+        """Whether all of it is a number."""
+        return bool(np.isfinite(self.record.mean).all() and np.isfinite(self.record.covariance).all())
+
+    def prior(self, i: int) -> tuple[Array, Array]:
+        """What is known at sample i from it alone: mean (d,) and covariance (d, d)."""
+        spin, spin_sigma = spin_start(self.track, self.settings)
+        mean = np.concatenate((self.track.positions[i], np.zeros(3), spin, self.means))
+        sigma = (
+            self.sigma[i],
+            np.full(3, self.settings.velocity_prior),
+            np.full(3, spin_sigma),
+            np.array(list(self.settings.coefficients.values())),
+        )
+        return mean, np.diag(np.concatenate(sigma) ** 2)
+
+    def _filter(self) -> None:
+        """All samples in turn; back to before the first of four that were rejected, with a hit there."""
+        n, record = len(self.track), self.record
+        ball = self._begin()
+        k = record.start + 1
+        rejected: list[int] = []
+        while k < n:
+            self._predict(ball, k)
+            if not np.isfinite(ball.x).all():
+                record.mean[k:] = np.nan
+                return
+            if k in self.skipped:
+                self._store(ball, k, used=False)
+            elif self._accept(ball, k):
+                rejected = []
+            else:
+                rejected.append(k)
+            if len(rejected) == REJECTED_FOR_HIT:
+                k, rejected = rejected[0], []
+                self._hit(ball, k)
+            else:
+                k += 1
+
+    def _begin(self) -> _BallFilter:
+        """The filter at its first sample, or at the window's end."""
+        record, owner = self.record, self.owner
+        first, second = self._first_pair(0)
+        mean, covariance = self.prior(first)
+        start = first
+        if owner.initialise == "window":
+            start = min(first + WINDOW - 1, len(self.track) - 1)
+            window = SlidingWindow(owner.model, owner.surfaces, self.settings).estimate(self.track)
+            record.mean[:, :STATE_DIM] = window.states
+            record.mean[:, STATE_DIM:] = mean[STATE_DIM:]
+            record.covariance[:] = covariance
+            record.covariance[:, :STATE_DIM, :STATE_DIM] = window.covariances
+            mean, covariance = record.mean[start].copy(), record.covariance[start].copy()
+        record.start = start
+        record.quality[:first] = Quality.OUTLIER
+        self.skipped.update(range(first + 1, second))
+        ball = _BallFilter(owner.trackwise, owner.surfaces, mean, covariance)
+        self._store(ball, start, used=True)
+        return ball
+
+    def _hit(self, ball: _BallFilter, since: int) -> None:
+        """Back to before sample `since`; the flight begins anew at the first good one from there on."""
+        first, second = self._first_pair(since)
+        self.skipped.update(range(since, first))
+        self.skipped.update(range(first + 1, second))
+        self.record.hits.append(first - 1)
+        ball.x = self.record.mean[since - 1].copy()
+        ball.P = self.record.covariance[since - 1].copy()
+
+    def _first_pair(self, first: int) -> tuple[int, int]:
+        """The first two good samples of a flight, from sample `first` on: with a third they lie on a parabola.
+
+        A filter believes its first two samples whatever they are, as nothing is known to hold against them. Of the
+        triples that end earliest, the one with the best parabola is taken.
+        """
+        if self.settings.find_events:
+            for last in range(first + 2, min(first + START_SEARCH, len(self.track))):
+                pairs = list(combinations(range(first, last), 2))
+                misses = [self._parabola_miss(i, j, last) for i, j in pairs]
+                if min(misses) < GATE:
+                    return pairs[int(np.argmin(misses))]
+        return first, first + 1
+
+    def _parabola_miss(self, i: int, j: int, k: int) -> float:
+        """Squared whitened distance of sample j from a flight between samples i and k; near a surface, zero."""
+        t, p, variance = self.track.times, self.track.positions, self.sigma**2
+        low = p[[i, j, k], Z, None] - self.owner.model.radius - np.array(self.owner.surfaces.heights())
+        if np.abs(low).min() < NEAR_SURFACE:
+            return 0.0
+        share = (t[k] - t[j]) / (t[k] - t[i])
+        miss = p[j] - share * p[i] - (1.0 - share) * p[k]
+        bend = 0.5 * (t[j] - t[i]) * (t[k] - t[j])
+        miss[Z] -= bend * STANDARD_GRAVITY
+        spread = variance[j] + share**2 * variance[i] + (1.0 - share) ** 2 * variance[k]
+        return float((miss**2 / (spread + (bend * START_ACCELERATION) ** 2)).sum())
+
+    def _predict(self, ball: _BallFilter, k: int) -> None:
+        """To the time of sample k."""
+        times, record = self.track.times, self.record
+        used = next((i for i in range(k, len(times)) if i not in self.skipped), k)
+        R = np.diag(self.sigma[used] ** 2)
+        point = ball.linearisation_point(self.track.positions[used], times[used] - times[k - 1], R)
+        motion = ball.move(point, times[k] - times[k - 1])
+        ball.Q = self._noise(k, motion)
+        ball.R = np.diag(self.sigma[k] ** 2)
+        ball.predict()
+        record.contacts.pop(k - 1, None)
+        if motion.contacts:
+            record.contacts[k - 1] = tuple(Contact(k - 1, times[k - 1] + t, height) for t, height in motion.contacts)
+        record.prior_mean[k], record.prior_covariance[k] = ball.x, ball.P
+        record.transition[k], record.noise[k] = ball.F, ball.Q
+
+    def _noise(self, k: int, motion: Motion) -> Array:
+        """(d, d) process noise from sample k - 1 to k: flight, contacts, a hit at an unknown time."""
+        process, dt = self.settings.process, np.diff(self.track.times[k - 1 : k + 1])
+        covariance = self.flight_noise[k - 1].copy()
+        for time, _ in motion.contacts:
+            covariance += process.contact(dt, np.array([time]))[0]
+        if k - 1 in self.record.hits:
+            covariance += process.hit(dt)[0]
+            covariance[POSITION, POSITION] += HIT_POSITION**2 * np.eye(3)
+        noise = np.zeros((len(self.record.mean[k]),) * 2)
+        noise[:STATE_DIM, :STATE_DIM] = covariance
+        return noise
+
+    def _accept(self, ball: _BallFilter, k: int) -> bool:
+        """Update with sample k unless it lies beyond the gate; the first sample after a hit always counts."""
+        measured = self.track.positions[k]
+        whitened = self.record.whitened[k] = ball.innovation(measured)
+        used = not self.settings.find_events or k - 1 in self.record.hits or bool(whitened @ whitened <= GATE)
+        if used:
+            ball.correct(measured)
+        self._store(ball, k, used)
+        return used
+
+    def _store(self, ball: _BallFilter, k: int, used: bool) -> None:
+        self.record.mean[k] = ball.x
+        self.record.covariance[k] = ball.P = (ball.P + ball.P.T) / 2
+        self.record.quality[k] = Quality.GOOD if used else Quality.OUTLIER
+
+    def position_rows(self, mean: Array) -> Rows:
+        """The samples that took part as whitened position residuals, linear in the states."""
+        taken = self.record.used & (np.arange(len(mean)) >= self.record.start)
+        whitening = taken[:, None] / self.sigma
+        jacobian = np.zeros((len(mean), 3, STATE_DIM))
+        jacobian[:, np.arange(3), np.arange(3)] = whitening
+        residual = whitening * (mean[:, POSITION] - self.track.positions)
+        return Rows(np.arange(len(mean))[:, None], residual, (jacobian,), Loss())
+
+    def fly_back(self, mean: Array, covariance: Array) -> None:
+        """Fills the states before the first used sample, in place: free flight back from it."""
+        for k in range(self.record.start - 1, -1, -1):
+            dt = torch.from_numpy(self.track.times[k : k + 1] - self.track.times[k + 1 : k + 2])
+            after, jacobian = fly_jacobian(self.owner.trackwise, torch.from_numpy(mean[k + 1 : k + 2]), dt)
+            F = jacobian[0].numpy()
+            widened = covariance[k + 1].copy()
+            widened[:STATE_DIM, :STATE_DIM] += self.flight_noise[k]
+            mean[k], covariance[k] = after[0].numpy(), F @ widened @ F.T

@@ -137,15 +137,14 @@ def _process_covariance(times: Array, dt: Array, events: Events, settings: Setti
     for contact in events.contacts:
         i = slice(contact.interval, contact.interval + 1)
         time = np.array([contact.time]) - times[i]
-        covariance[i] += noise.kick(dt[i], time, noise.contact_velocity, noise.contact_spin)
+        covariance[i] += noise.contact(dt[i], time)
     hits = events.segmentation.hits
-    for time in (np.zeros_like(dt[hits]), dt[hits]):
-        covariance[hits] += 0.5 * noise.kick(dt[hits], time, noise.hit_velocity, noise.hit_spin)
+    covariance[hits] += noise.hit(dt[hits])
     return covariance
 
 
 def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> list[FactorKind]:
-    """Wide priors on the first state of each piece; the label, where there is one, on the very first spin."""
+    """Wide priors on the first state of each piece; on its spin the label, where there is one, or the spin prior."""
     starts = [0, *(int(i) + 1 for i in segmentation.restarts)]
     label = track.spin_label
     kinds: list[FactorKind] = []
@@ -153,17 +152,20 @@ def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> lis
         mean, sigma = np.zeros(STATE_DIM), np.empty(STATE_DIM)
         mean[POSITION] = track.positions[start]
         sigma[POSITION], sigma[VELOCITY] = START_POSITION_SIGMA, settings.velocity_prior
-        labelled = start == 0 and label is not None
-        sigma[SPIN] = UNINFORMATIVE_SPIN if labelled else settings.spin_prior
+        sigma[SPIN] = UNINFORMATIVE_SPIN
         kinds.append(state_prior(start, mean, sigma))
+    unlabelled = np.array(starts if label is None else starts[1:], dtype=np.int64)
+    if len(unlabelled):
+        spread = np.full((len(unlabelled), 3), settings.spin_prior)
+        kinds.append(spin_prior(unlabelled, np.zeros_like(spread), spread, settings.spin_loss))
     if label is not None:
         spread = np.full((1, 3), settings.spin_label_noise)
-        kinds.append(spin_prior(np.array([0]), label[None], spread, settings.label_loss))
+        kinds.append(spin_prior(np.array([0]), label[None], spread, settings.spin_loss))
     return kinds
 
 
 UNINFORMATIVE_SPIN = 2000.0
-"""rad/s, prior about zero that stays beside a spin label, should the label's robust loss set it aside."""
+"""rad/s, prior about zero beside the label or the spin prior, should their robust loss set them aside."""
 
 
 def initial_values(states: Array, model: BallModel, settings: Settings) -> Values:

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.estimate.segmentation import Contact
+from ballfg.factors.kind import Rows
+from ballfg.factors.linear import weighted
 from ballfg.state import POSITION
 
 Array = NDArray[np.float64]
@@ -91,24 +93,27 @@ def whiten_innovation(innovation: Array, covariance: Array) -> Array:
     return np.asarray(np.linalg.solve(root, innovation[..., None])[..., 0])
 
 
-def leave_one_out(states: Array, covariances: Array, measured: Array, sigma: Array, weight: Array) -> Array:
+def leave_one_out(states: Array, covariances: Array, measured: Array, sigma: Array, samples: Rows) -> Array:
     """(n, 3) whitened innovations of a smoother: each sample against its prediction from all others.
 
-    With the sample's information w/R taken out of the posterior P, the prediction from the others has covariance
-    C = (P^-1 - w R^-1)^-1 and lies C P^-1 (z - x) from the measurement; that distance has covariance R + C.
+    With the sample's share M taken out of the posterior information, the others know the position to C = (P^-1 - M)^-1;
+    without the sample's pull g = M (x - z) (for a robust loss: its gradient) they place it at x + C g. The measurement
+    z lies z - x - C g from there, with covariance R + C.
 
     Args:
         states: (n, 9).  covariances: (n, 9, 9).
         measured: (n, 3) m.  sigma: (n, 3) m.
-        weight: (n,) in [0, 1], the robust loss's weight with which each sample took part.
+        samples: the position factors, linearised at the states.
     """
+    residual, (jacobian,) = weighted(samples)
+    jacobian = jacobian[..., POSITION]
+    pull = (jacobian.swapaxes(-1, -2) @ residual[..., None])[..., 0]
     information = np.linalg.inv(covariances[:, POSITION, POSITION])
     axes = np.arange(3)
-    others = information.copy()
-    others[:, axes, axes] -= weight[:, None] / sigma**2
+    others = information - jacobian.swapaxes(-1, -2) @ jacobian
     # a sample that alone decides its position leaves nothing: bound C, the whitened distance goes to zero
     others[:, axes, axes] += LEAST_INFORMATION * information[:, axes, axes]
     covariance = np.linalg.inv(others)
-    distance = covariance @ information @ (measured - states[:, POSITION])[..., None]
+    distance = measured - states[:, POSITION] - (covariance @ pull[..., None])[..., 0]
     covariance[:, axes, axes] += sigma**2
-    return whiten_innovation(distance[..., 0], covariance)
+    return whiten_innovation(distance, covariance)

@@ -86,7 +86,7 @@ def rts_smooth(record: FilterRecord) -> tuple[Array, Array]:
 
 
 def _gain(cross: Array, covariance: Array) -> Array:
-    """cross @ covariance^-1, with the covariance scaled to a correlation: its entries span eight decades."""
+    """The product cross @ covariance^-1, with the covariance scaled to a correlation: entries span eight decades."""
     scale = 1.0 / np.sqrt(np.diagonal(covariance))
     correlation = covariance * np.outer(scale, scale)
     return np.asarray(np.linalg.solve(correlation, (cross * scale).T).T * scale)

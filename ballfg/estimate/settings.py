@@ -37,11 +37,13 @@ class Settings:
     """Model parameters estimated for each track: prior standard deviation by parameter name. Empty: the model is
     taken to be exact."""
 
-    loss: Loss = field(default_factory=lambda: Loss("cauchy", 3.0))
-    """Loss on each measured position. `Loss("squared")` where there are no outliers."""
+    loss: Loss = field(default_factory=lambda: Loss("huber", 3.0))
+    """Loss on each measured position. `Loss("squared")` where there are no outliers. Gross outliers are found and set
+    aside beforehand; Huber's loss bounds what a missed one does and leaves good samples their full weight."""
 
-    label_loss: Loss = field(default_factory=lambda: Loss("cauchy", 3.0))
-    """Loss on a spin label."""
+    spin_loss: Loss = field(default_factory=lambda: Loss("huber", 2.0))
+    """Loss on a spin label or, without one, on the spin prior: a strong spin is rare but not against nature, and labels
+    were seen to contradict the flight."""
 
     find_events: bool = True
     """Look for hits, outliers and tracker shifts. False: the track is one undisturbed flight with contacts that the
@@ -58,6 +60,11 @@ class Settings:
                 raise ValueError(f"coefficients['{name}'] must be a positive standard deviation; got {sigma}")
 
 
+MEASURED = ProcessNoise(contact_tangential=0.2, contact_spin=10.0)
+"""Process noise on measured tracks: what friction does in a bounce is known to some 0.2 m/s only. Friction and tangential
+restitution as coefficients of a track would say the same, along a kink that no minimisation likes."""
+
+
 def uncertain(model: BallModel, **changes: object) -> Settings:
     """Settings for measured tracks: the model's coefficients are known as well as their priors say.
 
@@ -65,7 +72,7 @@ def uncertain(model: BallModel, **changes: object) -> Settings:
         model: gives the coefficients and their prior standard deviations.
         changes: other fields of `Settings`.
     """
-    return Settings(coefficients=coefficient_sigmas(model), **changes)  # type: ignore[arg-type]
+    return Settings(coefficients=coefficient_sigmas(model), process=MEASURED, **changes)  # type: ignore[arg-type]
 
 
 def sample_sigmas(settings: Settings, count: int, own: NDArray[np.float64] | None) -> NDArray[np.float64]:

@@ -79,7 +79,7 @@ class SlidingWindow(Estimator):
 
 
 def spin_start(track: Track, settings: Settings) -> tuple[Array, float]:
-    """Mean (3,) and standard deviation per axis of the spin at a track's first sample, rad/s: its label or the prior."""
+    """Mean (3,) and standard deviation per axis, rad/s, of the spin at a track's first sample: label or prior."""
     label = track.spin_label
     return (np.zeros(3), settings.spin_prior) if label is None else (label, settings.spin_label_noise)
 

@@ -107,8 +107,7 @@ class Smoother(Estimator):
             covariances = _prior_covariances(n, p, sigma, self.settings)
         else:
             covariances = marginal_covariances(minimum.step.bayes_net, n, p)
-        rows = solution.graph.kinds[0].linearize(minimum.values)
-        weight = rows.loss.weight(np.linalg.norm(rows.residual, axis=-1))
+        samples = solution.graph.kinds[0].linearize(minimum.values)
         states = minimum.values.states
         return Estimate(
             name=track.name,
@@ -116,7 +115,7 @@ class Smoother(Estimator):
             states=states,
             covariances=covariances.states,
             status=_status(minimum, n),
-            whitened=leave_one_out(states, covariances.states, track.positions, sigma, weight),
+            whitened=leave_one_out(states, covariances.states, track.positions, sigma, samples),
             coefficient_names=self.trackwise.names if isinstance(self.trackwise, AugmentedModel) else (),
             coefficients=minimum.values.coefficients,
             coefficient_covariance=covariances.coefficients,

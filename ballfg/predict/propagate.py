@@ -110,9 +110,7 @@ class Propagator:
             )
         bounced = after[:, VZ].abs() > REST_SPEED
         time = torch.where(plain, times[:, 0], h / 2)
-        kick = torch.from_numpy(
-            self.noise.kick(h.numpy(), time.numpy(), self.noise.contact_velocity, self.noise.contact_spin)
-        )
+        kick = torch.from_numpy(self.noise.contact(h.numpy(), time.numpy()))
         return after, jacobian, kick * bounced[:, None, None]
 
 

@@ -37,25 +37,25 @@ class Launcher:
     x: float = 0.0
     """m, muzzle; x = 0 is the launcher's end of the table."""
 
-    height: float = 0.45
+    height: float = 0.56
     """m, muzzle above the surface."""
 
-    speed_slow: float = 3.7
+    speed_slow: float = 3.4
     """m/s at velocity level 8; levels between are linear."""
 
     speed_fast: float = 4.1
     """m/s at velocity level 14."""
 
-    elevation_slow: float = 1.2
+    elevation_slow: float = 1.24
     """rad above the horizontal at velocity level 8; the head is lowered as the speed goes up."""
 
-    elevation_fast: float = 0.55
+    elevation_fast: float = -0.18
     """rad above the horizontal at velocity level 14."""
 
-    topspin_scale: float = 75.0
+    topspin_scale: float = 58.0
     """rad/s per level of topspin."""
 
-    sidespin_scale: float = 38.0
+    sidespin_scale: float = 48.0
     """rad/s per level of sidespin."""
 
     position_spread: float = 0.003
@@ -79,7 +79,7 @@ class Launcher:
     y_far: float = 1.2
     """m, a track ends where the ball is farther than this from the x axis."""
 
-    duration: float = 1.6
+    duration: float = 1.32
     """s, longest track."""
 
     def __post_init__(self) -> None:

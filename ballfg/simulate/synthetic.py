@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import itertools
+from collections.abc import Iterator
 
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.simulate.composition import KickedModel, true_model
@@ -16,33 +17,20 @@ from ballfg.tracks import DatasetInfo
 BLOCK = 256
 """Tracks that are computed at once: 4 MB of states. Another number would give another dataset for the same seed."""
 
-Progress = Callable[[int, int], None]
-"""Called with the number of tracks done and the number of all tracks."""
 
-
-def simulate(config: SimulationConfig, progress: Progress | None = None) -> Iterator[SimulatedTrack]:
+def simulate(config: SimulationConfig) -> Iterator[SimulatedTrack]:
     """Makes the tracks of a simulation, with their truth.
 
     Memory is that of one block, whatever the number of tracks.
 
     Args:
         config: everything about the simulation.
-        progress: called after each block.
     Returns: an iterator over the tracks in the order of their names, "000", "001" ...
     Raises: ValueError: at once, if an undeclared effect does not go with the model.
     """
     model = true_model(config.ball.model, config.undeclared)
-    blocks = (_block(config, model, block, first) for block, first in enumerate(range(0, config.tracks, BLOCK)))
-
-    def stream() -> Iterator[SimulatedTrack]:
-        done = 0
-        for tracks in blocks:
-            yield from tracks
-            done += len(tracks)
-            if progress is not None:
-                progress(done, config.tracks)
-
-    return stream()
+    starts = range(0, config.tracks, BLOCK)
+    return itertools.chain.from_iterable(_block(config, model, block, first) for block, first in enumerate(starts))
 
 
 def _block(config: SimulationConfig, model: AnalyticModel, block: int, first: int) -> list[SimulatedTrack]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, Literal, cast
@@ -15,11 +15,12 @@ from ballfg.dynamics import Effect, save_model
 from ballfg.simulate.balls import describe
 from ballfg.simulate.config import SimulationConfig
 from ballfg.simulate.measure import SimulatedTrack
-from ballfg.simulate.synthetic import Progress, dataset_info, simulate
+from ballfg.simulate.synthetic import dataset_info, simulate
 from ballfg.state import STATE_NAMES
 from ballfg.tracks import TableWriter, Track, write_dataset
 
 FileFormat = Literal["csv", "parquet"]
+Watch = Callable[[Iterable[SimulatedTrack]], Iterator[SimulatedTrack]]
 TRUTH_FILE: Final = "truth.yaml"
 MODEL_FILE: Final = "model.yaml"
 TRUTH_TABLES: Final = ("truth.csv", "truth.parquet")
@@ -31,7 +32,7 @@ def write_simulation(
     file_format: FileFormat = "csv",
     *,
     force: bool = False,
-    progress: Progress | None = None,
+    watch: Watch = iter,
 ) -> None:
     """Simulates tracks and writes them as a dataset, with their truth.
 
@@ -44,7 +45,7 @@ def write_simulation(
         config: the simulation.
         file_format: "csv" or "parquet", for tracks and truth.
         force: replace a simulated dataset that is there already.
-        progress: called after each block of tracks with the numbers of tracks done and of all.
+        watch: hands the tracks through, for instance to show progress.
     Raises:
         ValueError: the folder holds something else, an unknown format, or effects that do not go with the model.
         FileNotFoundError: the folder's parent does not exist.
@@ -52,7 +53,7 @@ def write_simulation(
     path = Path(folder)
     check_format(file_format)
     check_folder(path, force=force)
-    tracks = simulate(config, progress)
+    tracks = watch(simulate(config))
     made = not path.exists()
     if not path.parent.is_dir():
         raise FileNotFoundError(f"out must be in an existing folder; {path.parent} is none. Create it first.")

@@ -85,5 +85,5 @@ def test_unknown_ball_lists_the_known_ones() -> None:
 
 
 def test_model_of_another_radius_is_refused() -> None:
-    with pytest.raises(ValueError, match="radius 0.0335 m; got 0.02 m"):
+    with pytest.raises(ValueError, match=r"radius 0\.0335 m; got 0\.02 m"):
         with_model(tennis(), nominal_model(0.02))

@@ -51,20 +51,20 @@ def test_topspin_minus_3_comes_back_below_level_10(shots: Shots, speed: int) -> 
         assert shots.states[i][first, 3] < 0  # and goes back
 
 
-@pytest.mark.parametrize("speed", [12, 13, 14])
-def test_topspin_minus_3_goes_on_at_high_levels(shots: Shots, speed: int) -> None:
+@pytest.mark.parametrize("speed", [10, 12, 14])
+def test_topspin_minus_3_goes_on_from_level_10(shots: Shots, speed: int) -> None:
     for i in shots.select(topspin=-3, speed=speed):
         assert shots.states[i][shots.contacts[i][0], 3] > 0
 
 
 @pytest.mark.parametrize("sidespin", [-5, 5])
 def test_full_sidespin_turns_the_track_by_about_45_degrees(shots: Shots, sidespin: int) -> None:
-    turns = [
-        shots.turn(i) * np.sign(sidespin) for level in (-1, 0, 1) for i in shots.select(topspin=level, sidespin=sidespin)
-    ]
-    assert len(turns) >= 21
-    assert all(35 < turn < 55 for turn in turns)
-    assert np.median(turns) == pytest.approx(45, abs=4)
+    turns = np.array([shots.turn(i) * np.sign(sidespin) for i in shots.select(topspin=0, sidespin=sidespin)])
+    assert len(turns) >= 7
+    assert np.all((turns > 35) & (turns < 56))
+    # little topspin or backspin changes single tracks much (slow ones almost stop), not the typical one
+    near = [i for level in (-1, 0, 1) for i in shots.select(topspin=level, sidespin=sidespin)]
+    assert np.median([shots.turn(i) * np.sign(sidespin) for i in near]) == pytest.approx(45, abs=5)
 
 
 def test_no_sidespin_hardly_turns(shots: Shots) -> None:
@@ -77,7 +77,13 @@ def test_most_tracks_bounce_once_some_twice_or_three_times(shots: Shots) -> None
     assert count[1] > 0.6
     assert count[2] >= 0.1
     assert 0 < count[3] < 0.1
-    assert count[:4].sum() == 1
+    assert len(count) == 4
+
+
+def test_no_ball_bounces_beside_the_table(shots: Shots) -> None:
+    places = np.array([s[i, :2] for s, contacts in zip(shots.states, shots.contacts, strict=True) for i in contacts])
+    assert places[:, 0].max() < 2.74 + 0.05  # the frame after the contact
+    assert np.abs(places[:, 1]).max() < 1.525 / 2 + 0.05
 
 
 def test_tracks_end_before_the_ball_falls_beside_the_table(shots: Shots) -> None:
@@ -123,7 +129,7 @@ def test_levels_that_the_launcher_lacks(chosen: dict[str, list[int]], message: s
 
 
 def test_launcher_refuses_impossible_values() -> None:
-    with pytest.raises(ValueError, match="speed_slow must be at least 0.5"):
+    with pytest.raises(ValueError, match=r"speed_slow must be at least 0\.5"):
         Launcher(speed_slow=-3.0)
     with pytest.raises(TypeError, match="height must be a number; got 'high'"):
         Launcher(height="high")  # type: ignore[arg-type]

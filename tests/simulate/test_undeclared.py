@@ -56,11 +56,12 @@ def test_every_own_effect_is_tried_here() -> None:
 
 @pytest.mark.parametrize("text", ONE_OF_EACH.values(), ids=ONE_OF_EACH.keys())
 def test_each_effect_changes_the_tracks(text: str, plain: list[SimulatedTrack]) -> None:
+    distances = []
     for changed, old in zip(run(text), plain, strict=True):
         n = min(len(changed.track), len(old.track))
-        distance = np.abs(changed.track.positions[:n] - old.track.positions[:n]).max()
-        assert 1e-4 < distance < 1.0
+        distances.append(np.abs(changed.track.positions[:n] - old.track.positions[:n]).max())
         assert changed.track.labels["topspin"] == old.track.labels["topspin"]
+    assert 1e-3 < max(distances) < 1.0  # not every track shows every effect: a ball that slides does not grip
 
 
 @pytest.mark.parametrize("name", [n for n in ONE_OF_EACH if issubclass(UNDECLARED[n], MeasurementEffect)])
@@ -97,7 +98,7 @@ def test_gust_is_wind_in_its_middle_and_fades() -> None:
 
 
 def test_formulas_of_the_air_effects() -> None:
-    k, magnus = 0.12, nominal_model().flight["magnus"].k.item()  # type: ignore[union-attr,operator]
+    k, magnus = 0.12, nominal_model().flight["magnus"].k.item()  # type: ignore[operator]
     v, w = STATE[0, 3:6].numpy(), STATE[0, 6:].numpy()
     speed, ratio = np.linalg.norm(v), 0.02 * np.linalg.norm(w) / np.linalg.norm(v)
     np.testing.assert_allclose(added("drag_speed.slope=0.02"), -k * 0.02 * (speed - 5) * speed * v, rtol=1e-10)
@@ -105,9 +106,7 @@ def test_formulas_of_the_air_effects() -> None:
     lost = magnus * np.cross(w, v) * (1 / (1 + 0.5 * ratio) - 1)
     np.testing.assert_allclose(added("magnus_saturation.strength=0.5"), lost, rtol=1e-10)
     way = np.array([1.4, 0.5, 1.5]) - STATE[0, :3].numpy()
-    np.testing.assert_allclose(
-        added("pull.strength=0.3"), 0.3 * way / np.sqrt(way @ way + 0.09), rtol=1e-10
-    )
+    np.testing.assert_allclose(added("pull.strength=0.3"), 0.3 * way / np.sqrt(way @ way + 0.09), rtol=1e-10)
 
 
 def test_restitution_falls_with_speed() -> None:
@@ -139,8 +138,8 @@ def test_time_offset_reads_a_coordinate_later(plain: list[SimulatedTrack]) -> No
 def test_a_declared_effect_can_have_another_true_value() -> None:
     model = nominal_model()
     changed = true_model(model, parse_effects(["drag.k=0.15"]))
-    assert changed.flight["drag"].k.item() == 0.15  # type: ignore[union-attr,operator]
-    assert model.flight["drag"].k.item() == 0.12  # type: ignore[union-attr,operator]
+    assert changed.flight["drag"].k.item() == 0.15  # type: ignore[operator]
+    assert model.flight["drag"].k.item() == 0.12  # type: ignore[operator]
 
 
 class Lift(FlightEffect):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import tracemalloc
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from ballfg.dynamics.model_file import model_to_dict
 from ballfg.simulate import (
     MeasurementNoise,
     ProcessNoise,
+    SimulatedTrack,
     SimulationConfig,
     parse_effects,
     simulate,
@@ -138,11 +140,12 @@ def test_force_replaces_a_simulated_dataset_and_leaves_nothing_stale(tmp_path: P
 
 
 def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
-    def fail(done: int, total: int) -> None:
+    def fail(tracks: Iterable[SimulatedTrack]) -> Iterator[SimulatedTrack]:
+        yield next(iter(tracks))
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        write_simulation(tmp_path / "d", SimulationConfig(tracks=2), progress=fail)
+        write_simulation(tmp_path / "d", SimulationConfig(tracks=2), watch=fail)
     assert list(tmp_path.iterdir()) == []
 
 

@@ -12,7 +12,7 @@ class Drag(FlightEffect):
 
     name = "drag"
     sentence = "Quadratic air drag with a constant coefficient."
-    coefficients = (Coefficient("k", 0.12, 0.035, "1/m", 0.0, 2.0),)
+    coefficients = (Coefficient("k", 0.12, 0.035, "1/m", 0.0, 2.0, varies=True),)
     k: Tensor
 
     def acceleration(self, flight: Flight) -> Tensor:

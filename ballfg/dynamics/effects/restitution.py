@@ -12,7 +12,7 @@ class Restitution(BounceEffect):
 
     name = "restitution"
     sentence = "Constant coefficient of restitution along the normal."
-    coefficients = (Coefficient("e", 0.93, 0.02, "1", 0.0, 1.0),)
+    coefficients = (Coefficient("e", 0.93, 0.02, "1", 0.0, 1.0, varies=True),)
     e: Tensor
 
     def adjust(self, impact: Impact) -> Impact:

@@ -16,7 +16,7 @@ class TableHeight(BounceEffect):
 
     name = "table_height"
     sentence = "Surfaces lie higher or lower than declared."
-    coefficients = (Coefficient("offset", 0.0, 0.004, "m", -0.2, 0.2),)
+    coefficients = (Coefficient("offset", 0.0, 0.004, "m", -0.2, 0.2, varies=True),)
     offset: Tensor
 
     def surface_offset(self) -> Tensor:

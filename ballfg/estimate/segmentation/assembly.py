@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,7 +66,7 @@ def shifted(events: Sequence[Event], samples: int, level: float) -> NDArray[np.b
             jumps[event.index + 1] += event.offset
     marked = np.zeros(samples, dtype=bool)
     cuts = [0, *(i + 1 for i in intervals_of(events, *BREAKS)), samples]
-    for first, stop in zip(cuts, cuts[1:], strict=False):
+    for first, stop in pairwise(cuts):
         offsets = np.cumsum(jumps[first:stop], axis=0)
         offsets -= np.median(offsets, axis=0) if stop > first else 0.0
         marked[first:stop] = np.linalg.norm(offsets, axis=1) > level

@@ -40,6 +40,11 @@ class Bank:
     def __len__(self) -> int:
         return len(self.score)
 
+    @property
+    def resting(self) -> IntArray:
+        """Rows of the hypotheses that rest on a surface."""
+        return (self.surface != FLYING).nonzero()[0]
+
     def take(self, rows: IntArray | list[int]) -> Bank:
         """A copy of some hypotheses."""
         return Bank(

@@ -8,10 +8,9 @@ import numpy as np
 
 from ballfg.estimate.segmentation.bank import FLYING, Bank, FloatArray, concatenate
 from ballfg.estimate.segmentation.events import Event, EventKind, Node
-from ballfg.estimate.segmentation.evidence import OUTLIER, log_shares, update
+from ballfg.estimate.segmentation.evidence import OUTLIER, update
 from ballfg.estimate.segmentation.motion import lift, put_down
 from ballfg.estimate.segmentation.scene import Scene
-from ballfg.estimate.segmentation.surface_contact import resting_rows
 
 SHORTEST_STEP = 1e-3
 """s. An event is not made dearer than this by stamps that lie closer."""
@@ -37,7 +36,8 @@ def starts(
     Args:
         tip: last event before, or None.
         score: nats, carried on.
-        position: (3,) m, with noise sigma (3,) m.
+        position: (3,) m.
+        sigma: (3,) m, its noise.
         scene: ball, surfaces, settings.
         sample: index of the sample.
         time: s, its stamp.
@@ -48,10 +48,9 @@ def starts(
     flying.tips[0] = tip
     banks = [flying, *_rested(flying, position, scene, sample - 1, time)]
     lost = flying.take([0])
-    lost.score += log_shares(settings)[OUTLIER] - 3.0 * math.log(settings.outlier_spread)
+    lost.score += scene.log_shares[OUTLIER] - 3.0 * math.log(settings.outlier_spread)
     lost.add_event(0, Event(EventKind.OUTLIER, sample, time))
-    used = concatenate(banks)
-    update(used, position, sigma, scene, sample, time)
+    used, _ = update(concatenate(banks), position, sigma, scene, sample, time)
     return concatenate([used, lost])
 
 
@@ -71,7 +70,9 @@ def hits(best: Bank, position: FloatArray, dt: float, scene: Scene, interval: in
     return [bank, *_rested(bank, position, scene, interval, time)]
 
 
-def shifts(predicted: Bank, position: FloatArray, dt: float, scene: Scene, interval: int, time: float) -> list[Bank]:
+def shifts(
+    predicted: Bank, position: FloatArray, sigma: FloatArray, dt: float, scene: Scene, interval: int, time: float
+) -> list[Bank]:
     """The two best predictions, with the measurements jumping by an unknown offset."""
     settings = scene.settings
     if dt >= settings.short_gap:
@@ -81,20 +82,22 @@ def shifts(predicted: Bank, position: FloatArray, dt: float, scene: Scene, inter
     bank.score = bank.score - _rarity(settings.shift_rate, dt) - settings.shift_cost
     bank.age = np.zeros(len(bank), dtype=np.int64)
     for row in range(len(bank)):
-        offset = position - bank.mean[row, :, 0]
+        innovation = position - bank.mean[row, :, 0]
+        # the shift's expectation, not the innovation: after a gap most of that is the path's own uncertainty
+        offset = innovation * settings.shift_spread**2 / (bank.cov[row, :, 0, 0] + sigma**2)
         bank.add_event(row, Event(EventKind.SHIFT, interval, time, offset=offset))
     return [bank]
 
 
 def departures(predicted: Bank, dt: float, scene: Scene, interval: int, time: float) -> list[Bank]:
     """The best resting prediction, in the air from now on."""
-    rows = resting_rows(predicted)
+    rows = predicted.resting
     if len(rows) == 0:
         return []
     bank = predicted.take(rows).take_best()
     height = scene.height(int(bank.surface[0]))
     lift(bank, scene)
-    bank.score = bank.score - _rarity(scene.settings.hit_rate, dt)
+    bank.score = bank.score - _rarity(scene.settings.hit_rate, dt) - scene.settings.leave_cost
     bank.age = np.zeros(1, dtype=np.int64)
     bank.add_event(0, Event(EventKind.LEAVE, interval, time, height))
     return [bank]

@@ -10,56 +10,51 @@ from ballfg.estimate.segmentation.scene import Scene
 from ballfg.estimate.segmentation.settings import SegmentationSettings
 
 GOOD, WIDE, OUTLIER = range(3)
-"""The components of the noise."""
+"""The components of the noise, as in `Scene.log_shares`."""
 
 
-def log_shares(settings: SegmentationSettings) -> FloatArray:
-    """(3,) log prior of the noise components, in the order of `GOOD`, `WIDE`, `OUTLIER`."""
-    wide, out = settings.wide_share, settings.outlier_share
-    return np.log(np.array([1.0 - wide - out, wide, out]))
-
-
-def update(bank: Bank, position: FloatArray, sigma: FloatArray, scene: Scene, sample: int, time: float) -> FloatArray:
+def update(
+    bank: Bank, position: FloatArray, sigma: FloatArray, scene: Scene, sample: int, time: float
+) -> tuple[Bank, FloatArray]:
     """Takes a sample into every hypothesis: its most likely noise component, the Kalman update, the evidence.
 
-    Constants that all hypotheses share (3/2 log 2 pi) are left out of the score. The arrays of the bank are replaced,
-    not changed, so that the bank it was copied from stays valid.
+    Constants that all hypotheses share (3/2 log 2 pi) are left out of the score.
 
     Args:
-        bank: predicted hypotheses; changed.
+        bank: predicted hypotheses.
         position: (3,) m.
         sigma: (3,) m, stated noise.
         scene: settings.
         sample: index of the sample.
         time: s, its stamp.
-    Returns: (h,) squared whitened innovation, as of a good sample.
+    Returns: the updated hypotheses, and (h,) the squared whitened innovation, as of a good sample.
     """
     settings = scene.settings
     noise = sigma**2 + (settings.stamp_jitter * bank.mean[:, :, 1]) ** 2
     innovation = position - bank.mean[:, :, 0]
-    squared = innovation**2
     known = bank.cov[:, :, 0, 0]
-    S = np.empty((3, *squared.shape))
+    S = np.empty((3, *innovation.shape))
     S[GOOD] = known + noise
     S[WIDE] = known + settings.wide_factor**2 * noise
-    S[OUTLIER] = settings.outlier_spread**2
-    whitened = squared / S
-    evidence = log_shares(settings)[:, None] - 0.5 * (whitened + np.log(S)).sum(-1)
+    S[OUTLIER] = known + settings.outlier_spread**2
+    whitened = innovation**2 / S
+    evidence = scene.log_shares[:, None] - 0.5 * (whitened + np.log(S)).sum(-1)
     component = evidence.argmax(0)
     rows = np.arange(len(component))
     gain = bank.cov[..., 0] / S[component, rows][..., None]  # (h, axis, 3)
     gain[component == OUTLIER] = 0.0
-    bank.mean = bank.mean + gain * innovation[..., None]
-    bank.cov = bank.cov - gain[..., :, None] * bank.cov[..., 0, None, :]
-    bank.score = bank.score + evidence[component, rows]
-    bank.age = bank.age + (component != OUTLIER)
-    unusual = component.nonzero()[0]
-    if len(unusual):
-        bank.tips = bank.tips.copy()
-        for row in unusual:
-            kind = EventKind.WIDE if component[row] == WIDE else EventKind.OUTLIER
-            bank.add_event(int(row), Event(kind, sample, time))
-    return whitened[GOOD].sum(-1)
+    updated = Bank(
+        mean=bank.mean + gain * innovation[..., None],
+        cov=bank.cov - gain[..., :, None] * bank.cov[..., 0, None, :],
+        surface=bank.surface,
+        score=bank.score + evidence[component, rows],
+        age=bank.age + (component != OUTLIER),
+        tips=bank.tips.copy(),
+    )
+    for row in component.nonzero()[0]:
+        kind = EventKind.WIDE if component[row] == WIDE else EventKind.OUTLIER
+        updated.add_event(int(row), Event(kind, sample, time))
+    return updated, whitened[GOOD].sum(-1)
 
 
 def prune(bank: Bank, settings: SegmentationSettings) -> Bank:

@@ -58,7 +58,7 @@ def process_noise(dt: FloatArray, scene: Scene) -> FloatArray:
 def carry(bank: Bank, dt: float, scene: Scene) -> Bank:
     """All hypotheses after dt s without an event: the flying fly, the resting stay down."""
     mean, cov = fly(bank.mean, bank.cov, np.full(len(bank), dt), scene)
-    down = (bank.surface != FLYING).nonzero()[0]
+    down = bank.resting
     if len(down):
         mean[down, 2] = bank.mean[down, 2]
         cov[down, 2] = bank.cov[down, 2]

@@ -74,12 +74,17 @@ class Segmentation:
 
     @property
     def segments(self) -> list[tuple[int, int]]:
-        """First and last sample, inclusive, of each stretch without a hit; one stretch (0, n - 1) where there is none."""
+        """First and last sample, inclusive, of each stretch without a hit; all samples are one where there is none."""
         if len(self.quality) == 0:
             return []
         ends = [*self.hits.tolist(), len(self.quality) - 1]
         starts = [0, *(self.hits + 1).tolist()]
         return list(zip(starts, ends, strict=True))
+
+    def only_contacts(self) -> Segmentation:
+        """The same contacts and rests, without hits, every sample trusted: for tracks known to be undisturbed."""
+        none = np.zeros(0, dtype=np.int64)
+        return Segmentation(self.contacts, none, none, self.rests, np.zeros_like(self.quality))
 
     @property
     def usable(self) -> NDArray[np.bool_]:

@@ -20,6 +20,7 @@ class Scene:
     Attributes:
         centres: (s,) m, height of the ball's centre when it touches each surface, table first.
         restitution_sigmas: (s,).
+        log_shares: (3,) log prior of good, wide and outlying samples.
     """
 
     physics: SegmentationPhysics
@@ -27,6 +28,7 @@ class Scene:
     settings: SegmentationSettings
     centres: FloatArray = field(init=False)
     restitution_sigmas: FloatArray = field(init=False)
+    log_shares: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         heights = np.array(self.surfaces.heights())
@@ -34,17 +36,19 @@ class Scene:
         sigmas = np.full(len(heights), self.settings.floor_restitution_sigma)
         sigmas[0] = self.settings.restitution_sigma
         object.__setattr__(self, "restitution_sigmas", sigmas)
+        wide, out = self.settings.wide_share, self.settings.outlier_share
+        object.__setattr__(self, "log_shares", np.log([1.0 - wide - out, wide, out]))
 
     def height(self, surface: int) -> float:
         """m, declared height of a surface."""
         return self.surfaces.heights()[surface]
 
-    def reaches(self, surface: int, mean: FloatArray) -> NDArray[np.bool_]:
-        """(h,) whether a ball with these means (h, 3, 3) at a surface's height is over it, as far as is known."""
+    def reaches(self, surface: int, places: FloatArray) -> NDArray[np.bool_]:
+        """(h,) whether x, y (h, 2) m lie within a surface, as far as is known."""
         extent = self.surfaces.extent
         if surface != 0 or extent is None:
-            return np.ones(len(mean), dtype=bool)
+            return np.ones(len(places), dtype=bool)
         margin = self.settings.extent_margin
-        x, y = mean[:, 0, 0], mean[:, 1, 0]
+        x, y = places[:, 0], places[:, 1]
         inside = (x >= extent[0] - margin) & (x <= extent[1] + margin)
         return inside & (y >= extent[2] - margin) & (y <= extent[3] + margin)

@@ -37,9 +37,13 @@ def hits_at_contacts(
     """Intervals of contacts whose tangential jump exceeds what Coulomb friction gives: mu (1 + e) v_n.
 
     Args:
-        times: (n,) s.  positions: (n, 3) m.  usable: (n,) samples that measure the ball.
-        contacts: as found, in order.  hits: intervals; they bound the samples used, as neighbouring contacts do.
-        physics: of the ball.  settings: `friction_limit`.
+        times: (n,) s.
+        positions: (n, 3) m.
+        usable: (n,) samples that measure the ball.
+        contacts: as found, in order.
+        hits: intervals; they bound the samples used, as neighbouring contacts do.
+        physics: of the ball.
+        settings: for the excess.
     """
     ends = sorted({-1, len(times) - 1, *hits, *(contact.interval for contact in contacts)})
     found = []
@@ -54,7 +58,7 @@ def hits_at_contacts(
         if before is None or after is None:
             continue
         jump = np.hypot(*(after[:2] - before[:2]))
-        if jump > settings.friction_limit * (1.0 + physics.restitution) * abs(before[2]) + LEEWAY:
+        if jump > settings.friction_excess * physics.friction * (1.0 + physics.restitution) * abs(before[2]) + LEEWAY:
             found.append(i)
     return found
 

@@ -16,7 +16,7 @@ from ballfg.estimate.segmentation.evidence import prune, update
 from ballfg.estimate.segmentation.physics import SegmentationPhysics
 from ballfg.estimate.segmentation.scene import Scene
 from ballfg.estimate.segmentation.settings import SegmentationSettings
-from ballfg.estimate.segmentation.surface_contact import resting_rows, step
+from ballfg.estimate.segmentation.surface_contact import step
 
 
 @dataclass(frozen=True)
@@ -84,24 +84,22 @@ class Segmenter:
         return self._decide()
 
     def _next(self, bank: Bank, position: FloatArray, sigma: FloatArray, time: float) -> Bank:
-        """The hypotheses after the next sample, before pruning."""
+        """The hypotheses after the next sample, not pruned, from those before it, best first."""
         scene, sample, dt = self._scene, self._count, time - self._time
         settings = scene.settings
-        best = bank.take_best()
+        best = bank.take([0])
         if dt > settings.longest_gap:
             tip = Node(Event(EventKind.RESTART, sample - 1, time), best.tips[0])
             return branches.starts(tip, float(best.score[0]), position, sigma, scene, sample, time)
         predicted = self._predict(bank, dt)
-        updated = Bank(predicted.mean, predicted.cov, predicted.surface, predicted.score, predicted.age, predicted.tips)
-        surprise = update(updated, position, sigma, scene, sample, time)
+        updated, surprise = update(predicted, position, sigma, scene, sample, time)
         extra = branches.departures(predicted, dt, scene, sample - 1, time)
-        if surprise[updated.score.argmax()] > settings.surprise or len(resting_rows(best)):
+        if surprise[updated.score.argmax()] > settings.surprise or len(best.resting):
             extra += branches.hits(best, position, dt, scene, sample - 1, time)
-            extra += branches.shifts(predicted, position, dt, scene, sample - 1, time)
+            extra += branches.shifts(predicted, position, sigma, dt, scene, sample - 1, time)
         if not extra:
             return updated
-        others = concatenate(extra)
-        update(others, position, sigma, scene, sample, time)
+        others, _ = update(concatenate(extra), position, sigma, scene, sample, time)
         return concatenate([updated, others])
 
     def _predict(self, bank: Bank, dt: float) -> Bank:
@@ -118,7 +116,7 @@ class Segmenter:
     def _decide(self) -> Decision:
         """Makes old events final, drops the hypotheses that deny them, and reports."""
         assert self._bank is not None
-        pending = open_nodes(self._bank.take_best().tips[0])
+        pending = open_nodes(self._bank.tips[0])
         cutoff = self._count - self._scene.settings.lag
         old = [node for node in pending if node.event.index < cutoff]
         if not old:

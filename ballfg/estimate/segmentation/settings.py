@@ -31,8 +31,8 @@ class SegmentationSettings:
     """m/s^2 per sqrt(s). Its random walk."""
     velocity_drift: float = 0.05
     """m/s per sqrt(s). Random walk of the velocity."""
-    velocity_spread: float = 5.0
-    """m/s. Spread, per axis, of the velocity of which nothing is known; faster balls pay a few nats."""
+    velocity_spread: float = 15.0
+    """m/s. Spread, per axis, of the velocity of which nothing is known; a tennis serve at 60 m/s pays 8 nats."""
 
     # contacts
     contact_cost: float = 1.0
@@ -43,10 +43,8 @@ class SegmentationSettings:
     """Spread of the restitution on the table."""
     floor_restitution_sigma: float = 0.15
     """The same on the floor, of which a model of the table says little."""
-    tangential_keep: float = 0.85
-    """Share of the tangential velocity that a bounce of unknown spin keeps."""
-    tangential_sigma: float = 0.25
-    """m/s of tangential change per m/s of normal speed: friction that is not known."""
+    most_slowing: float = 0.15
+    """Largest share of its tangential velocity that a bounce of unknown spin is expected to take."""
     slack_at_contact: float = 3.0
     """m/s^2. A bounce changes the spin, and so the slack acceleration."""
     contact_window: float = 0.012
@@ -55,19 +53,21 @@ class SegmentationSettings:
     """m. Contacts this far outside a known table are still tried."""
 
     # rest
-    rest_speed: float = 0.35
+    rest_speed: float = 0.2
     """m/s. A ball that lands more slowly may stay down."""
     rest_cost: float = 1.2
     """nats."""
     rest_range: float = 0.02
     """m. A first sample, or one after a hit, this close to a surface may be that of a resting ball."""
+    leave_cost: float = 5.0
+    """nats on top of the prior rate of hits: a resting ball leaves over an edge, and then it stays away."""
     leave_speed: float = 0.15
     """m/s. Spread of the vertical velocity with which a resting ball gets into the air."""
 
     # hits, tracker shifts, gaps
     hit_rate: float = 1.0
     """1/s. Prior rate of hits, and of a resting ball leaving."""
-    hit_cost: float = 10.0
+    hit_cost: float = 7.0
     """nats on top of the prior rate; fades in gaps, where a hit needs no witness."""
     hit_spread: float = 0.03
     """m. How far from the prediction a ball may reappear after a hit, apart from its unknown velocity."""
@@ -83,8 +83,8 @@ class SegmentationSettings:
     """s. Over longer gaps no shift is tried, and a hit is judged without the prediction."""
     longest_gap: float = 0.5
     """s. Nothing links the two sides of a longer gap: the slack alone moves the ball by half a metre."""
-    friction_limit: float = 0.35
-    """Coulomb coefficient beyond which a contact's tangential jump needs a hit beside it."""
+    friction_excess: float = 1.4
+    """Tangential jump of a contact, in units of the largest that friction gives, beyond which a hit lies beside it."""
 
     # search
     surprise: float = 6.0

@@ -1,11 +1,11 @@
-"""Contacts: where a hypothesis may meet a surface it branches into one that did not, one that bounced, one that stayed."""
+"""Contacts: a hypothesis that may meet a surface branches: it did not, it bounced, it stayed down."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.estimate.segmentation.bank import FLYING, Bank, FloatArray, IntArray, concatenate
+from ballfg.estimate.segmentation.bank import FLYING, Bank, FloatArray, concatenate
 from ballfg.estimate.segmentation.events import Event, EventKind
 from ballfg.estimate.segmentation.motion import carry, fly, put_down
 from ballfg.estimate.segmentation.scene import Scene
@@ -42,7 +42,8 @@ def step(bank: Bank, dt: float, scene: Scene, interval: int, start: float, *, st
         times, speeds, ok = _meetings(bank, surface, dt, scene, strict=strict)
         rows = np.flatnonzero(ok)
         if len(rows):
-            landed, times = _touch(bank.take(rows), times[rows], surface, scene, interval, start)
+            times = times[rows]
+            landed = _touch(bank.take(rows), times, surface, scene, interval, start)
             slow = np.flatnonzero(speeds[rows] < scene.settings.rest_speed)
             if len(slow):
                 branches.append(_stay(landed.take(slow), dt - times[slow], surface, scene, interval, start + dt))
@@ -70,6 +71,7 @@ def _meetings(
     speed = np.sqrt(np.maximum(rise * rise + 2.0 * pull * height, 0.0))  # zero where the path stays below
     time = (rise + speed) / pull
     ok = (bank.surface == FLYING) & (speed > LEAST_FALL)
+    ok &= scene.reaches(surface, bank.mean[:, :2, 0] + bank.mean[:, :2, 1] * time[:, None])
     if strict:
         ok &= (time >= 0.0) & (time < dt)
     else:
@@ -80,35 +82,39 @@ def _meetings(
     return time, speed, ok
 
 
-def _touch(
-    bank: Bank, times: FloatArray, surface: int, scene: Scene, interval: int, start: float
-) -> tuple[Bank, FloatArray]:
-    """The hypotheses just before their contacts, priced and with the event, without those that miss the table."""
+def _touch(bank: Bank, times: FloatArray, surface: int, scene: Scene, interval: int, start: float) -> Bank:
+    """The hypotheses just before their contacts, priced and with the event; changes and returns the bank."""
     bank.mean, bank.cov = fly(bank.mean, bank.cov, times, scene)
-    over = scene.reaches(surface, bank.mean)
-    if not over.all():
-        bank, times = bank.take(np.flatnonzero(over)), times[over]
-    bank.score = bank.score - scene.settings.contact_cost
-    bank.age = np.zeros(len(bank), dtype=np.int64)
+    bank.score -= scene.settings.contact_cost
+    bank.age[:] = 0
     for row, time in enumerate(times.tolist()):
         bank.add_event(row, Event(EventKind.CONTACT, interval, start + time, scene.height(surface)))
-    return bank, times
+    return bank
 
 
 def _bounce(bank: Bank, rest_of_step: FloatArray, surface: int, scene: Scene) -> Bank:
-    """Hypotheses at a contact, bounced and flown on: mirrored in z, slowed by the friction of an unknown spin."""
+    """Hypotheses at a contact, bounced and flown on: mirrored in z, slowed by the friction of an unknown spin.
+
+    Friction changes the tangential velocity by mu (1 + e) v_n at most, either way: half of that is expected, but no
+    more than a ball without spin would lose, and half is the spread.
+    """
     settings = scene.settings
-    e, keep = scene.physics.restitution, settings.tangential_keep
+    e = scene.physics.restitution
     mean, cov = bank.mean, bank.cov
     speed = np.abs(mean[:, 2, 1])
-    mean[:, :2, 1] *= keep
+    friction = 0.5 * scene.physics.friction * (1.0 + e) * speed
+    sliding = np.maximum(np.hypot(mean[:, 0, 1], mean[:, 1, 1]), SLOWEST_CLOSING)
+    keep = 1.0 - np.minimum(friction / sliding, settings.most_slowing)
+    mean[:, :2, 1] *= keep[:, None]
     mean[:, 2, 1] = e * speed
     mean[:, 2, 0] = scene.centres[surface]
-    # J = diag(1, keep, 1) along the surface, diag(-e, -e, 1) along its normal: the path is mirrored, late or early
-    scale = np.array([[1.0, keep, 1.0], [1.0, keep, 1.0], [-e, -e, 1.0]])
-    cov *= scale[:, :, None] * scale[:, None, :]
+    # the Jacobian is diagonal: (1, keep, 1) along the surface, (-e, -e, 1) along its normal, for late or early paths
+    J = np.ones((len(bank), 3, 3))
+    J[:, :2, 1] = keep[:, None]
+    J[:, 2, :2] = -e
+    cov *= J[..., :, None] * J[..., None, :]
     cov[:, :2, 0, 0] += POSITION_JITTER**2
-    cov[:, :2, 1, 1] += (SLIDE_JITTER + settings.tangential_sigma * speed[:, None]) ** 2
+    cov[:, :2, 1, 1] += (SLIDE_JITTER + friction[:, None]) ** 2
     cov[:, 2, 0, 0] += ((1.0 + e) * settings.surface_sigma) ** 2
     cov[:, 2, 1, 1] += (BOUNCE_JITTER + scene.restitution_sigmas[surface] * speed) ** 2
     cov[:, :, 2, 2] += settings.slack_at_contact**2
@@ -122,12 +128,7 @@ def _stay(bank: Bank, rest_of_step: FloatArray, surface: int, scene: Scene, inte
     height_mean, height_cov = bank.mean[:, 2].copy(), bank.cov[:, 2].copy()
     bank.mean, bank.cov = fly(bank.mean, bank.cov, rest_of_step, scene)
     bank.mean[:, 2], bank.cov[:, 2] = height_mean, height_cov
-    bank.score = bank.score - scene.settings.rest_cost
+    bank.score -= scene.settings.rest_cost
     for row in range(len(bank)):
         bank.add_event(row, Event(EventKind.REST, interval, time, scene.height(surface)))
     return bank
-
-
-def resting_rows(bank: Bank) -> IntArray:
-    """Rows of the hypotheses that rest on a surface."""
-    return (bank.surface != FLYING).nonzero()[0]

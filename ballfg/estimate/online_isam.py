@@ -1,0 +1,300 @@
+"""iSAM2 over a window of states: one sample more, a few samples back, one state out at the old end.
+
+The window keeps a mirror of what iSAM2 holds: linearisation points and the linear solution about them. So it knows before
+an update which states GTSAM will relinearise, and evaluates their factors, together with the new one, in one torch
+call; the callbacks find their answers ready. docs/derivations/online.md explains the choices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.dynamics.model import BallModel
+from ballfg.estimate.online_interval import Interval, Motion, coefficient_count, evaluate, store
+from ballfg.estimate.problem import START_POSITION_SIGMA, UNINFORMATIVE_SPIN, coefficient_means
+from ballfg.estimate.settings import Settings
+from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
+from ballfg.factors.kind import FactorKind
+from ballfg.factors.position import PositionFactors
+from ballfg.factors.prior import coefficient_prior, spin_prior, state_prior
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+
+Array = NDArray[np.float64]
+
+VELOCITY_THRESHOLD = 0.1
+"""m/s. Drag that is linearised this far off is wrong by k dv^2 = 1.4e-3 m/s^2, a hundredth of what process noise explains
+in half a second; a spin of `SPIN_THRESHOLD` at the same time adds 4e-3."""
+SPIN_THRESHOLD = 15.0
+"""rad/s. The Magnus force is linear in the spin: only its product with an error in velocity matters."""
+POSITION_THRESHOLD = 0.5
+"""Measurement standard deviations. Flight does not depend on the position; a robust loss's weight does."""
+COEFFICIENT_THRESHOLD = 0.5
+"""Prior standard deviations. The coefficients touch every factor: moving them relinearises the whole window."""
+WILDFIRE = 1e-7
+"""m, m/s, rad/s. Back-substitution stops where the solution changes by less."""
+
+
+@dataclass
+class Sample:
+    """One observation in the window.
+
+    Attributes:
+        time: s.  position: (3,) m.  sigma: (3,) m, as it takes part.
+        label: (3,) rad/s, a spin label, on the first sample of a track.
+        slots: where iSAM2 keeps the sample's own factors: position first, then priors.
+    """
+
+    time: float
+    position: Array
+    sigma: Array
+    label: Array | None = None
+    slots: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class Update:
+    """What one update did.
+
+    Attributes:
+        innovation: (3,) whitened; NaN where nothing predicted the sample.
+        evaluated: factors of the motion evaluated, the new one among them.
+        calls: torch calls for them.
+        variables: states that iSAM2 eliminated again.
+    """
+
+    innovation: Array
+    evaluated: int
+    calls: int
+    variables: int
+
+
+class IncrementalWindow:
+    """The last samples of a stream as a factor graph in iSAM2.
+
+    Args:
+        model: the ball, from `problem.trackwise_model`.  settings: noise and priors.
+        position_sigma: m, of a good measurement; scales the threshold of relinearisation in position.
+
+    Attributes:
+        first: number of the window's first state since the stream began.
+        samples: n of them.  intervals: n - 1, None where nothing links two samples.
+        theta: (n, 9) linearisation points.  delta: (n, 9) solution about them.
+        coefficient_theta, coefficient_delta: (p,) the same for the coefficients.
+        summary_slots: where iSAM2 keeps the linear factors that marginalised states left.
+        newest_covariance: (9 + p, 9 + p) of the newest state and the coefficients.
+    """
+
+    def __init__(self, model: BallModel, settings: Settings, position_sigma: float) -> None:
+        self.model = model
+        self.settings = settings
+        self.position_sigma = position_sigma
+        self.p = coefficient_count(model)
+        self._own_means = coefficient_means(model.model, settings) if self.p else np.zeros(0)  # type: ignore[arg-type]
+        self._own_sigmas = np.array(list(settings.coefficients.values()))
+        self.first = 0
+        self.samples: list[Sample] = []
+        self.intervals: list[Interval | None] = []
+        self.summary_slots: set[int] = set()
+        self.threshold = np.empty(STATE_DIM)
+        self.threshold[POSITION] = POSITION_THRESHOLD * position_sigma
+        self.threshold[VELOCITY], self.threshold[SPIN] = VELOCITY_THRESHOLD, SPIN_THRESHOLD
+        self._clear()
+
+    def _clear(self) -> None:
+        """An empty iSAM2 and no states."""
+        self.isam = gtsam.ISAM2(_parameters(self.threshold, COEFFICIENT_THRESHOLD * self._own_sigmas))
+        self.theta, self.delta = np.zeros((0, STATE_DIM)), np.zeros((0, STATE_DIM))
+        self.coefficient_theta, self.coefficient_delta = self._own_means.copy(), np.zeros(self.p)
+        self.newest_covariance = np.zeros((0, 0))
+        self.fixed = False  # the first state and the coefficients, once something was marginalised onto them
+
+    @property
+    def states(self) -> Array:
+        """(n, 9) the present estimate."""
+        return self.theta + self.delta
+
+    @property
+    def coefficients(self) -> Array:
+        """(p,) the present estimate."""
+        return self.coefficient_theta + self.coefficient_delta
+
+    @property
+    def times(self) -> Array:
+        """(n,) s."""
+        return np.array([sample.time for sample in self.samples])
+
+    def append(self, sample: Sample, motion: Motion) -> Update:
+        """Take in a sample; `motion` led to it from the one before.
+
+        Raises: RuntimeError or ValueError: what GTSAM or the model raised; the window must then be built anew.
+        """
+        linked = motion.linked and len(self.samples) > 0
+        if not linked:
+            return self._append_start(sample)
+        dt = sample.time - self.samples[-1].time
+        interval = Interval(self.first + len(self.samples) - 1, motion, dt, self.model, self.settings.process)
+        estimate = self.states[-1], self.coefficients
+        piece, count, calls = self._relinearize(interval)
+        away = np.concatenate((estimate[0] - self.theta[-1], estimate[1] - self.coefficient_theta))
+        predicted = piece[:, 0] + piece[:, 1:] @ away
+        covariance = piece[:, 1:] @ self.newest_covariance @ piece[:, 1:].T + interval.covariance
+        state, innovation = self._corrected(predicted, covariance, sample)
+        store(interval, self.theta[-1], state, self.coefficient_theta, piece)
+        variables = self._insert(sample, state, interval)
+        return Update(innovation, count, calls, variables)
+
+    def _append_start(self, sample: Sample) -> Update:
+        """A sample that nothing predicts: its state has a wide prior of its own."""
+        state = np.zeros(STATE_DIM)
+        state[POSITION] = sample.position
+        priors: list[FactorKind] = []
+        sigma = np.concatenate((np.full(3, START_POSITION_SIGMA), np.full(3, self.settings.velocity_prior), np.zeros(3)))
+        sigma[SPIN] = self.settings.spin_prior if sample.label is None else UNINFORMATIVE_SPIN
+        priors.append(state_prior(0, state.copy(), sigma))
+        if sample.label is not None:
+            spread = np.full((1, 3), self.settings.spin_label_noise)
+            priors.append(spin_prior(np.array([0]), sample.label[None], spread, self.settings.spin_loss))
+            state[SPIN] = sample.label
+        _, count, calls = self._relinearize(None)
+        return Update(np.full(3, np.nan), count, calls, self._insert(sample, state, None, priors))
+
+    def _corrected(self, predicted: Array, covariance: Array, sample: Sample) -> tuple[Array, Array]:
+        """The predicted state moved by the measurement as a Kalman filter would, and the whitened innovation.
+
+        It is the new state's linearisation point only: closer to the final answer than the prediction, it saves
+        relinearisations, and a robust loss gets a weight near the one that it ends with.
+        """
+        innovation = sample.position - predicted[POSITION]
+        spread = covariance[POSITION, POSITION] + np.diag(sample.sigma**2)
+        whitened = np.linalg.solve(np.linalg.cholesky(spread), innovation)
+        weight = self.settings.loss.weight(np.linalg.norm(whitened, keepdims=True))
+        spread = covariance[POSITION, POSITION] + np.diag(sample.sigma**2 / weight)
+        return predicted + covariance[:, POSITION] @ np.linalg.solve(spread, innovation), whitened
+
+    def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
+        """Do ahead what iSAM2 will do: move the states whose solution left the thresholds, evaluate their factors.
+
+        Returns: the new interval's propagation (9, 1 + 9 + p), factors evaluated, torch calls.
+        """
+        moved = (np.abs(self.delta) > self.threshold).any(axis=1)
+        limit = COEFFICIENT_THRESHOLD * self._own_sigmas
+        shared = not self.fixed and bool((np.abs(self.coefficient_delta) > limit).any())
+        if self.fixed:
+            moved[0] = False
+        if moved.any():
+            self.theta = np.where(moved[:, None], self.theta + self.delta, self.theta)
+            self.delta = np.where(moved[:, None], 0.0, self.delta)
+        if shared:
+            self.coefficient_theta = self.coefficient_theta + self.coefficient_delta
+            self.coefficient_delta = np.zeros(self.p)
+        either = moved[:-1] | moved[1:] | shared
+        touched = [interval for k in np.flatnonzero(either) if (interval := self.intervals[k]) is not None]
+        begins = [interval.index - self.first for interval in touched]
+        ends = [k + 1 for k in begins]
+        if new is not None:
+            touched.append(new)
+            begins.append(len(self.theta) - 1)
+            ends.append(len(self.theta) - 1)  # a stand-in: `store` puts the right one
+        if not touched:
+            return np.empty(0), 0, 0
+        pieces, calls = evaluate(touched, self.theta[begins], self.theta[ends], self.coefficient_theta)
+        return pieces[-1], len(touched), calls
+
+    def _insert(
+        self,
+        sample: Sample,
+        state: Array,
+        interval: Interval | None,
+        priors: Sequence[FactorKind] = (),
+        summaries: Sequence[gtsam.LinearContainerFactor] = (),
+    ) -> int:
+        """Give iSAM2 a new state with its factors, and read back the solution.
+
+        Returns: how many states were eliminated again.
+        """
+        key = STATE_KEY + self.first + len(self.samples)
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        if interval is not None:
+            graph.push_back(interval.bridge.factor(0))
+        graph.push_back(self._position_factor(sample, key - STATE_KEY))
+        for prior in priors:
+            graph.push_back(Bridge(prior, "row").factor(0, [key - STATE_KEY]))
+        values.insert(key, state)
+        own = graph.size()
+        for summary in summaries:
+            graph.push_back(summary)
+        if self.p and len(self.theta) == 0:
+            values.insert(COEFFICIENT_KEY, self.coefficient_theta)
+            if not summaries:
+                prior = coefficient_prior(self._own_means, self._own_sigmas)
+                graph.push_back(Bridge(prior, "row").factor(0))
+        slots = self._update(graph, values, [], {key: 1, COEFFICIENT_KEY: 2} if self.p and len(self.theta) else {})
+        if interval is not None:
+            interval.slot = slots[0]
+        sample.slots = tuple(slots[interval is not None : own])
+        self.summary_slots |= set(slots[own : own + len(summaries)])
+        if self.samples:
+            self.intervals.append(interval)
+        self.samples.append(sample)
+        self.theta = np.concatenate((self.theta, state[None]))
+        self._read_back()
+        return int(self._result.getVariablesReeliminated())
+
+    def summaries(self) -> list[gtsam.LinearContainerFactor]:
+        """The linear factors that marginalised states left."""
+        factors = self.isam.getFactorsUnsafe()
+        return [factors.at(slot) for slot in sorted(self.summary_slots)]
+
+    def _position_factor(self, sample: Sample, state: int) -> gtsam.CustomFactor:
+        kind = PositionFactors(np.array([state]), sample.position[None], sample.sigma[None], self.settings.loss)
+        return Bridge(kind, "row").factor(0)
+
+    def _update(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int], last: dict[int, int]
+    ) -> list[int]:
+        """One iSAM2 update; `last` are keys eliminated after all others, by group; empty leaves it to GTSAM.
+
+        By itself GTSAM eliminates the newest states last, but not the coefficients: every state would then hang
+        on them from below, and no update would be local.
+        """
+        if last:
+            groups = gtsam.KeyGroupMap()
+            for key, group in last.items():
+                groups.insert2(key, group)
+            self._result = self.isam.update(graph, values, remove, groups)
+        else:
+            self._result = self.isam.update(graph, values, remove)
+        return list(self._result.getNewFactorsIndices())
+
+    def _read_back(self) -> None:
+        """The linear solution of all states, and the newest one's covariance."""
+        newest = STATE_KEY + self.first + len(self.theta) - 1
+        solution = self.isam.getDelta()
+        self.delta = solution.vector(range(STATE_KEY + self.first, newest + 1)).reshape(-1, STATE_DIM)
+        if self.p:
+            self.coefficient_delta = solution.at(COEFFICIENT_KEY)
+            self.newest_covariance = self.isam.jointMarginalCovariance([newest, COEFFICIENT_KEY]).fullMatrix()
+        else:
+            self.newest_covariance = self.isam.marginalCovariance(newest)
+
+
+def _parameters(threshold: Array, coefficient_threshold: Array) -> gtsam.ISAM2Params:
+    """QR, because a loose spin prior beside a tight process noise defeats Cholesky."""
+    parameters = gtsam.ISAM2Params()
+    parameters.setFactorization("QR")
+    parameters.relinearizeSkip = 1
+    parameters.findUnusedFactorSlots = True
+    thresholds = gtsam.ISAM2ThresholdMap()
+    thresholds.insert(("x", threshold))
+    if len(coefficient_threshold):
+        thresholds.insert(("c", coefficient_threshold))
+    parameters.setRelinearizeThreshold(thresholds)
+    solver = gtsam.ISAM2GaussNewtonParams()
+    solver.setWildfireThreshold(WILDFIRE)
+    parameters.setOptimizationParams(solver)
+    return parameters

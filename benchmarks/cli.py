@@ -1,0 +1,122 @@
+"""The app `ballfg-bench` and its entry point.
+
+Commands import what they need inside: `ballfg-bench --help` must not wait for torch or GTSAM.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ballfg.cli.errors import guarded
+from ballfg.cli.inputs import default_jobs
+
+if TYPE_CHECKING:
+    from ballfg.benchmarks.results import Results
+
+app = typer.Typer(
+    name="ballfg-bench",
+    help="The estimators against each other, and what an estimate costs: a table, results.json, pictures.",
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+
+Data = Annotated[Path | None, typer.Option("--data", help="Dataset of measured tracks; synthetic ones without it.")]
+Out = Annotated[Path, typer.Option("--out", help="Folder for results.json and pictures.")]
+Quick = Annotated[bool, typer.Option("--quick", help="Fewer tracks or runs: a look, not a measurement.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Of every random choice.")]
+Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Processes.", show_default="one per core")]
+
+
+@app.callback(invoke_without_command=True)
+def _root(context: typer.Context) -> None:
+    """The estimators against each other, and what an estimate costs: a table, results.json, pictures."""
+    if context.invoked_subcommand is None:
+        typer.echo(context.get_help())
+
+
+@app.command()
+def estimators(
+    data: Data = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = default_jobs()
+) -> None:
+    """Sliding window, EKF, RTS, online and smoother on the same tracks.
+
+    Without --data: synthetic tracks with known truth, by the paper's protocol and by a fair one. With it: observe the
+    first 0.25 s of each measured track, predict the next 0.3 s.
+
+    Example: ballfg-bench estimators --data data/aimy --out results/aimy
+    """
+    from ballfg.benchmarks.estimators import FULL, QUICK, run_dataset, run_synthetic
+
+    results = _start("estimators", data, quick, seed)
+    size = QUICK if quick else FULL
+    if data is None:
+        pictures = run_synthetic(results, _folder(out), size, jobs)
+    else:
+        from ballfg.tracks import read_dataset
+
+        dataset = read_dataset(data)
+        for note in dataset.notes:
+            print(f"note: {note}", file=sys.stderr)
+        pictures = run_dataset(results, dataset, _folder(out), size, jobs)
+    _finish(results, out, pictures)
+
+
+@app.command()
+def speed(data: Data = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0) -> None:
+    """What an estimate, an update and a prediction cost, next to a control; one thread, warm, medians.
+
+    The problem is fixed: 80 observations of a free flight. --data adds the time per track of a dataset.
+
+    Example: ballfg-bench speed --out results/speed
+    """
+    from ballfg.benchmarks.speed import run_speed
+
+    results = _start("speed", data, quick, seed)
+    run_speed(results, data, quick)
+    _finish(results, _folder(out), [])
+
+
+def _start(command: str, data: Path | None, quick: bool, seed: int) -> Results:
+    """Empty results that name the command; of a dataset's path only the folder's name is kept."""
+    import torch
+
+    from ballfg.benchmarks.results import Results
+
+    torch.set_num_threads(1)
+    words = ["ballfg-bench", command]
+    words += [] if data is None else ["--data", data.resolve().name]
+    words += ["--quick"] if quick else []
+    return Results(" ".join([*words, "--seed", str(seed)]), seed)
+
+
+def _folder(out: Path) -> Path:
+    if out.exists() and not out.is_dir():
+        raise ValueError(f"--out must be a folder; {out} is a file. Choose another name.")
+    out.mkdir(parents=True, exist_ok=True)
+    return out
+
+
+def _finish(results: Results, out: Path, pictures: Sequence[Path]) -> None:
+    """Print the table, write `results.json`, say where everything is."""
+    from ballfg.benchmarks.results import print_table
+
+    print_table(results.rows)
+    path = results.write(out)
+    print(f"\n{path}: {len(results.rows)} rows")
+    for picture in pictures:
+        print(picture)
+
+
+def run(arguments: Sequence[str] | None = None) -> None:
+    """Runs `ballfg-bench` with the given arguments, by default the command line's, and exits.
+
+    Raises: SystemExit: always; status 0, 2 on bad input, 130 after Ctrl-C.
+    """
+    command = typer.main.get_command(app)
+    given = sys.argv[1:] if arguments is None else list(arguments)
+    sys.exit(guarded(lambda: command.main(given, prog_name="ballfg-bench", standalone_mode=False)))

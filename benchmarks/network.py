@@ -1,0 +1,97 @@
+"""A small network in place of the aerodynamics, fitted to the analytic model: what a learned model costs an estimator."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from ballfg.dynamics import AnalyticModel, BallModel
+from ballfg.dynamics.model import Rates
+from ballfg.state import SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY
+
+HIDDEN = 80
+SPEED_SCALE = 6.0
+"""m/s that the network sees as one."""
+SPIN_SCALE = 100.0
+"""rad/s that the network sees as one."""
+FORCE_SCALE = 10.0
+"""m/s^2, the network's output of one."""
+FIT_SAMPLES = 2000
+FIT_ITERATIONS = 600
+"""Of L-BFGS; the fit then is off by about a twentieth of the aerodynamic acceleration."""
+
+
+class NetworkFlight(BallModel):
+    """Flight by gravity plus a 9-80-80-3 tanh network of velocity, spin and spin x velocity (7,523 parameters).
+
+    Bounces are another model's. The parameters are frozen: the benchmark estimates states, it learns nothing.
+
+    Args:
+        bounces: what a bounce does; its radius and inertia are taken too.
+        generator: draws the start weights.
+    """
+
+    def __init__(self, bounces: BallModel, generator: torch.Generator) -> None:
+        super().__init__(bounces.radius, bounces.inertia_factor)
+        self.bounces = bounces
+        sizes = (9, HIDDEN, HIDDEN, 3)
+        self.layers = nn.ModuleList(
+            nn.Linear(i, o, dtype=torch.float64) for i, o in zip(sizes[:-1], sizes[1:], strict=True)
+        )
+        with torch.no_grad():
+            for layer in self.layers:
+                assert isinstance(layer, nn.Linear)
+                spread = 1.0 / math.sqrt(layer.in_features)
+                layer.weight.copy_(spread * torch.randn(layer.weight.shape, generator=generator, dtype=torch.float64))
+                layer.bias.zero_()
+        self.register_buffer("gravity", torch.tensor([0.0, 0.0, -STANDARD_GRAVITY], dtype=torch.float64))
+
+    def force(self, state: Tensor) -> Tensor:
+        """(..., 3) the network's output: aerodynamic acceleration divided by `FORCE_SCALE`."""
+        velocity, spin = state[..., VELOCITY] / SPEED_SCALE, state[..., SPIN] / SPIN_SCALE
+        x = torch.cat((velocity, spin, torch.linalg.cross(spin, velocity)), dim=-1)
+        first, second, last = self.layers
+        result: Tensor = last(torch.tanh(second(torch.tanh(first(x)))))
+        return result
+
+    def rates(self, state: Tensor) -> Rates:
+        """Acceleration in free flight; the spin is constant."""
+        gravity: Tensor = self.gravity
+        return gravity + FORCE_SCALE * self.force(state), None
+
+    def bounce(self, state: Tensor) -> Tensor:
+        """That of the other model."""
+        return self.bounces.bounce(state)
+
+
+def fitted_network(model: AnalyticModel, seed: int = 0) -> NetworkFlight:
+    """A network fitted to a model's accelerations, in seconds and always to the same weights.
+
+    An unfitted network would make an ill-posed problem, on which a solver's time says nothing.
+    """
+    generator = torch.Generator().manual_seed(seed)
+    network = NetworkFlight(model, generator)
+    state = torch.zeros((FIT_SAMPLES, STATE_DIM), dtype=torch.float64)
+    state[:, VELOCITY] = SPEED_SCALE * torch.randn((FIT_SAMPLES, 3), generator=generator, dtype=torch.float64)
+    state[:, SPIN] = SPIN_SCALE * torch.randn((FIT_SAMPLES, 3), generator=generator, dtype=torch.float64)
+    with torch.no_grad():
+        target = (model.rates(state)[0] - network.gravity) / FORCE_SCALE
+    optimizer = torch.optim.LBFGS(
+        network.layers.parameters(), max_iter=FIT_ITERATIONS, history_size=30, line_search_fn="strong_wolfe"
+    )
+
+    def loss() -> Tensor:
+        optimizer.zero_grad()
+        value: Tensor = (network.force(state) - target).square().mean()
+        value.backward()  # type: ignore[no-untyped-call]
+        return value
+
+    optimizer.step(loss)  # type: ignore[arg-type]
+    return network.requires_grad_(False)
+
+
+def parameter_count(network: NetworkFlight) -> int:
+    """Weights and biases of the network."""
+    return sum(p.numel() for p in network.layers.parameters())

@@ -1,0 +1,171 @@
+"""The comparison on synthetic tracks: the paper's protocol, the fair one, and the smoother's consistency."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ballfg.benchmarks.metrics import (
+    Array,
+    Figure,
+    Statistic,
+    bootstrap,
+    chi_square_band,
+    pooled_mean,
+    pooled_rms,
+    ratio,
+)
+from ballfg.benchmarks.results import CURVE_MARK, Results
+from ballfg.benchmarks.scoring import (
+    BLOCKS,
+    LEVELS,
+    Candidate,
+    Scores,
+    TrackScore,
+    covered,
+    joined,
+    score_tracks,
+    summed,
+)
+from ballfg.benchmarks.synthetic import Protocol
+from ballfg.estimate import ExtendedKalmanFilter, Online, SlidingWindow, Smoother
+from ballfg.estimate.sliding_window import WINDOW
+from ballfg.state import STATE_DIM
+
+COUNTS = (5, 6, 7, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 70, 80)
+"""Numbers of observations on the curves."""
+SETTLED = 20
+"""Observations from which on the errors at the newest sample are pooled into one number."""
+PLACES = {"first": 0.0, "quarter": 0.25, "middle": 0.5, "three_quarters": 0.75, "last": 1.0}
+"""Where on a track the consistency is tested, as a share of its samples."""
+
+
+def paper_candidates(protocol: Protocol) -> dict[str, Candidate]:
+    """The paper's three methods, and the filter once more with another start.
+
+    In the paper filter and graph start from the mean velocity of the first five samples. To the filter that is a
+    belief, in place of these samples; to the graph a place to start the minimisation from. `ekf-no-window` starts like
+    the graph: it knows nothing and takes in every sample.
+    """
+    given = (protocol.model, protocol.surfaces, protocol.settings)
+    return {
+        "sliding-window": Candidate(SlidingWindow(*given), causal=True),
+        "ekf": Candidate(ExtendedKalmanFilter(*given, initialise="window"), causal=True),
+        "ekf-no-window": Candidate(ExtendedKalmanFilter(*given), causal=True),
+        "smoother": Candidate(Smoother(*given)),
+    }
+
+
+def fair_candidates(protocol: Protocol) -> dict[str, Candidate]:
+    """All estimators, with one and the same settings."""
+    given = (protocol.model, protocol.surfaces, protocol.settings)
+    return {
+        "sliding-window": Candidate(SlidingWindow(*given), causal=True),
+        "ekf": Candidate(ExtendedKalmanFilter(*given), causal=True),
+        "ekf+rts": Candidate(ExtendedKalmanFilter(*given, smooth=True)),
+        "online": Candidate(Online(*given)),
+        "smoother": Candidate(Smoother(*given)),
+    }
+
+
+def run_protocol(
+    results: Results, protocol: Protocol, candidates: Mapping[str, Candidate], jobs: int, counts: Sequence[int] = COUNTS
+) -> Scores:
+    """Score all candidates and add their rows."""
+    what = f"synthetic tracks estimated ({protocol.name})"
+    scores = score_tracks(candidates, protocol.tracks, counts, jobs, what)
+    add_rows(results, protocol.name, scores, counts)
+    return scores
+
+
+def add_rows(results: Results, case: str, scores: Scores, counts: Sequence[int]) -> None:
+    """RMSE, ratios, NEES, coverage, and the curve over the number of observations.
+
+    Samples before the window of five is full are left out, unless the metric's name says `all`: there the filter and
+    the window know next to nothing, which would flatter every smoother.
+    """
+    rng = np.random.default_rng([results.seed, 2])
+    for method, of_method in scores.items():
+        n = len(of_method)
+        for name, statistic, unit in _statistics(of_method, counts):
+            results.add(case, method, name, unit, bootstrap(statistic, n, rng), n)
+        results.add(case, method, "not_converged", "1", sum(not s.ok for s in of_method), n)
+        _add_curve(results, case, method, of_method, counts)
+    _add_ratios(results, case, scores, counts, rng)
+
+
+def _statistics(scores: Sequence[TrackScore], counts: Sequence[int]) -> list[tuple[str, Statistic, str]]:
+    """Metric, statistic and unit of everything that is pooled over samples."""
+    skip = WINDOW - 1
+    found = [
+        ("velocity_rmse", pooled_rms(*joined(scores, "velocity", skip)), "m/s"),
+        ("velocity_rmse_all", pooled_rms(*joined(scores, "velocity")), "m/s"),
+        ("velocity_rmse_newest", pooled_rms(*newest_sums(scores, counts)), "m/s"),
+        ("position_rmse", pooled_rms(*joined(scores, "position", skip)), "m"),
+        ("spin_rmse", pooled_rms(*joined(scores, "spin", skip)), "rad/s"),
+        ("nees", pooled_mean(*summed(scores, "nees", skip)), "1"),
+        ("nees_velocity", pooled_mean(*summed(scores, "velocity_nees", skip)), "1"),
+    ]
+    for i, level in enumerate(LEVELS):
+        for block, columns in BLOCKS.items():
+            share = pooled_mean(*covered(scores, i, columns, skip))
+            found.append((f"coverage_{100 * level:.0f}_{block}", share, "1"))
+    return found
+
+
+def newest_sums(scores: Sequence[TrackScore], counts: Sequence[int]) -> tuple[Array, Array]:
+    """For each track sum of squares and number of the newest-sample errors at `SETTLED` or more observations."""
+    settled = np.array(counts) >= min(SETTLED, max(counts))
+    newest = np.stack([score.newest for score in scores])[:, settled]
+    return np.nansum(newest**2, axis=1), np.isfinite(newest).sum(axis=1).astype(np.float64)
+
+
+def _add_curve(results: Results, case: str, method: str, scores: Sequence[TrackScore], counts: Sequence[int]) -> None:
+    """Root mean square, mean and standard deviation over tracks of the velocity error at the newest sample."""
+    newest = np.stack([score.newest for score in scores])
+    for count, errors in zip(counts, newest.T, strict=True):
+        seen = errors[np.isfinite(errors)]
+        if len(seen) < 2:
+            continue
+        figures = {"rmse": np.sqrt((seen**2).mean()), "mean": seen.mean(), "sd": seen.std(ddof=1)}
+        for name, value in figures.items():
+            results.add(case, method, f"velocity_{name}_newest{CURVE_MARK}{count}", "m/s", float(value), len(seen))
+
+
+def _add_ratios(
+    results: Results, case: str, scores: Scores, counts: Sequence[int], rng: np.random.Generator
+) -> None:
+    """The smoother's velocity RMSE divided by each other method's; below one, the smoother is better."""
+    statistics = {
+        method: {name: statistic for name, statistic, unit in _statistics(of_method, counts) if unit == "m/s"}
+        for method, of_method in scores.items()
+    }
+    own = statistics["smoother"]
+    n = len(scores["smoother"])
+    for metric, statistic in own.items():
+        for method in scores:
+            if method != "smoother":
+                figure = bootstrap(ratio(statistic, statistics[method][metric]), n, rng)
+                results.add(case, "smoother", f"{metric}_vs_{method}", "1", figure, n)
+
+
+def add_consistency(results: Results, case: str, scores: Sequence[TrackScore]) -> None:
+    """NEES of the smoother against chi-square bands.
+
+    At one sample of each track the NEES are independent from track to track, so that their mean has an exact band;
+    low and high are its ends. Samples of one track are not independent: the mean over all of them has the interval of
+    a bootstrap over tracks.
+    """
+    n = len(scores)
+    band = chi_square_band(STATE_DIM, n)
+    outside = 0
+    for place, share in PLACES.items():
+        values = [score.nees[round(share * (len(score.nees) - 1))] for score in scores]
+        mean = float(np.mean(values))
+        outside += not band[0] <= mean <= band[1]
+        results.add(case, "smoother", f"nees_{place}", "1", Figure(mean, *band), n)
+    figure = bootstrap(pooled_mean(*summed(scores, "nees")), n, np.random.default_rng([results.seed, 3]))
+    results.add(case, "smoother", "nees", "1", figure, n)
+    results.add(case, "smoother", "nees_places_outside_99", "1", outside, n)
+    results.add(case, "smoother", "not_converged", "1", sum(not s.ok for s in scores), n)

@@ -1,0 +1,164 @@
+"""What a benchmark hands over: rows of numbers, as `results.json` and as a table on the terminal."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import platform
+import sys
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any, TextIO
+
+from ballfg.benchmarks.metrics import Figure
+
+PACKAGES = ("ballfg", "gtsam", "torch", "numpy", "scipy", "filterpy")
+RESULTS_FILE = "results.json"
+CURVE_MARK = "@"
+"""In a metric's name before the place on a curve, as in `velocity_rmse_newest@20`: pictures show it, tables do not."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One number.
+
+    Attributes:
+        case: names the data (`paper`, `fair`, `aimy` ...).
+        method: what produced it (`smoother`, `ekf` ...).
+        metric: what it is.
+        unit: SI, or `1` for none.
+        value: None where it is not finite.
+        low: lower end of its interval, None where it has none.
+        high: upper end.
+        n: how many tracks, samples or runs it is over; docs/benchmarks.md says which for each metric.
+    """
+
+    case: str
+    method: str
+    metric: str
+    unit: str
+    value: float | None
+    low: float | None
+    high: float | None
+    n: int
+
+
+@dataclass
+class Results:
+    """Everything that one run of a benchmark measured.
+
+    Attributes:
+        command: as typed, with a dataset's folder name in place of its path.
+        seed: of every random choice.
+        rows: one a number.
+    """
+
+    command: str
+    seed: int
+    rows: list[Row] = field(default_factory=list)
+
+    def add(self, case: str, method: str, metric: str, unit: str, value: float | Figure, n: int) -> None:
+        """Add a number; a `Figure` brings its interval."""
+        figure = value if isinstance(value, Figure) else Figure(float(value), math.nan, math.nan)
+        finite = [float(x) if math.isfinite(x) else None for x in (figure.value, figure.low, figure.high)]
+        self.rows.append(Row(case, method, metric, unit, *finite, n=int(n)))
+
+    def value(self, case: str, method: str, metric: str) -> float | None:
+        """The value of a row. Raises: KeyError: if there is no such row."""
+        for row in self.rows:
+            if (row.case, row.method, row.metric) == (case, method, metric):
+                return row.value
+        raise KeyError(f"no row ({case}, {method}, {metric})")
+
+    def to_dict(self) -> dict[str, Any]:
+        """The content of `results.json`."""
+        return {
+            "command": self.command,
+            "versions": versions(),
+            "machine": machine(),
+            "seed": self.seed,
+            "rows": [asdict(row) for row in self.rows],
+        }
+
+    def write(self, folder: Path) -> Path:
+        """Write `results.json`; the name appears once the file is whole."""
+        folder.mkdir(parents=True, exist_ok=True)
+        path, part = folder / RESULTS_FILE, folder / f".{RESULTS_FILE}.part"
+        part.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        os.replace(part, path)
+        return path
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that the numbers depend on."""
+    return {"python": platform.python_version()} | {name: metadata.version(name) for name in PACKAGES}
+
+
+def machine() -> dict[str, Any]:
+    """Processor and cores that this process may use; nothing that tells one user's machine from another's."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"cpu": _cpu_model(), "cores": cores, "system": f"{platform.system()} {platform.machine()}"}
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return platform.processor() or "unknown"
+    found = (line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
+    return next(found, platform.processor() or "unknown")
+
+
+def print_table(rows: Iterable[Row], stream: TextIO | None = None) -> None:
+    """One table a case, a line per metric and a column per method; drawn on a terminal, plain text elsewhere."""
+    stream = stream or sys.stdout
+    shown = [row for row in rows if CURVE_MARK not in row.metric]
+    for case in dict.fromkeys(row.case for row in shown):
+        of_case = [row for row in shown if row.case == case]
+        columns, lines = _pivot(of_case)
+        if stream.isatty():
+            _print_rich(case, columns, lines, stream)
+        else:
+            _print_plain(case, columns, lines, stream)
+
+
+def _pivot(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
+    """Column heads, and lines of cells: metric, unit, one cell a method."""
+    methods = list(dict.fromkeys(row.method for row in rows))
+    keys = list(dict.fromkeys((row.metric, row.unit) for row in rows))
+    cells = {(row.metric, row.unit, row.method): _cell(row) for row in rows}
+    lines = [[metric, unit, *(cells.get((metric, unit, m), "") for m in methods)] for metric, unit in keys]
+    return ["metric", "unit", *methods], lines
+
+
+def _cell(row: Row) -> str:
+    text = _number(row.value)
+    return text if row.low is None or row.high is None else f"{text} [{_number(row.low)}, {_number(row.high)}]"
+
+
+def _number(value: float | None) -> str:
+    if value is None:
+        return "-"
+    return f"{value:.0f}" if value == int(value) and abs(value) < 1e6 else f"{value:.3g}"
+
+
+def _print_plain(case: str, columns: list[str], lines: list[list[str]], stream: TextIO) -> None:
+    widths = [max(len(line[i]) for line in [columns, *lines]) for i in range(len(columns))]
+    print(f"\n{case}", file=stream)
+    for line in [columns, *lines]:
+        print("  ".join(cell.ljust(width) for cell, width in zip(line, widths, strict=True)).rstrip(), file=stream)
+
+
+def _print_rich(case: str, columns: list[str], lines: list[list[str]], stream: TextIO) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=case, title_justify="left")
+    for i, name in enumerate(columns):
+        table.add_column(name, overflow="fold", justify="left" if i < 2 else "right")
+    for line in lines:
+        table.add_row(*line)
+    Console(file=stream).print(table)

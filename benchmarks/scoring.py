@@ -1,0 +1,146 @@
+"""Errors of estimates against the truth, track by track, on all cores."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import joblib
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ballfg.benchmarks.metrics import inside, nees, square_norms
+from ballfg.cli.progress import progress
+from ballfg.estimate import Estimator, Status
+from ballfg.simulate import SimulatedTrack
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+from ballfg.tracks import Track
+
+Array = NDArray[np.float64]
+
+LEVELS = (0.5, 0.9)
+"""Of the intervals whose coverage is reported."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """An estimator in a comparison.
+
+    Attributes:
+        estimator: with its settings.
+        causal: its state at a sample depends on no later sample, so that one pass over a track gives the newest state
+            for every number of observations. The others estimate the first k samples anew for each k.
+    """
+
+    estimator: Estimator
+    causal: bool = False
+
+
+@dataclass(frozen=True)
+class TrackScore:
+    """The errors of one estimate of n samples.
+
+    Attributes:
+        velocity: (n,) m/s, length of the error.  position: (n,) m.  spin: (n,) rad/s.
+        nees: (n,) of the whole state, 9 degrees of freedom.  velocity_nees: (n,) 3 degrees of freedom.
+        covered: (levels, n, 9) whether each component lies in the central interval of each of `LEVELS`.
+        newest: (k,) m/s, velocity error at the newest sample for each number of observations; NaN beyond the track.
+        ok: the estimation ended well.
+    """
+
+    velocity: Array
+    position: Array
+    spin: Array
+    nees: Array
+    velocity_nees: Array
+    covered: NDArray[np.bool_]
+    newest: Array
+    ok: bool
+
+
+Scores = dict[str, list[TrackScore]]
+"""By method, in the order of the tracks."""
+
+
+def score_tracks(
+    candidates: Mapping[str, Candidate], tracks: Sequence[SimulatedTrack], counts: Sequence[int], jobs: int, what: str
+) -> Scores:
+    """Scores of every candidate on every track.
+
+    Args:
+        candidates: by method.
+        tracks: with their truth.
+        counts: numbers of observations for `TrackScore.newest`.
+        jobs: processes.
+        what: for the progress line.
+    """
+    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator", batch_size=1)
+    scored = parallel(joblib.delayed(_score_all)(candidates, track, counts) for track in tracks)
+    per_track = list(progress(scored, len(tracks), what))
+    return {name: [scores[name] for scores in per_track] for name in candidates}
+
+
+def _score_all(
+    candidates: Mapping[str, Candidate], simulated: SimulatedTrack, counts: Sequence[int]
+) -> dict[str, TrackScore]:
+    torch.set_num_threads(1)  # the processes share the cores already
+    return {name: score_track(candidate, simulated, counts) for name, candidate in candidates.items()}
+
+
+def score_track(candidate: Candidate, simulated: SimulatedTrack, counts: Sequence[int]) -> TrackScore:
+    """Score of one estimator on one track. The estimator sees the measured track, never the truth."""
+    truth = simulated.true_states
+    estimate = candidate.estimator.estimate(simulated.track)
+    errors = estimate.states - truth
+    covariances = estimate.covariances
+    speed_error = np.sqrt(square_norms(errors[:, VELOCITY]))
+    return TrackScore(
+        velocity=speed_error,
+        position=np.sqrt(square_norms(errors[:, POSITION])),
+        spin=np.sqrt(square_norms(errors[:, SPIN])),
+        nees=nees(errors, covariances),
+        velocity_nees=nees(errors[:, VELOCITY], covariances[:, VELOCITY, VELOCITY]),
+        covered=np.stack([inside(errors, estimate.sigmas, level) for level in LEVELS]),
+        newest=_newest(candidate, simulated.track, truth, speed_error, counts),
+        ok=estimate.status is Status.OK,
+    )
+
+
+def _newest(candidate: Candidate, track: Track, truth: Array, whole: Array, counts: Sequence[int]) -> Array:
+    """(k,) m/s: velocity error at sample k - 1 when k samples were seen."""
+    found = np.full(len(counts), np.nan)
+    for i, count in enumerate(counts):
+        if count > len(track):
+            continue
+        if candidate.causal:
+            found[i] = whole[count - 1]
+        else:
+            seen = candidate.estimator.estimate(track.until(float(track.times[count - 1])))
+            found[i] = np.linalg.norm(seen.states[-1, VELOCITY] - truth[count - 1, VELOCITY])
+    return found
+
+
+def joined(scores: Sequence[TrackScore], name: str, skip: int = 0) -> tuple[Array, Array]:
+    """For each track the sum of squares of an error and the number of samples, the first `skip` left out.
+
+    Args: scores: of one method.  name: `velocity`, `position` or `spin`.  skip: samples.
+    """
+    errors = [getattr(score, name)[skip:] for score in scores]
+    return np.array([float((e**2).sum()) for e in errors]), np.array([float(len(e)) for e in errors])
+
+
+def summed(scores: Sequence[TrackScore], name: str, skip: int = 0) -> tuple[Array, Array]:
+    """For each track the sum of `nees` or `velocity_nees` and the number of samples, the first `skip` left out."""
+    values = [getattr(score, name)[skip:] for score in scores]
+    return np.array([float(v.sum()) for v in values]), np.array([float(len(v)) for v in values])
+
+
+def covered(scores: Sequence[TrackScore], level: int, block: slice, skip: int = 0) -> tuple[Array, Array]:
+    """For each track how many components of a block lie in the interval of `LEVELS[level]`, and how many there are."""
+    values = [score.covered[level, skip:, block] for score in scores]
+    return np.array([float(v.sum()) for v in values]), np.array([float(v.size) for v in values])
+
+
+BLOCKS = {"state": slice(0, STATE_DIM), "velocity": VELOCITY}
+"""Components whose coverage is reported."""
