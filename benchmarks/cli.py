@@ -29,7 +29,7 @@ Data = Annotated[Path | None, typer.Option("--data", help="Dataset of measured t
 Out = Annotated[Path, typer.Option("--out", help="Folder for results.json and pictures.")]
 Quick = Annotated[bool, typer.Option("--quick", help="Fewer tracks or runs: a look, not a measurement.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Of every random choice.")]
-Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Processes.", show_default="one per core")]
+Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes; one per core without it.")]
 
 
 @app.callback(invoke_without_command=True)
@@ -41,7 +41,7 @@ def _root(context: typer.Context) -> None:
 
 @app.command()
 def estimators(
-    data: Data = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = default_jobs()
+    data: Data = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = None
 ) -> None:
     """Sliding window, EKF, RTS, online and smoother on the same tracks.
 
@@ -53,16 +53,16 @@ def estimators(
     from ballfg.benchmarks.estimators import FULL, QUICK, run_dataset, run_synthetic
 
     results = _start("estimators", data, quick, seed)
-    size = QUICK if quick else FULL
+    size, processes = QUICK if quick else FULL, jobs or default_jobs()
     if data is None:
-        pictures = run_synthetic(results, _folder(out), size, jobs)
+        pictures = run_synthetic(results, _folder(out), size, processes)
     else:
         from ballfg.tracks import read_dataset
 
         dataset = read_dataset(data)
         for note in dataset.notes:
             print(f"note: {note}", file=sys.stderr)
-        pictures = run_dataset(results, dataset, _folder(out), size, jobs)
+        pictures = run_dataset(results, dataset, _folder(out), size, processes)
     _finish(results, out, pictures)
 
 

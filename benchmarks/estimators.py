@@ -6,18 +6,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from ballfg.benchmarks.consistency import run_consistency
 from ballfg.benchmarks.measured import HORIZON, OBSERVE, run_measured
 from ballfg.benchmarks.protocols import (
     COUNTS,
-    add_consistency,
     fair_candidates,
     paper_candidates,
     run_protocol,
 )
 from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.scoring import Candidate, score_tracks
+from ballfg.benchmarks.step_noise import StepNoise
 from ballfg.benchmarks.synthetic import Protocol, fair_protocol, paper_protocol
-from ballfg.estimate import Settings, Smoother
+from ballfg.dynamics import nominal_model
+from ballfg.estimate import Settings, dataset_settings
+from ballfg.factors.noise import ProcessNoise
 from ballfg.tracks import Dataset
 
 
@@ -55,16 +57,14 @@ def run_synthetic(results: Results, out: Path, size: Size, jobs: int) -> list[Pa
     run_protocol(results, paper, paper_candidates(paper), jobs, size.counts)
     run_protocol(results, fair, fair_candidates(fair), jobs, size.counts)
     many = fair_protocol(size.consistency, results.seed + CONSISTENCY_SEED, name="consistency")
-    smoother = {"smoother": Candidate(Smoother(many.model, many.surfaces, many.settings))}
-    scores = score_tracks(smoother, many.tracks, (), jobs, "synthetic tracks estimated (consistency)")
-    add_consistency(results, many.name, scores["smoother"])
+    run_consistency(results, many, jobs)
     titles = {
-        paper: "paper's protocol: free flight, true dynamics and spin known",
-        fair: "fair protocol: bounces, declared noise, same settings for all",
+        paper.name: "paper's protocol: free flight, true dynamics and spin known",
+        fair.name: "fair protocol: bounces, declared noise, same settings for all",
     }
     return [
-        observations_picture(results.rows, protocol.name, title, out / f"estimators_{protocol.name}.png")
-        for protocol, title in titles.items()
+        observations_picture(results.rows, name, title, out / f"estimators_{name}.png")
+        for name, title in titles.items()
     ]
 
 
@@ -72,6 +72,7 @@ def run_dataset(results: Results, dataset: Dataset, out: Path, size: Size, jobs:
     """Measured tracks. Returns: the pictures written."""
     from ballfg.benchmarks.pictures import calibration_picture, growth_picture, tracks_picture
 
+    print(measured_heading(dataset))
     measured = run_measured(results, dataset, size.measured, jobs)
     if measured.unseen:
         print(f"{measured.unseen} tracks end within the observed {OBSERVE:g} s: nothing to predict")
@@ -99,8 +100,8 @@ def describe_settings(settings: Settings) -> str:
     noise, process = settings.position_noise, settings.process
     parts = [
         f"position noise {' / '.join(f'{1e3 * s:.2g}' for s in noise)} mm",
-        ", ".join(f"{name} {value:g}" for name, value in vars(process).items() if not name.startswith("hit")),
-        f"spin label {settings.spin_label_noise:g} rad/s",
+        "process noise " + ", ".join(f"{name} {value:g}" for name, value in _noise_terms(process)),
+        f"spin label {settings.spin_label_noise:g} rad/s, spin prior {settings.spin_prior:g} rad/s",
         f"velocity prior {settings.velocity_prior:g} m/s",
         f"{settings.loss.name} loss",
     ]
@@ -109,6 +110,14 @@ def describe_settings(settings: Settings) -> str:
     return "; ".join(parts)
 
 
-def measured_heading(name: str, count: int, settings: Settings) -> str:
+def _noise_terms(process: ProcessNoise) -> list[tuple[str, float]]:
+    """The terms that act, by name, SI units."""
+    unused = ("acceleration", "contact", "hit") if isinstance(process, StepNoise) else ()
+    return [(name, value) for name, value in vars(process).items() if value and not name.startswith(unused)]
+
+
+def measured_heading(dataset: Dataset) -> str:
     """One line with what all estimators are told about measured tracks."""
-    return f"{name}: {count} tracks, {OBSERVE:g} s observed, {HORIZON:g} s predicted; {describe_settings(settings)}"
+    settings = dataset_settings(dataset, nominal_model(dataset.info.ball.radius))
+    what = f"{OBSERVE:g} s observed, {HORIZON:g} s predicted, nominal model"
+    return f"{dataset.info.name}: {len(dataset)} tracks; {what}; {describe_settings(settings)}"

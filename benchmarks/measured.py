@@ -1,9 +1,10 @@
-"""The comparison on measured tracks, where no truth exists: predict what was measured later, and check the intervals."""
+"""The comparison on measured tracks, where no truth exists: predict what was measured later."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,7 +157,7 @@ def _add_nis(results: Results, case: str, method: str, estimates: Sequence[Estim
 
 def _add_growth(results: Results, case: str, method: str, predictions: Sequence[TrackPrediction]) -> None:
     """Median and quartiles over tracks of the error in each bin of the horizon."""
-    for low, high in zip(BINS[:-1], BINS[1:], strict=True):
+    for low, high in pairwise(BINS):
         errors = []
         for p in predictions:
             now = (elapsed(p) > low) & (elapsed(p) <= high)

@@ -1,8 +1,9 @@
-"""A small network in place of the aerodynamics, fitted to the analytic model: what a learned model costs an estimator."""
+"""A small network in place of the aerodynamics, fitted to the analytic model: what a learned model costs."""
 
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import torch
 from torch import Tensor, nn
@@ -37,9 +38,7 @@ class NetworkFlight(BallModel):
         super().__init__(bounces.radius, bounces.inertia_factor)
         self.bounces = bounces
         sizes = (9, HIDDEN, HIDDEN, 3)
-        self.layers = nn.ModuleList(
-            nn.Linear(i, o, dtype=torch.float64) for i, o in zip(sizes[:-1], sizes[1:], strict=True)
-        )
+        self.layers = nn.ModuleList(nn.Linear(i, o, dtype=torch.float64) for i, o in pairwise(sizes))
         with torch.no_grad():
             for layer in self.layers:
                 assert isinstance(layer, nn.Linear)

@@ -8,15 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from ballfg.benchmarks.measured import HORIZON, OBSERVE, Measured
+from ballfg.benchmarks.results import CURVE_MARK, Row
+from ballfg.predict import TrackPrediction
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
-import numpy as np  # noqa: E402
-from matplotlib.figure import Figure  # noqa: E402
-
-from ballfg.benchmarks.measured import HORIZON, OBSERVE, Measured  # noqa: E402
-from ballfg.benchmarks.results import CURVE_MARK, Row  # noqa: E402
-from ballfg.predict import TrackPrediction  # noqa: E402
 
 DPI = 130
 COLOURS = {
@@ -67,9 +69,17 @@ def observations_picture(rows: list[Row], case: str, title: str, path: Path) -> 
         low = np.maximum(mean - deviation, 0.05 * mean)  # a logarithmic axis has no place for zero
         axes.fill_between(counts, low, mean + deviation, color=COLOURS[method], alpha=0.13, linewidth=0)
     axes.set(xlabel="number of observations", ylabel="velocity error at the newest one, m/s", yscale="log", title=title)
-    axes.grid(visible=True, which="both", alpha=0.25)
+    _plain_ticks(axes)
     axes.legend(title="mean, band: one standard deviation over tracks", ncols=3, fontsize="small")
     return save(figure, path)
+
+
+def _plain_ticks(axes: Axes) -> None:
+    """Numbers as 0.05, not as powers of ten, at 1, 2 and 5 of each decade of the vertical axis."""
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.grid(visible=True, which="major", alpha=0.25)
 
 
 def _line(method: str) -> dict[str, Any]:
@@ -100,7 +110,7 @@ def growth_picture(rows: list[Row], measured: Measured, path: Path) -> Path:
         yscale="log",
         title=f"{measured.name}: error over the horizon, median and quartiles of {_count(measured)} tracks",
     )
-    axes.grid(visible=True, which="both", alpha=0.25)
+    _plain_ticks(axes)
     axes.legend()
     return save(figure, path)
 

@@ -8,10 +8,8 @@ import numpy as np
 
 from ballfg.benchmarks.metrics import (
     Array,
-    Figure,
     Statistic,
     bootstrap,
-    chi_square_band,
     pooled_mean,
     pooled_rms,
     ratio,
@@ -24,21 +22,17 @@ from ballfg.benchmarks.scoring import (
     Scores,
     TrackScore,
     covered,
-    joined,
+    every,
     score_tracks,
-    summed,
+    sums,
 )
 from ballfg.benchmarks.synthetic import Protocol
 from ballfg.estimate import ExtendedKalmanFilter, Online, SlidingWindow, Smoother
-from ballfg.estimate.sliding_window import WINDOW
-from ballfg.state import STATE_DIM
 
 COUNTS = (5, 6, 7, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 70, 80)
 """Numbers of observations on the curves."""
 SETTLED = 20
 """Observations from which on the errors at the newest sample are pooled into one number."""
-PLACES = {"first": 0.0, "quarter": 0.25, "middle": 0.5, "three_quarters": 0.75, "last": 1.0}
-"""Where on a track the consistency is tested, as a share of its samples."""
 
 
 def paper_candidates(protocol: Protocol) -> dict[str, Candidate]:
@@ -82,8 +76,8 @@ def run_protocol(
 def add_rows(results: Results, case: str, scores: Scores, counts: Sequence[int]) -> None:
     """RMSE, ratios, NEES, coverage, and the curve over the number of observations.
 
-    Samples before the window of five is full are left out, unless the metric's name says `all`: there the filter and
-    the window know next to nothing, which would flatter every smoother.
+    Left out, unless the metric's name says `all`: samples before the window of five is full, where filter and window
+    know next to nothing, which would flatter every smoother; and samples at a bounce (`synthetic.AT_BOUNCE`).
     """
     rng = np.random.default_rng([results.seed, 2])
     for method, of_method in scores.items():
@@ -97,19 +91,18 @@ def add_rows(results: Results, case: str, scores: Scores, counts: Sequence[int])
 
 def _statistics(scores: Sequence[TrackScore], counts: Sequence[int]) -> list[tuple[str, Statistic, str]]:
     """Metric, statistic and unit of everything that is pooled over samples."""
-    skip = WINDOW - 1
     found = [
-        ("velocity_rmse", pooled_rms(*joined(scores, "velocity", skip)), "m/s"),
-        ("velocity_rmse_all", pooled_rms(*joined(scores, "velocity")), "m/s"),
+        ("velocity_rmse", pooled_rms(*sums(scores, "velocity", 2)), "m/s"),
+        ("velocity_rmse_all", pooled_rms(*sums(scores, "velocity", 2, every)), "m/s"),
         ("velocity_rmse_newest", pooled_rms(*newest_sums(scores, counts)), "m/s"),
-        ("position_rmse", pooled_rms(*joined(scores, "position", skip)), "m"),
-        ("spin_rmse", pooled_rms(*joined(scores, "spin", skip)), "rad/s"),
-        ("nees", pooled_mean(*summed(scores, "nees", skip)), "1"),
-        ("nees_velocity", pooled_mean(*summed(scores, "velocity_nees", skip)), "1"),
+        ("position_rmse", pooled_rms(*sums(scores, "position", 2)), "m"),
+        ("spin_rmse", pooled_rms(*sums(scores, "spin", 2)), "rad/s"),
+        ("nees", pooled_mean(*sums(scores, "nees", 1)), "1"),
+        ("nees_velocity", pooled_mean(*sums(scores, "velocity_nees", 1)), "1"),
     ]
     for i, level in enumerate(LEVELS):
         for block, columns in BLOCKS.items():
-            share = pooled_mean(*covered(scores, i, columns, skip))
+            share = pooled_mean(*covered(scores, i, columns))
             found.append((f"coverage_{100 * level:.0f}_{block}", share, "1"))
     return found
 
@@ -133,9 +126,7 @@ def _add_curve(results: Results, case: str, method: str, scores: Sequence[TrackS
             results.add(case, method, f"velocity_{name}_newest{CURVE_MARK}{count}", "m/s", float(value), len(seen))
 
 
-def _add_ratios(
-    results: Results, case: str, scores: Scores, counts: Sequence[int], rng: np.random.Generator
-) -> None:
+def _add_ratios(results: Results, case: str, scores: Scores, counts: Sequence[int], rng: np.random.Generator) -> None:
     """The smoother's velocity RMSE divided by each other method's; below one, the smoother is better."""
     statistics = {
         method: {name: statistic for name, statistic, unit in _statistics(of_method, counts) if unit == "m/s"}
@@ -148,24 +139,3 @@ def _add_ratios(
             if method != "smoother":
                 figure = bootstrap(ratio(statistic, statistics[method][metric]), n, rng)
                 results.add(case, "smoother", f"{metric}_vs_{method}", "1", figure, n)
-
-
-def add_consistency(results: Results, case: str, scores: Sequence[TrackScore]) -> None:
-    """NEES of the smoother against chi-square bands.
-
-    At one sample of each track the NEES are independent from track to track, so that their mean has an exact band;
-    low and high are its ends. Samples of one track are not independent: the mean over all of them has the interval of
-    a bootstrap over tracks.
-    """
-    n = len(scores)
-    band = chi_square_band(STATE_DIM, n)
-    outside = 0
-    for place, share in PLACES.items():
-        values = [score.nees[round(share * (len(score.nees) - 1))] for score in scores]
-        mean = float(np.mean(values))
-        outside += not band[0] <= mean <= band[1]
-        results.add(case, "smoother", f"nees_{place}", "1", Figure(mean, *band), n)
-    figure = bootstrap(pooled_mean(*summed(scores, "nees")), n, np.random.default_rng([results.seed, 3]))
-    results.add(case, "smoother", "nees", "1", figure, n)
-    results.add(case, "smoother", "nees_places_outside_99", "1", outside, n)
-    results.add(case, "smoother", "not_converged", "1", sum(not s.ok for s in scores), n)

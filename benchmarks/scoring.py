@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import joblib
@@ -11,11 +11,11 @@ import torch
 from numpy.typing import NDArray
 
 from ballfg.benchmarks.metrics import inside, nees, square_norms
+from ballfg.benchmarks.synthetic import Case
 from ballfg.cli.progress import progress
 from ballfg.estimate import Estimator, Status
-from ballfg.simulate import SimulatedTrack
+from ballfg.estimate.sliding_window import WINDOW
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
-from ballfg.tracks import Track
 
 Array = NDArray[np.float64]
 
@@ -45,6 +45,7 @@ class TrackScore:
         velocity: (n,) m/s, length of the error.  position: (n,) m.  spin: (n,) rad/s.
         nees: (n,) of the whole state, 9 degrees of freedom.  velocity_nees: (n,) 3 degrees of freedom.
         covered: (levels, n, 9) whether each component lies in the central interval of each of `LEVELS`.
+        away: (n,) the sample is not at a bounce (`away_from_bounces`).
         newest: (k,) m/s, velocity error at the newest sample for each number of observations; NaN beyond the track.
         ok: the estimation ended well.
     """
@@ -55,6 +56,7 @@ class TrackScore:
     nees: Array
     velocity_nees: Array
     covered: NDArray[np.bool_]
+    away: NDArray[np.bool_]
     newest: Array
     ok: bool
 
@@ -64,7 +66,7 @@ Scores = dict[str, list[TrackScore]]
 
 
 def score_tracks(
-    candidates: Mapping[str, Candidate], tracks: Sequence[SimulatedTrack], counts: Sequence[int], jobs: int, what: str
+    candidates: Mapping[str, Candidate], tracks: Sequence[Case], counts: Sequence[int], jobs: int, what: str
 ) -> Scores:
     """Scores of every candidate on every track.
 
@@ -81,17 +83,15 @@ def score_tracks(
     return {name: [scores[name] for scores in per_track] for name in candidates}
 
 
-def _score_all(
-    candidates: Mapping[str, Candidate], simulated: SimulatedTrack, counts: Sequence[int]
-) -> dict[str, TrackScore]:
+def _score_all(candidates: Mapping[str, Candidate], case: Case, counts: Sequence[int]) -> dict[str, TrackScore]:
     torch.set_num_threads(1)  # the processes share the cores already
-    return {name: score_track(candidate, simulated, counts) for name, candidate in candidates.items()}
+    return {name: score_track(candidate, case, counts) for name, candidate in candidates.items()}
 
 
-def score_track(candidate: Candidate, simulated: SimulatedTrack, counts: Sequence[int]) -> TrackScore:
+def score_track(candidate: Candidate, case: Case, counts: Sequence[int]) -> TrackScore:
     """Score of one estimator on one track. The estimator sees the measured track, never the truth."""
-    truth = simulated.true_states
-    estimate = candidate.estimator.estimate(simulated.track)
+    truth = case.true_states
+    estimate = candidate.estimator.estimate(case.track)
     errors = estimate.states - truth
     covariances = estimate.covariances
     speed_error = np.sqrt(square_norms(errors[:, VELOCITY]))
@@ -102,43 +102,59 @@ def score_track(candidate: Candidate, simulated: SimulatedTrack, counts: Sequenc
         nees=nees(errors, covariances),
         velocity_nees=nees(errors[:, VELOCITY], covariances[:, VELOCITY, VELOCITY]),
         covered=np.stack([inside(errors, estimate.sigmas, level) for level in LEVELS]),
-        newest=_newest(candidate, simulated.track, truth, speed_error, counts),
+        away=case.away,
+        newest=_newest(candidate, case, speed_error, counts),
         ok=estimate.status is Status.OK,
     )
 
 
-def _newest(candidate: Candidate, track: Track, truth: Array, whole: Array, counts: Sequence[int]) -> Array:
+def _newest(candidate: Candidate, case: Case, whole: Array, counts: Sequence[int]) -> Array:
     """(k,) m/s: velocity error at sample k - 1 when k samples were seen."""
+    track = case.track
     found = np.full(len(counts), np.nan)
     for i, count in enumerate(counts):
-        if count > len(track):
+        if count > len(track) or not case.away[count - 1]:
             continue
         if candidate.causal:
             found[i] = whole[count - 1]
         else:
             seen = candidate.estimator.estimate(track.until(float(track.times[count - 1])))
-            found[i] = np.linalg.norm(seen.states[-1, VELOCITY] - truth[count - 1, VELOCITY])
+            found[i] = np.linalg.norm(seen.states[-1, VELOCITY] - case.true_states[count - 1, VELOCITY])
     return found
 
 
-def joined(scores: Sequence[TrackScore], name: str, skip: int = 0) -> tuple[Array, Array]:
-    """For each track the sum of squares of an error and the number of samples, the first `skip` left out.
+def judged(score: TrackScore) -> NDArray[np.bool_]:
+    """(n,) the samples that are judged: the sliding window is full, and no bounce is at them."""
+    mask = score.away.copy()
+    mask[: WINDOW - 1] = False
+    return mask
 
-    Args: scores: of one method.  name: `velocity`, `position` or `spin`.  skip: samples.
+
+def every(score: TrackScore) -> NDArray[np.bool_]:
+    """(n,) all samples."""
+    return np.ones_like(score.away)
+
+
+Selection = Callable[[TrackScore], NDArray[np.bool_]]
+"""Which samples count."""
+
+
+def sums(scores: Sequence[TrackScore], name: str, power: int, select: Selection = judged) -> tuple[Array, Array]:
+    """For each track the sum of a field to a power, and the number of samples.
+
+    Args:
+        scores: of one method.
+        name: field of `TrackScore`, for instance `velocity` (power 2 for an RMSE) or `nees` (power 1 for a mean).
+        power: 1 or 2.
+        select: which samples.
     """
-    errors = [getattr(score, name)[skip:] for score in scores]
-    return np.array([float((e**2).sum()) for e in errors]), np.array([float(len(e)) for e in errors])
-
-
-def summed(scores: Sequence[TrackScore], name: str, skip: int = 0) -> tuple[Array, Array]:
-    """For each track the sum of `nees` or `velocity_nees` and the number of samples, the first `skip` left out."""
-    values = [getattr(score, name)[skip:] for score in scores]
+    values = [getattr(score, name)[select(score)] ** power for score in scores]
     return np.array([float(v.sum()) for v in values]), np.array([float(len(v)) for v in values])
 
 
-def covered(scores: Sequence[TrackScore], level: int, block: slice, skip: int = 0) -> tuple[Array, Array]:
+def covered(scores: Sequence[TrackScore], level: int, block: slice) -> tuple[Array, Array]:
     """For each track how many components of a block lie in the interval of `LEVELS[level]`, and how many there are."""
-    values = [score.covered[level, skip:, block] for score in scores]
+    values = [score.covered[level, judged(score), block] for score in scores]
     return np.array([float(v.sum()) for v in values]), np.array([float(v.size) for v in values])
 
 

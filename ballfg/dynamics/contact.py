@@ -8,6 +8,8 @@ to the third, so that both the saltation term of a Jacobian and the Hessian of a
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor
 
@@ -27,22 +29,27 @@ LEAST_FALL = 1.0
 """m/s^2. The search takes a ball to fall at least as fast as this."""
 LONGEST_FALL = 20.0
 """s. A contact further away counts as none."""
+BEYOND = 0.3
+"""s. A contact this far outside the interval that it was named for is no continuation of it any more."""
 MIN_SPEED = 1e-6
 """m/s. Least normal speed that a Newton step divides by; a ball that grazes more gently is at its apex."""
 
 
-def contact_time(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
+def contact_time(
+    model: BallModel, state: Tensor, height: Tensor | float, longest: float = LONGEST_FALL
+) -> Tensor:
     """Time until the falling ball touches a surface, on the branch on which it moves down.
 
-    Args: model: the ball.  state: (..., 9).  height: m, scalar or (...).
+    Args: model: the ball.  state: (..., 9).  height: m, scalar or (...).  longest: s, how far away to look.
     Returns: (...) s; negative when the ball is already below the surface on its way down. NaN where the ball,
-        in free flight, does not come down to that height within `LONGEST_FALL`. Differentiable in the state and the
+        in free flight, does not come down to that height within `longest`. Differentiable in the state and the
         parameters.
     """
     with torch.no_grad():
-        tau = _search(model, state, height, torch.zeros_like(state[..., Z]))
+        tau = _search(model, state, height, torch.zeros_like(state[..., Z]), longest)
         if bool(tau.isnan().any()):  # rare: lift above the weight, near misses, or no contact at all
-            scanned = _search(model, state, height, _scan(model, state, height, tau.isnan()))
+            start = _scan(model, state, height, tau.isnan(), longest)
+            scanned = _search(model, state, height, start, longest)
             tau = torch.where(tau.isnan(), scanned, tau)
     if torch.is_grad_enabled():
         for _ in range(2):
@@ -50,7 +57,7 @@ def contact_time(model: BallModel, state: Tensor, height: Tensor | float) -> Ten
     return tau
 
 
-def _search(model: BallModel, state: Tensor, height: Tensor | float, start: Tensor) -> Tensor:
+def _search(model: BallModel, state: Tensor, height: Tensor | float, start: Tensor, longest: float) -> Tensor:
     """Contact times (...) s near the times `start`, each step solving the parabola through the ball's motion there.
 
     NaN where the search does not arrive, or starts at NaN.
@@ -70,7 +77,7 @@ def _search(model: BallModel, state: Tensor, height: Tensor | float, start: Tens
             move.abs() < MIN_SPEED
         )
         tau = tau + move
-        lost |= ~(tau.abs() <= LONGEST_FALL)
+        lost |= ~(tau.abs() <= longest)
         if bool((arrived | lost).all()):
             break
         tau = tau.masked_fill(lost, 0.0)
@@ -78,7 +85,7 @@ def _search(model: BallModel, state: Tensor, height: Tensor | float, start: Tens
     return tau.masked_fill(lost | ~arrived, torch.nan)
 
 
-def _scan(model: BallModel, state: Tensor, height: Tensor | float, wanted: Tensor) -> Tensor:
+def _scan(model: BallModel, state: Tensor, height: Tensor | float, wanted: Tensor, longest: float) -> Tensor:
     """Times (...) s within one step of the contact: small steps, back in time for a ball that falls below the surface.
 
     NaN where the ball is not `wanted` or turns before it gets there.
@@ -87,7 +94,7 @@ def _scan(model: BallModel, state: Tensor, height: Tensor | float, wanted: Tenso
     h = model.gap(state, height)
     step = torch.where((h < 0) & (state[..., VZ] < 0), -MAX_STEP, MAX_STEP).to(state.dtype)
     open_ = wanted.clone()
-    for i in range(round(LONGEST_FALL / MAX_STEP)):
+    for i in range(math.ceil(longest / MAX_STEP)):
         after = rk4_step(model.rates, state, step.unsqueeze(-1))
         h_after = model.gap(after, height)
         forward = step > 0
@@ -129,7 +136,7 @@ def fly_through(
     lost = torch.zeros_like(dt, dtype=torch.bool)
     times = []
     for height in heights:
-        tau = contact_time(model, state, height)
+        tau = contact_time(model, state, height, _reach(dt))
         lost = lost | tau.isnan()
         tau = tau.masked_fill(lost, 0.0)
         state = model.bounce(fly(model, state, tau))
@@ -156,7 +163,7 @@ def fly_through_jacobian(
     times = []
     for height in heights:
         with torch.no_grad():
-            tau = contact_time(model, state, height)
+            tau = contact_time(model, state, height, _reach(dt))
         before, flight = fly_jacobian(model, state, tau)
         jacobian = flight @ jacobian
         with torch.no_grad():
@@ -177,6 +184,11 @@ def fly_through_jacobian(
         rate = derivative(model.rates, after)
     jacobian = flight @ jacobian - rate.unsqueeze(-1) * elapsed_by_state
     return after, torch.stack(times, dim=-1), jacobian
+
+
+def _reach(dt: Tensor) -> float:
+    """How far, s, a contact that is meant to lie in intervals dt may lie away."""
+    return float(dt.abs().max()) + BEYOND
 
 
 def _gap_gradient(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:

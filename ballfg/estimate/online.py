@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,9 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
-from ballfg.estimate.online_events import EventTracker, contact_step, first_difference
-from ballfg.estimate.online_events import SIGMA_FACTOR
-from ballfg.estimate.online_final import Frozen, collect, solve_window
+from ballfg.estimate.online_events import SIGMA_FACTOR, EventTracker, contact_step, first_difference
+from ballfg.estimate.online_final import Frozen, final_estimate, freeze
 from ballfg.estimate.online_interval import FLIGHT, Motion, motions_of
 from ballfg.estimate.online_isam import Sample, Update
 from ballfg.estimate.online_window import Window
@@ -25,8 +24,8 @@ from ballfg.tracks import Track
 
 Array = NDArray[np.float64]
 
-LAG = 256
-"""States in the window: more than any one flight of the measured data has, 1.4 s at 180 Hz."""
+LAG = 128
+"""States that stay when the window is cut: 0.7 s at 180 Hz, after which new samples say nothing about an old state."""
 LATEST_CHANGE = 80
 """Samples. The segmenter's events are final after 64; nothing older is built again."""
 YOUNG = 20
@@ -71,7 +70,7 @@ class Online(Estimator):
 
     Args:
         model: the ball.  surfaces: what it may bounce on.  settings: noise and priors.
-        lag: states in the window; older ones are marginalised.
+        lag: the window is cut to this many states whenever it holds twice as many.
 
     Attributes:
         window: the samples, states and factors that are held; None before the first observation.
@@ -92,9 +91,8 @@ class Online(Estimator):
         """Forget everything: the next observation begins a new stream."""
         self.window: Window | None = None
         self.events = EventTracker(self.surfaces, self.physics, self.settings.find_events)
-        self._motions: list[Motion] = []
-        self._factors = np.zeros(0)
-        self._sigmas = np.zeros((0, 3))
+        self._samples: list[Sample] = []  # of the window, also while iSAM2 is out of order
+        self._frozen: list[Frozen] | None = None  # states that left the window, where someone asks for them
         self._counts = np.zeros(2, dtype=np.int64)
 
     def push(self, time: float, position: ArrayLike, sigma: ArrayLike | None = None) -> OnlineState:
@@ -112,109 +110,130 @@ class Online(Estimator):
     def _push(self, time: float, position: ArrayLike, sigma: ArrayLike | None, label: Array | None) -> OnlineState:
         own = None if sigma is None else np.asarray(sigma, dtype=np.float64)[None]
         spread = sample_sigmas(self.settings, 1, own)[0]
-        point = np.asarray(position, dtype=np.float64)
+        point = np.array(position, dtype=np.float64)
         changed = self.events.push(time, point, spread)  # also checks the numbers
         if self.window is None:
             self.window = Window(self.trackwise, self.settings, float(spread.min()))
         self._counts[:] = 0
-        sample = Sample(time, point, spread, label)
+        sample = Sample(time, point, spread, label=label)
+        self._samples.append(sample)
+        status, rebuilt = Status.OK if len(self._samples) > 1 else Status.NO_VELOCITY, False
         try:
-            revised, update, rebuilt = *self._take_in(self.window, sample, spread, changed), False
-        except (RuntimeError, ValueError) as error:
-            revised, update, rebuilt = len(self.window), self._repair(self.window, sample, error), True
-        return self._state(self.window, sample, update, revised, rebuilt)
+            revised, update = self._take_in(self.window, sample, changed)
+        except (RuntimeError, ValueError) as error:  # GTSAM's, the bridge's or the model's
+            rebuilt, revised = True, len(self._samples) - 1
+            status, update = self._repair(error, status)
+        return self._state(self.window, self._samples[-1], update, revised, rebuilt, status)
 
-    def _take_in(self, window: Window, sample: Sample, spread: Array, changed: bool) -> tuple[int, Update]:
-        """Explain, take back what is explained otherwise now, append, move contacts, keep the window's length."""
-        self._sigmas = np.concatenate((self._sigmas, spread[None]))
-        motion, factor, again = FLIGHT, 1.0, []
-        if changed:
-            motions, factors = self._explained(window, sample)
-            again = self._take_back(window, motions, factors)
-            motion, factor = (motions[-1] if motions else FLIGHT), float(factors[-1])
+    def _take_in(self, window: Window, sample: Sample, changed: bool) -> tuple[int, Update]:
+        """Explain, go back to where the explanation changed, append, move contacts, keep the window's length."""
+        again = self._explain(window) if changed else []
         for old in again:
-            self._append(window, old, self._motions[len(window) - 1] if len(window) else FLIGHT)
-        self._motions += [motion] if len(window) else []
-        self._factors = np.append(self._factors, factor)
-        sample.sigma = spread * factor
-        update = self._append(window, sample, motion)
+            self._append(window, old)
+        update = self._append(window, sample)
         self._move_contacts(window)
-        self._shorten(window)
+        if len(window) > 2 * self.lag:
+            if self._frozen is not None:
+                self._frozen += freeze(window, len(window) - self.lag)
+            window.shorten(self.lag)
+            self._samples = list(window.samples)
         return len(again), update
 
-    def _append(self, window: Window, sample: Sample, motion: Motion) -> Update:
-        update = window.append(sample, motion)
+    def _append(self, window: Window, sample: Sample) -> Update:
+        update = window.append(sample)
         self._counts += update.evaluated, update.calls
         return update
 
-    def _explained(self, window: Window, sample: Sample) -> tuple[list[Motion], Array]:
-        """The motions and noise factors that the events amount to, the new sample's last."""
-        times = np.append(window.times, sample.time)
-        positions = np.array([*(s.position for s in window.samples), sample.position])
+    def _explain(self, window: Window) -> list[Sample]:
+        """Lay the events over the samples; those from the first difference on are taken back and returned."""
+        samples, held = self._samples, len(window)
+        times, positions = np.array([s.time for s in samples]), np.array([s.position for s in samples])
         segmentation = self.events.segmentation(window.first, times, positions)
         motions = motions_of(self.events.moved(segmentation, window.first), times)
         factors = SIGMA_FACTOR[segmentation.quality]
-        settled = max(len(window) - LATEST_CHANGE, 0)
-        motions[:settled], factors[:settled] = self._motions[:settled], self._factors[:settled]
-        return motions, factors
-
-    def _take_back(self, window: Window, motions: list[Motion], factors: Array) -> list[Sample]:
-        """Go back to before the first sample that is explained otherwise; give others their new noise."""
-        n = len(window)
-        start = first_difference(self._motions, self._factors, motions, factors)
-        again = [] if start is None else window.retract(start)
-        changed = np.flatnonzero(self._factors != factors[:n])
-        for k in changed.tolist():
-            if k < len(window):
-                window.replace_sigma(k, self._sigmas[k] * factors[k])
-            else:
-                again[k - len(window)].sigma = self._sigmas[k] * factors[k]
-        self._motions, self._factors = motions[: max(n - 1, 0)], factors[:n]
+        settled = max(held - LATEST_CHANGE, 0)
+        motions[: max(settled - 1, 0)] = [s.motion for s in samples[1:settled]]
+        factors[:settled] = [s.factor for s in samples[:settled]]
+        start = first_difference(samples[:held], motions, factors)
+        reweighed = [k for k in range(held) if samples[k].factor != factors[k]]
+        for k, sample in enumerate(samples):
+            sample.factor = float(factors[k])
+            if k and (k >= held or not sample.motion.same(motions[k - 1])):
+                sample.motion = motions[k - 1]
+        again = [] if start is None else samples[max(start, 1) : held]
+        if again:
+            window.retract(max(start or 0, 1))
+        staying = [k for k in reweighed if k < len(window)]
+        if staying:
+            window.reweigh(staying)
         return again
 
     def _move_contacts(self, window: Window) -> None:
         """Put young contacts where the estimate says they are; the newest one may not have happened yet."""
-        for k in range(max(len(window) - 1 - YOUNG, 0), len(window) - 1):
-            motion = self._motions[k]
+        samples, n = window.samples, len(window)
+        for k in range(max(n - YOUNG, 1), n):
+            motion = samples[k].motion
             if len(motion.heights) != 1 or motion.hit:
                 continue
             (height,) = motion.heights
-            dt = window.samples[k + 1].time - window.samples[k].time
-            step = contact_step(window.theta[k] + window.delta[k], self.events.rise(height), dt)
+            state = window.theta[k - 1] + window.delta[k - 1]
+            step = contact_step(state, self.events.rise(height), samples[k].time - samples[k - 1].time)
             other = k + step
-            free = 0 <= other < len(self._motions) and self._motions[other] == FLIGHT
-            if step == 0 or not free or not self.events.move(window.first + k, height, step):
+            if step == 0 or not 1 <= other < n or samples[other].motion != FLIGHT:
                 continue
-            shift = window.samples[k].time - window.samples[other].time
-            there = Motion(motion.heights, (motion.times[0] + shift,))
-            window.replace_motion(k, FLIGHT)
-            window.replace_motion(other, there)
-            self._motions[k], self._motions[other] = FLIGHT, there
+            if self.events.move(window.first + k - 1, height, step):
+                shift = samples[k - 1].time - samples[other - 1].time
+                samples[k].motion, samples[other].motion = FLIGHT, Motion(motion.heights, (motion.times[0] + shift,))
+                window.replace_motions([k, other])
 
-    def _shorten(self, window: Window) -> None:
-        while len(window) > self.lag:
-            window.drop_oldest()
-            self._motions, self._factors, self._sigmas = self._motions[1:], self._factors[1:], self._sigmas[1:]
+    def _repair(self, error: Exception, status: Status) -> tuple[Status, Update]:
+        """Build the window anew from its samples; if that fails as well, begin a new one with the newest sample."""
+        assert self.window is not None
+        try:
+            return status, self.window.start_anew(self._samples)
+        except (RuntimeError, ValueError):
+            first = self.window.first + len(self._samples) - 1
+            newest = replace(self._samples[-1], motion=FLIGHT, slots=())
+        self.window = Window(self.trackwise, self.settings, float(newest.stated.min()))
+        self.window.first = first
+        self._samples = [newest]
+        try:
+            return Status.FAILED, self.window.append(newest)
+        except (RuntimeError, ValueError):
+            raise error from None
 
-    def _repair(self, window: Window, sample: Sample, error: Exception) -> Update:
-        """Build the window anew from its samples; if that fails as well, from the newest one."""
-        keep = len(window.samples)
-        if not any(s is sample for s in window.samples):
-            window.samples.append(sample)
-            keep += 1
-        raise NotImplementedError from error
-
-    def _state(self, window: Window, sample: Sample, update: Update, revised: int, rebuilt: bool) -> OnlineState:
+    def _state(
+        self, window: Window, sample: Sample, update: Update, revised: int, rebuilt: bool, status: Status
+    ) -> OnlineState:
         return OnlineState(
             time=sample.time,
             state=window.theta[-1] + window.delta[-1],
             covariance=window.newest_covariance[:STATE_DIM, :STATE_DIM].copy(),
             coefficients=window.coefficients,
             innovation=update.innovation,
-            motion=self._motions[-1] if self._motions else FLIGHT,
+            motion=sample.motion,
             revised=revised,
             evaluated=int(self._counts[0]),
             calls=int(self._counts[1]),
             rebuilt=rebuilt,
-            status=Status.OK if len(window) > 1 else Status.NO_VELOCITY,
+            status=status,
         )
+
+    def estimate(self, track: Track) -> Estimate:
+        """The states of a track: all samples pushed, then the window minimised to a tight tolerance.
+
+        States that left the window before the end are as they were when they left it. `whitened` are the
+        innovations of the pushes.
+        """
+        self.reset()
+        self._frozen = []
+        sigma = sample_sigmas(self.settings, len(track), track.sigmas)
+        states = [
+            self._push(float(t), position, spread, track.spin_label if k == 0 else None)
+            for k, (t, position, spread) in enumerate(zip(track.times, track.positions, sigma, strict=True))
+        ]
+        whitened = np.array([state.innovation for state in states])
+        assert self.window is not None
+        result = final_estimate(self.window, track, self.events, self._frozen, whitened, self.settings)
+        self.reset()
+        return result

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -10,8 +11,9 @@ from numpy.typing import NDArray
 
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.online_interval import Motion
+from ballfg.estimate.online_isam import Sample
 from ballfg.estimate.problem import QUALITY_SIGMA
-from ballfg.estimate.segmentation import Contact, Event, EventKind, Segmentation, SegmentationPhysics, Segmenter
+from ballfg.estimate.segmentation import Event, EventKind, Segmentation, SegmentationPhysics, Segmenter
 from ballfg.estimate.segmentation.assembly import BREAKS, contacts_of, intervals_of, quality_of, rests_of
 from ballfg.estimate.segmentation.result import Quality
 from ballfg.estimate.segmentation.second_look import SIDE, hits_at_contacts
@@ -22,6 +24,8 @@ Array = NDArray[np.float64]
 
 SIGMA_FACTOR = np.array([QUALITY_SIGMA.get(quality, 1.0) for quality in Quality])
 """Standard deviation of a sample of each quality, in multiples of a good one's."""
+UNUSABLE = QUALITY_SIGMA[Quality.SHIFTED]
+"""Multiple of the standard deviation from which a sample does not shape its state."""
 MOVE_MARGIN = 0.02
 """Share of an interval by which the estimated contact must lie outside it before it moves: keeps it from flapping."""
 MOST_MOVES = 6
@@ -144,16 +148,14 @@ def contact_step(state: Array, rise: float, dt: float) -> int:
     return 1 if time > (1 + MOVE_MARGIN) * dt else 0
 
 
-def first_difference(motions: list[Motion], factors: Array, wanted: list[Motion], wanted_factors: Array) -> int | None:
-    """The first sample whose way there, or whose usability, is not what was built; None if only noise levels differ."""
-    for k, (have, want) in enumerate(zip(motions, wanted, strict=False)):
-        if not have.same(want):
-            return k + 1
-    worse = np.flatnonzero((factors >= UNUSABLE) != (wanted_factors[: len(factors)] >= UNUSABLE))
-    return int(worse[0]) if len(worse) else None
+def first_difference(samples: Sequence[Sample], motions: Sequence[Motion], factors: Array) -> int | None:
+    """The first sample that was reached otherwise, or whose usability differs, from what is now believed.
 
-
-UNUSABLE = QUALITY_SIGMA[Quality.SHIFTED]
-"""Multiple of the standard deviation from which a sample does not shape its state."""
-
-__all__ = ["UNUSABLE", "Contact", "EventTracker", "contact_step", "first_difference"]
+    None if only noise levels differ: those change without going back.
+    """
+    for k, sample in enumerate(samples):
+        if k and not sample.motion.same(motions[k - 1]):
+            return k
+        if (sample.factor >= UNUSABLE) != (factors[k] >= UNUSABLE):
+            return k
+    return None

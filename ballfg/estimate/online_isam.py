@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.dynamics.model import BallModel
-from ballfg.estimate.online_interval import Interval, Motion, coefficient_count, evaluate, store
+from ballfg.estimate.online_interval import FLIGHT, Interval, Motion, coefficient_count, evaluate, store
 from ballfg.estimate.problem import START_POSITION_SIGMA, UNINFORMATIVE_SPIN, coefficient_means
 from ballfg.estimate.settings import Settings
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
@@ -41,19 +41,28 @@ WILDFIRE = 1e-7
 
 @dataclass
 class Sample:
-    """One observation in the window.
+    """One observation, and what is believed of it.
 
     Attributes:
-        time: s.  position: (3,) m.  sigma: (3,) m, as it takes part.
+        time: s.  position: (3,) m.  stated: (3,) m, its standard deviation as stated.
+        factor: multiple of that with which it takes part.
+        motion: how the ball got here from the sample before.
         label: (3,) rad/s, a spin label, on the first sample of a track.
         slots: where iSAM2 keeps the sample's own factors: position first, then priors.
     """
 
     time: float
     position: Array
-    sigma: Array
+    stated: Array
+    factor: float = 1.0
+    motion: Motion = FLIGHT
     label: Array | None = None
     slots: tuple[int, ...] = ()
+
+    @property
+    def sigma(self) -> Array:
+        """(3,) m, the standard deviation with which it takes part."""
+        return self.stated * self.factor
 
 
 @dataclass(frozen=True)
@@ -85,7 +94,7 @@ class IncrementalWindow:
         samples: n of them.  intervals: n - 1, None where nothing links two samples.
         theta: (n, 9) linearisation points.  delta: (n, 9) solution about them.
         coefficient_theta, coefficient_delta: (p,) the same for the coefficients.
-        summary_slots: where iSAM2 keeps the linear factors that marginalised states left.
+        summaries: the linear factors that marginalised states left.
         newest_covariance: (9 + p, 9 + p) of the newest state and the coefficients.
     """
 
@@ -99,7 +108,7 @@ class IncrementalWindow:
         self.first = 0
         self.samples: list[Sample] = []
         self.intervals: list[Interval | None] = []
-        self.summary_slots: set[int] = set()
+        self.summaries: list[gtsam.LinearContainerFactor] = []
         self.threshold = np.empty(STATE_DIM)
         self.threshold[POSITION] = POSITION_THRESHOLD * position_sigma
         self.threshold[VELOCITY], self.threshold[SPIN] = VELOCITY_THRESHOLD, SPIN_THRESHOLD
@@ -107,11 +116,13 @@ class IncrementalWindow:
 
     def _clear(self) -> None:
         """An empty iSAM2 and no states."""
-        self.isam = gtsam.ISAM2(_parameters(self.threshold, COEFFICIENT_THRESHOLD * self._own_sigmas))
+        self.isam = self._new_isam()
         self.theta, self.delta = np.zeros((0, STATE_DIM)), np.zeros((0, STATE_DIM))
         self.coefficient_theta, self.coefficient_delta = self._own_means.copy(), np.zeros(self.p)
         self.newest_covariance = np.zeros((0, 0))
-        self.fixed = False  # the first state and the coefficients, once something was marginalised onto them
+
+    def _new_isam(self) -> gtsam.ISAM2:
+        return gtsam.ISAM2(_parameters(self.threshold, COEFFICIENT_THRESHOLD * self._own_sigmas))
 
     @property
     def states(self) -> Array:
@@ -128,16 +139,15 @@ class IncrementalWindow:
         """(n,) s."""
         return np.array([sample.time for sample in self.samples])
 
-    def append(self, sample: Sample, motion: Motion) -> Update:
-        """Take in a sample; `motion` led to it from the one before.
+    def append(self, sample: Sample) -> Update:
+        """Take in a sample.
 
         Raises: RuntimeError or ValueError: what GTSAM or the model raised; the window must then be built anew.
         """
-        linked = motion.linked and len(self.samples) > 0
-        if not linked:
+        if not (sample.motion.linked and self.samples):
             return self._append_start(sample)
         dt = sample.time - self.samples[-1].time
-        interval = Interval(self.first + len(self.samples) - 1, motion, dt, self.model, self.settings.process)
+        interval = Interval(self.first + len(self.samples) - 1, sample.motion, dt, self.model, self.settings.process)
         estimate = self.states[-1], self.coefficients
         piece, count, calls = self._relinearize(interval)
         away = np.concatenate((estimate[0] - self.theta[-1], estimate[1] - self.coefficient_theta))
@@ -158,7 +168,7 @@ class IncrementalWindow:
         priors.append(state_prior(0, state.copy(), sigma))
         if sample.label is not None:
             spread = np.full((1, 3), self.settings.spin_label_noise)
-            priors.append(spin_prior(np.array([0]), sample.label[None], spread, self.settings.spin_loss))
+            priors.append(spin_prior(np.array([0]), sample.label[None], spread, self.settings.label_loss))
             state[SPIN] = sample.label
         _, count, calls = self._relinearize(None)
         return Update(np.full(3, np.nan), count, calls, self._insert(sample, state, None, priors))
@@ -183,9 +193,7 @@ class IncrementalWindow:
         """
         moved = (np.abs(self.delta) > self.threshold).any(axis=1)
         limit = COEFFICIENT_THRESHOLD * self._own_sigmas
-        shared = not self.fixed and bool((np.abs(self.coefficient_delta) > limit).any())
-        if self.fixed:
-            moved[0] = False
+        shared = bool((np.abs(self.coefficient_delta) > limit).any())
         if moved.any():
             self.theta = np.where(moved[:, None], self.theta + self.delta, self.theta)
             self.delta = np.where(moved[:, None], 0.0, self.delta)
@@ -211,7 +219,7 @@ class IncrementalWindow:
         state: Array,
         interval: Interval | None,
         priors: Sequence[FactorKind] = (),
-        summaries: Sequence[gtsam.LinearContainerFactor] = (),
+        known: Sequence[gtsam.LinearContainerFactor] = (),
     ) -> int:
         """Give iSAM2 a new state with its factors, and read back the solution.
 
@@ -226,29 +234,23 @@ class IncrementalWindow:
             graph.push_back(Bridge(prior, "row").factor(0, [key - STATE_KEY]))
         values.insert(key, state)
         own = graph.size()
-        for summary in summaries:
-            graph.push_back(summary)
+        for factor in known:
+            graph.push_back(factor)
         if self.p and len(self.theta) == 0:
             values.insert(COEFFICIENT_KEY, self.coefficient_theta)
-            if not summaries:
+            if not known:
                 prior = coefficient_prior(self._own_means, self._own_sigmas)
                 graph.push_back(Bridge(prior, "row").factor(0))
         slots = self._update(graph, values, [], {key: 1, COEFFICIENT_KEY: 2} if self.p and len(self.theta) else {})
         if interval is not None:
             interval.slot = slots[0]
         sample.slots = tuple(slots[interval is not None : own])
-        self.summary_slots |= set(slots[own : own + len(summaries)])
         if self.samples:
             self.intervals.append(interval)
         self.samples.append(sample)
         self.theta = np.concatenate((self.theta, state[None]))
         self._read_back()
         return int(self._result.getVariablesReeliminated())
-
-    def summaries(self) -> list[gtsam.LinearContainerFactor]:
-        """The linear factors that marginalised states left."""
-        factors = self.isam.getFactorsUnsafe()
-        return [factors.at(slot) for slot in sorted(self.summary_slots)]
 
     def _position_factor(self, sample: Sample, state: int) -> gtsam.CustomFactor:
         kind = PositionFactors(np.array([state]), sample.position[None], sample.sigma[None], self.settings.loss)

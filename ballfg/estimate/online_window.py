@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import gtsam
+import numpy as np
 
-from ballfg.estimate.online_interval import Array, Interval, Motion, evaluate
-from ballfg.estimate.online_isam import IncrementalWindow, Sample
-from ballfg.factors.bridge import STATE_KEY
+from ballfg.estimate.online_interval import Interval, evaluate
+from ballfg.estimate.online_isam import IncrementalWindow, Sample, Update
+from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
 
 
 class Window(IncrementalWindow):
@@ -15,11 +16,10 @@ class Window(IncrementalWindow):
     def __len__(self) -> int:
         return len(self.samples)
 
-    def retract(self, count: int) -> list[Sample]:
+    def retract(self, count: int) -> None:
         """Take the newest samples back, with their states and factors; iSAM2 forgets them.
 
         Args: count: how many stay, at least 1.
-        Returns: the samples taken back, oldest first, ready to be appended again.
         """
         gone = self.samples[count:]
         slots = [slot for sample in gone for slot in sample.slots]
@@ -29,67 +29,126 @@ class Window(IncrementalWindow):
         self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), slots, {})
         self.theta = self.theta[:count]
         self._read_back()
-        for sample in gone:
-            sample.slots = ()
-        return gone
 
-    def replace_sigma(self, k: int, sigma: Array) -> None:
-        """Give sample k of the window another standard deviation (3,) m: its factor is taken out, another put in."""
-        sample = self.samples[k]
-        sample.sigma = sigma
+    def reweigh(self, numbers: list[int]) -> None:
+        """Put in anew the factors of the positions of some samples of the window, whose noise has changed."""
         self._relinearize(None)
-        graph = gtsam.NonlinearFactorGraph()
-        graph.push_back(self._position_factor(sample, self.first + k))
-        slots = self._update(graph, gtsam.Values(), [sample.slots[0]], {})
-        sample.slots = (slots[0], *sample.slots[1:])
+        graph, old = gtsam.NonlinearFactorGraph(), []
+        for k in numbers:
+            graph.push_back(self._position_factor(self.samples[k], self.first + k))
+            old.append(self.samples[k].slots[0])
+        slots = self._update(graph, gtsam.Values(), old, {})
+        for k, slot in zip(numbers, slots, strict=True):
+            self.samples[k].slots = (slot, *self.samples[k].slots[1:])
         self._read_back()
 
-    def replace_motion(self, k: int, motion: Motion) -> None:
-        """Give the linked interval k of the window another motion, about the same linearisation points."""
-        old = self.intervals[k]
-        assert old is not None
-        dt = self.samples[k + 1].time - self.samples[k].time
-        new = Interval(self.first + k, motion, dt, self.model, self.settings.process)
+    def replace_motions(self, numbers: list[int]) -> None:
+        """Put in anew the factors of some linked samples' motions, about the same linearisation points."""
         self._relinearize(None)
-        evaluate([new], self.theta[k : k + 1], self.theta[k + 1 : k + 2], self.coefficient_theta)
-        graph = gtsam.NonlinearFactorGraph()
-        graph.push_back(new.bridge.factor(0))
-        assert old.slot is not None
-        (new.slot,) = self._update(graph, gtsam.Values(), [old.slot], {})
-        self.intervals[k] = new
+        new = []
+        for k in numbers:
+            dt = self.samples[k].time - self.samples[k - 1].time
+            new.append(Interval(self.first + k - 1, self.samples[k].motion, dt, self.model, self.settings.process))
+        begins = [k - 1 for k in numbers]
+        evaluate(new, self.theta[begins], self.theta[numbers], self.coefficient_theta)
+        graph, old = gtsam.NonlinearFactorGraph(), []
+        for k, interval in zip(begins, new, strict=True):
+            graph.push_back(interval.bridge.factor(0))
+            before = self.intervals[k]
+            assert before is not None
+            assert before.slot is not None
+            old.append(before.slot)
+            self.intervals[k] = interval
+        slots = self._update(graph, gtsam.Values(), old, {})
+        for interval, slot in zip(new, slots, strict=True):
+            interval.slot = slot
         self._read_back()
 
-    def drop_oldest(self) -> None:
-        """Marginalise the oldest state: what it knew becomes a linear factor on the next state and the coefficients.
+    def shorten(self, keep: int) -> None:
+        """Let go of all but the newest states; what the others know becomes a linear factor on the first that stays.
 
-        Their linearisation points are fixed from then on, as GTSAM does it.
-        Raises: RuntimeError: if the state is not a leaf of iSAM2's tree; the window must then be built anew.
+        The factors of the leaving states are eliminated, by QR, at their linearisation points; iSAM2 is then made
+        anew from those that stay, whose linearisations are all at hand: no torch call.
+
+        Raises: RuntimeError: from GTSAM, when the leaving part is singular.
         """
-        leaf = gtsam.KeyList()
-        leaf.push_back(STATE_KEY + self.first)
-        made, deleted = self.isam.marginalizeLeavesWithIndices(leaf)
-        self.summary_slots = (self.summary_slots - set(deleted)) | set(made)
-        self.first += 1
-        del self.samples[0], self.intervals[0]
-        self.theta, self.delta = self.theta[1:], self.delta[1:]
-        self.fixed = True
+        leaving = len(self.samples) - keep
+        self._relinearize(None)
+        point = self._point(range(leaving + 1))
+        old = gtsam.GaussianFactorGraph()
+        for factor in (*self._factors(range(leaving), range(leaving)), *self.summaries):
+            old.push_back(factor.linearize(point))
+        ordering = gtsam.Ordering()
+        present = set(old.keyVector())
+        for key in (*range(STATE_KEY + self.first, STATE_KEY + self.first + leaving + 1), COEFFICIENT_KEY):
+            if key in present:
+                ordering.push_back(key)
+        bayes_net = old.eliminateSequential(ordering, gtsam.EliminateQR)
+        rest = [bayes_net.at(i) for i in range(leaving, bayes_net.size())]
+        self.summaries = [gtsam.LinearContainerFactor(_jacobian_factor(conditional), point) for conditional in rest]
+        self.first += leaving
+        del self.samples[:leaving], self.intervals[:leaving]
+        self.theta, self.delta = self.theta[leaving:], self.delta[leaving:]
+        self._renew()
 
-    def start_anew(self) -> None:
-        """Throw iSAM2 away, after an error left it half-updated, and take in all samples of the window again.
+    def _point(self, numbers: range) -> gtsam.Values:
+        """The linearisation points of some states of the window and of the coefficients."""
+        values = gtsam.Values()
+        for k in numbers:
+            values.insert(STATE_KEY + self.first + k, self.theta[k])
+        if self.p:
+            values.insert(COEFFICIENT_KEY, self.coefficient_theta)
+        return values
 
+    def _factors(self, samples: range, intervals: range) -> list[gtsam.NonlinearFactor]:
+        """The factors of some samples and intervals, out of iSAM2."""
+        held = self.isam.getFactorsUnsafe()
+        slots = [slot for k in samples for slot in self.samples[k].slots]
+        slots += [i.slot for k in intervals if (i := self.intervals[k]) is not None and i.slot is not None]
+        return [held.at(slot) for slot in slots]
+
+    def _renew(self) -> None:
+        """A new iSAM2 out of the window as it is."""
+        n = len(self.samples)
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in (*self._factors(range(n), range(n - 1)), *self.summaries):
+            graph.push_back(factor)
+        self.isam = self._new_isam()
+        last = {STATE_KEY + self.first + n - 1: 1, COEFFICIENT_KEY: 2} if self.p else {}
+        slots = iter(self._update(graph, self._point(range(n)), [], last))
+        for sample in self.samples:
+            sample.slots = tuple(next(slots) for _ in sample.slots)
+        for interval in self.intervals:
+            if interval is not None:
+                interval.slot = next(slots)
+        self._read_back()
+
+    def start_anew(self, samples: list[Sample]) -> Update:
+        """Throw iSAM2 away, after an error left it half-updated, and take in all samples again, oldest first.
+
+        Returns: of the last sample's update.
         Raises: RuntimeError or ValueError: if that fails as well.
         """
-        samples = self.samples
-        motions = [Motion(linked=False), *(i.motion if i else Motion(linked=False) for i in self.intervals)]
-        state, coefficients = self.states[:1], self.coefficients
-        summaries = self.summaries()
+        old_start, old_coefficients, summaries = self.states[:1], self.coefficients, self.summaries
         self._clear()
-        self.samples, self.intervals, self.summary_slots = [], [], set()
+        self.samples, self.intervals = [], []
         for sample in samples:
             sample.slots = ()
+        update = Update(np.full(3, np.nan), 0, 0, 0)
+        if summaries:
+            self.coefficient_theta = old_coefficients
         if any(STATE_KEY + self.first in summary.keys() for summary in summaries):
-            self.coefficient_theta = coefficients
-            self._insert(samples[0], state[0], None, summaries=summaries)
-            samples, motions = samples[1:], motions[1:]
-        for sample, motion in zip(samples, motions, strict=True):
-            self.append(sample, motion)
+            self._insert(samples[0], old_start[0], None, known=summaries)
+            samples = samples[1:]
+        for sample in samples:
+            update = self.append(sample)
+        return update
+
+
+def _jacobian_factor(conditional: gtsam.GaussianConditional) -> gtsam.JacobianFactor:
+    """A conditional R x + S y = d as a factor."""
+    keys, unit = list(conditional.keys()), gtsam.noiseModel.Unit.Create(len(conditional.d()))
+    if len(keys) == 1:
+        return gtsam.JacobianFactor(keys[0], conditional.R(), conditional.d(), unit)
+    first, second = keys
+    return gtsam.JacobianFactor(first, conditional.R(), second, conditional.S(), conditional.d(), unit)

@@ -160,7 +160,7 @@ def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> lis
         kinds.append(spin_prior(unlabelled, np.zeros_like(spread), spread, settings.spin_loss))
     if label is not None:
         spread = np.full((1, 3), settings.spin_label_noise)
-        kinds.append(spin_prior(np.array([0]), label[None], spread, settings.spin_loss))
+        kinds.append(spin_prior(np.array([0]), label[None], spread, settings.label_loss))
     return kinds
 
 

@@ -42,8 +42,10 @@ class Settings:
     aside beforehand; Huber's loss bounds what a missed one does and leaves good samples their full weight."""
 
     spin_loss: Loss = field(default_factory=lambda: Loss("huber", 2.0))
-    """Loss on a spin label or, without one, on the spin prior: a strong spin is rare but not against nature, and labels
-    were seen to contradict the flight."""
+    """Loss on the spin prior: a strong spin is rare but not against nature."""
+
+    label_loss: Loss = field(default_factory=lambda: Loss("cauchy", 3.0))
+    """Loss on a spin label: labels were seen to contradict the flight."""
 
     find_events: bool = True
     """Look for hits, outliers and tracker shifts. False: the track is one undisturbed flight with contacts that the

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ from ballfg.estimate.result import Estimate, Status, leave_one_out
 from ballfg.estimate.segmentation import Contact, Segmentation, physics_of, segment
 from ballfg.estimate.settings import Settings, sample_sigmas
 from ballfg.factors.covariance import Covariances, marginal_covariances
+from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
@@ -34,6 +35,12 @@ Array = NDArray[np.float64]
 
 MAX_REFINEMENTS = 6
 """How often contacts may move to a neighbouring interval; two were the most seen on measured tracks."""
+
+
+MAX_UNSEEN_HITS = 8
+"""How many hits the estimate may add to those that the segmentation found; measured logs needed three at most."""
+BROKEN = 8.0
+"""Norm of a whitened dynamics residual (9 dimensions) beyond which its interval hides a hit: chance gives one in 1e9."""
 
 
 @dataclass(frozen=True)
@@ -81,9 +88,23 @@ class Smoother(Estimator):
         """The events in a track."""
         sigma = sample_sigmas(self.settings, len(track), track.sigmas)
         found = segment(track.times, track.positions, sigma, surfaces=self.surfaces, physics=self.physics)
-        return found if self.settings.find_events else found.only_contacts()
+        if self.settings.find_events:
+            return found
+        none = np.zeros(0, dtype=np.int64)
+        return replace(found, hits=none, restarts=none, quality=np.zeros_like(found.quality))
 
     def solve(self, track: Track, segmentation: Segmentation, sigma: Array) -> Solution:
+        """Minimise; where the motion still breaks the model by far more than its noise, a hit went unseen: mark it."""
+        solution = self._settle(track, segmentation, sigma)
+        for _ in range(MAX_UNSEEN_HITS if self.settings.find_events else 0):
+            interval = _worst_break(solution)
+            if interval is None:
+                break
+            segmentation = replace(segmentation, hits=np.union1d(segmentation.hits, [interval]))
+            solution = self._settle(track, segmentation, sigma)
+        return solution
+
+    def _settle(self, track: Track, segmentation: Segmentation, sigma: Array) -> Solution:
         """Minimise, move contacts to where the estimate says they are, and minimise again until they stay."""
         events = Events(segmentation.contacts, segmentation)
         states = initial_states(track, events.contacts, segmentation, self.model)
@@ -126,6 +147,18 @@ class Smoother(Estimator):
             error=minimum.error,
             iterations=minimum.iterations,
         )
+
+
+def _worst_break(solution: Solution) -> int | None:
+    """The interval whose dynamics factor is broken most, if any is; intervals with a hit have theirs in the noise."""
+    worst, where = BROKEN, None
+    for kind in solution.graph.kinds:
+        if isinstance(kind, DynamicsFactors):
+            norm = np.linalg.norm(kind.linearize(solution.minimum.values).residual, axis=-1)
+            norm[np.isin(kind.variables[:, 0], solution.events.segmentation.hits)] = 0.0
+            if not norm.max() <= worst:
+                worst, where = norm.max(), int(kind.variables[norm.argmax(), 0])
+    return where
 
 
 def _places(contacts: tuple[Contact, ...]) -> tuple[tuple[int, float], ...]:

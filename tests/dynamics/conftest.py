@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from ballfg.dynamics import AnalyticModel, BallModel, EFFECTS, Surfaces
+from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Surfaces
 from ballfg.dynamics.model import Rates
 
 

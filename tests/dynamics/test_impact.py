@@ -45,9 +45,7 @@ def test_sliding_by_hand():
     velocity, spin = apply_impulse(impact((6.0, 0.0, -2.0), (0.0, 0.0, 50.0)), R, SHELL)
     lost = 0.25 * 1.9 * 2.0  # mu (1 + e) |vz|, less than 2/5 of the slip 6 m/s
     torch.testing.assert_close(velocity, torch.tensor((6.0 - lost, 0.0, 1.8), dtype=torch.float64), rtol=0, atol=1e-14)
-    torch.testing.assert_close(
-        spin, torch.tensor((0.0, lost * 1.5 / R, 50.0), dtype=torch.float64), rtol=0, atol=1e-12
-    )
+    torch.testing.assert_close(spin, torch.tensor((0.0, lost * 1.5 / R, 50.0), dtype=torch.float64), rtol=0, atol=1e-12)
 
 
 def test_topspin_accelerates_and_backspin_brakes():

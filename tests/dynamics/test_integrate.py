@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import numpy as np
@@ -97,7 +98,7 @@ def test_order_of_convergence_is_four(model, states):
     with torch.no_grad():
         exact = after(256)
         errors = [(after(n) - exact)[:, :6].norm() for n in (4, 8, 16)]
-    for coarse, fine in zip(errors, errors[1:], strict=False):
+    for coarse, fine in itertools.pairwise(errors):
         assert 13 < float(coarse / fine) < 19
 
 

@@ -39,9 +39,11 @@ def test_bounces_in_vacuum_have_heights_e2_h(build):
 
 
 @pytest.mark.parametrize(
-    "spin", [(0.0, 0.0, 0.0), (20.0, 300.0, -50.0), (0.0, -250.0, 100.0)], ids=["none", "topspin", "backspin"]
+    ("spin", "bounces"),
+    [((0.0, 0.0, 0.0), 2), ((20.0, 300.0, -50.0), 2), ((0.0, -250.0, 100.0), 1)],
+    ids=["none", "topspin", "backspin"],
 )
-def test_two_bounces_against_scipy(build, spin):
+def test_bounces_against_scipy(build, spin, bounces):
     g, k, m, e, mu = 9.81, 0.12, 0.0028, 0.92, 0.25
 
     def rates(_, y):  # the equations, written again
@@ -73,7 +75,7 @@ def test_two_bounces_against_scipy(build, spin):
         t, y = solved.t[-1], solved.y[:, -1]
         if solved.status == 1:
             y, contacts = bounced(y), contacts + 1
-    assert contacts == 2
+    assert contacts == bounces
     model = build(gravity={"g": g}, drag={"k": k}, magnus={"k": m}, restitution={"e": e}, friction={"mu": mu})
     start = rows((0, 0, 0.3, 5, 0.5, 0.5, *spin))
     with torch.no_grad():
@@ -121,7 +123,9 @@ def test_small_hops_do_not_depend_on_how_time_is_cut(build, speed):
     with torch.no_grad():
         whole = rollout(model, state, seconds(0.02, 0.04, 0.06), TABLE_ONLY)[:, -1]
         path = rollout(model, state, torch.linspace(0, 0.06, 301, dtype=torch.float64), TABLE_ONLY)[:, -1]
-    torch.testing.assert_close(path, whole, rtol=0, atol=1e-9)
+    # friction of rolling decays at 30 1/s: Runge-Kutta's error over 20 ms is (0.6)^5 / 120 of a small slip
+    torch.testing.assert_close(path, whole, rtol=0, atol=1e-5)
+    torch.testing.assert_close(path[:, [2, 5]], whole[:, [2, 5]], rtol=0, atol=1e-12)
 
 
 def test_one_ball_and_many_give_the_same(any_model, states):

@@ -15,7 +15,7 @@ SIGMA = 0.0015
 
 @dataclass
 class Truth:
-    """Clean positions (n, 3) at stamps (n,), and the intervals in which something happened."""
+    """True states (n, 9) at stamps (n,), and the intervals in which something happened."""
 
     times: np.ndarray
     states: np.ndarray
@@ -76,7 +76,7 @@ def matched(found: Sequence[int], true: Sequence[int], tolerance: int = 1) -> tu
 
 @pytest.fixture(scope="session")
 def rallies() -> list[Truth]:
-    return [rally(seed) for seed in range(20)]
+    return [rally(seed) for seed in range(12)]
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,108 @@
+"""The code, tables and numbers in docs/ hold."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+
+import pytest
+import torch
+import yaml
+
+from ballfg.dynamics import EFFECTS, advance, model_from_dict, model_to_dict, nominal_model
+from ballfg.dynamics.surfaces import Surfaces
+
+DOCS = Path(__file__).parents[2] / "docs"
+
+
+def blocks(page, language):
+    return re.findall(
+        rf"^```{language}\n(.*?)^```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE
+    )
+
+
+def coefficient_table():
+    lines = [
+        "| effect | section | coefficient | default | sigma | unit | bounds | what |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for name, effect in EFFECTS.items():
+        for c in effect.coefficients:
+            bounds = f"{c.low:g} to {c.high:g}"
+            cells = (name, effect.kind, c.name, f"{c.default:g}", f"{c.sigma:g}", c.unit, bounds, effect.sentence)
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def test_coefficient_table_is_that_of_the_registry():
+    text = (DOCS / "models.md").read_text(encoding="utf-8")
+    shown = re.search(r"<!-- coefficients -->\n(.*?)\n?<!-- end -->", text, re.DOTALL)
+    assert shown
+    assert shown[1] == coefficient_table(), "put this table into docs/models.md:\n" + coefficient_table()
+
+
+def test_model_file_example_loads():
+    (text,) = blocks("models.md", "yaml")
+    content = yaml.safe_load(text)
+    assert model_to_dict(model_from_dict(content)) == content
+
+
+def test_model_code_runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (code,) = blocks("models.md", "python")
+    names = {}
+    exec(compile(code, "models.md", "exec"), names)
+    assert model_to_dict(names["model"]) == model_to_dict(nominal_model())
+
+
+@pytest.fixture
+def example(tmp_path, monkeypatch):
+    """The example effect of the guide, imported from a file and registered."""
+    (code,) = blocks("add_an_effect.md", "python")
+    path = tmp_path / "restitution_slope.py"
+    path.write_text(code, encoding="utf-8")
+    spec = importlib.util.spec_from_file_location("restitution_slope", path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    effect = module.RestitutionSlope
+    monkeypatch.setitem(EFFECTS, effect.name, effect)
+    (text,) = blocks("add_an_effect.md", "yaml")
+    return model_from_dict(yaml.safe_load(text))
+
+
+def test_example_effect_does_what_it_says(example):
+    state = torch.tensor([[0, 0, 0.02, 0, 0, -4.0, 0, 0, 0], [0, 0, 0.02, 0, 0, -60.0, 0, 0, 0]], dtype=torch.float64)
+    assert example.bounce(state)[:, 5].tolist() == pytest.approx([4 * (0.95 - 0.02 * 4), 0.0])
+
+
+def test_example_effect_is_found_everywhere(example):
+    assert model_to_dict(example)["bounce"]["restitution_slope"] == {"slope": 0.02}
+    state = torch.tensor([[0, 0, 0.2, 4, 0, -1.0, 0, 50, 0]], dtype=torch.float64)
+    after = advance(example, state, torch.tensor([0.3], dtype=torch.float64), Surfaces(0.0))
+    slope = dict(example.named_parameters())["contact.restitution_slope.slope"]
+    (gradient,) = torch.autograd.grad(after[0, 2], slope)
+    assert gradient.item() < 0
+
+
+def test_example_effect_has_right_derivatives(example):
+    state = torch.tensor([[0, 0, 0.02, 4, 0, -3.0, 0, 50, 0]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s, *_: example.bounce(s), (state, *example.contact.parameters()))
+
+
+def test_nominal_values_in_the_physics_page():
+    text = (DOCS / "physics.md").read_text(encoding="utf-8")
+    nominal = {row[0]: row[1] for row in re.findall(r"^\| ([^|]+?) \| ([^|]+?) \|", text, re.MULTILINE)}
+    model = nominal_model()
+    for start, value in (
+        ("gravity", f"{model.flight['gravity'].g.item():g} m/s²"),
+        ("drag", f"{model.flight['drag'].k.item():g} 1/m"),
+        ("Magnus", f"{model.flight['magnus'].k.item():g}"),
+        ("restitution", f"{model.contact['restitution'].e.item():g}"),
+        ("friction", f"{model.contact['friction'].mu.item():g}"),
+        ("tangential restitution", f"{model.contact['tangential_restitution'].e_t.item():g}"),
+        ("table height", f"{1000 * model.contact['table_height'].offset.item():g} mm"),
+        ("radius", f"{model.radius:.3f} m"),
+    ):
+        shown = next(v for k, v in nominal.items() if k.startswith(start))
+        assert shown == value, start
