@@ -29,7 +29,11 @@ COLOURS = {
     "online": "#1b9e77",
     "smoother": "#3b4cc0",
 }
+WIDTHS = {"ekf": 4.5, "ekf-no-window": 3.0, "ekf+rts": 4.5, "online": 3.0, "smoother": 1.3}
+"""Points. Methods that agree lie on top of each other: the lower ones are wider."""
 DASHES = {"online": (0, (4, 2)), "ekf+rts": (0, (1, 1)), "ekf-no-window": (0, (4, 2))}
+LEAST_SHOWN = 0.1
+"""Lower end of a band divided by its mean; a logarithmic axis has no place for zero."""
 EXAMPLES = 3
 """Tracks shown one by one."""
 NINETY = 1.645
@@ -58,19 +62,30 @@ def curve(rows: Iterable[Row], case: str, method: str, metric: str) -> tuple[np.
 
 
 def observations_picture(rows: list[Row], case: str, title: str, path: Path) -> Path:
-    """The paper's figure: velocity error at the newest sample against the number of observations."""
-    figure, axes = plt.subplots(figsize=(7.5, 4.6), layout="constrained")
-    for method in dict.fromkeys(row.method for row in rows if row.case == case):
-        counts, mean = curve(rows, case, method, "velocity_mean_newest")
-        if not len(counts):
-            continue
-        _, deviation = curve(rows, case, method, "velocity_sd_newest")
-        axes.plot(counts, mean, **_line(method))
-        low = np.maximum(mean - deviation, 0.05 * mean)  # a logarithmic axis has no place for zero
-        axes.fill_between(counts, low, mean + deviation, color=COLOURS[method], alpha=0.13, linewidth=0)
-    axes.set(xlabel="number of observations", ylabel="velocity error at the newest one, m/s", yscale="log", title=title)
-    _plain_ticks(axes)
-    axes.legend(title="mean, band: one standard deviation over tracks", ncols=3, fontsize="small")
+    """The paper's figure, velocity error against the number of observations; beside it, when all were seen."""
+    figure, panels = plt.subplots(1, 2, figsize=(11.5, 4.6), sharey=True, layout="constrained")
+    labels = {
+        "newest": ("number of observations", "at the newest sample"),
+        "whole": ("sample", "at each sample, once the whole track was seen"),
+    }
+    for axes, (when, (place, what)) in zip(panels, labels.items(), strict=True):
+        for method in dict.fromkeys(row.method for row in rows if row.case == case):
+            counts, mean = curve(rows, case, method, f"velocity_mean_{when}")
+            if not len(counts):
+                continue
+            _, deviation = curve(rows, case, method, f"velocity_sd_{when}")
+            axes.plot(counts, mean, **_line(method))
+            low = np.maximum(mean - deviation, LEAST_SHOWN * mean)
+            axes.fill_between(counts, low, mean + deviation, color=COLOURS[method], alpha=0.13, linewidth=0)
+        axes.set(xlabel=place, yscale="log", title=what)
+        axes.title.set_size(10)
+        _plain_ticks(axes)
+    panels[0].set_ylabel("velocity error, m/s")
+    figure.suptitle(f"{title}\nmean, and one standard deviation over tracks", size=11)
+    handles, names = panels[0].get_legend_handles_labels()
+    more, other = panels[1].get_legend_handles_labels()
+    shown = dict(zip(names + other, handles + more, strict=True))
+    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=len(shown), fontsize="small")
     return save(figure, path)
 
 
@@ -87,7 +102,7 @@ def _line(method: str) -> dict[str, Any]:
         "color": COLOURS.get(method, "black"),
         "linestyle": DASHES.get(method, "solid"),
         "label": method,
-        "linewidth": 1.8,
+        "linewidth": WIDTHS.get(method, 2.0),
         "marker": "o",
         "markersize": 3,
     }

@@ -44,20 +44,20 @@ def paper_candidates(protocol: Protocol) -> dict[str, Candidate]:
     """
     given = (protocol.model, protocol.surfaces, protocol.settings)
     return {
-        "sliding-window": Candidate(SlidingWindow(*given), causal=True),
-        "ekf": Candidate(ExtendedKalmanFilter(*given, initialise="window"), causal=True),
-        "ekf-no-window": Candidate(ExtendedKalmanFilter(*given), causal=True),
+        "sliding-window": Candidate(SlidingWindow(*given), newest="pass"),
+        "ekf": Candidate(ExtendedKalmanFilter(*given, initialise="window"), newest="pass"),
+        "ekf-no-window": Candidate(ExtendedKalmanFilter(*given), newest="pass"),
         "smoother": Candidate(Smoother(*given)),
     }
 
 
 def fair_candidates(protocol: Protocol) -> dict[str, Candidate]:
-    """All estimators, with one and the same settings."""
+    """All estimators, with one and the same settings. At the newest sample the RTS pass leaves the filter's state."""
     given = (protocol.model, protocol.surfaces, protocol.settings)
     return {
-        "sliding-window": Candidate(SlidingWindow(*given), causal=True),
-        "ekf": Candidate(ExtendedKalmanFilter(*given), causal=True),
-        "ekf+rts": Candidate(ExtendedKalmanFilter(*given, smooth=True)),
+        "sliding-window": Candidate(SlidingWindow(*given), newest="pass"),
+        "ekf": Candidate(ExtendedKalmanFilter(*given), newest="pass"),
+        "ekf+rts": Candidate(ExtendedKalmanFilter(*given, smooth=True), newest="none"),
         "online": Candidate(Online(*given)),
         "smoother": Candidate(Smoother(*given)),
     }
@@ -94,12 +94,14 @@ def _statistics(scores: Sequence[TrackScore], counts: Sequence[int]) -> list[tup
     found = [
         ("velocity_rmse", pooled_rms(*sums(scores, "velocity", 2)), "m/s"),
         ("velocity_rmse_all", pooled_rms(*sums(scores, "velocity", 2, every)), "m/s"),
-        ("velocity_rmse_newest", pooled_rms(*newest_sums(scores, counts)), "m/s"),
         ("position_rmse", pooled_rms(*sums(scores, "position", 2)), "m"),
         ("spin_rmse", pooled_rms(*sums(scores, "spin", 2)), "rad/s"),
         ("nees", pooled_mean(*sums(scores, "nees", 1)), "1"),
         ("nees_velocity", pooled_mean(*sums(scores, "velocity_nees", 1)), "1"),
     ]
+    squares, number = newest_sums(scores, counts)
+    if number.all():
+        found.append(("velocity_rmse_newest", pooled_rms(squares, number), "m/s"))
     for i, level in enumerate(LEVELS):
         for block, columns in BLOCKS.items():
             share = pooled_mean(*covered(scores, i, columns))
@@ -115,15 +117,20 @@ def newest_sums(scores: Sequence[TrackScore], counts: Sequence[int]) -> tuple[Ar
 
 
 def _add_curve(results: Results, case: str, method: str, scores: Sequence[TrackScore], counts: Sequence[int]) -> None:
-    """Root mean square, mean and standard deviation over tracks of the velocity error at the newest sample."""
+    """Root mean square, mean and standard deviation over tracks of the velocity error at sample k.
+
+    `newest`: when k samples were seen; `whole`: when the whole track was.
+    """
     newest = np.stack([score.newest for score in scores])
-    for count, errors in zip(counts, newest.T, strict=True):
-        seen = errors[np.isfinite(errors)]
-        if len(seen) < 2:
-            continue
-        figures = {"rmse": np.sqrt((seen**2).mean()), "mean": seen.mean(), "sd": seen.std(ddof=1)}
-        for name, value in figures.items():
-            results.add(case, method, f"velocity_{name}_newest{CURVE_MARK}{count}", "m/s", float(value), len(seen))
+    for i, count in enumerate(counts):
+        whole = np.array([s.velocity[count - 1] for s in scores if len(s.away) >= count and s.away[count - 1]])
+        for when, errors in (("newest", newest[np.isfinite(newest[:, i]), i]), ("whole", whole)):
+            if len(errors) < 2:
+                continue
+            figures = {"rmse": np.sqrt((errors**2).mean()), "mean": errors.mean(), "sd": errors.std(ddof=1)}
+            for name, value in figures.items():
+                metric = f"velocity_{name}_{when}{CURVE_MARK}{count}"
+                results.add(case, method, metric, "m/s", float(value), len(errors))
 
 
 def _add_ratios(results: Results, case: str, scores: Scores, counts: Sequence[int], rng: np.random.Generator) -> None:
@@ -136,6 +143,6 @@ def _add_ratios(results: Results, case: str, scores: Scores, counts: Sequence[in
     n = len(scores["smoother"])
     for metric, statistic in own.items():
         for method in scores:
-            if method != "smoother":
+            if method != "smoother" and metric in statistics[method]:
                 figure = bootstrap(ratio(statistic, statistics[method][metric]), n, rng)
                 results.add(case, "smoother", f"{metric}_vs_{method}", "1", figure, n)

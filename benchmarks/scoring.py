@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import joblib
 import numpy as np
@@ -29,12 +30,13 @@ class Candidate:
 
     Attributes:
         estimator: with its settings.
-        causal: its state at a sample depends on no later sample, so that one pass over a track gives the newest state
-            for every number of observations. The others estimate the first k samples anew for each k.
+        newest: how its state at the newest of k samples comes about. "pass": a state depends on no later sample, so
+            that one pass over a track gives it for every k. "anew": the first k samples are estimated for each k.
+            "none": it is not asked for.
     """
 
     estimator: Estimator
-    causal: bool = False
+    newest: Literal["pass", "anew", "none"] = "anew"
 
 
 @dataclass(frozen=True)
@@ -113,9 +115,9 @@ def _newest(candidate: Candidate, case: Case, whole: Array, counts: Sequence[int
     track = case.track
     found = np.full(len(counts), np.nan)
     for i, count in enumerate(counts):
-        if count > len(track) or not case.away[count - 1]:
+        if count > len(track) or not case.away[count - 1] or candidate.newest == "none":
             continue
-        if candidate.causal:
+        if candidate.newest == "pass":
             found[i] = whole[count - 1]
         else:
             seen = candidate.estimator.estimate(track.until(float(track.times[count - 1])))

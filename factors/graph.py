@@ -65,6 +65,10 @@ class Minimum:
     iterations: int
 
 
+MOST_DAMPING = 1e8
+"""Marquardt's lambda at which a step is as good as none."""
+
+
 @dataclass(frozen=True)
 class LevenbergMarquardt:
     """Settings of the minimisation.
@@ -72,12 +76,13 @@ class LevenbergMarquardt:
     Attributes:
         tolerance: stop when the step that is left, measured in posterior standard deviations, is shorter.
         max_iterations: linearisations.
-        first_damping: Marquardt's lambda after a Gauss-Newton step failed.
+        first_damping: Marquardt's lambda after a Gauss-Newton step failed. Small: a tight process noise makes the
+            diagonal of J^T J large where the chain as a whole is free to move.
     """
 
     tolerance: float = 1e-6
     max_iterations: int = 60
-    first_damping: float = 1e-4
+    first_damping: float = 1e-8
 
     def minimize(self, graph: BallGraph, values: Values) -> Minimum:
         """Minimise a graph's objective from a starting point.
@@ -90,7 +95,7 @@ class LevenbergMarquardt:
         error = objective(linearized)
         if not np.isfinite(error):
             return Minimum(values, error, None, Convergence.NOT_FINITE, 1)
-        damping, step = 0.0, None
+        damping, growth = 0.0, 10.0
         for iteration in range(1, self.max_iterations + 1):
             step = _try_solve(linearized, values, damping)
             if step is not None and damping == 0.0 and np.sqrt(2 * abs(step.decrease)) < self.tolerance:
@@ -98,13 +103,15 @@ class LevenbergMarquardt:
             moved = None if step is None else values.moved(step.states, step.coefficients)
             trial = [] if moved is None else graph.linearize(moved)
             trial_error = objective(trial) if moved is not None else np.inf
-            if moved is not None and trial_error <= error * (1 + 1e-12):
+            if step is not None and moved is not None and trial_error <= error * (1 + 1e-12):
+                gain = (error - trial_error) / max(step.decrease, np.finfo(float).tiny)
                 values, linearized, error = moved, trial, trial_error
-                damping = 0.0 if damping < 10 * self.first_damping else damping / 30
-            elif damping > 1e10:
+                damping, growth = damping * (0.1 if gain > 0.5 else 0.5), 10.0
+                damping = 0.0 if damping < self.first_damping else damping
+            elif damping > MOST_DAMPING:
                 return Minimum(values, error, _try_solve(linearized, values, 0.0), Convergence.STUCK, iteration)
             else:
-                damping = self.first_damping if damping == 0.0 else 10 * damping
+                damping, growth = max(self.first_damping, growth * damping), 2.0 * growth
         final = _try_solve(linearized, values, 0.0)
         return Minimum(values, error, final, Convergence.TOO_MANY_ITERATIONS, self.max_iterations)
 

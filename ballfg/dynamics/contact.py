@@ -30,17 +30,17 @@ LEAST_FALL = 1.0
 LONGEST_FALL = 20.0
 """s. A contact further away counts as none."""
 BEYOND = 0.3
-"""s. A contact this far outside the interval that it was named for is no continuation of it any more."""
+"""s. A contact that lies further away than its interval's length and this is no continuation of it any more: NaN."""
 MIN_SPEED = 1e-6
 """m/s. Least normal speed that a Newton step divides by; a ball that grazes more gently is at its apex."""
 
 
 def contact_time(
-    model: BallModel, state: Tensor, height: Tensor | float, longest: float = LONGEST_FALL
+    model: BallModel, state: Tensor, height: Tensor | float, longest: Tensor | float = LONGEST_FALL
 ) -> Tensor:
     """Time until the falling ball touches a surface, on the branch on which it moves down.
 
-    Args: model: the ball.  state: (..., 9).  height: m, scalar or (...).  longest: s, how far away to look.
+    Args: model: the ball.  state: (..., 9).  height: m, scalar or (...).  longest: s, scalar or (...), how far to look.
     Returns: (...) s; negative when the ball is already below the surface on its way down. NaN where the ball,
         in free flight, does not come down to that height within `longest`. Differentiable in the state and the
         parameters.
@@ -57,7 +57,7 @@ def contact_time(
     return tau
 
 
-def _search(model: BallModel, state: Tensor, height: Tensor | float, start: Tensor, longest: float) -> Tensor:
+def _search(model: BallModel, state: Tensor, height: Tensor | float, start: Tensor, longest: Tensor | float) -> Tensor:
     """Contact times (...) s near the times `start`, each step solving the parabola through the ball's motion there.
 
     NaN where the search does not arrive, or starts at NaN.
@@ -85,7 +85,7 @@ def _search(model: BallModel, state: Tensor, height: Tensor | float, start: Tens
     return tau.masked_fill(lost | ~arrived, torch.nan)
 
 
-def _scan(model: BallModel, state: Tensor, height: Tensor | float, wanted: Tensor, longest: float) -> Tensor:
+def _scan(model: BallModel, state: Tensor, height: Tensor | float, wanted: Tensor, longest: Tensor | float) -> Tensor:
     """Times (...) s within one step of the contact: small steps, back in time for a ball that falls below the surface.
 
     NaN where the ball is not `wanted` or turns before it gets there.
@@ -94,7 +94,8 @@ def _scan(model: BallModel, state: Tensor, height: Tensor | float, wanted: Tenso
     h = model.gap(state, height)
     step = torch.where((h < 0) & (state[..., VZ] < 0), -MAX_STEP, MAX_STEP).to(state.dtype)
     open_ = wanted.clone()
-    for i in range(math.ceil(longest / MAX_STEP)):
+    furthest = float(longest.max()) if isinstance(longest, Tensor) else longest
+    for i in range(math.ceil(furthest / MAX_STEP)):
         after = rk4_step(model.rates, state, step.unsqueeze(-1))
         h_after = model.gap(after, height)
         forward = step > 0
@@ -136,7 +137,7 @@ def fly_through(
     lost = torch.zeros_like(dt, dtype=torch.bool)
     times = []
     for height in heights:
-        tau = contact_time(model, state, height, _reach(dt))
+        tau = contact_time(model, state, height, dt.abs() + BEYOND)
         lost = lost | tau.isnan()
         tau = tau.masked_fill(lost, 0.0)
         state = model.bounce(fly(model, state, tau))
@@ -163,7 +164,7 @@ def fly_through_jacobian(
     times = []
     for height in heights:
         with torch.no_grad():
-            tau = contact_time(model, state, height, _reach(dt))
+            tau = contact_time(model, state, height, dt.abs() + BEYOND)
         before, flight = fly_jacobian(model, state, tau)
         jacobian = flight @ jacobian
         with torch.no_grad():
@@ -184,11 +185,6 @@ def fly_through_jacobian(
         rate = derivative(model.rates, after)
     jacobian = flight @ jacobian - rate.unsqueeze(-1) * elapsed_by_state
     return after, torch.stack(times, dim=-1), jacobian
-
-
-def _reach(dt: Tensor) -> float:
-    """How far, s, a contact that is meant to lie in intervals dt may lie away."""
-    return float(dt.abs().max()) + BEYOND
 
 
 def _gap_gradient(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:

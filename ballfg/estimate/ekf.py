@@ -6,7 +6,6 @@ docs/estimators_ekf.md has the equations, what the filter does at contacts, hits
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Literal
 
 import numpy as np
@@ -23,12 +22,10 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
 from ballfg.estimate.problem import coefficient_means, trackwise_model
 from ballfg.estimate.result import Array, Estimate, Status, leave_one_out
-from ballfg.estimate.rts import FilterRecord, rts_smooth
+from ballfg.estimate.rts import FilterRecord, fly_back, rts_smooth
 from ballfg.estimate.segmentation import Contact, Quality
 from ballfg.estimate.settings import Settings, sample_sigmas
-from ballfg.estimate.sliding_window import WINDOW, SlidingWindow, spin_start
-from ballfg.factors.kind import Rows
-from ballfg.factors.loss import Loss
+from ballfg.estimate.sliding_window import WINDOW, SlidingWindow, first_pair, spin_start
 from ballfg.state import POSITION, STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
 from ballfg.tracks import Track
 
@@ -40,12 +37,8 @@ HIT_POSITION = 1.0
 """m, standard deviation of the position after a hit: it starts anew at the measurement."""
 WIDE_VELOCITY = 1.0
 """m/s. While the velocity is less well known, a step is linearised at the velocity that its sample suggests."""
-START_SEARCH = 12
-"""How many samples may be tried as the first one of a flight."""
-START_ACCELERATION = 20.0
-"""m/s^2, standard deviation of what bends three samples beside gravity: twice a fast ball's drag."""
 NEAR_SURFACE = 0.05
-"""m. Three samples, one of them this close to a surface, need not lie on one parabola: there may be a bounce."""
+"""m. Samples this close to a surface need not lie on one parabola with others: there may be a bounce."""
 
 
 @dataclass(frozen=True)
@@ -242,10 +235,10 @@ class ExtendedKalmanFilter(Estimator):
             return self._failed(track, run)
         mean, covariance = rts_smooth(record) if self.smooth else (record.mean, record.covariance)
         if record.start > 0 and (self.smooth or self.initialise == "prior"):
-            run.fly_back(mean, covariance)
+            fly_back(self.trackwise, record.start, track.times, run.flight_noise, mean, covariance)
         whitened = record.whitened
         if self.smooth:
-            samples = run.position_rows(mean)
+            samples = record.position_rows(mean, track.positions, run.sigma)
             states = mean[:, :STATE_DIM], covariance[:, :STATE_DIM, :STATE_DIM]
             whitened = leave_one_out(*states, track.positions, run.sigma, samples)
         return self._result(track, run, mean, covariance, whitened)
@@ -360,31 +353,12 @@ class _Run:
         ball.P = self.record.covariance[since - 1].copy()
 
     def _first_pair(self, first: int) -> tuple[int, int]:
-        """The first two good samples of a flight, from sample `first` on: with a third they lie on a parabola.
-
-        A filter believes its first two samples whatever they are, as nothing is known to hold against them. Of the
-        triples that end earliest, the one with the best parabola is taken.
-        """
-        if self.settings.find_events:
-            for last in range(first + 2, min(first + START_SEARCH, len(self.track))):
-                pairs = list(combinations(range(first, last), 2))
-                misses = [self._parabola_miss(i, j, last) for i, j in pairs]
-                if min(misses) < GATE:
-                    return pairs[int(np.argmin(misses))]
-        return first, first + 1
-
-    def _parabola_miss(self, i: int, j: int, k: int) -> float:
-        """Squared whitened distance of sample j from a flight between samples i and k; near a surface, zero."""
-        t, p, variance = self.track.times, self.track.positions, self.sigma**2
-        low = p[[i, j, k], Z, None] - self.owner.model.radius - np.array(self.owner.surfaces.heights())
-        if np.abs(low).min() < NEAR_SURFACE:
-            return 0.0
-        share = (t[k] - t[j]) / (t[k] - t[i])
-        miss = p[j] - share * p[i] - (1.0 - share) * p[k]
-        bend = 0.5 * (t[j] - t[i]) * (t[k] - t[j])
-        miss[Z] -= bend * STANDARD_GRAVITY
-        spread = variance[j] + share**2 * variance[i] + (1.0 - share) ** 2 * variance[k]
-        return float((miss**2 / (spread + (bend * START_ACCELERATION) ** 2)).sum())
+        """The first two good samples of a flight from sample `first` on; a filter believes them whatever they are."""
+        if not self.settings.find_events:
+            return first, first + 1
+        z = self.track.positions[:, Z, None] - self.owner.model.radius
+        near = np.abs(z - np.array(self.owner.surfaces.heights())).min(axis=-1) < NEAR_SURFACE
+        return first_pair(self.track.times, self.track.positions, self.sigma, near, first)
 
     def _predict(self, ball: _BallFilter, k: int) -> None:
         """To the time of sample k."""
@@ -429,22 +403,3 @@ class _Run:
         self.record.mean[k] = ball.x
         self.record.covariance[k] = ball.P = (ball.P + ball.P.T) / 2
         self.record.quality[k] = Quality.GOOD if used else Quality.OUTLIER
-
-    def position_rows(self, mean: Array) -> Rows:
-        """The samples that took part as whitened position residuals, linear in the states."""
-        taken = self.record.used & (np.arange(len(mean)) >= self.record.start)
-        whitening = taken[:, None] / self.sigma
-        jacobian = np.zeros((len(mean), 3, STATE_DIM))
-        jacobian[:, np.arange(3), np.arange(3)] = whitening
-        residual = whitening * (mean[:, POSITION] - self.track.positions)
-        return Rows(np.arange(len(mean))[:, None], residual, (jacobian,), Loss())
-
-    def fly_back(self, mean: Array, covariance: Array) -> None:
-        """Fills the states before the first used sample, in place: free flight back from it."""
-        for k in range(self.record.start - 1, -1, -1):
-            dt = torch.from_numpy(self.track.times[k : k + 1] - self.track.times[k + 1 : k + 2])
-            after, jacobian = fly_jacobian(self.owner.trackwise, torch.from_numpy(mean[k + 1 : k + 2]), dt)
-            F = jacobian[0].numpy()
-            widened = covariance[k + 1].copy()
-            widened[:STATE_DIM, :STATE_DIM] += self.flight_noise[k]
-            mean[k], covariance[k] = after[0].numpy(), F @ widened @ F.T

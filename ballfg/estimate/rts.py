@@ -9,9 +9,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from ballfg.dynamics.integrate import fly_jacobian
+from ballfg.dynamics.model import BallModel
 from ballfg.estimate.segmentation import Contact, Quality
+from ballfg.factors.kind import Rows
+from ballfg.factors.loss import Loss
+from ballfg.state import POSITION, STATE_DIM
 
 Array = NDArray[np.float64]
 
@@ -64,6 +70,17 @@ class FilterRecord:
         """(n,) samples that took part."""
         return self.quality != Quality.OUTLIER
 
+    def position_rows(self, mean: Array, measured: Array, sigma: Array) -> Rows:
+        """The samples that took part, as whitened position residuals at `mean` (n, d).
+
+        Args: mean: (n, d).  measured: (n, 3) m.  sigma: (n, 3) m.
+        """
+        n = len(mean)
+        whitening = (self.used & (np.arange(n) >= self.start))[:, None] / sigma
+        jacobian = np.zeros((n, 3, STATE_DIM))
+        jacobian[:, np.arange(3), np.arange(3)] = whitening
+        return Rows(np.arange(n)[:, None], whitening * (mean[:, POSITION] - measured), (jacobian,), Loss())
+
 
 def rts_smooth(record: FilterRecord) -> tuple[Array, Array]:
     """Means (n, d) and covariances (n, d, d) given all samples; those before `record.start` are left as they are.
@@ -90,3 +107,24 @@ def _gain(cross: Array, covariance: Array) -> Array:
     scale = 1.0 / np.sqrt(np.diagonal(covariance))
     correlation = covariance * np.outer(scale, scale)
     return np.asarray(np.linalg.solve(correlation, (cross * scale).T).T * scale)
+
+
+def fly_back(model: BallModel, start: int, times: Array, noise: Array, mean: Array, covariance: Array) -> None:
+    """Fills the states before sample `start`, in place: free flight back from it.
+
+    Args:
+        model: the ball, with its coefficients in the state.
+        start: the first sample with a state.
+        times: (n,) s.
+        noise: (n - 1, 9, 9), process noise of free flight over each interval.
+        mean: (n, d).
+        covariance: (n, d, d).
+    """
+    for k in range(start - 1, -1, -1):
+        after, jacobian = fly_jacobian(
+            model, torch.from_numpy(mean[k + 1 : k + 2]), torch.from_numpy(times[k : k + 1] - times[k + 1 : k + 2])
+        )
+        F = jacobian[0].numpy()
+        widened = covariance[k + 1].copy()
+        widened[:STATE_DIM, :STATE_DIM] += noise[k]
+        mean[k], covariance[k] = after[0].numpy(), F @ widened @ F.T

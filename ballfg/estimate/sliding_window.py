@@ -6,6 +6,8 @@ Roto-Translational Invariant Representations", section IV: the average velocity 
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
@@ -21,6 +23,12 @@ from ballfg.tracks import Track
 
 WINDOW = 5
 """Samples in a window."""
+START_SEARCH = 12
+"""How many samples are looked at for the first good ones of a flight."""
+START_GATE = 30.7
+"""Squared whitened miss beyond which three samples are not one flight: chi-square, 3 degrees of freedom, 1e-6."""
+START_ACCELERATION = 20.0
+"""m/s^2, standard deviation of what bends three samples beside gravity: twice a fast ball's drag."""
 FRICTION_SHARE = 0.5
 """Largest change of tangential speed in a bounce, as a share of the normal speed's change: Coulomb's mu."""
 
@@ -187,3 +195,40 @@ def _neighbour_slopes(times: Array, positions: Array) -> Array:
     slopes = np.diff(positions, axis=0) / np.diff(times)[:, None]
     padded = np.concatenate((slopes[:1], slopes, slopes[-1:]))
     return np.asarray((padded[1:] + padded[:-1]) / 2)
+
+
+def first_pair(
+    times: Array, positions: Array, sigma: Array, near: NDArray[np.bool_], first: int = 0
+) -> tuple[int, int]:
+    """The first two good samples of a flight: with a third they lie on a parabola.
+
+    Of the triples that end earliest, the one with the best parabola is taken. Samples near a surface agree with all,
+    as there may be a bounce between them.
+
+    Args:
+        times: (n,) s.
+        positions: (n, 3) m.
+        sigma: (n, 3) m.
+        near: (n,) bool, samples near a surface.
+        first: the first sample to look at.
+    Returns: indices of two samples; `first` and the next one where nothing fits.
+    """
+    for last in range(first + 2, min(first + START_SEARCH, len(times))):
+        pairs = list(combinations(range(first, last), 2))
+        misses = [
+            0.0 if near[[i, j, last]].any() else _parabola_miss(times, positions, sigma, i, j, last) for i, j in pairs
+        ]
+        if min(misses) < START_GATE:
+            return pairs[int(np.argmin(misses))]
+    return first, first + 1
+
+
+def _parabola_miss(times: Array, positions: Array, sigma: Array, i: int, j: int, k: int) -> float:
+    """Squared whitened distance of sample j from a flight between samples i and k, drag and lift unknown."""
+    span = times[k] - times[i]
+    shares = np.array([(times[k] - times[j]) / span, -1.0, (times[j] - times[i]) / span])
+    bend = 0.5 * (times[j] - times[i]) * (times[k] - times[j])
+    miss = shares @ positions[[i, j, k]]
+    miss[Z] += bend * STANDARD_GRAVITY
+    variance = shares**2 @ sigma[[i, j, k]] ** 2 + (bend * START_ACCELERATION) ** 2
+    return float((miss**2 / variance).sum())

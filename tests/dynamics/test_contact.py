@@ -182,8 +182,7 @@ def test_saltation_formula(model, states):
 def test_jacobian_by_three_routes(any_model, states, differences, contacts):
     state = states(6)
     state[:, 2] -= 0.15
-    state[:, 5] -= 1.0
-    dt = torch.linspace(0.05, 0.15, 6, dtype=torch.float64)  # contacts fall in and outside
+    dt = torch.linspace(0.05, 0.15, 6, dtype=torch.float64) + 0.3 * contacts  # contacts fall in and outside
     heights = (0.0,) * contacts
     after, times, jacobian = fly_through_jacobian(any_model, state, dt, heights)
     value, graph_times = fly_through(any_model, state, dt, heights)
@@ -273,9 +272,8 @@ def test_two_newton_steps_give_the_exact_hessian_and_one_does_not(any_model, sta
 
 
 def test_hessian_of_fly_through(any_model, states):
-    start, dt = states(1)[0], torch.tensor([0.1], dtype=torch.float64)
+    start, dt = states(1)[0], torch.tensor([0.4], dtype=torch.float64)
     start[2] -= 0.2
-    start[5] -= 1.0
 
     def loss(s):
         return fly_through(any_model, s[None], dt, (0.0, 0.0))[0][..., :6].square().sum()
@@ -301,6 +299,16 @@ def test_grazing_stays_finite(model):
     assert tau.item() == pytest.approx(0.0, abs=1e-6)
     (gradient,) = torch.autograd.grad(tau.sum(), state)
     assert gradient.isfinite().all()
+
+
+def test_a_named_contact_far_from_its_interval_is_none(build):
+    model = build(gravity={"g": 10.0}, restitution={"e": 0.9})
+    far = rows((0, 0, R + 0.8, 1, 0, 0, 0, 0, 0))  # touches after 0.4 s
+    dt = torch.tensor([0.09, 0.11], dtype=torch.float64)
+    for flow in (fly_through, fly_through_jacobian):
+        times = flow(model, far.expand(2, 9), dt, (0.0,))[1]
+        assert times[0].isnan().all()
+        assert times[1].item() == pytest.approx(0.4, abs=1e-12)
 
 
 def test_empty_batch(model):

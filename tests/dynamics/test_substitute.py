@@ -89,7 +89,7 @@ def test_augmented_motion_is_that_of_the_substituted_model(augmented, model):
 @pytest.mark.parametrize("heights", [(), (0.0,), (0.0, 0.0)])
 def test_augmented_jacobian_by_two_routes(augmented, heights):
     ball, state = augmented
-    dt = torch.full((7,), 0.1, dtype=torch.float64)
+    dt = torch.full((7,), 0.1 + 0.3 * len(heights), dtype=torch.float64)
     state[:, 2] -= 0.15
     _, _, jacobian = fly_through_jacobian(ball, state, dt, heights)
 

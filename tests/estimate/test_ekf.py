@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from ballfg.factors.loss import Loss
+from ballfg.factors.noise import ProcessNoise
 from scipy.stats import chi2
 
 from ballfg.dynamics.analytic import AnalyticModel
@@ -20,8 +22,7 @@ from ballfg.estimate.ekf import ExtendedKalmanFilter, advance_jacobian
 from ballfg.estimate.result import Estimate, Status
 from ballfg.estimate.segmentation import Quality
 from ballfg.estimate.settings import Settings, uncertain
-from ballfg.factors.loss import Loss
-from ballfg.factors.noise import ProcessNoise
+from ballfg.estimate.sliding_window import SlidingWindow
 from ballfg.state import POSITION, STATE_DIM, VELOCITY
 from ballfg.tracks import Track, read_dataset
 
@@ -192,13 +193,10 @@ def test_motion_is_the_rollout_and_its_jacobian(start, dt):
         return advance(trackwise, x, torch.full((len(x),), dt, dtype=torch.float64), surfaces).detach()
 
     torch.testing.assert_close(motion.after, move(state), rtol=1e-9, atol=1e-9)
-    resting = "rest" if abs(float(motion.after[0, 5])) < 1e-9 else ""
     step = 1e-6 * torch.eye(11, dtype=torch.float64)
     difference = ((move(state + step) - move(state - step)) / 2e-6).T
-    if resting and start[2] == 0.02:
-        step[2, 2] = step[5, 5] = 0.0  # a resting ball that is lifted flies: another motion
-    else:
-        torch.testing.assert_close(motion.jacobian, difference, rtol=1e-5, atol=2e-5)
+    # differences of 1e-6 in numbers up to 100, found to 1e-12: 1e-5 relative
+    torch.testing.assert_close(motion.jacobian, difference, rtol=1e-5, atol=2e-5)
 
 
 # --- consistency -------------------------------------------------------------------------------------------------
@@ -229,7 +227,6 @@ def test_nees_and_nis_lie_in_their_bands(many, smooth):
         last.append(errors[-1])
         middle.append(errors[20])
         nis.append(result.nis[2:])
-    print(estimator.name, np.mean(last), np.mean(middle), np.mean(nis))
     assert inside(np.mean(last), 9, len(last))
     assert inside(np.mean(middle), 9, len(middle))
     if not smooth:
@@ -379,8 +376,6 @@ def test_a_contact_close_to_a_stamp(shift, rng):
 
 
 def test_window_start_equals_the_sliding_window_and_uses_nothing_twice(flight):
-    from ballfg.estimate.sliding_window import SlidingWindow
-
     truth, track = flight
     window = SlidingWindow(nominal_model(), TABLE, PLAIN).estimate(track)
     result = run(track, initialise="window")
@@ -400,7 +395,7 @@ def test_coefficients_are_learnt_on_the_way(rng):
     parameters = dict(model.named_parameters())
     with torch.no_grad():
         parameters["contact.restitution.e"].fill_(0.85)
-    truth, track = simulate(model, settings, SERVE, np.arange(60) * 0.01, rng, label=False)
+    _, track = simulate(model, settings, SERVE, np.arange(60) * 0.01, rng, label=False)
     with torch.no_grad():
         parameters["contact.restitution.e"].fill_(0.93)
     result = ExtendedKalmanFilter(model, TABLE, settings, smooth=True).estimate(track)

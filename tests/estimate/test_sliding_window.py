@@ -1,4 +1,4 @@
-"""The sliding-window mean against closed forms, its covariance against simulation, and the fits that start smoothers."""
+"""The sliding-window mean against closed forms, its covariance against simulation, and fits that start smoothers."""
 
 from __future__ import annotations
 
