@@ -17,6 +17,7 @@ from ballfg.cli.inputs import default_jobs
 
 if TYPE_CHECKING:
     from ballfg.benchmarks.results import Results
+    from ballfg.tracks import Dataset
 
 app = typer.Typer(
     name="ballfg-bench",
@@ -57,11 +58,7 @@ def estimators(
     if data is None:
         pictures = run_synthetic(results, _folder(out), size, processes)
     else:
-        from ballfg.tracks import read_dataset
-
-        dataset = read_dataset(data)
-        for note in dataset.notes:
-            print(f"note: {note}", file=sys.stderr)
+        dataset = _open(data)
         pictures = run_dataset(results, dataset, _folder(out), size, processes)
     _finish(results, out, pictures)
 
@@ -77,7 +74,7 @@ def speed(data: Data = None, out: Out = Path("results"), quick: Quick = False, s
     from ballfg.benchmarks.speed import run_speed
 
     results = _start("speed", data, quick, seed)
-    run_speed(results, data, quick)
+    run_speed(results, None if data is None else _open(data), quick)
     _finish(results, _folder(out), [])
 
 
@@ -92,6 +89,16 @@ def _start(command: str, data: Path | None, quick: bool, seed: int) -> Results:
     words += [] if data is None else ["--data", data.resolve().name]
     words += ["--quick"] if quick else []
     return Results(" ".join([*words, "--seed", str(seed)]), seed)
+
+
+def _open(data: Path) -> Dataset:
+    """A dataset; what was repaired in it is said on stderr."""
+    from ballfg.tracks import read_dataset
+
+    dataset = read_dataset(data)
+    for note in dataset.notes:
+        print(f"note: {note}", file=sys.stderr)
+    return dataset
 
 
 def _folder(out: Path) -> Path:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +20,6 @@ from ballfg.benchmarks.step_noise import StepNoise
 from ballfg.benchmarks.synthetic import Protocol, fair_protocol, paper_protocol
 from ballfg.dynamics import nominal_model
 from ballfg.estimate import Settings, dataset_settings
-from ballfg.factors.noise import ProcessNoise
 from ballfg.tracks import Dataset
 
 
@@ -81,7 +81,7 @@ def run_dataset(results: Results, dataset: Dataset, out: Path, size: Size, jobs:
             f"{dataset.path}: no track goes on after {OBSERVE:g} s, so that nothing can be predicted. "
             "Give a dataset with longer tracks."
         )
-    rows, name = results.rows, measured.name
+    rows, name = results.rows, re.sub(r"[^\w-]+", "-", measured.name)
     return [
         growth_picture(rows, measured, out / f"growth_{name}.png"),
         calibration_picture(rows, measured, out / f"calibration_{name}.png"),
@@ -97,10 +97,10 @@ def describe(protocol: Protocol) -> str:
 
 def describe_settings(settings: Settings) -> str:
     """Noise and priors in words."""
-    noise, process = settings.position_noise, settings.process
+    noise = settings.position_noise
     parts = [
         f"position noise {' / '.join(f'{1e3 * s:.2g}' for s in noise)} mm",
-        "process noise " + ", ".join(f"{name} {value:g}" for name, value in _noise_terms(process)),
+        "process noise " + ", ".join(f"{name} {value:g}" for name, value in _noise_terms(settings)),
         f"spin label {settings.spin_label_noise:g} rad/s, spin prior {settings.spin_prior:g} rad/s",
         f"velocity prior {settings.velocity_prior:g} m/s",
         f"{settings.loss.name} loss",
@@ -110,9 +110,11 @@ def describe_settings(settings: Settings) -> str:
     return "; ".join(parts)
 
 
-def _noise_terms(process: ProcessNoise) -> list[tuple[str, float]]:
+def _noise_terms(settings: Settings) -> list[tuple[str, float]]:
     """The terms that act, by name, SI units."""
-    unused = ("acceleration", "contact", "hit") if isinstance(process, StepNoise) else ()
+    process = settings.process
+    unused = () if settings.find_events else ("hit",)
+    unused += ("acceleration", "contact") if isinstance(process, StepNoise) else ()
     return [(name, value) for name, value in vars(process).items() if value and not name.startswith(unused)]
 
 

@@ -65,12 +65,12 @@ class NetworkFlight(BallModel):
         return self.bounces.bounce(state)
 
 
-def fitted_network(model: AnalyticModel, seed: int = 0) -> NetworkFlight:
+def fitted_network(model: AnalyticModel, iterations: int = FIT_ITERATIONS) -> NetworkFlight:
     """A network fitted to a model's accelerations, in seconds and always to the same weights.
 
     An unfitted network would make an ill-posed problem, on which a solver's time says nothing.
     """
-    generator = torch.Generator().manual_seed(seed)
+    generator = torch.Generator().manual_seed(0)
     network = NetworkFlight(model, generator)
     state = torch.zeros((FIT_SAMPLES, STATE_DIM), dtype=torch.float64)
     state[:, VELOCITY] = SPEED_SCALE * torch.randn((FIT_SAMPLES, 3), generator=generator, dtype=torch.float64)
@@ -78,7 +78,7 @@ def fitted_network(model: AnalyticModel, seed: int = 0) -> NetworkFlight:
     with torch.no_grad():
         target = (model.rates(state)[0] - network.gravity) / FORCE_SCALE
     optimizer = torch.optim.LBFGS(
-        network.layers.parameters(), max_iter=FIT_ITERATIONS, history_size=30, line_search_fn="strong_wolfe"
+        network.layers.parameters(), max_iter=iterations, history_size=30, line_search_fn="strong_wolfe"
     )
 
     def loss() -> Tensor:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -29,7 +28,7 @@ from ballfg.factors.kind import Values
 from ballfg.factors.loss import Loss
 from ballfg.predict import Belief, Propagator
 from ballfg.state import POSITION
-from ballfg.tracks import SPIN_LABELS, Track, read_dataset
+from ballfg.tracks import SPIN_LABELS, Dataset, Track
 
 Array = NDArray[np.float64]
 
@@ -52,19 +51,20 @@ DATASET_TRACKS = 20
 """Tracks of a dataset that are timed."""
 
 
-def run_speed(results: Results, data: Path | None, quick: bool) -> None:
+def run_speed(results: Results, dataset: Dataset | None, quick: bool) -> None:
     """All times; a control before and after, and with --data the time for each of some measured tracks."""
     watch = Stopwatch(runs=10 if quick else 60)
     results.add(CASE, "control", "matrix_product_time", "ms", watch.control(), watch.runs)
     model = problem_model()
-    models: dict[str, BallModel] = {"analytic": model, "network": fitted_network(model)}
+    network = fitted_network(model)
+    models: dict[str, BallModel] = {"analytic": model, "network": network}
     track = problem_track(model)
     for name, ball in progress(models.items(), len(models), "models timed"):
         _time_model(results, name, ball, track, watch)
     _time_coefficients(results, model, track, watch)
-    results.add(CASE, "network", "parameters", "1", parameter_count(fitted_network(model)), 1)
-    if data is not None:
-        _time_dataset(results, data)
+    results.add(CASE, "network", "parameters", "1", parameter_count(network), 1)
+    if dataset is not None:
+        _time_dataset(results, dataset)
     results.add(CASE, "control", "matrix_product_time_after", "ms", watch.control(), watch.runs)
 
 
@@ -194,9 +194,8 @@ def _time_prediction(results: Results, name: str, estimator: Estimator, track: T
     results.add(CASE, name, "prediction_time", "ms", figure, watch.runs)
 
 
-def _time_dataset(results: Results, data: Path) -> None:
+def _time_dataset(results: Results, dataset: Dataset) -> None:
     """Time of the smoother for each of the first tracks of a dataset."""
-    dataset = read_dataset(data)
     model = nominal_model(dataset.info.ball.radius)
     smoother = Smoother(model, dataset_surfaces(dataset), dataset_settings(dataset, model))
     tracks = [track for track, _ in zip(dataset, range(DATASET_TRACKS), strict=False)]

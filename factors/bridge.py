@@ -1,8 +1,8 @@
 """The bridge to GTSAM's own solvers: every row of a kind as a CustomFactor, answered from a batch.
 
 GTSAM asks for one factor at a time, in C++ order; torch is quick only on batches. A `Bridge` keeps the last residual
-and Jacobians of every row together with the very bytes of the inputs they belong to. A question about the same inputs is
-answered from there; any other question is a miss. docs/custom_factors.md is the contract.
+and Jacobians of every row together with the very bytes of the inputs they belong to. A question about the same inputs
+is answered from there; any other question is a miss. docs/custom_factors.md is the contract.
 """
 
 from __future__ import annotations
@@ -82,21 +82,16 @@ class Bridge:
         self.calls += 1
         residual, jacobians = checked(self.kind, rows, inputs, *self.kind.compute(rows, inputs))
         for k, row in enumerate(rows.tolist()):
-            self._inputs[row] = tuple(block[k].tobytes() for block in inputs)
-            self._answers[row] = residual[k], tuple(j[k] for j in jacobians)
+            self.keep(row, tuple([x[k] for x in inputs]), residual[k], tuple([j[k] for j in jacobians]))
         return residual, jacobians
 
     def keep(self, row: int, inputs: tuple[Array, ...], residual: Array, jacobians: tuple[Array, ...]) -> None:
-        """Keep an answer that the caller computed itself, checked like any other.
+        """Keep an answer that the caller computed itself and put through `checked`.
 
         Args: row: which.  inputs: vectors (d,).  residual: (r,), whitened.  jacobians: (r, d) each.
-        Raises: ValueError: as `prepare`.
         """
-        batch = checked(
-            self.kind, np.array([row]), tuple(x[None] for x in inputs), residual[None], tuple(j[None] for j in jacobians)
-        )
         self._inputs[row] = tuple([x.tobytes() for x in inputs])
-        self._answers[row] = batch[0][0], tuple([j[0] for j in batch[1]])
+        self._answers[row] = residual, jacobians
 
     def answer(self, row: int, keys: Sequence[int], values: gtsam.Values) -> tuple[Array, tuple[Array, ...]]:
         """Residual (r,) and Jacobians (r, d) of a row at GTSAM's values."""
@@ -160,10 +155,8 @@ def checked(
             f"{name}.compute must return one Jacobian per variable, {len(inputs)}; got {len(jacobians)}. "
             "A block left out would end the interpreter."
         )
-    expected = [("residual", residual, (count, kind.dim))]
-    expected += [
-        (f"Jacobian {i}", block, (count, kind.dim, inputs[i].shape[-1])) for i, block in enumerate(jacobians)
-    ]
+    expected: list[tuple[str, Array, tuple[int, ...]]] = [("residual", residual, (count, kind.dim))]
+    expected += [(f"Jacobian {i}", block, (count, kind.dim, inputs[i].shape[-1])) for i, block in enumerate(jacobians)]
     for label, array, shape in expected:
         _check_array(f"{name}.compute: {label}", array, shape, rows)
     return np.ascontiguousarray(residual), tuple(np.ascontiguousarray(block) for block in jacobians)

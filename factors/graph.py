@@ -65,6 +65,9 @@ class Minimum:
     iterations: int
 
 
+AT_KINK = 1e-3
+"""Posterior standard deviations. A step this short that does not reduce the objective ends the search too: the minimum
+lies where a loss or the friction bends."""
 MOST_DAMPING = 1e8
 """Marquardt's lambda at which a step is as good as none."""
 
@@ -108,6 +111,8 @@ class LevenbergMarquardt:
                 values, linearized, error = moved, trial, trial_error
                 damping, growth = damping * (0.1 if gain > 0.5 else 0.5), 10.0
                 damping = 0.0 if damping < self.first_damping else damping
+            elif step is not None and damping == 0.0 and np.sqrt(2 * abs(step.decrease)) < AT_KINK:
+                return Minimum(values, error, step, Convergence.CONVERGED, iteration)
             elif damping > MOST_DAMPING:
                 return Minimum(values, error, _try_solve(linearized, values, 0.0), Convergence.STUCK, iteration)
             else:

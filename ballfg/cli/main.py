@@ -11,6 +11,8 @@ from collections.abc import Sequence
 import typer
 
 from ballfg.cli.errors import guarded
+from ballfg.cli.estimate import estimate
+from ballfg.cli.predict import predict
 from ballfg.cli.simulate import simulate
 
 app = typer.Typer(
@@ -21,6 +23,8 @@ app = typer.Typer(
     rich_markup_mode="rich",
 )
 
+app.command()(estimate)
+app.command()(predict)
 app.command()(simulate)
 
 

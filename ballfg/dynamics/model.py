@@ -142,7 +142,7 @@ def take_rows(module: M, rows: Tensor, count: int) -> M:
 
 
 def _shallow_copy(module: M) -> M:
-    """A module of its own with the same parts; a tenth of what `copy.copy` takes, which estimators pay at each stage."""
+    """A module of its own with the same parts; cheaper than `copy.copy`, since estimators pay for it at each stage."""
     clone = object.__new__(type(module))
     own = clone.__dict__
     own.update(module.__dict__)

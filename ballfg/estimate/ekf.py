@@ -307,7 +307,7 @@ class _Run:
         rejected: list[int] = []
         while k < n:
             self._predict(ball, k)
-            if not np.isfinite(ball.x).all():
+            if not (np.isfinite(ball.x).all() and np.isfinite(ball.P).all()):
                 record.mean[k:] = np.nan
                 return
             if k in self.skipped:
@@ -372,7 +372,8 @@ class _Run:
         ball.predict()
         record.contacts.pop(k - 1, None)
         if motion.contacts:
-            record.contacts[k - 1] = tuple(Contact(k - 1, times[k - 1] + t, height) for t, height in motion.contacts)
+            begin = float(times[k - 1])
+            record.contacts[k - 1] = tuple(Contact(k - 1, begin + time, height) for time, height in motion.contacts)
         record.prior_mean[k], record.prior_covariance[k] = ball.x, ball.P
         record.transition[k], record.noise[k] = ball.F, ball.Q
 

@@ -11,7 +11,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
 from ballfg.estimate.online_events import SIGMA_FACTOR, EventTracker, contact_step, first_difference
-from ballfg.estimate.online_final import Frozen, final_estimate, freeze
+from ballfg.estimate.online_final import Frozen, WindowSmoother, final_estimate, freeze
 from ballfg.estimate.online_interval import FLIGHT, Motion, motions_of
 from ballfg.estimate.online_isam import Sample, Update
 from ballfg.estimate.online_window import Window
@@ -234,6 +234,9 @@ class Online(Estimator):
         ]
         whitened = np.array([state.innovation for state in states])
         assert self.window is not None
-        result = final_estimate(self.window, track, self.events, self._frozen, whitened, self.settings)
+        smoother = WindowSmoother(self.window, self.model, self.surfaces, self.settings)
+        first = self.window.first
+        found = self.events.segmentation(first, track.times[first:], track.positions[first:])
+        result = final_estimate(smoother, self.window, track, found, self._frozen)
         self.reset()
-        return result
+        return replace(result, whitened=whitened)

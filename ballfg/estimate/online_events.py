@@ -100,7 +100,7 @@ class EventTracker:
         return replace(segmentation, contacts=tuple(contacts))
 
     def move(self, interval: int, height: float, step: int) -> bool:
-        """Note that the contact now in an interval of the stream belongs to a neighbour; False if it moved too often."""
+        """Note that the contact in an interval of the stream belongs to a neighbour; False if it moved too often."""
         for place, steps in self._moves.items():
             if place[1] == height and place[0] + sum(steps) == interval:
                 if len(steps) >= MOST_MOVES:

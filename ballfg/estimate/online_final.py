@@ -7,19 +7,20 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+from numpy.typing import NDArray
 
-from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.estimate.online_events import SIGMA_FACTOR, EventTracker
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimate.online_events import SIGMA_FACTOR
 from ballfg.estimate.online_isam import Sample
 from ballfg.estimate.online_window import Window
 from ballfg.estimate.problem import Events, build_graph, effective_sigmas
 from ballfg.estimate.result import Estimate
 from ballfg.estimate.segmentation import Contact, Segmentation
 from ballfg.estimate.settings import Settings
-from ballfg.estimate.smoother import MAX_REFINEMENTS, Solution, _places, _prior_covariances, _refined, _status, _timed
+from ballfg.estimate.smoother import MAX_REFINEMENTS, Smoother, Solution, _places, _refined
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
-from ballfg.factors.covariance import Covariances, marginal_covariances
-from ballfg.factors.graph import BallGraph, LevenbergMarquardt
+from ballfg.factors.graph import BallGraph
 from ballfg.factors.kind import COEFFICIENTS, Array, FactorKind, Index, Values
 from ballfg.factors.prior import PriorFactors
 from ballfg.state import STATE_DIM
@@ -56,9 +57,10 @@ class LinearFactors(FactorKind):
     """
 
     def __init__(self, factor: gtsam.LinearContainerFactor, values: Values, first: int) -> None:
-        numbers = [COEFFICIENTS if k == COEFFICIENT_KEY else k - STATE_KEY - first for k in factor.keys()]
+        keys = list(factor.keys())
+        numbers = [COEFFICIENTS if k == COEFFICIENT_KEY else k - STATE_KEY - first for k in keys]
         at = gtsam.Values()
-        for number, key in zip(numbers, factor.keys(), strict=True):
+        for number, key in zip(numbers, keys, strict=True):
             at.insert(key, values.coefficients if number == COEFFICIENTS else values.states[number])
         matrix, self.b = factor.linearize(at).jacobian()
         super().__init__(np.array([numbers]), len(self.b))
@@ -72,28 +74,30 @@ class LinearFactors(FactorKind):
         return (np.sum(parts, axis=0) - self.b)[None], tuple(block[None] for block in self.blocks)
 
 
-def solve_window(window: Window, track: Track, segmentation: Segmentation, settings: Settings) -> Solution:
-    """Minimise the graph of the window's samples, and move contacts as the smoother does.
+class WindowSmoother(Smoother):
+    """The smoother on the samples of a window: it starts at the window's estimate, and knows what left the window.
 
-    Args:
-        window: where the minimisation starts, and what marginalised states know.
-        track: the window's samples.  segmentation: of them.  settings: noise and priors.
+    Args: window: of the online estimator.  surfaces, settings: as the smoother's.
     """
-    sigma = effective_sigmas(track, segmentation, settings)
-    values = Values(window.states, window.coefficients)
-    summaries = [LinearFactors(factor, values, window.first) for factor in window.summaries]
-    events = Events(segmentation.contacts, segmentation)
-    optimizer, seen = LevenbergMarquardt(), {}
-    for _ in range(MAX_REFINEMENTS):
-        graph = with_summaries(build_graph(track, window.model, events, sigma, settings), summaries)
-        solution = Solution(events, graph, optimizer.minimize(graph, values))
-        seen[_places(events.contacts)] = solution
-        refined = _refined(track.times, solution)
-        if _places(refined) in seen:
-            break
-        values = solution.minimum.values
-        events = Events(refined, segmentation)
-    return min(seen.values(), key=lambda s: s.minimum.error)
+
+    def __init__(self, window: Window, model: BallModel, surfaces: Surfaces, settings: Settings) -> None:
+        super().__init__(model, surfaces, settings)
+        self.start = Values(window.states, window.coefficients)
+        self.summaries = [LinearFactors(factor, self.start, window.first) for factor in window.summaries]
+
+    def _settle(self, track: Track, segmentation: Segmentation, sigma: Array) -> Solution:
+        """Minimise, move contacts to where the estimate says they are, and minimise again until they stay."""
+        events, values, seen = Events(segmentation.contacts, segmentation), self.start, {}
+        for _ in range(MAX_REFINEMENTS):
+            graph = with_summaries(build_graph(track, self.trackwise, events, sigma, self.settings), self.summaries)
+            solution = Solution(events, graph, self.optimizer.minimize(graph, values))
+            seen[_places(events.contacts)] = solution
+            refined = _refined(track.times, solution)
+            if _places(refined) in seen:
+                break
+            values = solution.minimum.values
+            events = Events(refined, segmentation)
+        return min(seen.values(), key=lambda s: s.minimum.error)
 
 
 def with_summaries(graph: BallGraph, summaries: Sequence[FactorKind]) -> BallGraph:
@@ -106,47 +110,38 @@ def with_summaries(graph: BallGraph, summaries: Sequence[FactorKind]) -> BallGra
 
 
 def final_estimate(
-    window: Window, track: Track, events: EventTracker, frozen: Sequence[Frozen], whitened: Array, settings: Settings
+    smoother: WindowSmoother, window: Window, track: Track, found: Segmentation, frozen: Sequence[Frozen]
 ) -> Estimate:
     """The result over a whole track.
 
     Args:
-        window: after the last push.  track: all of it.  events: of the stream.
+        smoother: of the window.
+        window: after the last push.
+        track: all of it.
+        found: the events among the window's samples.
         frozen: the states that left the window, oldest first.
-        whitened: (n, 3) innovations of the pushes.  settings: noise and priors.
     """
     first = window.first
     part = track if first == 0 else track.between(float(track.times[first]), float(track.times[-1]))
-    segmentation = events.segmentation(first, part.times, part.positions)
-    solution = solve_window(window, part, segmentation, settings)
-    minimum, n, p = solution.minimum, len(part), window.p
-    if minimum.step is None:
-        covariances = _prior_covariances(n, p, effective_sigmas(part, segmentation, settings), settings)
-    else:
-        covariances = marginal_covariances(minimum.step.bayes_net, n, p)
-    joints = np.array([f.joint for f in frozen]).reshape(-1, STATE_DIM + p, STATE_DIM + p)
-    old_contacts, old_hits, old_quality = _events_of(frozen)
-    contacts = [replace(c, interval=c.interval + first) for c in _timed(part.times, solution)]
-    return Estimate(
-        name=track.name,
+    sigma = effective_sigmas(part, found, smoother.settings)
+    late = smoother._result(part, sigma, smoother.solve(part, found, sigma))
+    if not frozen:
+        return late
+    joints = np.array([f.joint for f in frozen])
+    contacts, hits, quality = _events_of(frozen)
+    return replace(
+        late,
         times=track.times,
-        states=np.concatenate((np.array([f.state for f in frozen]).reshape(-1, STATE_DIM), minimum.values.states)),
-        covariances=np.concatenate((joints[:, :STATE_DIM, :STATE_DIM], covariances.states)),
-        status=_status(minimum, len(track)),
-        whitened=whitened,
-        coefficient_names=window.model.names if isinstance(window.model, AugmentedModel) else (),
-        coefficients=minimum.values.coefficients,
-        coefficient_covariance=covariances.coefficients,
-        cross_covariances=np.concatenate((joints[:, :STATE_DIM, STATE_DIM:], covariances.cross)),
-        contacts=(*old_contacts, *contacts),
-        hits=np.concatenate((old_hits, segmentation.hits + first)),
-        quality=np.concatenate((old_quality, segmentation.quality)),
-        error=minimum.error,
-        iterations=minimum.iterations,
+        states=np.concatenate((np.array([f.state for f in frozen]), late.states)),
+        covariances=np.concatenate((joints[:, :STATE_DIM, :STATE_DIM], late.covariances)),
+        cross_covariances=np.concatenate((joints[:, :STATE_DIM, STATE_DIM:], late.cross_covariances)),
+        contacts=(*contacts, *(replace(c, interval=c.interval + first) for c in late.contacts)),
+        hits=np.concatenate((hits, late.hits + first)),
+        quality=np.concatenate((quality, late.quality)),
     )
 
 
-def _events_of(frozen: Sequence[Frozen]) -> tuple[list[Contact], Index, Array]:
+def _events_of(frozen: Sequence[Frozen]) -> tuple[list[Contact], Index, NDArray[np.int8]]:
     """Contacts, hits and qualities of the samples that left the window."""
     contacts, hits = [], []
     for k, state in enumerate(frozen):

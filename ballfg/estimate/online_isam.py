@@ -1,8 +1,8 @@
 """iSAM2 over a window of states: one sample more, a few samples back, one state out at the old end.
 
-The window keeps a mirror of what iSAM2 holds: linearisation points and the linear solution about them. So it knows before
-an update which states GTSAM will relinearise, and evaluates their factors, together with the new one, in one torch
-call; the callbacks find their answers ready. docs/derivations/online.md explains the choices.
+The window keeps a mirror of what iSAM2 holds: linearisation points and the linear solution about them. So it knows
+before an update which states GTSAM will relinearise, and evaluates their factors, together with the new one, in one
+torch call; the callbacks find their answers ready. docs/derivations/online.md explains the choices.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.dynamics.model import BallModel
-from ballfg.estimate.online_interval import FLIGHT, Interval, Motion, coefficient_count, evaluate, store
+from ballfg.estimate.online_interval import FLIGHT, Interval, IntervalMaker, Motion, coefficient_count, evaluate, store
 from ballfg.estimate.problem import START_POSITION_SIGMA, UNINFORMATIVE_SPIN, coefficient_means
 from ballfg.estimate.settings import Settings
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
@@ -26,10 +26,12 @@ from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 Array = NDArray[np.float64]
 
-VELOCITY_THRESHOLD = 0.1
-"""m/s. Drag that is linearised this far off is wrong by k dv^2 = 1.4e-3 m/s^2, a hundredth of what process noise explains
-in half a second; a spin of `SPIN_THRESHOLD` at the same time adds 4e-3."""
-SPIN_THRESHOLD = 15.0
+VELOCITY_THRESHOLD = 0.3
+"""m/s. Linearised this far off, drag is wrong by k dv^2 = 0.012 m/s^2, and by 0.04 m/s^2 where the spin is off by
+`SPIN_THRESHOLD` as well: a third of the acceleration that the process noise allows over half a second, for as long as
+it takes the next state to be relinearised. Three times less costs twice the evaluations and changes nothing
+(docs/derivations/online.md)."""
+SPIN_THRESHOLD = 40.0
 """rad/s. The Magnus force is linear in the spin: only its product with an error in velocity matters."""
 POSITION_THRESHOLD = 0.5
 """Measurement standard deviations. Flight does not depend on the position; a robust loss's weight does."""
@@ -102,6 +104,7 @@ class IncrementalWindow:
         self.model = model
         self.settings = settings
         self.position_sigma = position_sigma
+        self.maker = IntervalMaker(model, settings.process)
         self.p = coefficient_count(model)
         self._own_means = coefficient_means(model.model, settings) if self.p else np.zeros(0)  # type: ignore[arg-type]
         self._own_sigmas = np.array(list(settings.coefficients.values()))
@@ -147,7 +150,7 @@ class IncrementalWindow:
         if not (sample.motion.linked and self.samples):
             return self._append_start(sample)
         dt = sample.time - self.samples[-1].time
-        interval = Interval(self.first + len(self.samples) - 1, sample.motion, dt, self.model, self.settings.process)
+        interval = self.maker.make(self.first + len(self.samples) - 1, sample.motion, dt)
         estimate = self.states[-1], self.coefficients
         piece, count, calls = self._relinearize(interval)
         away = np.concatenate((estimate[0] - self.theta[-1], estimate[1] - self.coefficient_theta))
@@ -163,7 +166,8 @@ class IncrementalWindow:
         state = np.zeros(STATE_DIM)
         state[POSITION] = sample.position
         priors: list[FactorKind] = []
-        sigma = np.concatenate((np.full(3, START_POSITION_SIGMA), np.full(3, self.settings.velocity_prior), np.zeros(3)))
+        sigma = np.empty(STATE_DIM)
+        sigma[POSITION], sigma[VELOCITY] = START_POSITION_SIGMA, self.settings.velocity_prior
         sigma[SPIN] = self.settings.spin_prior if sample.label is None else UNINFORMATIVE_SPIN
         priors.append(state_prior(0, state.copy(), sigma))
         if sample.label is not None:
@@ -182,7 +186,7 @@ class IncrementalWindow:
         innovation = sample.position - predicted[POSITION]
         spread = covariance[POSITION, POSITION] + np.diag(sample.sigma**2)
         whitened = np.linalg.solve(np.linalg.cholesky(spread), innovation)
-        weight = self.settings.loss.weight(np.linalg.norm(whitened, keepdims=True))
+        weight = self.settings.loss.weight(np.array([np.linalg.norm(whitened)]))
         spread = covariance[POSITION, POSITION] + np.diag(sample.sigma**2 / weight)
         return predicted + covariance[:, POSITION] @ np.linalg.solve(spread, innovation), whitened
 
@@ -191,7 +195,7 @@ class IncrementalWindow:
 
         Returns: the new interval's propagation (9, 1 + 9 + p), factors evaluated, torch calls.
         """
-        moved = (np.abs(self.delta) > self.threshold).any(axis=1)
+        moved = np.asarray((np.abs(self.delta) > self.threshold).any(axis=1), dtype=bool)
         limit = COEFFICIENT_THRESHOLD * self._own_sigmas
         shared = bool((np.abs(self.coefficient_delta) > limit).any())
         if moved.any():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from ballfg.estimate.online_interval import Interval, evaluate
+from ballfg.estimate.online_interval import evaluate
 from ballfg.estimate.online_isam import IncrementalWindow, Sample, Update
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
 
@@ -48,7 +48,7 @@ class Window(IncrementalWindow):
         new = []
         for k in numbers:
             dt = self.samples[k].time - self.samples[k - 1].time
-            new.append(Interval(self.first + k - 1, self.samples[k].motion, dt, self.model, self.settings.process))
+            new.append(self.maker.make(self.first + k - 1, self.samples[k].motion, dt))
         begins = [k - 1 for k in numbers]
         evaluate(new, self.theta[begins], self.theta[numbers], self.coefficient_theta)
         graph, old = gtsam.NonlinearFactorGraph(), []
@@ -137,7 +137,7 @@ class Window(IncrementalWindow):
         update = Update(np.full(3, np.nan), 0, 0, 0)
         if summaries:
             self.coefficient_theta = old_coefficients
-        if any(STATE_KEY + self.first in summary.keys() for summary in summaries):
+        if any(STATE_KEY + self.first in list(summary.keys()) for summary in summaries):
             self._insert(samples[0], old_start[0], None, known=summaries)
             samples = samples[1:]
         for sample in samples:

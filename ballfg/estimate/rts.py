@@ -85,6 +85,8 @@ class FilterRecord:
 def rts_smooth(record: FilterRecord) -> tuple[Array, Array]:
     """Means (n, d) and covariances (n, d, d) given all samples; those before `record.start` are left as they are.
 
+    Filterpy has this pass for linear filters only: it predicts with F x; here the prediction is the motion itself.
+
     With C = P_k F^T (P-_{k+1})^-1, from the last sample to the first:
     x^s_k = x_k + C (x^s_{k+1} - x-_{k+1}) and P^s_k = (I - C F) P_k (I - C F)^T + C (P^s_{k+1} + Q) C^T.
 

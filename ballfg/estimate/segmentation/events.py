@@ -41,7 +41,7 @@ class Event:
     Attributes:
         kind: what happened.
         index: the interval it lies in (-1: before the first sample), or the sample.
-        time: s, on the track's clock.
+        time: s, on the track's clock: of a contact itself; of anything else the stamp of the sample that shows it.
         height: m, declared height of the surface, where one is involved.
         offset: (3,) m, by which measurements jumped, for a shift.
     """

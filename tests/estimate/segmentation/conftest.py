@@ -76,7 +76,7 @@ def matched(found: Sequence[int], true: Sequence[int], tolerance: int = 1) -> tu
 
 @pytest.fixture(scope="session")
 def rallies() -> list[Truth]:
-    return [rally(seed) for seed in range(12)]
+    return [rally(seed) for seed in range(10)]
 
 
 @pytest.fixture(scope="session")
