@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from ballfg.factors.kind import COEFFICIENTS, Array, Rows, Values
+from ballfg.factors.kind import COEFFICIENTS, Array, Index, Rows, Values
+from ballfg.state import STATE_DIM
+
+Piece = tuple[Index, Array, tuple[Array, ...]]
+"""Variables (m, a), weighted residuals (m, r) and weighted Jacobians of some factors."""
 
 
 @dataclass(frozen=True)
@@ -53,53 +58,86 @@ def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> S
     Raises: RuntimeError: from GTSAM, when the system is singular; its text holds `Indetermin`.
     """
     n, p = len(values.states), len(values.coefficients)
-    graph, decrease = gtsam.GaussianFactorGraph(), 0.0
-    diagonal, gradient = np.zeros((n + 1, 9 + p)), 0.0
-    pieces = []
-    for rows in linearized:
-        residual, jacobians = weighted(rows)
-        pieces.append((rows.variables, residual, jacobians))
-        _append(graph, np.where(rows.variables == COEFFICIENTS, n, rows.variables), residual, jacobians)
-        if damping:
-            for column, jacobian in zip(rows.variables.T, jacobians, strict=True):
-                squares = (jacobian**2).sum(axis=1)
-                np.add.at(diagonal[:, : squares.shape[-1]], np.where(column == COEFFICIENTS, n, column), squares)
+    pieces = [(rows.variables, *weighted(rows)) for rows in linearized]
+    graph = gtsam.GaussianFactorGraph()
+    for variables, residual, jacobians in _folded(pieces, n):
+        _append(graph, np.where(variables == COEFFICIENTS, n, variables), residual, jacobians)
     if damping:
-        _damp(graph, np.sqrt(damping * diagonal), n, p)
-    ordering = gtsam.Ordering()
-    for key in range(n + (p > 0)):
-        ordering.push_back(key)
-    bayes_net = graph.eliminateSequential(ordering, gtsam.EliminateQR)
+        _damp(graph, np.sqrt(damping * _diagonal(pieces, n, p)), n, p)
+    bayes_net = graph.eliminateSequential(_in_order(n + (p > 0)), gtsam.EliminateQR)
     solution = bayes_net.optimize()
-    states = solution.vector(list(range(n))).reshape(n, 9)
+    states = solution.vector(list(range(n))).reshape(n, STATE_DIM)
     coefficients = solution.at(n) if p else np.zeros(0)
+    decrease = 0.0
     for variables, residual, jacobians in pieces:
         change = _apply(variables, jacobians, states, coefficients)
-        gradient -= float((residual * change).sum())
         decrease -= float((residual * change).sum() + 0.5 * (change**2).sum())
     return Step(states, coefficients, bayes_net, decrease)
 
 
-def _append(graph: gtsam.GaussianFactorGraph, keys: Array, residual: Array, jacobians: tuple[Array, ...]) -> None:
+@functools.lru_cache(maxsize=256)
+def _in_order(count: int) -> gtsam.Ordering:
+    ordering = gtsam.Ordering()
+    for key in range(count):
+        ordering.push_back(key)
+    return ordering
+
+
+def _folded(pieces: Sequence[Piece], n: int) -> list[Piece]:
+    """The same rows in fewer factors: those on one state alone join the factor that leads on from that state.
+
+    Building a factor from Python costs more than eliminating it.
+    """
+    single = next((i for i, (v, _, _) in enumerate(pieces) if v.shape[1] == 1 and _distinct_states(v[:, 0])), None)
+    if single is None:
+        return list(pieces)
+    variables, residual, (jacobian,) = pieces[single]
+    place = np.full(n, -1)
+    place[variables[:, 0]] = np.arange(len(variables))
+    folded = []
+    for i, (others, r, blocks) in enumerate(pieces):
+        rows = place[others[:, 0]] if others.shape[1] > 1 else np.array([-1])
+        if i == single or (rows < 0).any():
+            continue
+        place[others[:, 0]] = -1
+        joined = [np.concatenate((blocks[0], jacobian[rows]), axis=1)]
+        for block in blocks[1:]:
+            joined.append(np.concatenate((block, np.zeros((len(rows), residual.shape[1], block.shape[2]))), axis=1))
+        folded.append((i, (others, np.concatenate((r, residual[rows]), axis=1), tuple(joined))))
+    taken = {single, *(i for i, _ in folded)}
+    left = place[variables[:, 0]] >= 0
+    rest = [piece for i, piece in enumerate(pieces) if i not in taken]
+    return [piece for _, piece in folded] + [*rest, (variables[left], residual[left], (jacobian[left],))]
+
+
+def _distinct_states(variables: Index) -> bool:
+    return len(variables) > 1 and bool(variables.min() >= 0) and len(np.unique(variables)) == len(variables)
+
+
+def _diagonal(pieces: Sequence[Piece], n: int, p: int) -> Array:
+    """(n + 1, 9 + p) diagonal of J^T J; the coefficients stand in row n."""
+    diagonal = np.zeros((n + 1, STATE_DIM + p))
+    for variables, _, jacobians in pieces:
+        for column, jacobian in zip(variables.T, jacobians, strict=True):
+            squares = (jacobian**2).sum(axis=1)
+            np.add.at(diagonal[:, : squares.shape[-1]], np.where(column == COEFFICIENTS, n, column), squares)
+    return diagonal
+
+
+def _append(graph: gtsam.GaussianFactorGraph, keys: Index, residual: Array, jacobians: tuple[Array, ...]) -> None:
     unit = gtsam.noiseModel.Unit.Create(residual.shape[-1])
-    factor, b = gtsam.JacobianFactor, -residual
-    push = graph.push_back
-    if len(jacobians) == 1:
-        (first,) = jacobians
-        for i, key in enumerate(keys[:, 0].tolist()):
-            push(factor(key, first[i], b[i], unit))
-    elif len(jacobians) == 2:
-        first, second = jacobians
-        for i, (key, other) in enumerate(keys.tolist()):
-            push(factor(key, first[i], other, second[i], b[i], unit))
-    else:
-        first, second, third = jacobians
-        for i, (key, other, last) in enumerate(keys.tolist()):
-            push(factor(key, first[i], other, second[i], last, third[i], b[i], unit))
+    factor, push = gtsam.JacobianFactor, graph.push_back
+    for key, b, *blocks in zip(keys.tolist(), -residual, *jacobians, strict=True):
+        if len(blocks) == 1:
+            push(factor(key[0], blocks[0], b, unit))
+        elif len(blocks) == 2:
+            push(factor(key[0], blocks[0], key[1], blocks[1], b, unit))
+        else:
+            push(factor(key[0], blocks[0], key[1], blocks[1], key[2], blocks[2], b, unit))
 
 
 def _damp(graph: gtsam.GaussianFactorGraph, root: Array, n: int, p: int) -> None:
-    for key, d in [(i, 9) for i in range(n)] + [(n, p)] * (p > 0):
+    for key, d in [(i, STATE_DIM) for i in range(n)] + [(n, p)] * (p > 0):
         graph.push_back(
             gtsam.JacobianFactor(key, np.diag(root[key, :d]), np.zeros(d), gtsam.noiseModel.Unit.Create(d))
         )

@@ -11,7 +11,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
 from ballfg.estimate.online_events import SIGMA_FACTOR, EventTracker, contact_step, first_difference
-from ballfg.estimate.online_final import Frozen, WindowSmoother, final_estimate, freeze
+from ballfg.estimate.online_final import Frozen, WindowSmoother, final_estimate, freeze, unknown
 from ballfg.estimate.online_interval import FLIGHT, Motion, motions_of
 from ballfg.estimate.online_isam import Sample, Update
 from ballfg.estimate.online_window import Window
@@ -131,13 +131,13 @@ class Online(Estimator):
         for old in again:
             self._append(window, old)
         update = self._append(window, sample)
-        self._move_contacts(window)
+        moved = self._move_contacts(window)
         if len(window) > 2 * self.lag:
             if self._frozen is not None:
                 self._frozen += freeze(window, len(window) - self.lag)
             window.shorten(self.lag)
             self._samples = list(window.samples)
-        return len(again), update
+        return max(len(again), moved), update
 
     def _append(self, window: Window, sample: Sample) -> Update:
         update = window.append(sample)
@@ -168,9 +168,12 @@ class Online(Estimator):
             window.reweigh(staying)
         return again
 
-    def _move_contacts(self, window: Window) -> None:
-        """Put young contacts where the estimate says they are; the newest one may not have happened yet."""
-        samples, n = window.samples, len(window)
+    def _move_contacts(self, window: Window) -> int:
+        """Put young contacts where the estimate says they are; the newest one may not have happened yet.
+
+        Returns: how many samples were taken back for it.
+        """
+        samples, n = self._samples, len(window)
         for k in range(max(n - YOUNG, 1), n):
             motion = samples[k].motion
             if len(motion.heights) != 1 or motion.hit:
@@ -184,7 +187,11 @@ class Online(Estimator):
             if self.events.move(window.first + k - 1, height, step):
                 shift = samples[k - 1].time - samples[other - 1].time
                 samples[k].motion, samples[other].motion = FLIGHT, Motion(motion.heights, (motion.times[0] + shift,))
-                window.replace_motions([k, other])
+                window.retract(min(k, other))
+                for sample in samples[min(k, other) :]:
+                    self._append(window, sample)
+                return n - min(k, other)
+        return 0
 
     def _repair(self, error: Exception, status: Status) -> tuple[Status, Update]:
         """Build the window anew from its samples; if that fails as well, begin a new one with the newest sample."""
@@ -192,6 +199,8 @@ class Online(Estimator):
         try:
             return status, self.window.start_anew(self._samples)
         except (RuntimeError, ValueError):
+            if self._frozen is not None:
+                self._frozen += [unknown(s, self.settings, self.window.p) for s in self._samples[:-1]]
             first = self.window.first + len(self._samples) - 1
             newest = replace(self._samples[-1], motion=FLIGHT, slots=())
         self.window = Window(self.trackwise, self.settings, float(newest.stated.min()))
@@ -239,4 +248,5 @@ class Online(Estimator):
         found = self.events.segmentation(first, track.times[first:], track.positions[first:])
         result = final_estimate(smoother, self.window, track, found, self._frozen)
         self.reset()
-        return replace(result, whitened=whitened)
+        lost = any(state.status is Status.FAILED for state in states)
+        return replace(result, whitened=whitened, status=Status.NOT_CONVERGED if lost else result.status)

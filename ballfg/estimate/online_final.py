@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from ballfg.dynamics.integrate import fly
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.online_events import SIGMA_FACTOR
@@ -23,7 +25,7 @@ from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.kind import COEFFICIENTS, Array, FactorKind, Index, Values
 from ballfg.factors.prior import PriorFactors
-from ballfg.state import STATE_DIM
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ
 from ballfg.tracks import Track
 
 
@@ -47,6 +49,15 @@ def freeze(window: Window, count: int) -> list[Frozen]:
         joint = window.isam.jointMarginalCovariance([STATE_KEY + window.first + k, *shared]).fullMatrix()
         frozen.append(Frozen(window.samples[k], states[k], joint))
     return frozen
+
+
+def unknown(sample: Sample, settings: Settings, p: int) -> Frozen:
+    """A state of which nothing but its observation is known, because its window could not be solved."""
+    state, sigma = np.zeros(STATE_DIM), np.empty(STATE_DIM + p)
+    state[POSITION], sigma[POSITION] = sample.position, sample.sigma
+    sigma[VELOCITY], sigma[SPIN] = settings.velocity_prior, settings.spin_prior
+    sigma[STATE_DIM:] = list(settings.coefficients.values())
+    return Frozen(sample, state, np.diag(sigma**2))
 
 
 class LinearFactors(FactorKind):
@@ -89,6 +100,7 @@ class WindowSmoother(Smoother):
         """Minimise, move contacts to where the estimate says they are, and minimise again until they stay."""
         events, values, seen = Events(segmentation.contacts, segmentation), self.start, {}
         for _ in range(MAX_REFINEMENTS):
+            values = self._falling(track.times, values, events)
             graph = with_summaries(build_graph(track, self.trackwise, events, sigma, self.settings), self.summaries)
             solution = Solution(events, graph, self.optimizer.minimize(graph, values))
             seen[_places(events.contacts)] = solution
@@ -98,6 +110,20 @@ class WindowSmoother(Smoother):
             values = solution.minimum.values
             events = Events(refined, segmentation)
         return min(seen.values(), key=lambda s: s.minimum.error)
+
+    def _falling(self, times: Array, values: Values, events: Events) -> Values:
+        """The values, a state that rises into an interval with a contact replaced by the flight that leads to it.
+
+        A contact that moves to the next interval leaves such a state behind, and from there it is out of reach.
+        """
+        states = values.states.copy()
+        occupied = {contact.interval for contact in events.contacts}
+        for i in sorted(occupied):
+            if i > 0 and i - 1 not in occupied and states[i, VZ] > 0.0:
+                start, dt = torch.from_numpy(states[i - 1 : i]), torch.tensor([times[i] - times[i - 1]])
+                with torch.no_grad():
+                    states[i] = fly(self.model, start, dt)[0].numpy()
+        return Values(states, values.coefficients)
 
 
 def with_summaries(graph: BallGraph, summaries: Sequence[FactorKind]) -> BallGraph:

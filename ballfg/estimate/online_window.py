@@ -5,7 +5,6 @@ from __future__ import annotations
 import gtsam
 import numpy as np
 
-from ballfg.estimate.online_interval import evaluate
 from ballfg.estimate.online_isam import IncrementalWindow, Sample, Update
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
 
@@ -40,28 +39,6 @@ class Window(IncrementalWindow):
         slots = self._update(graph, gtsam.Values(), old, {})
         for k, slot in zip(numbers, slots, strict=True):
             self.samples[k].slots = (slot, *self.samples[k].slots[1:])
-        self._read_back()
-
-    def replace_motions(self, numbers: list[int]) -> None:
-        """Put in anew the factors of some linked samples' motions, about the same linearisation points."""
-        self._relinearize(None)
-        new = []
-        for k in numbers:
-            dt = self.samples[k].time - self.samples[k - 1].time
-            new.append(self.maker.make(self.first + k - 1, self.samples[k].motion, dt))
-        begins = [k - 1 for k in numbers]
-        evaluate(new, self.theta[begins], self.theta[numbers], self.coefficient_theta)
-        graph, old = gtsam.NonlinearFactorGraph(), []
-        for k, interval in zip(begins, new, strict=True):
-            graph.push_back(interval.bridge.factor(0))
-            before = self.intervals[k]
-            assert before is not None
-            assert before.slot is not None
-            old.append(before.slot)
-            self.intervals[k] = interval
-        slots = self._update(graph, gtsam.Values(), old, {})
-        for interval, slot in zip(new, slots, strict=True):
-            interval.slot = slot
         self._read_back()
 
     def shorten(self, keep: int) -> None:

@@ -12,6 +12,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
 from ballfg.estimate.initial import initial_states
+from ballfg.estimate.near_contact import widen_near_contacts
 from ballfg.estimate.problem import (
     START_POSITION_SIGMA,
     Events,
@@ -129,19 +130,19 @@ class Smoother(Estimator):
         else:
             covariances = marginal_covariances(minimum.step.bayes_net, n, p)
         samples = solution.graph.kinds[0].linearize(minimum.values)
-        states = minimum.values.states
+        states, contacts = minimum.values.states, _timed(track.times, solution)
         return Estimate(
             name=track.name,
             times=track.times,
             states=states,
-            covariances=covariances.states,
+            covariances=widen_near_contacts(track.times, states, covariances.states, contacts, self.model),
             status=_status(minimum, n),
             whitened=leave_one_out(states, covariances.states, track.positions, sigma, samples),
             coefficient_names=self.trackwise.names if isinstance(self.trackwise, AugmentedModel) else (),
             coefficients=minimum.values.coefficients,
             coefficient_covariance=covariances.coefficients,
             cross_covariances=covariances.cross,
-            contacts=_timed(track.times, solution),
+            contacts=contacts,
             hits=segmentation.hits,
             quality=segmentation.quality,
             error=minimum.error,
@@ -207,7 +208,6 @@ def _prior_covariances(n: int, p: int, sigma: Array, settings: Settings) -> Cova
         diagonal = spread if spread is not None else np.full((n, 3), width)
         axes = np.arange(block.start, block.stop)
         states[:, axes, axes] = diagonal**2
-    return Covariances(states, np.diag([s**2 for s in settings.coefficients.values()]).reshape(p, p), np.zeros((n, 9, p)))
-
-
-
+    return Covariances(
+        states, np.diag([s**2 for s in settings.coefficients.values()]).reshape(p, p), np.zeros((n, 9, p))
+    )
