@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ballfg.dynamics.contact import fly_through
 from ballfg.dynamics.model import BallModel
 from ballfg.estimate.segmentation import Contact, Quality, Segmentation
 from ballfg.estimate.sliding_window import window_velocities
+from ballfg.factors.kind import Values
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
 from ballfg.tracks import Track
 
@@ -58,3 +62,28 @@ def _start_contact(states: Array, contact: Contact, model: BallModel) -> None:
 
 LEAST_FALL = 0.05
 """m/s, least downward speed that a guess has before a contact."""
+
+
+def move_contacts(
+    values: Values, times: Array, old: Sequence[tuple[int, float]], new: Sequence[tuple[int, float]], model: BallModel
+) -> Values:
+    """Values to go on from when contacts have moved: a state that was after its contact is now before it, or vice versa.
+
+    Args:
+        values: the states that went with the old contacts.
+        times: (n,) s.
+        old: interval and height of each contact so far.  new: the same of those to come.
+        model: gives the state at the end of the first interval that gained or lost a contact, from that at its start.
+    """
+    states = values.states.copy()
+    changed = sorted({i for i, _ in set(old) ^ set(new)})
+    for interval in changed:
+        if interval - 1 in changed:
+            continue  # the contact came from there or went there; the state after both is right already
+        start = torch.from_numpy(np.concatenate((states[interval], values.coefficients))[None])
+        heights = tuple(height for i, height in new if i == interval)
+        with torch.no_grad():
+            after, _ = fly_through(model, start, torch.from_numpy(np.diff(times[interval : interval + 2])), heights)
+        if bool(after.isfinite().all()):
+            states[interval + 1] = after[0, :STATE_DIM].numpy()
+    return Values(states, values.coefficients)

@@ -9,6 +9,7 @@ from scipy.stats import norm
 
 from ballfg.dynamics.integrate import fly
 from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.segmentation import Contact
 from ballfg.state import VZ, Z
 
@@ -21,13 +22,19 @@ LEAST_SPEED = 1e-3
 
 
 def widen_near_contacts(
-    times: Array, states: Array, covariances: Array, contacts: tuple[Contact, ...], model: BallModel
+    times: Array,
+    states: Array,
+    covariances: Array,
+    contacts: tuple[Contact, ...],
+    model: BallModel,
+    surfaces: Surfaces,
 ) -> Array:
     """Covariances that own up to the two sides of a contact.
 
     A state within the uncertainty of a contact's time is on the side that the estimate took with probability p and
     on the other with 1 - p. With the jump d between the sides, the covariance about the estimate is larger by p (1 - p)
-    d d^T. The contact's time is known to sigma_z / |v_z|, often 0.1 ms: few stamps are concerned.
+    d d^T. The contact's time is known to sigma_z / |v_z|, often 0.1 ms: few stamps are concerned. The last sample may lie
+    just after a contact that nothing has shown yet.
 
     Args:
         times: (n,) s.
@@ -35,6 +42,7 @@ def widen_near_contacts(
         covariances: (n, 9, 9).
         contacts: with the times that the estimate gives them.
         model: the ball.
+        surfaces: what it may bounce on.
     Returns: (n, 9, 9).
     """
     widened = covariances.copy()
@@ -44,9 +52,24 @@ def widen_near_contacts(
             margin = (contact.time - times[k]) * np.sign(beyond - k) / sigma
             if margin < FAR:
                 jump = _carried(model, states[beyond], times[k] - times[beyond]) - states[k]
-                p = norm.cdf(max(margin, 0.0))  # on the wrong side of its own contact: either is as likely
-                widened[k] += p * (1.0 - p) * np.outer(jump, jump)
+                widened[k] += _mixture(margin, jump)
+    last = torch.from_numpy(states[-1])
+    height = float(surfaces.height_below(last))
+    margin = (
+        float(model.gap(last, height).detach()) / float(np.sqrt(covariances[-1, Z, Z]))
+        if np.isfinite(height)
+        else np.inf
+    )
+    if margin < FAR and last[VZ] < 0.0:
+        with torch.no_grad():
+            widened[-1] += _mixture(margin, model.bounce(last).numpy() - states[-1])
     return widened
+
+
+def _mixture(margin: float, jump: Array) -> Array:
+    """(9, 9) what the other side adds; on the wrong side of its own contact a state has even chances."""
+    p = norm.cdf(max(margin, 0.0))
+    return np.asarray(p * (1.0 - p) * np.outer(jump, jump))
 
 
 def _carried(model: BallModel, state: Array, dt: float) -> Array:

@@ -78,5 +78,5 @@ def uncertain(model: BallModel, **changes: object) -> Settings:
 
 
 def sample_sigmas(settings: Settings, count: int, own: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """(n, 3) m: a track's own sigmas where it has them, else the settings'."""
-    return np.broadcast_to(np.array(settings.position_noise), (count, 3)).copy() if own is None else own
+    """(n, 3) m, the caller's to change: a track's own sigmas where it has them, else the settings'."""
+    return np.broadcast_to(np.array(settings.position_noise), (count, 3)).copy() if own is None else own.copy()

@@ -5,13 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.contact import contact_time
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
-from ballfg.estimate.initial import initial_states
+from ballfg.estimate.initial import initial_states, move_contacts
 from ballfg.estimate.near_contact import widen_near_contacts
 from ballfg.estimate.problem import (
     START_POSITION_SIGMA,
@@ -29,7 +31,7 @@ from ballfg.estimate.settings import Settings, sample_sigmas
 from ballfg.factors.covariance import Covariances, marginal_covariances
 from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum
-from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ
 from ballfg.tracks import Track
 
 Array = NDArray[np.float64]
@@ -116,9 +118,16 @@ class Smoother(Estimator):
             solution = Solution(events, graph, self.optimizer.minimize(graph, values))
             seen[_places(events.contacts)] = solution
             refined = _refined(track.times, solution)
+            if _places(refined) == _places(events.contacts):
+                unseen = _contact_at_end(track.times, solution, self.trackwise, self.surfaces)
+                if not unseen:
+                    return solution
+                refined = (*refined, *unseen)
             if _places(refined) in seen:
                 break
-            values = solution.minimum.values
+            values = move_contacts(
+                solution.minimum.values, track.times, _places(events.contacts), _places(refined), self.trackwise
+            )
             events = Events(refined, segmentation)
         return min(seen.values(), key=lambda s: s.minimum.error)
 
@@ -135,7 +144,9 @@ class Smoother(Estimator):
             name=track.name,
             times=track.times,
             states=states,
-            covariances=widen_near_contacts(track.times, states, covariances.states, contacts, self.model),
+            covariances=widen_near_contacts(
+                track.times, states, covariances.states, contacts, self.model, self.surfaces
+            ),
             status=_status(minimum, n),
             whitened=leave_one_out(states, covariances.states, track.positions, sigma, samples),
             coefficient_names=self.trackwise.names if isinstance(self.trackwise, AugmentedModel) else (),
@@ -160,6 +171,27 @@ def _worst_break(solution: Solution) -> int | None:
             if not norm.max() <= worst:
                 worst, where = norm.max(), int(kind.variables[norm.argmax(), 0])
     return where
+
+
+def _contact_at_end(times: Array, solution: Solution, model: BallModel, surfaces: Surfaces) -> tuple[Contact, ...]:
+    """A contact that only the last sample could show, too little for the segmentation: that state is below a surface.
+
+    Returns: the contact, if there is one in the last interval.
+    """
+    events, last = solution.events, len(times) - 2
+    taken = {c.interval for c in events.contacts} | set(events.segmentation.hits.tolist())
+    if last < 0 or last in taken or any(rest.last >= last for rest in events.segmentation.rests):
+        return ()
+    values = solution.minimum.values
+    state = torch.from_numpy(np.concatenate((values.states[-2:], np.tile(values.coefficients, (2, 1))), axis=1))
+    with torch.no_grad():
+        height = surfaces.level_below(state)[0]
+        above, below = model.gap(state, height).tolist()
+        if not (above >= 0.0 > below and surfaces.over_table(state)[1] and state[1, VZ] < 0.0):
+            return ()
+        elapsed = float(contact_time(model, state[:1], height)[0])
+    dt = float(times[-1] - times[-2])
+    return (Contact(last, float(times[-2]) + elapsed, float(height)),) if 0.0 <= elapsed <= dt else ()
 
 
 def _places(contacts: tuple[Contact, ...]) -> tuple[tuple[int, float], ...]:

@@ -1,0 +1,109 @@
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from ballfg.dynamics import EFFECTS, AnalyticModel
+from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.factors.kind import COEFFICIENTS, FactorKind, Rows, Values
+
+NAMES = ("flight.drag.k", "flight.magnus.k", "contact.restitution.e", "contact.friction.mu", "contact.table_height.offset")
+
+
+@pytest.fixture
+def model() -> AnalyticModel:
+    """Every effect at once, away from its defaults."""
+    values = {
+        "gravity": {"g": 9.79},
+        "drag": {"k": 0.13},
+        "magnus": {"k": 0.0031},
+        "spin_decay": {"rate": 0.3},
+        "restitution": {"e": 0.91},
+        "friction": {"mu": 0.22},
+        "tangential_restitution": {"e_t": 0.2},
+        "table_height": {"offset": -0.004},
+    }
+    return AnalyticModel([EFFECTS[name](**v) for name, v in values.items()])
+
+
+@pytest.fixture
+def augmented(model: AnalyticModel) -> AugmentedModel:
+    return AugmentedModel(model, NAMES)
+
+
+@pytest.fixture
+def coefficients(augmented: AugmentedModel) -> np.ndarray:
+    """(5,) away from the model's own."""
+    parameters = dict(augmented.model.named_parameters())
+    return np.array([float(parameters[name].detach()) for name in NAMES]) * (1.1, 0.9, 0.98, 1.1, 0.5)
+
+
+def offset(values: Values, variable: int) -> slice:
+    """The columns of a variable in the dense Jacobian: states in order, then the coefficients."""
+    if variable == COEFFICIENTS:
+        return slice(values.states.size, values.states.size + len(values.coefficients))
+    return slice(9 * variable, 9 * variable + 9)
+
+
+@pytest.fixture
+def dense() -> Callable[[Sequence[Rows], Values], tuple[np.ndarray, np.ndarray]]:
+    """Residual (m,) and Jacobian (m, 9 n + p) of linearised rows, before the loss."""
+
+    def assemble(linearized: Sequence[Rows], values: Values) -> tuple[np.ndarray, np.ndarray]:
+        size = values.states.size + len(values.coefficients)
+        residuals, jacobians = [], []
+        for rows in linearized:
+            for i, variables in enumerate(rows.variables.tolist()):
+                jacobian = np.zeros((rows.residual.shape[1], size))
+                for block, variable in zip(rows.jacobians, variables, strict=True):
+                    jacobian[:, offset(values, variable)] += block[i]
+                residuals.append(rows.residual[i])
+                jacobians.append(jacobian)
+        return np.concatenate(residuals), np.concatenate(jacobians)
+
+    return assemble
+
+
+@pytest.fixture
+def differences() -> Callable[[Callable[[Values], np.ndarray], Values], np.ndarray]:
+    """(m, 9 n + p) derivative of f(values) (m,) by fourth-order central differences.
+
+    Steps: 2e-4 m, 5e-4 m/s, 2e-2 rad/s, 1e-3 of a coefficient's size. Over them the motion of a ball in a frame is smooth to
+    some 1e-3 of itself, so that truncation (step^4) is below 1e-12; rounding, eps |x| / step, is about 1e-11 in
+    position and velocity and 1e-10 of the largest element after whitening.
+    """
+
+    def jacobian(function: Callable[[Values], np.ndarray], values: Values) -> np.ndarray:
+        n, p = len(values.states), len(values.coefficients)
+        steps = np.concatenate((np.tile(np.repeat((2e-4, 5e-4, 2e-2), 3), n), 1e-3 * np.abs(values.coefficients)))
+        columns = []
+        for j, h in enumerate(steps):
+            unit = np.zeros(9 * n + p)
+            unit[j] = h
+            at = {k: function(values.moved(k * unit[: 9 * n].reshape(n, 9), k * unit[9 * n :])) for k in (-2, -1, 1, 2)}
+            columns.append((8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * h))
+        return np.stack(columns, axis=-1)
+
+    return jacobian
+
+
+@pytest.fixture
+def check_jacobian(dense, differences) -> Callable[[FactorKind, Values], float]:
+    """Worst error of a kind's Jacobians, each row relative to its largest element per variable, at non-zero residual."""
+
+    def check(kind: FactorKind, values: Values) -> float:
+        residual, given = dense([kind.linearize(values)], values)
+        assert np.abs(residual).min() > 1e-3, "a zero residual hides errors"
+        expected = differences(lambda v: kind.linearize(v).residual.ravel(), values)
+        worst = 0.0
+        for variable in np.unique(kind.variables).tolist():
+            columns = offset(values, variable)
+            scale = np.abs(expected[:, columns]).max(axis=1, keepdims=True)
+            touched = scale[:, 0] > 0
+            assert not given[~touched, columns].any()
+            worst = max(worst, float((np.abs(given - expected)[touched, columns] / scale[touched]).max()))
+        return worst
+
+    return check
