@@ -36,14 +36,15 @@ def weighted(rows: Rows) -> tuple[Array, tuple[Array, ...]]:
     """Residuals and Jacobians such that J^T r is the gradient of the losses and J^T J close to their Hessian.
 
     The weight w = rho'/d scales both; along the residual the Jacobian shrinks further, by the root of the loss's
-    `stretch`, and the residual grows by as much (B. Triggs et al., "Bundle adjustment - a modern synthesis", 2000, 4.3).
+    `stretch`, and the residual grows by as much (Triggs et al., "Bundle adjustment - a modern synthesis", 2000, 4.3).
     """
     if rows.loss.name == "squared":
         return rows.residual, rows.jacobians
     norm = np.linalg.norm(rows.residual, axis=-1)
     root, along = np.sqrt(rows.loss.weight(norm)), np.sqrt(rows.loss.stretch(norm))
     unit = rows.residual / np.maximum(norm, np.finfo(float).tiny)[:, None]
-    turn = root[:, None, None] * (np.eye(unit.shape[-1]) - ((1.0 - along)[:, None] * unit)[..., None] * unit[:, None, :])
+    radial = ((1.0 - along)[:, None] * unit)[..., None] * unit[:, None, :]
+    turn = root[:, None, None] * (np.eye(unit.shape[-1]) - radial)
     return rows.residual * (root / along)[:, None], tuple(turn @ j for j in rows.jacobians)
 
 
@@ -138,15 +139,15 @@ def _append(graph: gtsam.GaussianFactorGraph, keys: Index, residual: Array, jaco
 
 def _damp(graph: gtsam.GaussianFactorGraph, root: Array, n: int, p: int) -> None:
     for key, d in [(i, STATE_DIM) for i in range(n)] + [(n, p)] * (p > 0):
-        graph.push_back(
-            gtsam.JacobianFactor(key, np.diag(root[key, :d]), np.zeros(d), gtsam.noiseModel.Unit.Create(d))
-        )
+        graph.push_back(gtsam.JacobianFactor(key, np.diag(root[key, :d]), np.zeros(d), gtsam.noiseModel.Unit.Create(d)))
 
 
-def _apply(variables: Array, jacobians: tuple[Array, ...], states: Array, coefficients: Array) -> Array:
+def _apply(variables: Index, jacobians: tuple[Array, ...], states: Array, coefficients: Array) -> Array:
     """(m, r) J d of some rows."""
-    total = 0.0
+    total = np.zeros(jacobians[0].shape[:2])
     for column, jacobian in zip(variables.T, jacobians, strict=True):
-        step = coefficients if len(column) and column[0] == COEFFICIENTS else states[column][..., None]
-        total = total + (jacobian @ step if step.ndim == 1 else (jacobian @ step)[..., 0])
-    return np.asarray(total)
+        if len(column) and column[0] == COEFFICIENTS:
+            total += jacobian @ coefficients
+        else:
+            total += (jacobian @ states[column][..., None])[..., 0]
+    return total

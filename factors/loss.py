@@ -68,5 +68,7 @@ class Loss:
         unit = gtsam.noiseModel.Unit.Create(dim)
         if self.name == "squared":
             return unit
-        estimator = {"huber": gtsam.noiseModel.mEstimator.Huber, "cauchy": gtsam.noiseModel.mEstimator.Cauchy}
-        return gtsam.noiseModel.Robust.Create(estimator[self.name].Create(self.scale), unit)
+        estimators = gtsam.noiseModel.mEstimator
+        huber = self.name == "huber"
+        estimator = estimators.Huber.Create(self.scale) if huber else estimators.Cauchy.Create(self.scale)
+        return gtsam.noiseModel.Robust.Create(estimator, unit)

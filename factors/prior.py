@@ -53,4 +53,6 @@ def coefficient_prior(mean: Array, sigma: Array) -> PriorFactors:
 
 def _check_sigma(sigma: Array) -> None:
     if not (np.isfinite(sigma).all() and (sigma > 0).all()):
-        raise ValueError(f"sigma must be positive and finite; got {sigma.min():g}. Leave the prior out if it is unknown.")
+        raise ValueError(
+            f"sigma must be positive and finite; got {sigma.min():g}. Leave out a prior that says nothing."
+        )

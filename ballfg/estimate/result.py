@@ -116,4 +116,4 @@ def leave_one_out(states: Array, covariances: Array, measured: Array, sigma: Arr
     covariance = np.linalg.inv(others)
     distance = measured - states[:, POSITION] - (covariance @ pull[..., None])[..., 0]
     covariance[:, axes, axes] += sigma**2
-    return whiten_innovation(distance, covariance)
+    return whiten_innovation(distance, np.asarray(covariance, dtype=np.float64))

@@ -134,12 +134,14 @@ class Smoother(Estimator):
     def _result(self, track: Track, sigma: Array, solution: Solution) -> Estimate:
         minimum, segmentation = solution.minimum, solution.events.segmentation
         n, p = len(track), len(minimum.values.coefficients)
+        states, contacts = minimum.values.states, _timed(track.times, solution)
         if minimum.step is None:
             covariances = _prior_covariances(n, p, sigma, self.settings)
+            whitened = np.full((n, 3), np.nan)
         else:
             covariances = marginal_covariances(minimum.step.bayes_net, n, p)
-        samples = solution.graph.kinds[0].linearize(minimum.values)
-        states, contacts = minimum.values.states, _timed(track.times, solution)
+            samples = solution.graph.kinds[0].linearize(minimum.values)
+            whitened = leave_one_out(states, covariances.states, track.positions, sigma, samples)
         return Estimate(
             name=track.name,
             times=track.times,
@@ -148,7 +150,7 @@ class Smoother(Estimator):
                 track.times, states, covariances.states, contacts, self.model, self.surfaces
             ),
             status=_status(minimum, n),
-            whitened=leave_one_out(states, covariances.states, track.positions, sigma, samples),
+            whitened=whitened,
             coefficient_names=self.trackwise.names if isinstance(self.trackwise, AugmentedModel) else (),
             coefficients=minimum.values.coefficients,
             coefficient_covariance=covariances.coefficients,

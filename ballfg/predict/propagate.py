@@ -1,7 +1,13 @@
-"""Propagation of a belief: mean and covariance through flight, contacts and rest, with process noise."""
+"""Propagation of a belief: mean and covariance through flight, contacts and rest, with process noise.
+
+The mean is the rollout of the mean. The covariance goes through the derivative of that rollout, contact times included
+(docs/derivations/prediction.md).
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -9,13 +15,16 @@ import torch
 from torch import Tensor
 
 from ballfg.dynamics.contact import fly_through_jacobian
-from ballfg.dynamics.integrate import MAX_STEP, batch_jacobian, fly_jacobian
+from ballfg.dynamics.integrate import batch_jacobian, fly_jacobian, step_count
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.rollout import REST_SPEED, advance, is_resting
+from ballfg.dynamics.rollout import advance, is_resting
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
 from ballfg.predict.belief import Belief
 from ballfg.state import STATE_DIM, VZ
+
+SAME = 1e-6
+"""m, m/s, rad/s. Two ways to a state that agree to this had the same events."""
 
 
 @dataclass(frozen=True)
@@ -50,23 +59,36 @@ class Propagator:
 
         Args:
             belief: n balls.
-            times: (n, k) s on each ball's clock, not decreasing, not before the belief.
-        Raises: ValueError: if a time lies before the one before it.
+            times: (n, k) s on each ball's clock, or (k,) for all; not decreasing, not before the belief.
+        Raises: ValueError: if the shape is another, or a time lies before the one before it.
         """
-        steps = torch.diff(times, dim=-1, prepend=belief.time[:, None])
-        if bool((steps < 0).any()):
-            raise ValueError("times must not decrease and must not lie before the belief's time. Sort them.")
+        if times.dim() == 1:
+            times = times.expand(len(belief), -1)
         states, covariances = [], []
-        for dt in steps.unbind(-1):
-            belief = self.forward(belief, dt)
-            states.append(belief.mean[:, :STATE_DIM])
-            covariances.append(belief.covariance[:, :STATE_DIM, :STATE_DIM])
+        for later in self.walk(belief, times):
+            states.append(later.mean[:, :STATE_DIM])
+            covariances.append(later.covariance[:, :STATE_DIM, :STATE_DIM])
         return Prediction(times, torch.stack(states, dim=1), torch.stack(covariances, dim=1))
 
+    def walk(self, belief: Belief, times: Tensor) -> Iterator[Belief]:
+        """The beliefs at given times, one after the other; arguments and errors as for `rollout`."""
+        if times.dim() != 2 or len(times) != len(belief) or times.shape[1] == 0:
+            raise ValueError(f"times must have shape ({len(belief)}, k) with k >= 1; got {tuple(times.shape)}")
+        steps = torch.diff(times, dim=-1, prepend=belief.time[:, None])
+        if not bool((steps >= 0).all()):
+            raise ValueError("times must not decrease and must not lie before the belief's time. Sort them.")
+        for dt in steps.unbind(-1):
+            belief = self.forward(belief, dt)
+            yield belief
+
     def forward(self, belief: Belief, dt: Tensor) -> Belief:
-        """The belief after dt (n,) s."""
-        longest = float(dt.max()) if len(dt) else 0.0
-        count = max(1, int(-(-longest // MAX_STEP)))
+        """The belief after dt (n,) s.
+
+        Raises: ValueError: if a dt is negative, infinite or not a number.
+        """
+        if not bool((dt >= 0).all()):
+            raise ValueError(f"dt must be a number, not negative; got {float(dt.min()):g} s")
+        count = step_count(dt)
         for _ in range(count):
             belief = self._step(belief, dt / count)
         return belief
@@ -74,44 +96,62 @@ class Propagator:
     def in_flight(self, belief: Belief, dt: Tensor) -> Belief:
         """The belief after dt (n,) s of free flight; surfaces are not there."""
         after, jacobian = fly_jacobian(belief.model, belief.mean, dt)
-        return self._moved(belief, dt, after, jacobian, torch.from_numpy(self.noise.flight(dt.numpy())))
+        return _moved(belief, dt, after, jacobian, torch.from_numpy(self.noise.flight(dt.numpy())))
 
     def _step(self, belief: Belief, h: Tensor) -> Belief:
+        """One step of at most `MAX_STEP`."""
         model, mean = belief.model, belief.mean
-        height = self.surfaces.height_below(mean)
+        level = self.surfaces.level_below(mean)
         after, jacobian = fly_jacobian(model, mean, h)
-        touching = is_resting(model, mean, height) | ((model.gap(after, height) < 0) & (after[:, VZ] < 0))
         noise = torch.from_numpy(self.noise.flight(h.numpy()))
+        with torch.no_grad():
+            touching = is_resting(model, mean, level) | ((model.gap(after, level) < 0) & (after[:, VZ] < 0))
         rows = touching.nonzero()[:, 0]
         if len(rows):
-            after[rows], jacobian[rows], kick = self._touch(model, mean[rows], h[rows], height[rows])
+            after[rows], jacobian[rows], kick = self._touch(model, mean[rows], h[rows], level[rows])
             noise[rows] += kick
-        return self._moved(belief, h, after, jacobian, noise)
+        return _moved(belief, h, after, jacobian, noise)
 
-    @staticmethod
-    def _moved(belief: Belief, h: Tensor, after: Tensor, jacobian: Tensor, noise: Tensor) -> Belief:
-        covariance = jacobian @ belief.covariance @ jacobian.transpose(-1, -2)
-        covariance[:, :STATE_DIM, :STATE_DIM] += noise
-        return replace(belief, time=belief.time + h, mean=after, covariance=covariance)
+    def _touch(self, model: BallModel, mean: Tensor, h: Tensor, level: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean, Jacobian and the impacts' noise of balls that reach a surface's level, or rest, within a step.
 
-    def _touch(self, model: BallModel, mean: Tensor, h: Tensor, height: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean, Jacobian and the impacts' noise of balls that meet a surface, or rest on it, within a step.
-
-        One plain bounce has its Jacobian composed; what is rarer (several bounces in a step, a table's edge, coming to
-        rest) goes through autograd.
+        `advance` says what happens. Bounces have their Jacobian composed, with the time of each; what is left
+        (rest, coming to rest, rolling over an edge) goes through autograd and has no impact.
         """
-        after, times, jacobian = fly_through_jacobian(model, mean, h, (height,))
-        expected = advance(model, mean, h, self.surfaces).detach()
-        plain = (after - expected).abs().amax(-1) < 1e-6
-        other = (~plain).nonzero()[:, 0]
-        if len(other):
-            after[other], jacobian[other] = batch_jacobian(
-                partial(_advanced, model, h[other], self.surfaces), mean[other]
-            )
-        bounced = after[:, VZ].abs() > REST_SPEED
-        time = torch.where(plain, times[:, 0], h / 2)
-        kick = torch.from_numpy(self.noise.contact(h.numpy(), time.numpy()))
-        return after, jacobian, kick * bounced[:, None, None]
+        with torch.no_grad():
+            expected = advance(model, mean, h, self.surfaces)
+            bouncing = ~is_resting(model, mean, level)
+        after, jacobian = expected.clone(), mean.new_empty((*mean.shape, mean.shape[-1]))
+        kick = mean.new_zeros((len(mean), STATE_DIM, STATE_DIM))
+        left = torch.ones_like(bouncing)
+        for heights in self._contacts(level):
+            rows = (left & bouncing).nonzero()[:, 0]
+            if not len(rows):
+                break
+            state, times, by_mean = fly_through_jacobian(model, mean[rows], h[rows], tuple(z[rows] for z in heights))
+            same = (state - expected[rows]).abs().amax(-1) < SAME
+            rows = rows[same]
+            jacobian[rows] = by_mean[same]
+            left[rows] = False
+            for time in times[same].unbind(-1):
+                kick[rows] += torch.from_numpy(self.noise.contact(h[rows].numpy(), time.numpy()))
+        rows = left.nonzero()[:, 0]
+        if len(rows):
+            _, jacobian[rows] = batch_jacobian(partial(_advanced, model, h[rows], self.surfaces), mean[rows])
+        return after, jacobian, kick
+
+    def _contacts(self, level: Tensor) -> tuple[tuple[Tensor, ...], ...]:
+        """What may happen to a ball that reaches `level` (n,) m: a bounce, two, none beside the table, the floor."""
+        lowest = self.surfaces.lowest()
+        floor = ((torch.full_like(level, lowest),),) if math.isfinite(lowest) else ()
+        return (level,), (level, level), (), *floor
+
+
+def _moved(belief: Belief, h: Tensor, after: Tensor, jacobian: Tensor, noise: Tensor) -> Belief:
+    covariance = jacobian @ belief.covariance @ jacobian.transpose(-1, -2)
+    covariance[:, :STATE_DIM, :STATE_DIM] += noise
+    covariance = (covariance + covariance.transpose(-1, -2)) / 2  # rounding would add up
+    return replace(belief, time=belief.time + h, mean=after, covariance=covariance)
 
 
 def _advanced(model: BallModel, h: Tensor, surfaces: Surfaces, mean: Tensor) -> Tensor:

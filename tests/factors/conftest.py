@@ -66,23 +66,25 @@ def dense() -> Callable[[Sequence[Rows], Values], tuple[np.ndarray, np.ndarray]]
     return assemble
 
 
+STEPS = np.repeat((2e-4, 5e-4, 2e-2), 3)
+"""m, m/s, rad/s: see `differences`."""
+
+
 @pytest.fixture
-def differences() -> Callable[[Callable[[Values], np.ndarray], Values], np.ndarray]:
-    """(m, 9 n + p) derivative of f(values) (m,) by fourth-order central differences.
+def differences() -> Callable[[Callable[[np.ndarray], np.ndarray], np.ndarray, np.ndarray], np.ndarray]:
+    """Derivative (..., d) of f(x) by x (..., d) along the last axis, f row-wise, by fourth-order central differences.
 
     Steps: 2e-4 m, 5e-4 m/s, 2e-2 rad/s, 1e-3 of a coefficient's size. Over them the motion of a ball in a frame is smooth to
     some 1e-3 of itself, so that truncation (step^4) is below 1e-12; rounding, eps |x| / step, is about 1e-11 in
     position and velocity and 1e-10 of the largest element after whitening.
     """
 
-    def jacobian(function: Callable[[Values], np.ndarray], values: Values) -> np.ndarray:
-        n, p = len(values.states), len(values.coefficients)
-        steps = np.concatenate((np.tile(np.repeat((2e-4, 5e-4, 2e-2), 3), n), 1e-3 * np.abs(values.coefficients)))
+    def jacobian(function, x: np.ndarray, steps: np.ndarray) -> np.ndarray:
         columns = []
         for j, h in enumerate(steps):
-            unit = np.zeros(9 * n + p)
+            unit = np.zeros(x.shape[-1])
             unit[j] = h
-            at = {k: function(values.moved(k * unit[: 9 * n].reshape(n, 9), k * unit[9 * n :])) for k in (-2, -1, 1, 2)}
+            at = {k: function(x + k * unit) for k in (-2, -1, 1, 2)}
             columns.append((8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * h))
         return np.stack(columns, axis=-1)
 
@@ -90,20 +92,25 @@ def differences() -> Callable[[Callable[[Values], np.ndarray], Values], np.ndarr
 
 
 @pytest.fixture
-def check_jacobian(dense, differences) -> Callable[[FactorKind, Values], float]:
-    """Worst error of a kind's Jacobians, each row relative to its largest element per variable, at non-zero residual."""
+def check_jacobian(differences) -> Callable[[FactorKind, Values], float]:
+    """Worst error of a kind's Jacobians: each row of a block relative to its largest element (or 1e-4 of the block's)."""
 
     def check(kind: FactorKind, values: Values) -> float:
-        residual, given = dense([kind.linearize(values)], values)
-        assert np.abs(residual).min() > 1e-3, "a zero residual hides errors"
-        expected = differences(lambda v: kind.linearize(v).residual.ravel(), values)
+        rows = kind.linearize(values)
+        assert (np.linalg.norm(rows.residual, axis=-1) > 0.1).all(), "a zero residual hides errors"
+        inputs = [np.array(values.gather(column)) for column in kind.variables.T]
         worst = 0.0
-        for variable in np.unique(kind.variables).tolist():
-            columns = offset(values, variable)
-            scale = np.abs(expected[:, columns]).max(axis=1, keepdims=True)
-            touched = scale[:, 0] > 0
-            assert not given[~touched, columns].any()
-            worst = max(worst, float((np.abs(given - expected)[touched, columns] / scale[touched]).max()))
+        for i, given in enumerate(rows.jacobians):
+            steps = STEPS if kind.variables[0, i] != COEFFICIENTS else 1e-3 * np.abs(values.coefficients)
+
+            def residual(x: np.ndarray, i: int = i) -> np.ndarray:
+                return kind.compute(slice(None), (*inputs[:i], x, *inputs[i + 1 :]))[0]
+
+            expected = differences(residual, inputs[i], steps)
+            assert expected.shape == given.shape
+            per_row, per_block = np.abs(expected).max(axis=2), np.abs(expected).max(axis=(1, 2))
+            scale = np.maximum(per_row, 1e-4 * per_block[:, None])[..., None]
+            worst = max(worst, float((np.abs(given - expected) / scale).max()))
         return worst
 
     return check

@@ -266,30 +266,21 @@ def test_the_checker_names_the_bad_block(rng):
     assert sum(error.relative > 1e-6 for error in jacobian_errors(kind, start)) == 1
 
 
-@pytest.mark.parametrize("coefficients", [False, True])
-def test_jacobians_of_all_kinds(rng, coefficients):
-    model, means = nominal_model(), np.zeros(0)
-    if coefficients:
-        names = (*NAMES, "contact.restitution.e")
-        parameters = dict(model.named_parameters())
-        means = np.array([float(parameters[name].detach()) for name in names])
-        model = AugmentedModel(model, names)
-    states = np.tile([0.0, 0.0, 0.05, 4.0, 0.4, -3.0, 20.0, 60.0, -30.0], (5, 1))
-    states += rng.standard_normal((5, 9)) * np.repeat([0.003, 0.3, 10.0], 3)
-    values = Values(states, means)
-    dt, rows = np.array([0.012, 0.018, 0.015, 0.02]), np.arange(4)
+def test_the_checker_passes_every_kind(rng):
+    model = nominal_model()
+    states = np.tile([0.0, 0.0, 0.05, 4.0, 0.4, -3.0, 20.0, 60.0, -30.0], (3, 1))
+    states += rng.standard_normal((3, 9)) * np.repeat([0.003, 0.3, 10.0], 3)
+    values = Values(states, np.zeros(0))
+    dt, rows = np.array([0.012, 0.018]), np.arange(2)
     covariance = ProcessNoise().flight(dt)
-    on_table = np.zeros((4, 1))
-    resting = Values(states * np.array([1, 1, 0, 1, 1, 0, 1, 1, 1]) + np.eye(9)[2] * 0.02, means)
+    resting = Values(states * np.array([1, 1, 0, 1, 1, 0, 1, 1, 1]) + np.eye(9)[2] * 0.02, np.zeros(0))
     for kind, point in (
         (FlightFactors(model, rows, dt, covariance), values),
-        (FlightFactors(model, rows, dt * 4, covariance), values),
-        (ContactFactors(model, rows, dt, covariance, on_table), values),
-        (ContactFactors(model, rows[:2], dt[:2] * 40, covariance[:2], np.zeros((2, 2))), values),
-        (RestFactors(model, rows, dt, covariance, on_table[:, 0]), resting),
-        (PositionFactors(rows, states[:4, :3] + 0.01, np.full((4, 3), 0.002)), values),
+        (ContactFactors(model, rows, dt, covariance, np.zeros((2, 1))), values),
+        (RestFactors(model, rows, dt, covariance, np.zeros(2)), resting),
+        (PositionFactors(rows, states[:2, :3] + 0.01, np.full((2, 3), 0.002)), values),
         (state_prior(2, np.zeros(9), np.ones(9)), values),
-        (spin_prior(rows, np.zeros((4, 3)), np.full((4, 3), 20.0)), values),
+        (spin_prior(rows, np.zeros((2, 3)), np.full((2, 3), 20.0)), values),
     ):
         assert check_factor(kind, point) < 1e-6
 
