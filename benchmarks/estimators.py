@@ -113,7 +113,7 @@ def describe_settings(settings: Settings) -> str:
 def _noise_terms(settings: Settings) -> list[tuple[str, float]]:
     """The terms that act, by name, SI units."""
     process = settings.process
-    unused = () if settings.find_events else ("hit",)
+    unused: tuple[str, ...] = () if settings.find_events else ("hit",)
     unused += ("acceleration", "contact") if isinstance(process, StepNoise) else ()
     return [(name, value) for name, value in vars(process).items() if value and not name.startswith(unused)]
 

@@ -39,6 +39,8 @@ CALIBRATION = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 """Nominal levels of the calibration curve."""
 BINS = np.linspace(0.0, HORIZON, 13)
 """s, edges of the error-growth curve."""
+WHOLE = "smoother (whole tracks)"
+"""The method in `results.json` of what is said about smoothing without prediction."""
 WITHIN = 5.0
 """Standard deviations within which a whitened innovation is explained."""
 
@@ -116,34 +118,40 @@ def covered(predictions: Sequence[TrackPrediction], level: float, axes: slice = 
 
 def _add_predictions(results: Results, measured: Measured) -> None:
     rng = np.random.default_rng([results.seed, 4])
+    case = measured.name
     for method, predictions in measured.predictions.items():
-        n = len(predictions)
-        if n == 0:
+        if not predictions:
             continue
-
-        def add(metric: str, unit: str, statistic: Statistic, count: int, method: str = method) -> None:
-            results.add(measured.name, method, metric, unit, bootstrap(statistic, count, rng), count)
-
-        rmse = np.array([1e3 * prediction_rmse(p) for p in predictions])
-        ends = 1e3 * np.array([end_error(p) for p in predictions])
-        ends = ends[np.isfinite(ends)]
-        for name, q in (("median", 0.5), ("lower_quartile", 0.25), ("upper_quartile", 0.75)):
-            add(f"prediction_rmse_{name}", "mm", quantile(rmse, q), n)
-        if len(ends):
-            add("prediction_end_error_median", "mm", quantile(ends, 0.5), len(ends))
-        for level in LEVELS:
-            add(f"coverage_{100 * level:.0f}", "1", pooled_mean(*covered(predictions, level)), n)
-            for i, axis in enumerate("xyz"):
-                share = pooled_mean(*covered(predictions, level, slice(i, i + 1)))
-                add(f"coverage_{100 * level:.0f}_{axis}", "1", share, n)
+        for metric, unit, statistic, count in _statistics(predictions):
+            results.add(case, method, metric, unit, bootstrap(statistic, count, rng), count)
         for level in CALIBRATION:
-            hits, count = covered(predictions, level)
-            metric = f"coverage{CURVE_MARK}{level:g}"
-            results.add(measured.name, method, metric, "1", hits.sum() / count.sum(), n)
-        _add_nis(results, measured.name, method, [p.estimate for p in predictions])
+            held, total = covered(predictions, level)
+            share = float(held.sum() / total.sum())
+            results.add(case, method, f"coverage{CURVE_MARK}{level:g}", "1", share, len(predictions))
+        _add_nis(results, case, method, [p.estimate for p in predictions])
         failed = sum(p.status is not Status.OK for p in predictions)
-        results.add(measured.name, method, "not_converged", "1", failed, n)
-        _add_growth(results, measured.name, method, predictions)
+        results.add(case, method, "not_converged", "1", failed, len(predictions))
+        _add_growth(results, case, method, predictions)
+
+
+def _statistics(predictions: Sequence[TrackPrediction]) -> list[tuple[str, str, Statistic, int]]:
+    """Metric, unit, statistic and number of tracks of everything that has an interval."""
+    n = len(predictions)
+    rmse = [1e3 * prediction_rmse(p) for p in predictions]
+    ends = [1e3 * e for e in map(end_error, predictions) if np.isfinite(e)]
+    found = [
+        (f"prediction_rmse_{name}", "mm", quantile(rmse, q), n)
+        for name, q in (("median", 0.5), ("lower_quartile", 0.25), ("upper_quartile", 0.75))
+    ]
+    if ends:
+        found.append(("prediction_end_error_median", "mm", quantile(ends, 0.5), len(ends)))
+    for level in LEVELS:
+        metric = f"coverage_{100 * level:.0f}"
+        found.append((metric, "1", pooled_mean(*covered(predictions, level)), n))
+        for i, axis in enumerate("xyz"):
+            share = pooled_mean(*covered(predictions, level, slice(i, i + 1)))
+            found.append((f"{metric}_{axis}", "1", share, n))
+    return found
 
 
 def _add_nis(results: Results, case: str, method: str, estimates: Sequence[Estimate]) -> None:
@@ -171,43 +179,41 @@ def _add_growth(results: Results, case: str, method: str, predictions: Sequence[
 
 
 def _add_smoothing(results: Results, measured: Measured) -> None:
-    """How well the smoother explains whole tracks: whitened innovations, marked samples, hits, contacts."""
+    """How well the smoother explains whole tracks: whitened innovations, marked samples, hits, contacts.
+
+    Samples next to a marked hit do not count.
+    """
     estimates, case = measured.smoothed, measured.name
-    explained = np.array([_explained(e) for e in estimates]).T  # within, within and unmarked, all
+    counted = [_explained(e) for e in estimates]
     rng = np.random.default_rng([results.seed, 5])
-    n = len(estimates)
-    figures = {
-        "within_5_sigma": explained[0],
-        "within_5_sigma_marked_fail": explained[1],
-        "share_marked": explained[3],
-        "share_wide": explained[4],
-    }
-    for metric, sums in figures.items():
-        figure = bootstrap(pooled_mean(sums, explained[2]), n, rng)
-        results.add(case, "smoother (whole tracks)", metric, "1", figure, int(explained[2].sum()))
-    for metric, count in {
+    samples = [c["samples"] for c in counted]
+    for metric in ("within_5_sigma", "within_5_sigma_marked_fail", "share_marked", "share_wide"):
+        figure = bootstrap(pooled_mean([c[metric] for c in counted], samples), len(counted), rng)
+        results.add(case, WHOLE, metric, "1", figure, sum(samples))
+    counts = {
         "hits": sum(len(e.hits) for e in estimates),
         "contacts": sum(len(e.contacts) for e in estimates),
         "not_converged": sum(e.status is not Status.OK for e in estimates),
-    }.items():
-        results.add(case, "smoother (whole tracks)", metric, "1", count, n)
+    }
+    for metric, count in counts.items():
+        results.add(case, WHOLE, metric, "1", count, len(estimates))
 
 
-def _explained(estimate: Estimate) -> tuple[float, float, float, float, float]:
-    """Samples away from hits: within 5 sigma; the same and not marked; all; marked; wide.
+def _explained(estimate: Estimate) -> dict[str, int]:
+    """Numbers of samples away from hits: all, within 5 sigma, the same and not marked, marked, wide.
 
     Marked is what the segmentation calls shifted or an outlier, whose innovations are measured against a much larger
     noise; wide samples are measured against a noise four times as large.
     """
     away = np.ones(len(estimate.times), dtype=bool)
     away[estimate.hits] = away[estimate.hits + 1] = False
-    within = (np.abs(estimate.whitened) <= WITHIN).all(axis=-1)
+    within = (np.abs(estimate.whitened) <= WITHIN).all(axis=-1)  # NaN is not within
     marked = estimate.quality >= Quality.SHIFTED
-    wide = estimate.quality == Quality.WIDE
-    return (
-        float((away & within).sum()),
-        float((away & within & ~marked).sum()),
-        float(away.sum()),
-        float((away & marked).sum()),
-        float((away & wide).sum()),
-    )
+    masks = {
+        "samples": away,
+        "within_5_sigma": away & within,
+        "within_5_sigma_marked_fail": away & within & ~marked,
+        "share_marked": away & marked,
+        "share_wide": away & (estimate.quality == Quality.WIDE),
+    }
+    return {name: int(mask.sum()) for name, mask in masks.items()}

@@ -45,7 +45,7 @@ class NetworkFlight(BallModel):
                 spread = 1.0 / math.sqrt(layer.in_features)
                 layer.weight.copy_(spread * torch.randn(layer.weight.shape, generator=generator, dtype=torch.float64))
                 layer.bias.zero_()
-        self.register_buffer("gravity", torch.tensor([0.0, 0.0, -STANDARD_GRAVITY], dtype=torch.float64))
+        self.gravity = torch.tensor([0.0, 0.0, -STANDARD_GRAVITY], dtype=torch.float64)
 
     def force(self, state: Tensor) -> Tensor:
         """(..., 3) the network's output: aerodynamic acceleration divided by `FORCE_SCALE`."""
@@ -57,8 +57,7 @@ class NetworkFlight(BallModel):
 
     def rates(self, state: Tensor) -> Rates:
         """Acceleration in free flight; the spin is constant."""
-        gravity: Tensor = self.gravity
-        return gravity + FORCE_SCALE * self.force(state), None
+        return self.gravity + FORCE_SCALE * self.force(state), None
 
     def bounce(self, state: Tensor) -> Tensor:
         """That of the other model."""
@@ -84,10 +83,10 @@ def fitted_network(model: AnalyticModel, iterations: int = FIT_ITERATIONS) -> Ne
     def loss() -> Tensor:
         optimizer.zero_grad()
         value: Tensor = (network.force(state) - target).square().mean()
-        value.backward()  # type: ignore[no-untyped-call]
+        value.backward()
         return value
 
-    optimizer.step(loss)  # type: ignore[arg-type]
+    optimizer.step(loss)
     return network.requires_grad_(False)
 
 

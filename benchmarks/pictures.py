@@ -103,6 +103,7 @@ def _line(method: str) -> dict[str, Any]:
         "linestyle": DASHES.get(method, "solid"),
         "label": method,
         "linewidth": WIDTHS.get(method, 2.0),
+        "zorder": 10.0 - WIDTHS.get(method, 2.0),
         "marker": "o",
         "markersize": 3,
     }

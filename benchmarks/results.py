@@ -63,8 +63,8 @@ class Results:
     def add(self, case: str, method: str, metric: str, unit: str, value: float | Figure, n: int) -> None:
         """Add a number; a `Figure` brings its interval."""
         figure = value if isinstance(value, Figure) else Figure(float(value), math.nan, math.nan)
-        finite = [float(x) if math.isfinite(x) else None for x in (figure.value, figure.low, figure.high)]
-        self.rows.append(Row(case, method, metric, unit, *finite, n=int(n)))
+        ends = _finite(figure.low), _finite(figure.high)
+        self.rows.append(Row(case, method, metric, unit, _finite(figure.value), *ends, int(n)))
 
     def value(self, case: str, method: str, metric: str) -> float | None:
         """The value of a row. Raises: KeyError: if there is no such row."""
@@ -90,6 +90,10 @@ class Results:
         part.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
         os.replace(part, path)
         return path
+
+
+def _finite(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
 
 
 def versions() -> dict[str, str]:

@@ -14,8 +14,6 @@ from ballfg.benchmarks.metrics import Figure
 
 Array = NDArray[np.float64]
 
-WARM_UP = 5
-"""Runs that are not counted."""
 CONTROL_SIZE = 512
 """Of the square float64 matrices whose product is the control."""
 
@@ -25,14 +23,16 @@ class Stopwatch:
     """How times are taken.
 
     Attributes:
-        runs: timed ones, after `WARM_UP` others.
+        runs: timed ones.
+        warm_up: runs before them, not counted.
     """
 
     runs: int
+    warm_up: int = 5
 
     def time(self, action: Callable[[], object]) -> Figure:
         """Median and quartiles of an action's time, ms."""
-        for _ in range(WARM_UP):
+        for _ in range(self.warm_up):
             action()
         gc.collect()
         return quartiles(np.array([_once(action) for _ in range(self.runs)]))

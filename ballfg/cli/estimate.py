@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import default_jobs, open_inputs
+from ballfg.cli.inputs import check_out, default_jobs, open_inputs, status_lines
 from ballfg.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -41,19 +41,20 @@ def estimate(
     from ballfg.estimate import estimate_tracks
     from ballfg.tracks import TableWriter
 
-    inputs = open_inputs(dataset, model)
-    count = len(inputs.dataset)
     statuses: Counter[str] = Counter()
     rows = hits = 0
     with TableWriter(out) as table:
+        check_out(out, dataset)
+        inputs = open_inputs(dataset, model)
+        count = len(inputs.dataset)
         estimates = estimate_tracks(inputs.estimator(method.value), inputs.dataset, count, jobs)
         for result in progress(estimates, count, "tracks estimated"):
             table.write(_columns(result))
             statuses[result.status.value] += 1
             rows, hits = rows + len(result.times), hits + len(result.hits)
     print(f"{out}: {rows} states of {count} tracks by {method.value}; {hits} hits found")
-    for text, number in statuses.items():
-        print(f"  {number} tracks: {text}")
+    for line in status_lines(statuses):
+        print(line)
 
 
 def _columns(result: Estimate) -> dict[str, str | np.ndarray]:

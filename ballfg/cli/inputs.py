@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import sys
+from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -13,6 +15,9 @@ if TYPE_CHECKING:
     from ballfg.dynamics.surfaces import Surfaces
     from ballfg.estimate import Estimator, Settings
     from ballfg.tracks import Dataset
+
+DATASET_TABLES = ("tracks", "labels", "detections", "truth")
+"""Names, without their endings, of the tables that a dataset's folder holds."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,21 @@ def open_inputs(dataset: Path, model: Path | None) -> Inputs:
     radius = data.info.ball.radius
     ball = nominal_model(radius) if model is None else load_model(model, radius=radius)
     return Inputs(data, ball, dataset_surfaces(data), dataset_settings(data, ball))
+
+
+def check_out(out: Path, dataset: Path) -> None:
+    """A result must not take the place of the measurements.
+
+    Raises: ValueError: if `out` is a table of the dataset.
+    """
+    if out.stem in DATASET_TABLES and out.resolve().parent == dataset.resolve():
+        raise ValueError(f"out must not be a table of the dataset itself; got {out}. Choose another name.")
+
+
+def status_lines(statuses: Counter[str]) -> Iterator[str]:
+    """How many tracks ended how, most first."""
+    for text, number in statuses.most_common():
+        yield f"  {number} track{'s' if number > 1 else ''}: {text}"
 
 
 def default_jobs() -> int:

@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ballfg.cli.estimate import Method
-from ballfg.cli.inputs import default_jobs, open_inputs
+from ballfg.cli.inputs import check_out, default_jobs, open_inputs, status_lines
 from ballfg.cli.progress import progress
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from ballfg.predict import TrackPrediction
 
 
 def predict(
@@ -24,29 +30,34 @@ def predict(
 
     Example: ballfg predict data/ballgun --observe 0.25 --out predictions.csv
     """
-    import numpy as np
-
-    from ballfg.predict import predict_tracks
+    from ballfg.predict import check_observe, predict_tracks
     from ballfg.tracks import TableWriter
 
-    inputs = open_inputs(dataset, model)
-    count = len(inputs.dataset)
-    estimator = inputs.estimator(method.value)
+    statuses: Counter[str] = Counter()
     rows, squares, ended = 0, 0.0, 0
     with TableWriter(out) as table:
-        predictions = predict_tracks(estimator, inputs.dataset, count, observe, jobs=jobs)
+        check_out(out, dataset)
+        check_observe(observe)
+        inputs = open_inputs(dataset, model)
+        count = len(inputs.dataset)
+        predictions = predict_tracks(inputs.estimator(method.value), inputs.dataset, count, observe, jobs=jobs)
         for result in progress(predictions, count, "tracks predicted"):
-            x, sigma = result.positions, result.sigmas
-            table.write(
-                {"trajectory": np.repeat(result.name, len(x)), "t": result.times}
-                | {name: x[:, i] for i, name in enumerate(("x", "y", "z"))}
-                | {name: sigma[:, i] for i, name in enumerate(("sigma_x", "sigma_y", "sigma_z"))}
-            )
-            rows += len(x)
-            ended += len(x) == 0
-            squares += float(((x - result.measured) ** 2).sum())
+            table.write(_columns(result))
+            statuses[result.status.value] += 1
+            rows += len(result.times)
+            ended += len(result.times) == 0
+            squares += float(((result.positions - result.measured) ** 2).sum())
     print(f"{out}: {rows} positions of {count} tracks, from the first {observe:g} s of each by {method.value}")
+    for line in status_lines(statuses):
+        print(line)
     if rows:
         print(f"  RMSE against what was measured there: {1e3 * (squares / rows) ** 0.5:.1f} mm over all stamps")
     if ended:
-        print(f"  {ended} tracks end within {observe:g} s: nothing to predict")
+        print(f"  {ended} of the tracks end within {observe:g} s: nothing to predict")
+
+
+def _columns(result: TrackPrediction) -> dict[str, str | np.ndarray]:
+    columns: dict[str, str | np.ndarray] = {"trajectory": result.name, "t": result.times}
+    columns |= dict(zip(("x", "y", "z"), result.positions.T, strict=True))
+    columns |= dict(zip(("sigma_x", "sigma_y", "sigma_z"), result.sigmas.T, strict=True))
+    return columns

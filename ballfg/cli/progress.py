@@ -1,4 +1,4 @@
-"""Progress of long work: a bar on a terminal, a plain line now and then elsewhere; nothing for work under two seconds."""
+"""Progress of long work: a bar on a terminal, plain lines now and then elsewhere; nothing for less than two seconds."""
 
 from __future__ import annotations
 
@@ -37,12 +37,17 @@ def _bar(items: Iterable[T], total: int, what: str) -> Iterator[T]:
 
 
 def _lines(items: Iterable[T], total: int, what: str) -> Iterator[T]:
-    start = time.monotonic()
-    due = start + QUIET
+    due = time.monotonic() + QUIET
+    since: tuple[float, int] | None = None
     for done, item in enumerate(items, start=1):
         yield item
         now = time.monotonic()
-        if now >= due:
-            left = (now - start) / done * (total - done)
-            print(f"{done} of {total} {what}, {left:.0f} s left", file=sys.stderr, flush=True)
-            due = now + LINE_EVERY
+        if now < due or done == total:
+            continue
+        left = ""
+        if since is None:  # the time up to here went into the start of processes too: count from here on
+            since = now, done
+        else:
+            left = f", {(now - since[0]) / (done - since[1]) * (total - done):.0f} s left"
+        print(f"{done} of {total} {what}{left}", file=sys.stderr, flush=True)
+        due = now + LINE_EVERY

@@ -23,7 +23,7 @@ def initial_states(track: Track, contacts: tuple[Contact, ...], segmentation: Se
     """(n, 9) states from the sliding window: measured positions, mean velocities of windows that no event cuts.
 
     The spin is the label's, or zero, up to the first contact; each contact changes it as the model says. A ball that
-    rests is put on its surface.
+    rests is put on its surface and rolls.
     """
     states = np.zeros((len(track), STATE_DIM))
     states[:, POSITION] = _bridged_positions(track, segmentation)
@@ -34,9 +34,7 @@ def initial_states(track: Track, contacts: tuple[Contact, ...], segmentation: Se
     for contact in sorted(contacts, key=lambda c: c.time):
         _start_contact(states, contact, model)
     for rest in segmentation.rests:
-        resting = torch.from_numpy(states[rest.first : rest.last + 2])
-        states[rest.first : rest.last + 2, Z] -= model.gap(resting, rest.height).detach().numpy()
-        states[rest.first : rest.last + 2, VZ] = 0.0
+        _start_rest(states[rest.first : rest.last + 2], rest.height, model)
     return states
 
 
@@ -60,6 +58,14 @@ def _start_contact(states: Array, contact: Contact, model: BallModel) -> None:
         states[contact.interval + 1 :, SPIN] = model.bounce(before)[SPIN].numpy()
 
 
+def _start_rest(states: Array, height: float, model: BallModel) -> None:
+    """Put states on a surface, rolling: friction that has saturated does not tell in which direction the spin lies."""
+    states[:, Z] -= model.gap(torch.from_numpy(states), height).detach().numpy()
+    states[:, VZ] = 0.0
+    states[:, SPIN.start] = -states[:, VELOCITY.start + 1] / model.radius
+    states[:, SPIN.start + 1] = states[:, VELOCITY.start] / model.radius
+
+
 LEAST_FALL = 0.05
 """m/s, least downward speed that a guess has before a contact."""
 
@@ -80,8 +86,12 @@ def move_contacts(
     for interval in changed:
         if interval - 1 in changed:
             continue  # the contact came from there or went there; the state after both is right already
-        start = torch.from_numpy(np.concatenate((states[interval], values.coefficients))[None])
         heights = tuple(height for i, height in new if i == interval)
+        start = torch.from_numpy(np.concatenate((states[interval], values.coefficients))[None])
+        gap = float(model.gap(start, heights[0])[0].detach()) if heights else 0.0
+        if gap < 0.0 < states[interval, VZ]:  # it was on the way up, from below: before the contact it mirrors that
+            states[interval, [Z, VZ]] -= (2.0 * gap, 2.0 * states[interval, VZ])
+            start[0, : STATE_DIM] = torch.from_numpy(states[interval])
         with torch.no_grad():
             after, _ = fly_through(model, start, torch.from_numpy(np.diff(times[interval : interval + 2])), heights)
         if bool(after.isfinite().all()):

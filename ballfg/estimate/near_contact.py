@@ -33,8 +33,8 @@ def widen_near_contacts(
 
     A state within the uncertainty of a contact's time is on the side that the estimate took with probability p and
     on the other with 1 - p. With the jump d between the sides, the covariance about the estimate is larger by p (1 - p)
-    d d^T. The contact's time is known to sigma_z / |v_z|, often 0.1 ms: few stamps are concerned. The last sample may lie
-    just after a contact that nothing has shown yet.
+    d d^T. The contact's time is known to sigma_z / |v_z|, often 0.1 ms: few stamps are concerned. The last sample may
+    lie just after a contact that nothing has shown yet.
 
     Args:
         times: (n,) s.

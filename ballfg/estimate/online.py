@@ -111,6 +111,8 @@ class Online(Estimator):
         own = None if sigma is None else np.asarray(sigma, dtype=np.float64)[None]
         spread = sample_sigmas(self.settings, 1, own)[0]
         point = np.array(position, dtype=np.float64)
+        if not (np.isfinite(spread) & (spread > 0.0)).all():
+            raise ValueError(f"sigma must be positive and finite, in m; got {sigma!r}. Leave it out if it is unknown.")
         changed = self.events.push(time, point, spread)  # also checks the numbers
         if self.window is None:
             self.window = Window(self.trackwise, self.settings, float(spread.min()))

@@ -67,7 +67,7 @@ class LinearFactors(FactorKind):
         factor: of iSAM2.  values: v*, of the window.  first: number of the window's first state.
     """
 
-    def __init__(self, factor: gtsam.LinearContainerFactor, values: Values, first: int) -> None:
+    def __init__(self, factor: gtsam.NonlinearFactor, values: Values, first: int) -> None:
         keys = list(factor.keys())
         numbers = [COEFFICIENTS if k == COEFFICIENT_KEY else k - STATE_KEY - first for k in keys]
         at = gtsam.Values()
@@ -94,7 +94,8 @@ class WindowSmoother(Smoother):
     def __init__(self, window: Window, model: BallModel, surfaces: Surfaces, settings: Settings) -> None:
         super().__init__(model, surfaces, settings)
         self.start = Values(window.states, window.coefficients)
-        self.summaries = [LinearFactors(factor, self.start, window.first) for factor in window.summaries]
+        shared = window.shared if window.first else []
+        self.summaries = [LinearFactors(factor, self.start, window.first) for factor in shared]
 
     def _settle(self, track: Track, segmentation: Segmentation, sigma: Array) -> Solution:
         """Minimise, move contacts to where the estimate says they are, and minimise again until they stay."""

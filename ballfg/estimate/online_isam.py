@@ -96,7 +96,8 @@ class IncrementalWindow:
         samples: n of them.  intervals: n - 1, None where nothing links two samples.
         theta: (n, 9) linearisation points.  delta: (n, 9) solution about them.
         coefficient_theta, coefficient_delta: (p,) the same for the coefficients.
-        summaries: the linear factors that marginalised states left.
+        shared: factors that belong to no sample: the prior of the coefficients; once the window was cut, the linear
+            factors that took its place and that of all states that left.
         newest_covariance: (9 + p, 9 + p) of the newest state and the coefficients.
     """
 
@@ -111,7 +112,9 @@ class IncrementalWindow:
         self.first = 0
         self.samples: list[Sample] = []
         self.intervals: list[Interval | None] = []
-        self.summaries: list[gtsam.LinearContainerFactor] = []
+        self.shared: list[gtsam.NonlinearFactor] = []
+        if self.p:
+            self.shared.append(Bridge(coefficient_prior(self._own_means, self._own_sigmas), "row").factor(0))
         self.threshold = np.empty(STATE_DIM)
         self.threshold[POSITION] = POSITION_THRESHOLD * position_sigma
         self.threshold[VELOCITY], self.threshold[SPIN] = VELOCITY_THRESHOLD, SPIN_THRESHOLD
@@ -223,7 +226,6 @@ class IncrementalWindow:
         state: Array,
         interval: Interval | None,
         priors: Sequence[FactorKind] = (),
-        known: Sequence[gtsam.LinearContainerFactor] = (),
     ) -> int:
         """Give iSAM2 a new state with its factors, and read back the solution.
 
@@ -238,13 +240,11 @@ class IncrementalWindow:
             graph.push_back(Bridge(prior, "row").factor(0, [key - STATE_KEY]))
         values.insert(key, state)
         own = graph.size()
-        for factor in known:
-            graph.push_back(factor)
-        if self.p and len(self.theta) == 0:
-            values.insert(COEFFICIENT_KEY, self.coefficient_theta)
-            if not known:
-                prior = coefficient_prior(self._own_means, self._own_sigmas)
-                graph.push_back(Bridge(prior, "row").factor(0))
+        if len(self.theta) == 0:
+            for factor in self.shared:
+                graph.push_back(factor)
+            if self.p:
+                values.insert(COEFFICIENT_KEY, self.coefficient_theta)
         slots = self._update(graph, values, [], {key: 1, COEFFICIENT_KEY: 2} if self.p and len(self.theta) else {})
         if interval is not None:
             interval.slot = slots[0]

@@ -51,9 +51,22 @@ class Window(IncrementalWindow):
         """
         leaving = len(self.samples) - keep
         self._relinearize(None)
+        before = self.first, self.samples, self.intervals, self.theta, self.delta, self.shared
+        try:
+            self.shared = self._summary(leaving)
+            self.first += leaving
+            self.samples, self.intervals = self.samples[leaving:], self.intervals[leaving:]
+            self.theta, self.delta = self.theta[leaving:], self.delta[leaving:]
+            self._renew()
+        except RuntimeError:
+            self.first, self.samples, self.intervals, self.theta, self.delta, self.shared = before
+            raise
+
+    def _summary(self, leaving: int) -> list[gtsam.NonlinearFactor]:
+        """What the oldest states know, as linear factors on the first state that stays and on the coefficients."""
         point = self._point(range(leaving + 1))
         old = gtsam.GaussianFactorGraph()
-        for factor in (*self._factors(range(leaving), range(leaving)), *self.summaries):
+        for factor in (*self._factors(range(leaving), range(leaving)), *self.shared):
             old.push_back(factor.linearize(point))
         ordering = gtsam.Ordering()
         present = set(old.keyVector())
@@ -61,12 +74,10 @@ class Window(IncrementalWindow):
             if key in present:
                 ordering.push_back(key)
         bayes_net = old.eliminateSequential(ordering, gtsam.EliminateQR)
-        rest = [bayes_net.at(i) for i in range(leaving, bayes_net.size())]
-        self.summaries = [gtsam.LinearContainerFactor(_jacobian_factor(conditional), point) for conditional in rest]
-        self.first += leaving
-        del self.samples[:leaving], self.intervals[:leaving]
-        self.theta, self.delta = self.theta[leaving:], self.delta[leaving:]
-        self._renew()
+        conditionals = [bayes_net.at(i) for i in range(bayes_net.size())]  # by branches of the forest, not in order
+        gone = range(STATE_KEY + self.first, STATE_KEY + self.first + leaving)
+        rest = [_jacobian_factor(c) for c in conditionals if list(c.keys())[0] not in gone]  # noqa: RUF015
+        return [gtsam.LinearContainerFactor(factor, point) for factor in rest]
 
     def _point(self, numbers: range) -> gtsam.Values:
         """The linearisation points of some states of the window and of the coefficients."""
@@ -88,7 +99,7 @@ class Window(IncrementalWindow):
         """A new iSAM2 out of the window as it is."""
         n = len(self.samples)
         graph = gtsam.NonlinearFactorGraph()
-        for factor in (*self._factors(range(n), range(n - 1)), *self.summaries):
+        for factor in (*self._factors(range(n), range(n - 1)), *self.shared):
             graph.push_back(factor)
         self.isam = self._new_isam()
         last = {STATE_KEY + self.first + n - 1: 1, COEFFICIENT_KEY: 2} if self.p else {}
@@ -106,16 +117,16 @@ class Window(IncrementalWindow):
         Returns: of the last sample's update.
         Raises: RuntimeError or ValueError: if that fails as well.
         """
-        old_start, old_coefficients, summaries = self.states[:1], self.coefficients, self.summaries
+        start, coefficients = self.states[:1], self.coefficients
         self._clear()
         self.samples, self.intervals = [], []
         for sample in samples:
             sample.slots = ()
         update = Update(np.full(3, np.nan), 0, 0, 0)
-        if summaries:
-            self.coefficient_theta = old_coefficients
-        if any(STATE_KEY + self.first in list(summary.keys()) for summary in summaries):
-            self._insert(samples[0], old_start[0], None, known=summaries)
+        if self.first:
+            self.coefficient_theta = coefficients
+        if any(STATE_KEY + self.first in list(factor.keys()) for factor in self.shared):
+            self._insert(samples[0], start[0], None)
             samples = samples[1:]
         for sample in samples:
             update = self.append(sample)

@@ -63,8 +63,8 @@ class Settings:
 
 
 MEASURED = ProcessNoise(contact_tangential=0.2, contact_spin=10.0)
-"""Process noise on measured tracks: what friction does in a bounce is known to some 0.2 m/s only. Friction and tangential
-restitution as coefficients of a track would say the same, along a kink that no minimisation likes."""
+"""Process noise on measured tracks: what friction does in a bounce is known to some 0.2 m/s only. Friction and
+tangential restitution as coefficients of a track would say the same, along a kink that no minimisation likes."""
 
 
 def uncertain(model: BallModel, **changes: object) -> Settings:

@@ -9,7 +9,6 @@ import torch
 from numpy.typing import NDArray
 
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.contact import contact_time
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
@@ -43,7 +42,7 @@ MAX_REFINEMENTS = 6
 MAX_UNSEEN_HITS = 8
 """How many hits the estimate may add to those that the segmentation found; measured logs needed three at most."""
 BROKEN = 8.0
-"""Norm of a whitened dynamics residual (9 dimensions) beyond which its interval hides a hit: chance gives one in 1e9."""
+"""Norm of a whitened dynamics residual (9 dimensions) beyond which its interval hides a hit; chance: one in 1e9."""
 
 
 @dataclass(frozen=True)
@@ -119,10 +118,10 @@ class Smoother(Estimator):
             seen[_places(events.contacts)] = solution
             refined = _refined(track.times, solution)
             if _places(refined) == _places(events.contacts):
-                unseen = _contact_at_end(track.times, solution, self.trackwise, self.surfaces)
+                unseen = _contacts_at_ends(track.times, solution, self.trackwise, self.surfaces)
                 if not unseen:
                     return solution
-                refined = (*refined, *unseen)
+                refined = tuple(sorted((*refined, *unseen), key=lambda c: c.time))
             if _places(refined) in seen:
                 break
             values = move_contacts(
@@ -175,25 +174,31 @@ def _worst_break(solution: Solution) -> int | None:
     return where
 
 
-def _contact_at_end(times: Array, solution: Solution, model: BallModel, surfaces: Surfaces) -> tuple[Contact, ...]:
-    """A contact that only the last sample could show, too little for the segmentation: that state is below a surface.
+def _contacts_at_ends(
+    times: Array, solution: Solution, model: BallModel, surfaces: Surfaces
+) -> tuple[Contact, ...]:
+    """Contacts that a single sample at either end could show, too little for the segmentation.
 
-    Returns: the contact, if there is one in the last interval.
+    The last state has fallen through a surface; or the first, where later samples lead back to, rises from below one.
     """
-    events, last = solution.events, len(times) - 2
+    values, events, last = solution.minimum.values, solution.events, len(times) - 1
     taken = {c.interval for c in events.contacts} | set(events.segmentation.hits.tolist())
-    if last < 0 or last in taken or any(rest.last >= last for rest in events.segmentation.rests):
-        return ()
-    values = solution.minimum.values
-    state = torch.from_numpy(np.concatenate((values.states[-2:], np.tile(values.coefficients, (2, 1))), axis=1))
-    with torch.no_grad():
-        height = surfaces.level_below(state)[0]
-        above, below = model.gap(state, height).tolist()
-        if not (above >= 0.0 > below and surfaces.over_table(state)[1] and state[1, VZ] < 0.0):
-            return ()
-        elapsed = float(contact_time(model, state[:1], height)[0])
-    dt = float(times[-1] - times[-2])
-    return (Contact(last, float(times[-2]) + elapsed, float(height)),) if 0.0 <= elapsed <= dt else ()
+    for rest in events.segmentation.rests:
+        taken |= set(range(rest.first, rest.last + 1))
+    found = []
+    for inside, beyond in ((1, 0), (last - 1, last)) if last > 0 else ():
+        interval = min(inside, beyond)
+        states = np.concatenate((values.states[[inside, beyond]], np.tile(values.coefficients, (2, 1))), axis=1)
+        pair = torch.from_numpy(states)
+        height = surfaces.level_below(pair)[0]
+        with torch.no_grad():
+            above, below = model.gap(pair, height).tolist()
+        outwards = (beyond - inside) * float(pair[1, VZ]) < 0.0
+        if interval not in taken and above >= 0.0 > below and outwards and bool(surfaces.over_table(pair)[1]):
+            time = times[beyond] - below / float(pair[1, VZ])
+            found.append(Contact(interval, float(np.clip(time, times[interval], times[interval + 1])), float(height)))
+            taken.add(interval)
+    return tuple(found)
 
 
 def _places(contacts: tuple[Contact, ...]) -> tuple[tuple[int, float], ...]:

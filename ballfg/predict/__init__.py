@@ -3,7 +3,7 @@
 from ballfg.predict.belief import Belief
 from ballfg.predict.crossing import Crossing, apex, next_contact, next_crossing, plane_crossing
 from ballfg.predict.propagate import Prediction, Propagator
-from ballfg.predict.tracks import TrackPrediction, predict_tracks
+from ballfg.predict.tracks import TrackPrediction, check_observe, predict_tracks
 
 __all__ = [
     "Belief",
@@ -12,6 +12,7 @@ __all__ = [
     "Propagator",
     "TrackPrediction",
     "apex",
+    "check_observe",
     "next_contact",
     "next_crossing",
     "plane_crossing",

@@ -65,9 +65,10 @@ class Belief:
         prior = dict.fromkeys(estimates[0].coefficient_names, np.nan) if coefficients is None else coefficients
         names = tuple(prior)
         for e in estimates:
-            if not set(e.coefficient_names) <= set(names) or coefficients is None and e.coefficient_names != names:
+            own = e.coefficient_names
+            if not set(own) <= set(names) or (coefficients is None and own != names):
                 raise ValueError(
-                    f"estimates must share their coefficients; track {e.name!r} has {list(e.coefficient_names)}, "
+                    f"estimates must share their coefficients; track {e.name!r} has {list(own)}, "
                     f"not {list(names)}. Make them with the same settings."
                 )
         bounded = AugmentedModel(model, names) if names else model

@@ -7,20 +7,21 @@ g = 0: a ball that is late is further back but crosses at the same place (docs/d
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
 
 from ballfg.dynamics.contact import contact_time
-from ballfg.dynamics.integrate import MAX_STEP, batch_jacobian, derivative, fly
+from ballfg.dynamics.integrate import MAX_STEP, RateFunction, batch_jacobian, derivative, fly
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.rollout import advance, is_resting
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.predict.belief import Belief
 from ballfg.predict.propagate import Propagator
-from ballfg.state import POSITION, STATE_DIM, VELOCITY, VZ
+from ballfg.state import POSITION, STATE_DIM, VZ
 
 EventFunction = Callable[[Tensor], Tensor]
 """(..., d) states to (..., 1) values; the event is where the value falls through zero."""
@@ -77,7 +78,8 @@ def next_contact(
             tau, height = found
             there = propagator.in_flight(belief, tau)
             if float(there.time) > earliest:
-                return _projected(there, lambda state: model.gap(state, height).unsqueeze(-1), model.rates)
+                return _projected(there, partial(_gap, model, height), model.rates)
+            h = tau + JUST_NOW  # a small hop may be over within the step
         belief = propagator.forward(belief, h)
     return None
 
@@ -111,6 +113,10 @@ def plane_crossing(
         return ((state[..., POSITION] * normal).sum(-1, keepdim=True) - offset) / length
 
     return next_crossing(propagator, belief, distance, horizon, after=after, either_way=True)
+
+
+def _gap(model: BallModel, height: float, state: Tensor) -> Tensor:
+    return model.gap(state, height).unsqueeze(-1)
 
 
 def _vertical_speed(state: Tensor) -> Tensor:
@@ -159,9 +165,7 @@ def _span(belief: Belief, horizon: float) -> tuple[float, float]:
     return start, start + horizon
 
 
-def _contact_within(
-    model: BallModel, mean: Tensor, h: Tensor, surfaces: Surfaces
-) -> tuple[Tensor, float] | None:
+def _contact_within(model: BallModel, mean: Tensor, h: Tensor, surfaces: Surfaces) -> tuple[Tensor, float] | None:
     """Time (1,) s until a falling ball meets a surface in a step, and that surface's height; None if it does not."""
     with torch.no_grad():
         after = fly(model, mean, h)
@@ -170,6 +174,69 @@ def _contact_within(
             if not falls or bool(is_resting(model, mean, height)):
                 continue
             tau = contact_time(model, mean, height)
-            if float(tau) >= 0.0 and _under(surfaces, fly(model, mean, tau), height):
+            if float(tau) >= 0.0 and _lies_under(surfaces, fly(model, mean, tau), height):
                 return tau, height
     return None
+
+
+def _lies_under(surfaces: Surfaces, state: Tensor, height: float) -> bool:
+    return height != surfaces.table_height or bool(surfaces.over_table(state))
+
+
+def _crossings(
+    propagator: Propagator, belief: Belief, event: EventFunction, h: Tensor, either_way: bool
+) -> Iterator[float]:
+    """Times (s from the belief's) at which the value goes through zero within a step h (1,)."""
+    looks = torch.linspace(0.0, 1.0, LOOKS + 1, dtype=torch.float64)
+
+    def changes(low: Tensor, high: Tensor) -> Iterator[tuple[Tensor, Tensor, float]]:
+        """Brackets of the sign changes between two times, and the value's size at the end of each."""
+        times = low + (high - low) * looks
+        values = event(_mean_at(belief, times, propagator.surfaces))[:, 0]
+        falls = (values[:-1] > 0) & (values[1:] <= 0)
+        rises = (values[:-1] < 0) & (values[1:] >= 0)
+        for i in (falls | rises if either_way else falls).nonzero()[:, 0].tolist():
+            yield times[i], times[i + 1], float(values[i + 1].abs())
+
+    for low, high, size in changes(torch.zeros_like(h), h):
+        while float(high - low) > TIME_TOLERANCE:
+            low, high, size = next(changes(low, high))
+        if size < VALUE_JUMP:
+            yield float(high)
+
+
+def _mean_at(belief: Belief, times: Tensor, surfaces: Surfaces) -> Tensor:
+    """(k, d) means of one ball at times (k,) s from the belief's, all within one step."""
+    with torch.no_grad():
+        later = advance(belief.model, belief.mean.expand(len(times), -1), times, surfaces)
+        return torch.where((times > 0.0).unsqueeze(-1), later, belief.mean)  # a ball at a contact has not bounced yet
+
+
+def _rates(propagator: Propagator, belief: Belief) -> RateFunction:
+    """What moves the ball: the air and its weight, or where it rests, friction."""
+    level = propagator.surfaces.level_below(belief.mean)
+    with torch.no_grad():
+        resting = bool(is_resting(belief.model, belief.mean, level))
+    resting = resting and _lies_under(propagator.surfaces, belief.mean, float(level))
+    return belief.model.roll if resting else belief.model.rates
+
+
+def _projected(there: Belief, event: EventFunction, rates: RateFunction) -> Crossing:
+    """The crossing whose mean is `there`, with the covariance projected along the motion onto the event's surface.
+
+    Where the motion only touches the surface, nothing fixes the time: its sigma is infinite, the covariance that
+    at the mean time.
+    """
+    mean, covariance = there.mean, there.covariance[0]
+    _, gradient = batch_jacobian(event, mean, outputs=1)
+    with torch.no_grad():
+        rate = derivative(rates, mean)  # (1, d)
+    closing = (gradient[:, 0] * rate).sum()
+    time_sigma = math.inf
+    if float(closing) != 0.0:
+        time_by_state = -gradient[0] / closing  # (1, d)
+        projection = torch.eye(mean.shape[-1], dtype=mean.dtype) + rate.T @ time_by_state
+        time_sigma = math.sqrt(max(float(time_by_state @ covariance @ time_by_state.T), 0.0))
+        covariance = projection @ covariance @ projection.T
+        covariance = (covariance + covariance.T) / 2
+    return Crossing(float(there.time), time_sigma, mean[0, :STATE_DIM], covariance[:STATE_DIM, :STATE_DIM])

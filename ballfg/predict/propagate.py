@@ -108,12 +108,11 @@ class Propagator:
             touching = is_resting(model, mean, level) | ((model.gap(after, level) < 0) & (after[:, VZ] < 0))
         rows = touching.nonzero()[:, 0]
         if len(rows):
-            after[rows], jacobian[rows], kick = self._touch(model, mean[rows], h[rows], level[rows])
-            noise[rows] += kick
+            after[rows], jacobian[rows], noise[rows] = self._touch(model, mean[rows], h[rows], level[rows])
         return _moved(belief, h, after, jacobian, noise)
 
     def _touch(self, model: BallModel, mean: Tensor, h: Tensor, level: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean, Jacobian and the impacts' noise of balls that reach a surface's level, or rest, within a step.
+        """Mean, Jacobian and noise of balls that reach a surface's level, or rest, within a step.
 
         `advance` says what happens. Bounces have their Jacobian composed, with the time of each; what is left
         (rest, coming to rest, rolling over an edge) goes through autograd and has no impact.
@@ -122,7 +121,7 @@ class Propagator:
             expected = advance(model, mean, h, self.surfaces)
             bouncing = ~is_resting(model, mean, level)
         after, jacobian = expected.clone(), mean.new_empty((*mean.shape, mean.shape[-1]))
-        kick = mean.new_zeros((len(mean), STATE_DIM, STATE_DIM))
+        noise = torch.from_numpy(self.noise.flight(h.numpy()))
         left = torch.ones_like(bouncing)
         for heights in self._contacts(level):
             rows = (left & bouncing).nonzero()[:, 0]
@@ -130,21 +129,35 @@ class Propagator:
                 break
             state, times, by_mean = fly_through_jacobian(model, mean[rows], h[rows], tuple(z[rows] for z in heights))
             same = (state - expected[rows]).abs().amax(-1) < SAME
-            rows = rows[same]
+            rows, times = rows[same], times[same]
             jacobian[rows] = by_mean[same]
             left[rows] = False
-            for time in times[same].unbind(-1):
-                kick[rows] += torch.from_numpy(self.noise.contact(h[rows].numpy(), time.numpy()))
+            if len(rows) and heights:
+                noise[rows] = self._bounce_noise(model, mean[rows], h[rows], times, jacobian[rows])
         rows = left.nonzero()[:, 0]
         if len(rows):
             _, jacobian[rows] = batch_jacobian(partial(_advanced, model, h[rows], self.surfaces), mean[rows])
-        return after, jacobian, kick
+        return after, jacobian, noise
+
+    def _bounce_noise(self, model: BallModel, mean: Tensor, h: Tensor, times: Tensor, jacobian: Tensor) -> Tensor:
+        """(n, 9, 9) covariance gathered in a step with impacts at times (n, k).
+
+        What the flight gathers before the first impact goes through it; each impact adds its own.
+        """
+        first = times[:, 0].clamp(torch.zeros_like(h), h)
+        _, flight = fly_jacobian(model, mean, first)
+        onward = torch.linalg.solve(flight.mT, jacobian.mT).mT[:, :STATE_DIM, :STATE_DIM]  # from the impact to the end
+        before = torch.from_numpy(self.noise.flight(first.numpy()))
+        noise = onward @ before @ onward.mT + torch.from_numpy(self.noise.flight((h - first).numpy()))
+        for time in times.unbind(-1):
+            noise += torch.from_numpy(self.noise.contact(h.numpy(), time.numpy()))
+        return noise
 
     def _contacts(self, level: Tensor) -> tuple[tuple[Tensor, ...], ...]:
-        """What may happen to a ball that reaches `level` (n,) m: a bounce, two, none beside the table, the floor."""
+        """What may happen to a ball that reaches `level` (n,) m: none beside the table, a bounce, two, the floor."""
         lowest = self.surfaces.lowest()
         floor = ((torch.full_like(level, lowest),),) if math.isfinite(lowest) else ()
-        return (level,), (level, level), (), *floor
+        return (), (level,), (level, level), *floor
 
 
 def _moved(belief: Belief, h: Tensor, after: Tensor, jacobian: Tensor, noise: Tensor) -> Belief:

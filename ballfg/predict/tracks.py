@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from ballfg.estimate.batch import estimate_tracks
 from ballfg.estimate.estimator import Estimator
 from ballfg.estimate.result import Estimate, Status
+from ballfg.estimate.settings import sample_sigmas
 from ballfg.predict.belief import Belief
 from ballfg.predict.propagate import Propagator
 from ballfg.state import POSITION
@@ -61,44 +63,67 @@ def predict_tracks(
         estimator: from what it sees of a track comes the belief that is propagated.
         tracks: a stream; some tens at a time are in memory.
         count: how many there are, about.
-        observe: s from the track's first stamp.
-        horizon: s after the observed part; later stamps are left out.
+        observe: s from the track's first stamp; a stamp at its end is observed.
+        horizon: s after the last observed stamp; later stamps are left out.
         jobs: processes for the estimation.
 
-    Raises: ValueError: if observe is not positive.
+    Raises: ValueError: if observe or horizon is not positive.
     """
+    check_observe(observe)
+    if not horizon > 0.0:
+        raise ValueError(f"horizon must be a positive number of seconds; got {horizon:g}. Leave it out for all stamps.")
+    return _predictions(estimator, tracks, count, observe, horizon, jobs)
+
+
+def check_observe(observe: float) -> None:
+    """Raises ValueError if `observe` (s) is not positive."""
     if not observe > 0.0:
-        raise ValueError(f"observe must be positive seconds; got {observe:g}")
+        raise ValueError(
+            f"observe must be a positive number of seconds; got {observe:g}. A quarter of a second is 0.25."
+        )
+
+
+def _predictions(
+    estimator: Estimator, tracks: Iterable[Track], count: int, observe: float, horizon: float, jobs: int
+) -> Iterator[TrackPrediction]:
     propagator = Propagator(estimator.surfaces, estimator.settings.process)
-    waiting: list[Track] = []
+    waiting: deque[Track] = deque()
 
     def observed() -> Iterator[Track]:
         for track in tracks:
             waiting.append(track)
-            yield track.until(float(track.times[0]) + observe + STAMP_TOLERANCE)
+            yield track.until(float(track.times[0]) + observe + _tolerance(track))
 
     estimates = estimate_tracks(estimator, observed(), count, jobs)
     while block := list(islice(estimates, BLOCK)):
-        whole, waiting[: len(block)] = waiting[: len(block)], []
-        yield from _predict_block(estimator, propagator, block, whole, horizon)
+        yield from _predict_block(estimator, propagator, block, [waiting.popleft() for _ in block], horizon)
+
+
+def _tolerance(track: Track) -> float:
+    """Seconds by which a stamp may miss a limit: `STAMP_TOLERANCE`, more where large stamps are rounded."""
+    return STAMP_TOLERANCE + 2.0 * float(np.spacing(np.abs(track.times[[0, -1]]).max()))
 
 
 def _predict_block(
     estimator: Estimator, propagator: Propagator, estimates: list[Estimate], tracks: list[Track], horizon: float
 ) -> Iterator[TrackPrediction]:
-    ends = np.array([e.times[-1] for e in estimates])
-    later = [(t.times > end) & (t.times <= end + horizon + STAMP_TOLERANCE) for t, end in zip(tracks, ends, strict=True)]
-    counts = [int(mask.sum()) for mask in later]
-    times = np.repeat(ends[:, None], max(counts), axis=1)
-    for row, track, mask, k in zip(times, tracks, later, counts, strict=True):
-        row[:k] = track.times[mask]
-        row[k:] = row[k - 1] if k else row[k:]  # short tracks wait at their last stamp
-    belief = Belief.last(estimator.model, estimates)
-    rolled = propagator.rollout(belief, torch.from_numpy(times)) if max(counts) else None
-    for i, (track, result, mask, k) in enumerate(zip(tracks, estimates, later, counts, strict=True)):
-        positions, sigmas = np.zeros((0, 3)), np.zeros((0, 3))
-        if rolled is not None and k:
-            noise = np.array(estimator.settings.position_noise) if track.sigmas is None else track.sigmas[mask]
-            variance = torch.diagonal(rolled.covariances[i, :k], dim1=-2, dim2=-1)[:, POSITION].numpy()
-            positions, sigmas = rolled.states[i, :k, POSITION].numpy(), np.sqrt(variance + noise**2)
-        yield TrackPrediction(track.name, track.times[mask], positions, sigmas, track.positions[mask], result)
+    ends = [float(e.times[-1]) for e in estimates]
+    later = [(t.times > end) & (t.times <= end + horizon + _tolerance(t)) for t, end in zip(tracks, ends, strict=True)]
+    times = _padded([t.times[mask] for t, mask in zip(tracks, later, strict=True)], ends)
+    belief = Belief.last(estimator.model, estimates, estimator.settings.coefficients)
+    positions, variances = np.zeros((*times.shape, 3)), np.zeros((*times.shape, 3))
+    for k, predicted in enumerate(propagator.walk(belief, torch.from_numpy(times)) if times.size else ()):
+        positions[:, k] = predicted.mean[:, POSITION].numpy()
+        variances[:, k] = torch.diagonal(predicted.covariance, dim1=-2, dim2=-1)[:, POSITION].numpy()
+    for i, (track, result, mask) in enumerate(zip(tracks, estimates, later, strict=True)):
+        k = int(mask.sum())
+        noise = sample_sigmas(estimator.settings, len(track), track.sigmas)[mask]
+        sigmas = np.sqrt(variances[i, :k] + noise**2)
+        yield TrackPrediction(track.name, track.times[mask], positions[i, :k], sigmas, track.positions[mask], result)
+
+
+def _padded(times: list[Array], ends: list[float]) -> Array:
+    """(n, k) s: each row's times, then the last of them again; a row without any holds the end of its observation."""
+    longest = max(map(len, times))
+    rows = [np.concatenate(([end], row)) for row, end in zip(times, ends, strict=True)]
+    return np.stack([np.pad(row, (0, longest + 1 - len(row)), mode="edge")[1:] for row in rows])

@@ -1,13 +1,15 @@
 """Small runs of what takes minutes in earnest. Times are never tested, only that they were taken."""
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from ballfg.benchmarks import speed
 from ballfg.benchmarks.estimators import Size, describe, run_synthetic
-from ballfg.benchmarks.measured import prediction_rmse
+from ballfg.benchmarks.measured import WHOLE, Measured, _add_smoothing, prediction_rmse
 from ballfg.benchmarks.network import fitted_network, parameter_count
 from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.speed import problem_model, run_speed
@@ -87,10 +89,12 @@ def test_network_is_the_same_each_time_and_close_to_the_model() -> None:
     assert error.square().mean().sqrt() < 0.1 * force.square().mean().sqrt()
 
 
-def test_speed_run_has_every_time() -> None:
+def test_speed_run_has_every_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(speed, "fitted_network", partial(fitted_network, iterations=100))
     results = Results("test", 0)
     run_speed(results, None, quick=True)
     expected = {
+        "matrix_product_time",
         "lm_time",
         "lm_time_gtsam",
         "covariances_time",
@@ -104,8 +108,30 @@ def test_speed_run_has_every_time() -> None:
     for method in ("analytic", "network"):
         found = {row.metric for row in results.rows if row.method == method and row.unit == "ms"}
         assert found == expected
-    assert {row.metric for row in results.rows if row.method == "control"} == {
-        "matrix_product_time",
-        "matrix_product_time_after",
-    }
+    assert {row.metric for row in results.rows if row.method == "control"} == {"matrix_product_time"}
     assert all(row.value is not None and row.value > 0 for row in results.rows)
+
+
+def test_innovations_next_to_a_hit_do_not_count_and_marked_ones_count_as_failures() -> None:
+    whitened = np.zeros((6, 3))
+    whitened[0] = [0.0, 5.1, 0.0]  # too far
+    whitened[2] = [9.0, 0.0, 0.0]  # next to the hit
+    quality = np.array([0, 1, 0, 0, 3, 0], dtype=np.int8)
+    estimate = Estimate(
+        "0",
+        np.arange(6.0),
+        np.zeros((6, 9)),
+        np.tile(np.eye(9), (6, 1, 1)),
+        Status.OK,
+        whitened,
+        hits=np.array([2]),
+        quality=quality,
+    )
+    results = Results("test", 0)
+    _add_smoothing(results, Measured("toy", {}, [estimate], 0))
+    # samples 0, 1, 4, 5 count
+    assert results.value("toy", WHOLE, "within_5_sigma") == pytest.approx(3 / 4)
+    assert results.value("toy", WHOLE, "within_5_sigma_marked_fail") == pytest.approx(2 / 4)
+    assert results.value("toy", WHOLE, "share_marked") == pytest.approx(1 / 4)
+    assert results.value("toy", WHOLE, "share_wide") == pytest.approx(1 / 4)
+    assert results.value("toy", WHOLE, "hits") == 1

@@ -1,0 +1,295 @@
+"""`ballfg estimate` as a user meets it: the table, the messages, the exit statuses."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow.csv as pa_csv
+import pyarrow.parquet as pq
+import pytest
+
+from ballfg.cli import progress as progress_module
+from ballfg.cli.main import run
+from ballfg.cli.progress import progress
+from ballfg.simulate import SimulationConfig, write_simulation
+from ballfg.tracks import read_dataset
+
+METHODS = ("smoother", "online", "ekf", "sliding-window")
+STATE = ["x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz"]
+COLUMNS = ["trajectory", "t", *STATE, *(f"sigma_{name}" for name in STATE)]
+
+
+def status(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as exit_:
+        run([str(argument) for argument in arguments])
+    assert isinstance(exit_.value.code, int)
+    return exit_.value.code
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("cli") / "four shots"
+    write_simulation(folder, SimulationConfig(tracks=4, rate=60.0, seed=2))
+    return folder
+
+
+@pytest.fixture
+def damaged(dataset: Path, tmp_path: Path) -> Path:
+    """A copy for a test to damage."""
+    return Path(shutil.copytree(dataset, tmp_path / "damaged"))
+
+
+# --- the table ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_one_row_of_finite_numbers_for_each_stamp(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], method: str
+) -> None:
+    out = tmp_path / "states.csv"
+    assert status("estimate", dataset, "--method", method, "--out", out) == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    assert said.out.startswith(f"{out}: ")
+    assert f"states of 4 tracks by {method}" in said.out
+    assert "  4 tracks: converged\n" in said.out
+    table = pa_csv.read_csv(out, convert_options=pa_csv.ConvertOptions(column_types={"trajectory": "string"}))
+    assert table.column_names == COLUMNS
+    values = np.stack([table[name].to_numpy() for name in COLUMNS[1:]], axis=1)
+    assert np.isfinite(values).all()
+    assert (values[:, 10:] > 0).all()
+    tracks = list(read_dataset(dataset))
+    assert table["trajectory"].to_pylist() == [t.name for t in tracks for _ in t.times]
+    np.testing.assert_array_equal(values[:, 0], np.concatenate([t.times for t in tracks]))
+    assert np.abs(values[:, 1:4] - np.concatenate([t.positions for t in tracks])).max() < 0.03
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["states.csv"]
+
+
+def test_parquet_holds_the_same_and_the_smoother_is_the_default(dataset: Path, tmp_path: Path) -> None:
+    assert status("estimate", dataset, "--method", "smoother", "--out", tmp_path / "states.csv") == 0
+    assert status("estimate", dataset, "--out", tmp_path / "states.parquet") == 0
+    read = pa_csv.read_csv(
+        tmp_path / "states.csv", convert_options=pa_csv.ConvertOptions(column_types={"trajectory": "string"})
+    )
+    assert read.equals(pq.read_table(tmp_path / "states.parquet"))
+
+
+def test_the_same_bytes_on_one_process_or_two(tmp_path: Path) -> None:
+    folder = tmp_path / "many"
+    write_simulation(folder, SimulationConfig(tracks=70, rate=30.0, seed=3))  # more than a block of predictions
+    for command in (["estimate", folder], ["predict", folder, "--observe", 0.3]):
+        for name, jobs in (("one", 1), ("again", 1), ("two", 2)):
+            options = ["--method", "sliding-window", "--jobs", jobs, "--out", tmp_path / f"{name}.csv"]
+            assert status(*command, *options) == 0
+        first = (tmp_path / "one.csv").read_bytes()
+        assert (tmp_path / "again.csv").read_bytes() == first
+        assert (tmp_path / "two.csv").read_bytes() == first
+
+
+def test_repaired_input_is_noted_on_stderr_and_exact_repeats_count_once(
+    damaged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    header, *rows = (damaged / "tracks.csv").read_text().splitlines()
+    more = [f"{header},remark", *(f"{row},fine" for row in [*rows, rows[0]])]
+    (damaged / "tracks.csv").write_text("\n".join(more) + "\n")
+    assert status("estimate", damaged, "--method", "sliding-window", "--out", tmp_path / "s.csv") == 0
+    said = capsys.readouterr()
+    assert all(line.startswith("note: ") for line in said.err.splitlines())
+    assert "column 'remark' ignored" in said.err
+    assert "note:" not in said.out
+    assert len((tmp_path / "s.csv").read_text().splitlines()) == 1 + len(rows)
+
+
+def test_from_any_folder_with_relative_paths(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.copytree(dataset, tmp_path / "my shots")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    options = ("--method", "sliding-window", "--model", "../my shots/model.yaml", "--out", "my states.csv")
+    assert status("estimate", "../my shots", *options) == 0
+    assert capsys.readouterr().out.startswith("my states.csv: ")
+    assert (tmp_path / "elsewhere" / "my states.csv").is_file()
+
+
+def test_an_older_result_is_replaced(dataset: Path, tmp_path: Path) -> None:
+    out = tmp_path / "states.csv"
+    out.write_text("old")
+    assert status("estimate", dataset, "--method", "sliding-window", "--out", out) == 0
+    assert out.read_text().startswith("trajectory,t,x,y,z,")
+
+
+# --- bad input ---------------------------------------------------------------------------------------------------
+
+
+def assert_refused(
+    capsys: pytest.CaptureFixture[str], out: Path, message: str, *arguments: object, command: str = "estimate"
+) -> None:
+    """Status 2, one line, and neither a table nor half of one."""
+    before = sorted(out.parent.iterdir()) if out.parent.is_dir() else []
+    assert status(command, *arguments, "--out", out) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("ballfg: error: ")
+    assert said.err.count("\n") == 1
+    assert message in said.err
+    assert (sorted(out.parent.iterdir()) if out.parent.is_dir() else []) == before
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("trajectory,t,x,y,z", "trajectory,t,x,y,height", "z"),
+        ("trajectory,t,x,y,z", "trajectory,t,x,y", "tracks.csv"),
+        (None, "", "tracks.csv"),
+    ],
+)
+def test_bad_columns(
+    damaged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], old: str | None, new: str, message: str
+) -> None:
+    text = (damaged / "tracks.csv").read_text()
+    (damaged / "tracks.csv").write_text(new if old is None else text.replace(old, new, 1))
+    assert_refused(capsys, tmp_path / "s.csv", message, damaged)
+
+
+@pytest.mark.parametrize("cell", ["nan", "inf", "soon", ""])
+def test_bad_cells(damaged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], cell: str) -> None:
+    lines = (damaged / "tracks.csv").read_text().splitlines()
+    lines[5] = ",".join([*lines[5].split(",")[:-1], cell])
+    (damaged / "tracks.csv").write_text("\n".join(lines) + "\n")
+    assert_refused(capsys, tmp_path / "s.csv", "tracks.csv", damaged)
+
+
+@pytest.mark.parametrize(
+    "text", ["flight: {drag: {k: fast}}", "flight: {lift: {k: 1}}", "flight: [", "flight: {drag: {k: -3}}", "{}: 1"]
+)
+def test_bad_model_files(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], text: str) -> None:
+    (tmp_path / "model.yaml").write_text(text)
+    assert_refused(capsys, tmp_path / "s.csv", "model.yaml", dataset, "--model", tmp_path / "model.yaml")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--method", "kalman"], "'kalman' is not one of 'smoother', 'online', 'ekf', 'sliding-window'"),
+        (["--jobs", "0"], "'--jobs'"),
+        (["--model", "none.yaml"], "none.yaml does not exist"),
+        (["--bogus"], "--bogus"),
+    ],
+)
+def test_bad_options(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    assert_refused(capsys, tmp_path / "s.csv", message, dataset, *options)
+
+
+def test_bad_paths(dataset: Path, damaged: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert_refused(capsys, tmp_path / "s.csv", "none does not. Give the folder", tmp_path / "none")
+    assert_refused(capsys, tmp_path / "s.csv", "is a file", dataset / "tracks.csv")
+    assert_refused(capsys, tmp_path / "s.xlsx", "must end in .csv or .parquet", dataset)
+    assert_refused(capsys, tmp_path / "none" / "s.csv", "is none. Create it first", dataset)
+    (tmp_path / "folder.csv").mkdir()
+    assert_refused(capsys, tmp_path / "folder.csv", "is a folder", dataset)
+    (damaged / "dataset.yaml").unlink()
+    assert_refused(capsys, tmp_path / "s.csv", "must hold dataset.yaml", damaged)
+
+
+@pytest.mark.parametrize("name", ["tracks.csv", "tracks.parquet", "labels.csv", "truth.csv"])
+@pytest.mark.parametrize("command", [("estimate",), ("predict", "--observe", "0.2")])
+def test_the_measurements_are_not_replaced(
+    damaged: Path, capsys: pytest.CaptureFixture[str], name: str, command: tuple[str, ...]
+) -> None:
+    before = {p.name: p.read_bytes() for p in damaged.iterdir()}
+    message = "out must not be a table of the dataset itself"
+    assert_refused(capsys, damaged / name, message, damaged, *command[1:], command=command[0])
+    assert {p.name: p.read_bytes() for p in damaged.iterdir()} == before
+
+
+def test_missing_option(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert status("estimate", dataset) == 2
+    assert "--out" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["estimate", "predict"])
+def test_ctrl_c_leaves_nothing(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    def interrupt(items: object, *_: object) -> object:
+        yield next(iter(items))  # type: ignore[call-overload]
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(f"ballfg.cli.{command}.progress", interrupt)
+    options = ["--observe", "0.2"] if command == "predict" else []
+    assert status(command, dataset, "--method", "sliding-window", *options, "--out", tmp_path / "s.csv") == 130
+    assert "interrupted" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- help, start, progress ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("command", ["estimate", "predict"])
+def test_help_shows_an_example(capsys: pytest.CaptureFixture[str], command: str) -> None:
+    assert status(command, "--help") == 0
+    assert f"Example: ballfg {command} data/" in capsys.readouterr().out
+
+
+def test_help_does_not_wait_for_the_heavy_libraries() -> None:
+    """Also after the help of each command was printed."""
+    code = """
+import sys
+from ballfg.cli.main import run
+for command in (["--help"], ["estimate", "--help"], ["predict", "--help"]):
+    try:
+        run(command)
+    except SystemExit as done:
+        assert not done.code
+loaded = {"torch", "gtsam", "numpy", "pyarrow", "joblib", "scipy"} & set(sys.modules)
+assert not loaded, loaded
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+class Clock:
+    """Time that passes as a test says."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr(progress_module, "time", made)
+    return made
+
+
+def work(clock: Clock, start: float, each: float, total: int) -> list[int]:
+    def items() -> object:
+        clock.now += start
+        for i in range(total):
+            clock.now += each
+            yield i
+
+    return list(progress(items(), total, "tracks estimated"))  # type: ignore[arg-type]
+
+
+def test_short_work_is_quiet(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    assert work(clock, 0.5, 0.1, 14) == list(range(14))
+    assert capsys.readouterr().err == ""
+
+
+def test_the_start_does_not_count_as_work(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    """10 s until processes run, then 0.5 s a track: the first line tells no time, the second the right one."""
+    work(clock, 10.0, 0.5, 88)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:2] == ["1 of 88 tracks estimated", "21 of 88 tracks estimated, 34 s left"]
+    assert len(lines) == 5

@@ -1,0 +1,42 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ballfg.dynamics import model_from_dict
+from ballfg.simulate import MeasurementNoise, SimulationConfig, table_tennis, with_model, write_simulation
+
+PLANTED = {"flight.drag.k": 0.155, "contact.restitution.e": 0.88, "contact.table_height.offset": 0.006}
+
+
+def simulated(folder: Path, tracks: int, *, spin_labels: bool = True) -> Path:
+    """A dataset of balls that drag more and bounce less than the nominal one, on a table that lies higher."""
+    content = {
+        "flight": {"gravity": {}, "drag": {"k": PLANTED["flight.drag.k"]}, "magnus": {"k": 0.0028}},
+        "bounce": {
+            "restitution": {"e": PLANTED["contact.restitution.e"]},
+            "friction": {"mu": 0.25},
+            "tangential_restitution": {"e_t": 0.15},
+            "table_height": {"offset": PLANTED["contact.table_height.offset"]},
+        },
+    }
+    ball = with_model(table_tennis(), model_from_dict(content))
+    noise = MeasurementNoise(position=0.0015)
+    write_simulation(folder, SimulationConfig(tracks, 80.0, seed=3, ball=ball, noise=noise, spin_labels=spin_labels))
+    return folder
+
+
+@pytest.fixture(scope="session")
+def few_tracks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulated(tmp_path_factory.mktemp("few") / "data", 6)
+
+
+@pytest.fixture(scope="session")
+def many_tracks(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulated(tmp_path_factory.mktemp("many") / "data", 24)
+
+
+@pytest.fixture(scope="session")
+def no_spin_labels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return simulated(tmp_path_factory.mktemp("plain") / "data", 3, spin_labels=False)

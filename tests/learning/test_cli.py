@@ -1,0 +1,163 @@
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from ballfg.cli.main import run as ballfg
+from ballfg.dynamics import load_model
+from ballfg.learning import folder as files
+from ballfg.learning.cli import run
+from ballfg.learning.coefficients import values_of
+
+SHORT = ("max_iterations=2", "tolerance=1e-12", "jobs=1")
+
+
+def status(*words: object, command: Any = run) -> int:
+    with pytest.raises(SystemExit) as ended:
+        command([str(word) for word in words])
+    assert isinstance(ended.value.code, int)
+    return ended.value.code
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("config") / "calibrate.yaml"
+    path.write_text("seed: 1\n")
+    return path
+
+
+@pytest.fixture(scope="module")
+def finished(config: Path, few_tracks: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("finished") / "run"
+    assert status(config, *SHORT, "--data", few_tracks, "--out", out) == 0
+    return out
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_a_run_writes_all_its_files(finished: Path, few_tracks: Path, tmp_path: Path) -> None:
+    assert names(finished) == sorted(files.FILES)
+    resolved = yaml.safe_load((finished / "config.yaml").read_text())
+    assert (resolved["seed"], resolved["max_iterations"], resolved["data"]) == (1, 2, str(few_tracks))
+    assert {"python", "ballfg", "torch", "gtsam"} <= set(json.loads((finished / "versions.json").read_text()))
+    report = json.loads((finished / "report.json").read_text())
+    assert report["iterations"] == 2
+    assert report["fitted"]["tracks"] == report["judged"]["tracks"] == 3
+    drag = report["coefficients"]["flight.drag.k"]
+    assert drag["before"] == 0.12
+    assert drag["unit"] == "1/m"
+    model = load_model(finished / "model.yaml")
+    assert values_of(model, ["flight.drag.k"]).tolist() == [drag["after"]]
+    assert "median RMSE" in report["verdict"]
+    assert (finished / "calibration.png").read_bytes().startswith(b"\x89PNG")
+    predictions = tmp_path / "p.csv"
+    words = ("predict", few_tracks, "--model", finished / "model.yaml", "--observe", 0.25, "--out", predictions)
+    assert status(*words, "--jobs", 1, command=ballfg) == 0
+
+
+def interrupt_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
+    real = files.write_checkpoint
+
+    def write(folder: Path, problem: Any, done: list[Any]) -> None:
+        real(folder, problem, done)
+        if len(done) == steps:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(files, "write_checkpoint", write)
+
+
+def test_ctrl_c_keeps_the_checkpoint_and_a_resumed_run_ends_the_same(
+    config: Path, few_tracks: Path, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        interrupt_after(patch, 2)
+        assert status(config, *SHORT, "--data", few_tracks, "--out", out) == 130
+    assert names(out) == ["checkpoint.json", "config.yaml", "versions.json"]
+    said = capsys.readouterr()
+    assert f"continue with --resume {out}" in said.err
+    assert "iteration 0: flight.drag.k 0.12" in said.out
+    assert status(config, *SHORT, "--data", few_tracks, "--resume", out) == 0
+    said = capsys.readouterr()
+    assert "iteration 1" not in said.out
+    assert "iteration 2" in said.out
+    for name in ("checkpoint.json", "report.json", "model.yaml"):
+        assert (out / name).read_bytes() == (finished / name).read_bytes(), name
+    assert names(out) == sorted(files.FILES)
+
+
+def test_resume_refuses_another_run(
+    config: Path, few_tracks: Path, no_spin_labels: Path, finished: Path, tmp_path: Path, capsys: Any
+) -> None:
+    out = tmp_path / "run"
+    shutil.copytree(finished, out)
+    before = {name: (out / name).read_bytes() for name in names(out)}
+    model = tmp_path / "other.yaml"
+    model.write_text((finished / "model.yaml").read_text())
+    given = (config, *SHORT, "--data", few_tracks)
+    for words, message in (
+        ((*given, "--resume", out, "seed=2"), "'seed' was 1 and is 2"),
+        ((config, *SHORT, "--data", no_spin_labels, "--resume", out), "was made from another dataset"),
+        ((*given, "--resume", out, f"model={model}"), "was started from another model"),
+        ((*given, "--resume", tmp_path / "none"), "needs the folder of an earlier run"),
+        ((*given, "--resume", out, "--out", tmp_path / "else"), "must name one folder"),
+        ((*given, "--out", out), f"continue that run with --resume {out}"),
+    ):
+        assert status(*words) == 2
+        said = capsys.readouterr()
+        assert message in said.err
+        assert said.err.count("\n") == 1
+    assert {name: (out / name).read_bytes() for name in names(out)} == before
+    (out / "checkpoint.json").write_text('{"data": 1}')
+    assert status(*given, "--resume", out) == 2
+    assert "not a checkpoint" in capsys.readouterr().err
+
+
+def test_bad_input_is_one_line_and_writes_nothing(
+    config: Path, few_tracks: Path, no_spin_labels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "run"
+    (tmp_path / "file").write_text("")
+    for words, message in (
+        ((config, "--out", out), "a dataset is needed; got none. Give --data FOLDER"),
+        ((config, "--out", out, "--data", tmp_path / "none"), "none does not"),
+        ((tmp_path / "none.yaml", "--out", out), "none.yaml does not exist"),
+        ((config, "sed=1", "--out", out), "Did you mean 'seed'?"),
+        ((config, "model=none.yaml", "--data", few_tracks, "--out", out), "model file none.yaml does not exist"),
+        ((config, "coefficients=[flight.magnus.k]", "--data", no_spin_labels, "--out", out), "spin labels"),
+        ((config, "split=label", "--data", few_tracks, "--out", out), "needs a column 'split'"),
+        ((config, "--data", few_tracks, "--out", tmp_path / "file"), "out must be a folder"),
+        ((config, "--bogus"), "--bogus"),
+        ((), "CONFIG"),
+    ):
+        assert status(*words) == 2
+        said = capsys.readouterr()
+        assert said.err.startswith("ballfg: error: ")
+        assert said.err.count("\n") == 1
+        assert message in said.err
+    assert not out.exists()
+
+
+def test_a_crash_while_writing_leaves_the_earlier_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files.write_json(tmp_path / "checkpoint.json", {"a": 1})
+    monkeypatch.setattr("os.replace", lambda *_: (_ for _ in ()).throw(OSError("no space")))
+    with pytest.raises(OSError, match="no space"):
+        files.write_json(tmp_path / "checkpoint.json", {"a": 2})
+    assert json.loads((tmp_path / "checkpoint.json").read_text()) == {"a": 1}
+
+
+def test_help_has_an_example_and_does_not_wait(capsys: pytest.CaptureFixture[str]) -> None:
+    assert status("--help") == 0
+    assert "Example: ballfg-train calibrate.yaml --data" in " ".join(capsys.readouterr().out.split())
+    heavy = ("torch", "gtsam", "numpy", "pydantic", "matplotlib")
+    code = f"import sys, ballfg.learning.cli; sys.exit(any(name in sys.modules for name in {heavy}))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
