@@ -93,6 +93,7 @@ def problem_settings(coefficients: dict[str, float] | None = None) -> Settings:
         spin_label_noise=LABEL_NOISE,
         loss=Loss("squared"),
         spin_loss=Loss("squared"),
+        label_loss=Loss("squared"),
         find_events=False,
         coefficients=coefficients or {},
     )

@@ -115,7 +115,7 @@ def _load(path: Path) -> dict[str, Any]:
         return {}
     if not isinstance(content, dict):
         raise ValueError(f"{path}: a config maps keys to values; got {content!r}. Write for instance 'seed: 0'.")
-    keys = [key.value for key, _ in node.value]
+    keys = [] if node is None else [key.value for key, _ in node.value]
     twice = next((key for key in keys if keys.count(key) > 1), None)
     if twice is not None:
         raise ValueError(f"{path}: '{twice}' stands twice. Delete one of them.")

@@ -1,11 +1,11 @@
 """Empirical Bayes over tracks: the mean of a population of coefficients and its spread from track to track.
 
-Track i sees its own coefficients b_i through a Gaussian likelihood, known by its information L_i and the vector
-h_i = L_i y_i; directions that it does not see have no information. The tracks are draws b_i ~ N(theta, D) with a
-diagonal D, and theta ~ N(start, sigma^2) is the prior of the model. theta and D maximise the likelihood of all tracks
-with every b_i integrated out, times the prior of theta (N. Laird, J. Ware, "Random-effects models for longitudinal data",
-Biometrics 38, 1982). Given D, theta is a least-squares solution; D follows by the minorisation step of H. Zhou, L. Hu,
-J. Zhou, K. Lange, "MM algorithms for variance components models", J. Comput. Graph. Stat. 28, 2019, which never
+Track i sees its own coefficients b_i through a Gaussian likelihood, known by its information L_i and the vector h_i =
+L_i y_i; directions that it does not see have no information. The tracks are draws b_i ~ N(theta, D) with a diagonal
+D, and theta ~ N(start, sigma^2) is the prior of the model. theta and D maximise the likelihood of all tracks with
+every b_i integrated out, times the prior of theta (N. Laird, J. Ware, "Random-effects models for longitudinal data",
+Biometrics 38, 1982). Given D, theta is a least-squares solution; D follows by the minorisation step of H. Zhou, L.
+Hu, J. Zhou, K. Lange, "MM algorithms for variance components models", J. Comput. Graph. Stat. 28, 2019, which never
 lowers the likelihood and needs no step size.
 """
 

@@ -132,11 +132,11 @@ def verdict(problem: Problem, last: Step, comparison: Comparison) -> str:
 
 def table(problem: Problem, last: Step, comparison: Comparison) -> str:
     """Coefficients and errors, before and after, as plain text."""
-    rows = [("", "unit", "before", "after", "sigma", "spread between tracks")]
+    rows: list[tuple[str, ...]] = [("", "unit", "before", "after", "sigma", "spread between tracks")]
     for k, name in enumerate(problem.chosen.names):
         values = (problem.chosen.start[k], last.mean[k], last.sigma[k], last.spread[k])
         rows.append((name, problem.chosen.units[k], *(f"{value:.4g}" for value in values)))
-    errors = [("judged tracks", "unit", "before", "after", "after, spread as prior", "")]
+    errors: list[tuple[str, ...]] = [("judged tracks", "unit", "before", "after", "after, spread as prior", "")]
     summaries = (comparison.before, comparison.after, comparison.with_spread)
     for label, unit, field, scale in (
         ("RMSE, median", "mm", "rmse_median", 1e3),
@@ -146,7 +146,7 @@ def table(problem: Problem, last: Step, comparison: Comparison) -> str:
         ("NIS of observed part (3)", "1", "nis", 1.0),
     ):
         cells = ("-" if s is None else f"{scale * getattr(s, field):.4g}" for s in summaries)
-        errors.append((label, unit, *cells, ""))  # type: ignore[arg-type]
+        errors.append((label, unit, *cells, ""))
     return "\n\n".join(_aligned(part) for part in (rows, errors))
 
 

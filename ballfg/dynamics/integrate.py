@@ -20,6 +20,9 @@ MAX_STEP = 0.02
 """s. Longer intervals are cut into equal steps. The error of a step of 0.02 s is 2e-9 m at 6 m/s, 2e-7 m at
 20 m/s."""
 
+HEAVY = 300_000
+"""Parameters times states from which arithmetic, not the number of torch calls, decides what a Jacobian costs."""
+
 RateFunction = Callable[[Tensor], Rates]
 
 _EYE3 = torch.eye(3, dtype=torch.float64)
@@ -95,16 +98,17 @@ def fly_jacobian(model: BallModel, state: Tensor, dt: Tensor) -> tuple[Tensor, T
     for _ in range(steps):
         with torch.no_grad():
             after, stages = _stages(model.rates, state, h)
-        step = _step_jacobian(model.rates, stages, h)
+        step = _step_jacobian(model, stages, h)
         jacobian = step if jacobian is None else step @ jacobian
         state = after
     assert jacobian is not None
     return state, jacobian
 
 
-def _step_jacobian(rates: RateFunction, stages: tuple[Tensor, ...], h: Tensor) -> Tensor:
+def _step_jacobian(model: BallModel, stages: tuple[Tensor, ...], h: Tensor) -> Tensor:
     """(n, 9, 9) derivative of one Runge-Kutta step, from the rates' Jacobians A_i at its stages."""
-    a1, a2, a3, a4 = rate_jacobian(rates, torch.stack(stages))
+    heavy = model.parameter_count * len(stages) * len(h) > HEAVY
+    a1, a2, a3, a4 = rate_jacobian(model.rates, torch.stack(stages), heavy=heavy)
     half, whole = (h / 2).unsqueeze(-1), h.unsqueeze(-1)
     k2 = a2 + half * (a2 @ a1)
     k3 = a3 + half * (a3 @ k2)
@@ -113,23 +117,26 @@ def _step_jacobian(rates: RateFunction, stages: tuple[Tensor, ...], h: Tensor) -
     return identity + (whole / 6) * (a1 + 2 * (k2 + k3) + k4)
 
 
-def rate_jacobian(rates: RateFunction, state: Tensor) -> Tensor:
+def rate_jacobian(rates: RateFunction, state: Tensor, *, heavy: bool = False) -> Tensor:
     """(..., 9, 9) derivative of `derivative(rates, state)` by the state.
 
-    A batch repeated three times gives all rows of a 3-vector's Jacobian in one backward pass, six times where the spin
-    changes in flight: the number of calls decides, not the size of the batch.
+    A batch repeated three times gives all rows of a 3-vector's Jacobian in one backward pass: for effects of a few
+    operations the number of calls decides, not the size of the batch. For a `heavy` model, a network, arithmetic decides:
+    it is evaluated once, and the backward pass is batched over the rows.
     """
     width = state.shape[-1]
     jacobian = state.new_zeros((*state.shape, width))
     jacobian[..., POSITION, VELOCITY] = _EYE3
-    leaf = state.detach().expand(3, *state.shape).requires_grad_(True)
+    leaf = (state.detach() if heavy else state.detach().expand(3, *state.shape)).requires_grad_(True)
     with torch.enable_grad():
         acceleration, spin_rate = rates(leaf)
     for value, rows in ((acceleration, VELOCITY), (spin_rate, SPIN)):
         if value is None or not value.requires_grad:  # gravity alone does not depend on the state
             continue
-        cotangent = _EYE3.view(3, *(1,) * (state.dim() - 1), 3).expand_as(value)
-        (by_state,) = torch.autograd.grad(value, leaf, cotangent, retain_graph=True, allow_unused=True)
+        cotangent = _EYE3.view(3, *(1,) * (state.dim() - 1), 3).expand(3, *state.shape[:-1], 3)
+        (by_state,) = torch.autograd.grad(
+            value, leaf, cotangent, retain_graph=True, allow_unused=True, is_grads_batched=heavy
+        )
         if by_state is not None:
             jacobian[..., rows, :] = by_state.movedim(0, -2)
     return jacobian

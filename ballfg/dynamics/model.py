@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import Final, TypeVar
@@ -48,6 +49,11 @@ class BallModel(nn.Module, ABC):
             )
         self.radius = float(radius)
         self.inertia_factor = float(inertia_factor)
+
+    @functools.cached_property
+    def parameter_count(self) -> int:
+        """Number of the model's parameters."""
+        return sum(p.numel() for p in self.parameters())
 
     @abstractmethod
     def rates(self, state: Tensor) -> Rates:

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+from ballfg.dynamics import EFFECTS
+from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.estimate.result import Status
 from ballfg.estimate.settings import Settings
 from ballfg.estimate.smoother import Smoother
@@ -105,9 +107,6 @@ def test_half_the_noise_is_noticed(runs) -> None:
 
 def test_coefficients_of_a_track_are_honest() -> None:
     """Truth drawn from the coefficients' priors; estimated with the track: their errors in their own covariance."""
-    from ballfg.dynamics import EFFECTS
-    from ballfg.dynamics.analytic import coefficient_sigmas
-
     names = coefficient_sigmas(CONFIG.ball.model)
     rng = np.random.default_rng(8)
     settings = Settings(**{**vars(SETTINGS), "coefficients": names})

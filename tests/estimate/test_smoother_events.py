@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import Surfaces, nominal_model, rollout
+from ballfg.dynamics import Surfaces, contact_time, nominal_model, rollout
 from ballfg.estimate.initial import initial_states, move_contacts
 from ballfg.estimate.problem import effective_sigmas, initial_values
 from ballfg.estimate.result import Estimate, Status
@@ -40,6 +40,15 @@ def truth(start: list[float], times: np.ndarray = TIMES, surfaces: Surfaces = TA
     with torch.no_grad():
         state = torch.tensor([start], dtype=torch.float64)
         return rollout(MODEL, state, torch.from_numpy(times - times[0]), surfaces)[0].numpy()
+
+
+LATER = TIMES + 0.005
+"""s, stamps between which the serve bounces half way: at 0.3498 s."""
+
+
+def truth_at(times: np.ndarray) -> np.ndarray:
+    """The serve at times of its own clock."""
+    return truth(SERVE, np.concatenate(([0.0], times)))[1:]
 
 
 def measured(states: np.ndarray, seed: int = 1) -> np.ndarray:
@@ -72,8 +81,8 @@ def estimate_of(states: np.ndarray, positions: np.ndarray, settings: Settings, t
 @pytest.mark.parametrize("phase", [0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98])
 def test_contact_time(phase, settings) -> None:
     """Wherever in its interval the bounce happens: its time within 3 sigma, the states honest."""
-    fine = truth(SERVE, np.arange(0.0, 0.5, 1e-5))
-    first = 1e-5 * bounces(fine)[0]  # of the contact, to 10 microseconds
+    with torch.no_grad():
+        first = float(contact_time(MODEL, torch.tensor([SERVE], dtype=torch.float64), 0.0)[0])
     times = TIMES + first - 0.01 * (np.floor(first / 0.01) + phase)
     times = times[times >= 0.0]
     states = truth(SERVE, np.concatenate(([0.0], times)))[1:]
@@ -82,17 +91,15 @@ def test_contact_time(phase, settings) -> None:
     honest(estimate, states)
     contact = estimate.contacts[0]
     sigma = estimate.sigmas[contact.interval, 2] / abs(estimate.states[contact.interval, 5])
-    assert abs(contact.time - first) < 3 * sigma + 1e-5
+    assert abs(contact.time - first) < 3 * sigma
     if 0.1 <= phase <= 0.9:  # further than 3 sigma from the stamps: the interval is certain
-        assert intervals(estimate) == bounces(states)
+        assert contact.interval == bounces(states)[0]
         assert times[contact.interval] <= contact.time <= times[contact.interval + 1]
 
 
 @pytest.mark.parametrize("shift", [-2, -1, 1, 2])
 def test_a_contact_in_the_wrong_interval_moves_to_the_right_one(shift, settings) -> None:
-    states = truth(SERVE)
-    states[:, 0] += 0.0
-    track = Track("t", TIMES + 0.004, measured(truth(SERVE, np.concatenate(([0.0], TIMES + 0.004)))[1:]))
+    track = Track("t", LATER, measured(truth_at(LATER)))
     smoother = Smoother(MODEL, TABLE, settings)
     found = smoother.segment(track)
     right = [c.interval for c in smoother.solve(track, found, effective_sigmas(track, found, settings)).events.contacts]
@@ -121,33 +128,50 @@ def test_values_to_go_on_from_change_sides_with_their_contact() -> None:
 
 
 def test_a_bounce_that_only_the_last_sample_saw(settings) -> None:
-    states = truth(SERVE)
-    end = bounces(states)[0] + 2
-    times = TIMES[:end] + np.where(np.arange(end) == end - 1, 0.006, 0.0)
-    states = truth(SERVE, times)
+    times = LATER[: bounces(truth_at(LATER))[0] + 2]
+    states = truth_at(times)
     estimate = estimate_of(states, measured(states), settings, times)
-    assert intervals(estimate) == bounces(states)
+    assert intervals(estimate) == bounces(states) == [len(times) - 2]
     honest(estimate, states)
 
 
 def test_a_bounce_that_only_the_first_sample_saw(settings) -> None:
-    states = truth(SERVE)
-    start = bounces(states)[0]
-    times = TIMES[start:] - np.where(np.arange(80 - start) == 0, 0.006, 0.0)
-    states = truth(SERVE, np.concatenate(([0.0], times)))[1:]
+    times = LATER[bounces(truth_at(LATER))[0] :]
+    states = truth_at(times)
     estimate = estimate_of(states, measured(states), settings, times)
-    assert intervals(estimate)[0] == 0
+    assert intervals(estimate)[0] == bounces(states)[0] == 0
     assert len(estimate.contacts) == len(bounces(states))
     honest(estimate, states)
 
 
-@pytest.mark.parametrize("kick", [(-8.0, 1.0, 0.5), (0.7, -0.4, 0.5)], ids=["racket", "touch"])
-def test_a_hit_that_the_segmentation_missed_is_marked(kick, settings) -> None:
-    """The hit's dynamics factor is broken by far more than chance; solve() marks it and estimates again."""
+KICKS = {"racket": (-8.0, 1.0, 0.5), "touch": (0.7, -0.4, 0.5)}
+
+
+def hit_serve(kick: tuple[float, float, float]) -> np.ndarray:
+    """The serve, hit at sample 20."""
     before = truth(SERVE, TIMES[:21])
     start = before[-1].copy()
     start[3:6] += kick
-    states = np.concatenate((before, truth(start.tolist(), TIMES[20:])[1:]))
+    return np.concatenate((before, truth(start.tolist(), TIMES[20:])[1:]))
+
+
+@pytest.mark.parametrize("kick", KICKS)
+def test_a_hit_is_found(kick, settings) -> None:
+    states = hit_serve(KICKS[kick])
+    estimate = estimate_of(states, measured(states), settings)
+    assert estimate.status is Status.OK
+    assert estimate.hits.tolist() == [20]
+    assert len(estimate.contacts) == len(bounces(states))
+    states[20, 3:9] = estimate.states[20, 3:9]  # at the very stamp of the hit it may be before or after
+    honest(estimate, states)
+
+
+def test_a_hit_that_the_segmentation_missed_is_marked(settings) -> None:
+    """Its dynamics factor is broken by far more than chance; solve() marks it and estimates again.
+
+    A touch of 1 m/s would not break it: process noise of several intervals makes room for that.
+    """
+    states = hit_serve(KICKS["racket"])
     track = Track("t", TIMES, measured(states))
     smoother = Smoother(MODEL, TABLE, settings)
     blind = replace(smoother.segment(track), hits=np.zeros(0, dtype=np.int64))
@@ -155,10 +179,8 @@ def test_a_hit_that_the_segmentation_missed_is_marked(kick, settings) -> None:
     hits = solution.events.segmentation.hits
     assert len(hits) == 1
     assert 19 <= hits[0] <= 21
-    found = smoother.estimate(track)
-    honest(found, states, sigmas=4.5) if found.hits.tolist() == [20] else None
     unhurt = np.r_[0:18, 24:80]
-    off = np.abs(solution.minimum.values.states - states)[unhurt] / found.sigmas[unhurt]
+    off = np.abs(solution.minimum.values.states - states)[unhurt] / smoother.estimate(track).sigmas[unhurt]
     assert off[:, :6].max() < 4.5
 
 
@@ -214,12 +236,17 @@ def test_one_observation(settings) -> None:
     np.testing.assert_allclose(estimate.sigmas[0, 3:6], 20.0, rtol=1e-6)
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_five_observations_around_a_bounce(seed, settings) -> None:
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("labelled", [True, False], ids=["label", "no-label"])
+def test_five_observations_around_a_bounce(seed, labelled) -> None:
+    """With a label the model may be exact; without, whether the ball slides or grips is open, which no Gaussian says:
+    the tangential noise of `uncertain` stands for it."""
     states = truth(SERVE)
     part = slice(bounces(states)[0] - 2, bounces(states)[0] + 3)
-    estimate = estimate_of(states[part], measured(states, seed)[part], settings, TIMES[part])
-    honest(estimate, states[part])
+    labels = dict(zip(("spin_x", "spin_y", "spin_z"), states[part][0, 6:].tolist(), strict=True)) if labelled else {}
+    settings = replace(EXACT, spin_label_noise=5.0) if labelled else UNCERTAIN
+    track = Track("t", TIMES[part], measured(states, seed)[part], labels=labels)
+    honest(Smoother(MODEL, TABLE, settings).estimate(track), states[part])
 
 
 @pytest.mark.parametrize("before", [1, 8, 15])
