@@ -68,6 +68,9 @@ class Minimum:
 AT_KINK = 1e-3
 """Posterior standard deviations. A step this short that does not reduce the objective ends the search too: the minimum
 lies where a loss or the friction bends."""
+NEAR = 0.5
+"""What a step promises when it is one posterior standard deviation long. Along shorter ones the objective is a parabola
+well enough to say which share of the step is best."""
 MOST_DAMPING = 1e8
 """Marquardt's lambda at which a step is as good as none."""
 
@@ -83,7 +86,7 @@ class LevenbergMarquardt:
             diagonal of J^T J large where the chain as a whole is free to move.
     """
 
-    tolerance: float = 1e-6
+    tolerance: float = 1e-5
     max_iterations: int = 60
     first_damping: float = 1e-8
 
@@ -106,6 +109,13 @@ class LevenbergMarquardt:
             moved = None if step is None else values.moved(step.states, step.coefficients)
             trial = [] if moved is None else graph.linearize(moved)
             trial_error = objective(trial) if moved is not None else np.inf
+            if step is not None and damping == 0.0 and step.decrease < NEAR and np.isfinite(trial_error):
+                share = _better_share(error - trial_error, step.decrease)
+                if share < 1.0:
+                    nearer = values.moved(share * step.states, share * step.coefficients)
+                    linearized_nearer = graph.linearize(nearer)
+                    if objective(linearized_nearer) < min(error, trial_error):
+                        moved, trial, trial_error = nearer, linearized_nearer, objective(linearized_nearer)
             if step is not None and moved is not None and trial_error <= error * (1 + 1e-12):
                 gain = (error - trial_error) / max(step.decrease, np.finfo(float).tiny)
                 values, linearized, error = moved, trial, trial_error
@@ -119,6 +129,16 @@ class LevenbergMarquardt:
                 damping, growth = max(self.first_damping, growth * damping), 2.0 * growth
         final = _try_solve(linearized, values, 0.0)
         return Minimum(values, error, final, Convergence.TOO_MANY_ITERATIONS, self.max_iterations)
+
+
+def _better_share(decrease: float, promised: float) -> float:
+    """How much of a Gauss-Newton step to take, from what all of it brought: 1 where it kept half of its promise.
+
+    Where the objective bends r times as much along the step as the linear model says (friction between slip and grip
+    does), the whole step brings (2 - r) of its promise and 1 / r of it is best. Whole steps then creep or diverge.
+    """
+    gain = decrease / max(promised, np.finfo(float).tiny)
+    return 1.0 if gain > 0.5 else 1.0 / (2.0 - gain)
 
 
 def _try_solve(linearized: Sequence[Rows], values: Values, damping: float) -> Step | None:

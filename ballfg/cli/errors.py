@@ -29,6 +29,8 @@ def guarded(command: Callable[[], object]) -> int:
     except (KeyboardInterrupt, typer.Abort):
         return _interrupted()
     except USER_ERRORS as error:
+        if type(error).__name__ == "LinAlgError":  # numpy makes it a ValueError, but no user can mend it
+            raise
         return _bad_input(str(error))
     except Exception as error:
         # errors in the use of a command: typer's own base class has moved between versions, their method has not

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -43,15 +44,16 @@ def rk4_step(rates: RateFunction, state: Tensor, h: Tensor) -> Tensor:
 
 def _stages(rates: RateFunction, state: Tensor, h: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
     """The state after a step, and the four states at which the rates were taken."""
-    k1 = derivative(rates, state)
     half = h / 2
+    k1 = derivative(rates, state)
     x2 = torch.addcmul(state, half, k1)
     k2 = derivative(rates, x2)
     x3 = torch.addcmul(state, half, k2)
     k3 = derivative(rates, x3)
     x4 = torch.addcmul(state, h, k3)
     k4 = derivative(rates, x4)
-    return torch.addcmul(state, h / 6, torch.add(k1 + k4, k2 + k3, alpha=2)), (state, x2, x3, x4)
+    total = torch.add(k1 + k4, k2 + k3, alpha=2.0)
+    return torch.addcmul(state, h / 6, total), (state, x2, x3, x4)
 
 
 def step_count(dt: Tensor) -> int:
@@ -108,21 +110,24 @@ def fly_jacobian(model: BallModel, state: Tensor, dt: Tensor) -> tuple[Tensor, T
 def _step_jacobian(model: BallModel, stages: tuple[Tensor, ...], h: Tensor) -> Tensor:
     """(n, 9, 9) derivative of one Runge-Kutta step, from the rates' Jacobians A_i at its stages."""
     heavy = model.parameter_count * len(stages) * len(h) > HEAVY
-    a1, a2, a3, a4 = rate_jacobian(model.rates, torch.stack(stages), heavy=heavy)
-    half, whole = (h / 2).unsqueeze(-1), h.unsqueeze(-1)
+    a1, a2, a3, a4 = rate_jacobian(model.rates, torch.stack(stages), heavy=heavy).numpy()  # small products: quicker
+    whole = h.numpy()[..., None]
+    half = whole / 2
     k2 = a2 + half * (a2 @ a1)
     k3 = a3 + half * (a3 @ k2)
     k4 = a4 + whole * (a4 @ k3)
-    identity = torch.eye(a1.shape[-1], dtype=h.dtype)
-    return identity + (whole / 6) * (a1 + 2 * (k2 + k3) + k4)
+    jacobian = (whole / 6) * (a1 + 2 * (k2 + k3) + k4)
+    diagonal = np.arange(a1.shape[-1])
+    jacobian[..., diagonal, diagonal] += 1.0
+    return torch.from_numpy(jacobian)
 
 
 def rate_jacobian(rates: RateFunction, state: Tensor, *, heavy: bool = False) -> Tensor:
     """(..., 9, 9) derivative of `derivative(rates, state)` by the state.
 
     A batch repeated three times gives all rows of a 3-vector's Jacobian in one backward pass: for effects of a few
-    operations the number of calls decides, not the size of the batch. For a `heavy` model, a network, arithmetic decides:
-    it is evaluated once, and the backward pass is batched over the rows.
+    operations the number of calls decides, not the size of the batch. For a `heavy` model, a network, arithmetic
+    decides: it is evaluated once, and the backward pass is batched over the rows.
     """
     width = state.shape[-1]
     jacobian = state.new_zeros((*state.shape, width))

@@ -87,8 +87,8 @@ def _advance_step(model: BallModel, state: Tensor, h: Tensor, surfaces: Surfaces
     active = torch.arange(state.shape[0])
     for contacts in range(MAX_CONTACTS + 1):
         after = fly(model, state, remaining)
-        resting = _stays(model, state.detach(), height, surfaces)
-        height, landing = _next_surface(model, state.detach(), after.detach(), height, ~resting, surfaces)
+        resting = stays(model, state.detach(), height, surfaces)
+        height, landing = next_surface(model, state.detach(), after.detach(), height, ~resting, surfaces)
         if bool(resting.any()):
             part = take_rows(model, resting, len(state))
             rolled = roll(part, state[resting], remaining[resting], height[resting])
@@ -101,7 +101,7 @@ def _advance_step(model: BallModel, state: Tensor, h: Tensor, surfaces: Surfaces
     return done
 
 
-def _stays(model: BallModel, state: Tensor, height: Tensor, surfaces: Surfaces) -> Tensor:
+def stays(model: BallModel, state: Tensor, height: Tensor, surfaces: Surfaces) -> Tensor:
     """(n,) bool: the ball rests on the surface at `height`, and its weight keeps it there."""
     resting = is_resting(model, state, height)
     if bool(resting.any()):
@@ -111,7 +111,7 @@ def _stays(model: BallModel, state: Tensor, height: Tensor, surfaces: Surfaces) 
     return resting
 
 
-def _next_surface(
+def next_surface(
     model: BallModel, state: Tensor, after: Tensor, height: Tensor, flying: Tensor, surfaces: Surfaces
 ) -> tuple[Tensor, Tensor]:
     """Heights (n,) m of the surfaces that count in this step and whether (n,) the flying balls come down on them."""

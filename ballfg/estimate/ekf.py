@@ -5,19 +5,16 @@ docs/estimators_ekf.md has the equations, what the filter does at contacts, hits
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
 import torch
 from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF
 from scipy.stats import chi2
-from torch import Tensor
 
-from ballfg.dynamics.contact import contact_time, fly_through_jacobian
-from ballfg.dynamics.integrate import batch_jacobian, fly, fly_jacobian, step_count
+from ballfg.dynamics.advance_jacobian import Motion, advance_jacobian
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.rollout import MAX_CONTACTS, REST_SPEED, is_resting, place_on, roll
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
 from ballfg.estimate.problem import coefficient_means, trackwise_model
@@ -26,7 +23,7 @@ from ballfg.estimate.rts import FilterRecord, fly_back, rts_smooth
 from ballfg.estimate.segmentation import Contact, Quality
 from ballfg.estimate.settings import Settings, sample_sigmas
 from ballfg.estimate.sliding_window import WINDOW, SlidingWindow, first_pair, spin_start
-from ballfg.state import POSITION, STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
+from ballfg.state import POSITION, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
 from ballfg.tracks import Track
 
 GATE = float(chi2.isf(1e-6, 3))
@@ -39,99 +36,6 @@ WIDE_VELOCITY = 1.0
 """m/s. While the velocity is less well known, a step is linearised at the velocity that its sample suggests."""
 NEAR_SURFACE = 0.05
 """m. Samples this close to a surface need not lie on one parabola with others: there may be a bounce."""
-
-
-@dataclass(frozen=True)
-class Motion:
-    """A motion over an interval.
-
-    Attributes:
-        after: (1, d) the state at the end.
-        jacobian: (d, d) its derivative by the state at the start, at fixed duration.
-        contacts: time since the start, s, and the surface's height, m, of each contact.
-    """
-
-    after: Tensor
-    jacobian: Tensor
-    contacts: tuple[tuple[float, float], ...]
-
-
-@torch.no_grad()
-def advance_jacobian(model: BallModel, state: Tensor, dt: float, surfaces: Surfaces) -> Motion:
-    """`rollout.advance` of one state (1, d) over dt s, with its Jacobian: flight, contacts, rest."""
-    steps = step_count(torch.tensor([dt]))
-    jacobian = torch.eye(state.shape[-1], dtype=state.dtype)
-    contacts: list[tuple[float, float]] = []
-    for i in range(steps):
-        part = _advance_step(model, state, dt / steps, surfaces)
-        state, jacobian = part.after, part.jacobian @ jacobian
-        contacts += [(i * dt / steps + time, height) for time, height in part.contacts]
-    return Motion(state, jacobian, tuple(contacts))
-
-
-def _advance_step(model: BallModel, state: Tensor, h: float, surfaces: Surfaces) -> Motion:
-    """One step of at most `integrate.MAX_STEP`, cut at its contacts, by the rules of `rollout`."""
-    height = float(surfaces.level_below(state))
-    jacobian: Tensor | None = None
-    contacts: list[tuple[float, float]] = []
-    elapsed, resting = 0.0, _stays(model, state, height, surfaces)
-    while True:
-        after, step = (_rolled if resting else _flown)(model, state, h - elapsed, height)
-        landing = None if resting else _landing(model, state, after, height, surfaces)
-        if landing is None:
-            return Motion(after, step if jacobian is None else step @ jacobian, tuple(contacts))
-        height = landing
-        state, step, tau = _bounced(model, state, height)
-        jacobian = step if jacobian is None else step @ jacobian
-        elapsed += tau
-        contacts.append((elapsed, height))
-        resting = float(state[0, VZ]) < REST_SPEED or len(contacts) == MAX_CONTACTS
-
-
-def _stays(model: BallModel, state: Tensor, height: float, surfaces: Surfaces) -> bool:
-    """Whether the ball rests on the surface, and its weight keeps it there."""
-    if abs(float(state[0, VZ])) > REST_SPEED or not bool(is_resting(model, state, height)):
-        return False  # the first test spares most states the second
-    if float(model.rates(state)[0][0, Z]) > 0.0:
-        return False
-    return height != surfaces.table_height or bool(surfaces.over_table(state))
-
-
-def _landing(model: BallModel, state: Tensor, after: Tensor, height: float, surfaces: Surfaces) -> float | None:
-    """The surface that a flight from `state` to `after` comes down on; None where it meets none."""
-    if not (float(after[0, VZ]) < 0.0 and float(model.gap(after, height)) < 0.0):
-        return None
-    if surfaces.extent is not None and height == surfaces.table_height:
-        touch = fly(model, state, torch.nan_to_num(contact_time(model, state, height)))
-        if not bool(surfaces.over_table(touch)):
-            height = surfaces.lowest()
-    return height if float(model.gap(after, height)) < 0.0 else None
-
-
-def _flown(model: BallModel, state: Tensor, dt: float, height: float) -> tuple[Tensor, Tensor]:
-    after, jacobian = fly_jacobian(model, state, state.new_tensor([dt]))
-    return after, jacobian[0]
-
-
-def _rolled(model: BallModel, state: Tensor, dt: float, height: float) -> tuple[Tensor, Tensor]:
-    def motion(x: Tensor) -> Tensor:
-        return roll(model, x, x.new_tensor([dt]), height)
-
-    after, jacobian = batch_jacobian(motion, state)
-    return after, jacobian[0]
-
-
-def _bounced(model: BallModel, state: Tensor, height: float) -> tuple[Tensor, Tensor, float]:
-    """State just after the next contact, Jacobian at that fixed time, the time since the start, s.
-
-    A ball below the surface that never comes up again (its contact time is NaN) is there already, with no speed left.
-    """
-    tau = contact_time(model, state, height)
-    if bool(tau.isnan()):
-        after, impact = batch_jacobian(model.bounce, state)
-        return place_on(model, after, height), impact[0], 0.0
-    after, _, jacobian = fly_through_jacobian(model, state, tau, (height,))
-    return after, jacobian[0], float(tau)
 
 
 class _BallFilter(FilterpyEKF):

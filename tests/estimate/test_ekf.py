@@ -8,21 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from ballfg.factors.loss import Loss
-from ballfg.factors.noise import ProcessNoise
 from scipy.stats import chi2
 
+from ballfg.dynamics.advance_jacobian import advance_jacobian
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.effects.gravity import Gravity
 from ballfg.dynamics.model_file import nominal_model
 from ballfg.dynamics.rollout import advance
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimate.ekf import ExtendedKalmanFilter, advance_jacobian
+from ballfg.estimate.ekf import ExtendedKalmanFilter
 from ballfg.estimate.result import Estimate, Status
 from ballfg.estimate.segmentation import Quality
 from ballfg.estimate.settings import Settings, uncertain
 from ballfg.estimate.sliding_window import SlidingWindow
+from ballfg.factors.loss import Loss
+from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, STATE_DIM, VELOCITY
 from ballfg.tracks import Track, read_dataset
 
