@@ -146,8 +146,8 @@ def next_crossing(
     start, end = _span(belief, horizon)
     earliest = max(start, after) + JUST_NOW
     while (left := end - float(belief.time)) > 0.0:
-        h = torch.tensor([min(left, MAX_STEP)], dtype=torch.float64)
-        for tau in _crossings(propagator, belief, event, h, either_way):
+        h = torch.tensor([min(left, MAX_STEP - JUST_NOW)], dtype=torch.float64)
+        for tau in _crossings(propagator, belief, event, h + JUST_NOW, either_way):  # no gap between steps
             if float(belief.time) + tau > earliest:
                 there = propagator.forward(belief, torch.tensor([tau], dtype=torch.float64))
                 return _projected(there, event, _rates(propagator, there))
@@ -174,8 +174,8 @@ def _contact_within(model: BallModel, mean: Tensor, h: Tensor, surfaces: Surface
             if not falls or bool(is_resting(model, mean, height)):
                 continue
             tau = contact_time(model, mean, height)
-            if float(tau) >= 0.0 and _lies_under(surfaces, fly(model, mean, tau), height):
-                return tau, height
+            if float(tau) >= -JUST_NOW and _lies_under(surfaces, fly(model, mean, tau), height):
+                return tau.clamp_min(0.0), height
     return None
 
 

@@ -53,6 +53,28 @@ def test_apex_before_and_after_bounces(model, beliefs, table):
     assert apex(table, beliefs(model, FALLING)).time > next_contact(table, beliefs(model, FALLING)).time
 
 
+def test_clocks_of_any_origin(model, beliefs, table):
+    """Stamps in seconds since 1970 are rounded to 2e-7 s; no event is lost or found twice."""
+    late, near = (beliefs(model, RISING, time=origin) for origin in (1.7e9, 0.0))
+    after, other = -math.inf, -math.inf
+    for _ in range(3):
+        for event in (apex, next_contact):
+            found, expected = event(table, late, after=after), event(table, near, after=other)
+            assert found.time - 1.7e9 == pytest.approx(expected.time, abs=1e-5)
+            assert found.time_sigma == pytest.approx(expected.time_sigma, rel=1e-3)
+            after, other = found.time, expected.time
+
+
+@pytest.mark.parametrize("cut", [0.02, 0.02 - 1e-9, 0.2, 0.1])
+def test_events_at_the_end_of_a_step_are_found(gravity, beliefs, table, cut):
+    """The apex, the contact and the plane lie exactly where the search passes from one step to the next."""
+    rising = beliefs(gravity, [0, 0, 0.5, 1.0, 0, 9.81 * cut, 0, 0, 0])
+    assert apex(table, rising).time == pytest.approx(cut, abs=1e-12)
+    assert plane_crossing(table, rising, X, cut).time == pytest.approx(cut, abs=1e-12)
+    falling = beliefs(gravity, [0, 0, 0.02 + cut + 9.81 * cut**2 / 2, 1.0, 0, -1.0, 0, 0, 0])
+    assert next_contact(table, falling).time == pytest.approx(cut, abs=1e-12)
+
+
 def test_contact_is_where_the_rollout_turns(model, beliefs, table):
     for start in (RISING, FALLING):
         times, states = dense(model, start, table.surfaces)
