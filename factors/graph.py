@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ballfg.factors.kind import Array, FactorKind, Rows, Values
+from ballfg.factors.kind import FactorKind, Rows, Values
 from ballfg.factors.linear import Step, solve
 
 
@@ -71,8 +71,27 @@ lies where a loss or the friction bends."""
 NEAR = 0.5
 """What a step promises when it is one posterior standard deviation long. Along shorter ones the objective is a parabola
 well enough to say which share of the step is best."""
+WHOLE = 0.5
+"""A step that keeps more than this share of its promise is as good as the linear model can make it."""
+RATE_MARGIN = 10.0
+"""How many times slower than so far the lengths of the steps may fall for the next one to be left out."""
 MOST_DAMPING = 1e8
 """Marquardt's lambda at which a step is as good as none."""
+
+
+@dataclass(frozen=True)
+class _Point:
+    """Values, the graph linearised there, the objective."""
+
+    values: Values
+    linearized: Sequence[Rows]
+    error: float
+
+    def moved(self, graph: BallGraph, step: Step, share: float = 1.0) -> _Point:
+        """The point a step, or a share of it, further on."""
+        values = self.values.moved(share * step.states, share * step.coefficients)
+        linearized = graph.linearize(values)
+        return _Point(values, linearized, objective(linearized))
 
 
 @dataclass(frozen=True)
@@ -80,8 +99,8 @@ class LevenbergMarquardt:
     """Settings of the minimisation.
 
     Attributes:
-        tolerance: stop when the step that is left, measured in posterior standard deviations, is shorter.
-        max_iterations: linearisations.
+        tolerance: stop when the distance to the minimum, in posterior standard deviations, is shorter.
+        max_iterations: linear solutions.
         first_damping: Marquardt's lambda after a Gauss-Newton step failed. Small: a tight process noise makes the
             diagonal of J^T J large where the chain as a whole is free to move.
     """
@@ -95,56 +114,56 @@ class LevenbergMarquardt:
 
         Each iteration tries the Gauss-Newton step; where it does not reduce the objective, lambda grows until a
         step does. The length of an undamped step in the metric of J^T J, |J d|, is the distance to the minimum in
-        posterior standard deviations: free of units, and what `tolerance` bounds.
+        posterior standard deviations: free of units, and what `tolerance` bounds. When the lengths fall so quickly that
+        the next step would be within the tolerance, the present one is the last.
         """
         linearized = graph.linearize(values)
-        error = objective(linearized)
-        if not np.isfinite(error):
-            return Minimum(values, error, None, Convergence.NOT_FINITE, 1)
-        damping, growth = 0.0, 10.0
+        point = _Point(values, linearized, objective(linearized))
+        if not np.isfinite(point.error):
+            return Minimum(values, point.error, None, Convergence.NOT_FINITE, 1)
+        damping, growth, last = 0.0, 10.0, np.inf
         for iteration in range(1, self.max_iterations + 1):
-            step = _try_solve(linearized, values, damping)
-            if step is not None and damping == 0.0 and np.sqrt(2 * abs(step.decrease)) < self.tolerance:
-                return Minimum(values, error, step, Convergence.CONVERGED, iteration)
-            moved = None if step is None else values.moved(step.states, step.coefficients)
-            trial = [] if moved is None else graph.linearize(moved)
-            trial_error = objective(trial) if moved is not None else np.inf
-            if step is not None and damping == 0.0 and step.decrease < NEAR and np.isfinite(trial_error):
-                share = _better_share(error - trial_error, step.decrease)
-                if share < 1.0:
-                    nearer = values.moved(share * step.states, share * step.coefficients)
-                    linearized_nearer = graph.linearize(nearer)
-                    if objective(linearized_nearer) < min(error, trial_error):
-                        moved, trial, trial_error = nearer, linearized_nearer, objective(linearized_nearer)
-            if step is not None and moved is not None and trial_error <= error * (1 + 1e-12):
-                gain = (error - trial_error) / max(step.decrease, np.finfo(float).tiny)
-                values, linearized, error = moved, trial, trial_error
-                damping, growth = damping * (0.1 if gain > 0.5 else 0.5), 10.0
+            step = _try_solve(point, damping)
+            length = np.sqrt(2 * abs(step.decrease)) if step is not None and damping == 0.0 else np.inf
+            if step is not None and length < self.tolerance:
+                return Minimum(point.values, point.error, step, Convergence.CONVERGED, iteration)
+            if step is not None and RATE_MARGIN * length * (length / last) < self.tolerance and np.isfinite(last):
+                moved = point.values.moved(step.states, step.coefficients)
+                return Minimum(moved, point.error - step.decrease, step, Convergence.CONVERGED, iteration)
+            trial = None if step is None else _tried(graph, point, step, damping)
+            if step is not None and trial is not None and trial.error <= point.error * (1 + 1e-12):
+                gain = (point.error - trial.error) / max(step.decrease, np.finfo(float).tiny)
+                point, last = trial, length if gain > WHOLE else np.inf
+                damping, growth = damping * (0.1 if gain > WHOLE else 0.5), 10.0
                 damping = 0.0 if damping < self.first_damping else damping
-            elif step is not None and damping == 0.0 and np.sqrt(2 * abs(step.decrease)) < AT_KINK:
-                return Minimum(values, error, step, Convergence.CONVERGED, iteration)
+            elif length < AT_KINK:
+                return Minimum(point.values, point.error, step, Convergence.CONVERGED, iteration)
             elif damping > MOST_DAMPING:
-                return Minimum(values, error, _try_solve(linearized, values, 0.0), Convergence.STUCK, iteration)
+                return Minimum(point.values, point.error, _try_solve(point, 0.0), Convergence.STUCK, iteration)
             else:
                 damping, growth = max(self.first_damping, growth * damping), 2.0 * growth
-        final = _try_solve(linearized, values, 0.0)
-        return Minimum(values, error, final, Convergence.TOO_MANY_ITERATIONS, self.max_iterations)
+        final = _try_solve(point, 0.0)
+        return Minimum(point.values, point.error, final, Convergence.TOO_MANY_ITERATIONS, self.max_iterations)
 
 
-def _better_share(decrease: float, promised: float) -> float:
-    """How much of a Gauss-Newton step to take, from what all of it brought: 1 where it kept half of its promise.
+def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> _Point:
+    """Where a step leads: all of it, or a share where an undamped one brought less than half of its promise.
 
     Where the objective bends r times as much along the step as the linear model says (friction between slip and grip
     does), the whole step brings (2 - r) of its promise and 1 / r of it is best. Whole steps then creep or diverge.
     """
-    gain = decrease / max(promised, np.finfo(float).tiny)
-    return 1.0 if gain > 0.5 else 1.0 / (2.0 - gain)
+    whole = point.moved(graph, step)
+    gain = (point.error - whole.error) / max(step.decrease, np.finfo(float).tiny)
+    if damping > 0.0 or gain > WHOLE or not np.isfinite(whole.error):
+        return whole
+    nearer = point.moved(graph, step, 1.0 / (2.0 - gain))
+    return nearer if nearer.error < min(point.error, whole.error) else whole
 
 
-def _try_solve(linearized: Sequence[Rows], values: Values, damping: float) -> Step | None:
+def _try_solve(point: _Point, damping: float) -> Step | None:
     """The linear solution, or None where the system is singular."""
     try:
-        step = solve(linearized, values, damping)
+        step = solve(point.linearized, point.values, damping)
     except RuntimeError as error:  # GTSAM's text changed between versions; the word did not
         if "Indetermin" not in str(error):
             raise
@@ -152,4 +171,4 @@ def _try_solve(linearized: Sequence[Rows], values: Values, damping: float) -> St
     return step if np.isfinite(step.states).all() else None
 
 
-__all__ = ["Array", "BallGraph", "Convergence", "LevenbergMarquardt", "Minimum", "objective"]
+__all__ = ["BallGraph", "Convergence", "LevenbergMarquardt", "Minimum", "objective"]

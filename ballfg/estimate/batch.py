@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterable, Iterator
 
 import joblib
@@ -11,12 +12,18 @@ from ballfg.estimate.estimator import Estimator
 from ballfg.estimate.result import Estimate
 from ballfg.tracks import Track
 
-FEW_TRACKS = 20
-"""Below it starting worker processes takes longer than the work."""
+PROBED = 10
+"""Tracks done in this process first, to see how long one takes; the first of them warms up and does not count."""
+START_UP = 5.0
+"""s that worker processes take to start (they import torch and gtsam): less work than that stays here."""
+BATCH = 16
+"""Tracks that go to a worker together, with one copy of the estimator."""
 
 
 def estimate_tracks(estimator: Estimator, tracks: Iterable[Track], count: int, jobs: int) -> Iterator[Estimate]:
     """Estimates in the order of the tracks, a few tracks ahead of what is taken.
+
+    Worker processes are started only where they save more time than they take to start.
 
     Args:
         estimator: copied to every process.
@@ -24,11 +31,24 @@ def estimate_tracks(estimator: Estimator, tracks: Iterable[Track], count: int, j
         count: how many tracks there are, about.
         jobs: processes; 1 stays in this one.
     """
-    if jobs == 1 or count < FEW_TRACKS:
-        yield from map(estimator.estimate, tracks)
+    stream = iter(tracks)
+    if jobs > 1:
+        spent = 0.0
+        for i in range(PROBED):
+            track = next(stream, None)
+            if track is None:
+                return
+            start = time.perf_counter()
+            result = estimator.estimate(track)
+            spent += (time.perf_counter() - start) * (i > 0)
+            yield result
+        left = spent / (PROBED - 1) * (count - PROBED)
+        jobs = jobs if left * (1.0 - 1.0 / jobs) > START_UP else 1
+    if jobs == 1:
+        yield from map(estimator.estimate, stream)
         return
-    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator", pre_dispatch="4*n_jobs", batch_size=4)
-    yield from parallel(joblib.delayed(_estimate)(estimator, track) for track in tracks)
+    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator", pre_dispatch=f"{2 * BATCH}*n_jobs", batch_size=BATCH)
+    yield from parallel(joblib.delayed(_estimate)(estimator, track) for track in stream)
 
 
 def _estimate(estimator: Estimator, track: Track) -> Estimate:

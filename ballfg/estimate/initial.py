@@ -73,7 +73,7 @@ LEAST_FALL = 0.05
 def move_contacts(
     values: Values, times: Array, old: Sequence[tuple[int, float]], new: Sequence[tuple[int, float]], model: BallModel
 ) -> Values:
-    """Values to go on from when contacts have moved: a state that was after its contact is now before it, or vice versa.
+    """Values to go on from when contacts have moved: a state after its contact is now before it, or the other way round.
 
     Args:
         values: the states that went with the old contacts.
@@ -91,7 +91,7 @@ def move_contacts(
         gap = float(model.gap(start, heights[0])[0].detach()) if heights else 0.0
         if gap < 0.0 < states[interval, VZ]:  # it was on the way up, from below: before the contact it mirrors that
             states[interval, [Z, VZ]] -= (2.0 * gap, 2.0 * states[interval, VZ])
-            start[0, : STATE_DIM] = torch.from_numpy(states[interval])
+            start[0, :STATE_DIM] = torch.from_numpy(states[interval])
         with torch.no_grad():
             after, _ = fly_through(model, start, torch.from_numpy(np.diff(times[interval : interval + 2])), heights)
         if bool(after.isfinite().all()):

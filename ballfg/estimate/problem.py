@@ -1,8 +1,8 @@
 """From a track and the events in it to a factor graph.
 
 Every interval between two samples gets one dynamics factor: free flight, flight through the contacts found in it, or
-rest on a surface; a hit adds its jump to the process noise. An interval that nothing links (a long gap with a hit in it)
-gets none. Every sample gets a position factor, the first state of each linked piece a prior.
+rest on a surface; a hit adds its jump to the process noise. An interval that nothing links (a long gap with a hit in
+it) gets none. Every sample gets a position factor, the first state of each linked piece a prior.
 """
 
 from __future__ import annotations

@@ -174,9 +174,7 @@ def _worst_break(solution: Solution) -> int | None:
     return where
 
 
-def _contacts_at_ends(
-    times: Array, solution: Solution, model: BallModel, surfaces: Surfaces
-) -> tuple[Contact, ...]:
+def _contacts_at_ends(times: Array, solution: Solution, model: BallModel, surfaces: Surfaces) -> tuple[Contact, ...]:
     """Contacts that a single sample at either end could show, too little for the segmentation.
 
     The last state has fallen through a surface; or the first, where later samples lead back to, rises from below one.

@@ -1,7 +1,7 @@
 """The smoother's covariances are honest: NEES and NIS over simulated tracks whose noise is what the settings declare.
 
-Process noise in flight, kicks in contacts, label noise, a bounce or two in every track. Per track the NEES is averaged over
-its stamps; were stamps independent, the band would be narrower than the one used here, which counts each track once.
+Process noise in flight, kicks in contacts, label noise, a bounce or two in every track. Per track the NEES is averaged
+over its stamps; were they independent, the band would be narrower than the one used here, which counts each track once.
 """
 
 from __future__ import annotations
@@ -67,9 +67,7 @@ def test_all_converge_and_find_their_bounces(runs) -> None:
     ids=["state", "position", "velocity", "spin"],
 )
 def test_nees_is_inside_its_band(runs, part, dimension) -> None:
-    means = [
-        nees((e.states - s.true_states)[:, part], e.covariances[:, part, part]).mean() for s, e in runs
-    ]
+    means = [nees((e.states - s.true_states)[:, part], e.covariances[:, part, part]).mean() for s, e in runs]
     low, high = band(dimension)
     assert low < np.mean(means) < high
 

@@ -1,4 +1,4 @@
-"""Contacts are found and refined, hits that the segmentation missed are marked, bad samples do no harm, short tracks are honest.
+"""Contacts are found and refined, missed hits are marked, bad samples do no harm, short tracks are honest.
 
 Truth is a rollout of the model the smoother uses, without process noise; positions have 1.5 mm of noise. "Honest" is: a
 status that says how it went, finite numbers, and the truth within 4 standard deviations in every component.
@@ -103,7 +103,9 @@ def test_a_contact_in_the_wrong_interval_moves_to_the_right_one(shift, settings)
     smoother = Smoother(MODEL, TABLE, settings)
     found = smoother.segment(track)
     right = [c.interval for c in smoother.solve(track, found, effective_sigmas(track, found, settings)).events.contacts]
-    planted = tuple(Contact(c.interval + shift * (i == 0), c.time + 0.01 * shift, c.height) for i, c in enumerate(found.contacts))
+    planted = tuple(
+        Contact(c.interval + shift * (i == 0), c.time + 0.01 * shift, c.height) for i, c in enumerate(found.contacts)
+    )
     wrong = replace(found, contacts=planted)
     solution = smoother.solve(track, wrong, effective_sigmas(track, wrong, settings))
     assert [c.interval for c in solution.events.contacts] == right

@@ -1,9 +1,9 @@
 """The estimate goes with the frame it is made in: shifts in space and time, rotation about the vertical, factor order.
 
-Tolerances are in posterior standard deviations. The minimisation stops within 1e-6 of them (`LevenbergMarquardt.tolerance`;
-its last Gauss-Newton step is not taken); a contact's Newton search adds its own 1e-13 s. So 1e-5 is what a moved problem,
-whose iterates round differently, can promise. Not quite invariant are the priors: on the first position (about its own
-measurement, so it moves along), on velocity and spin (isotropic about zero).
+Tolerances are in posterior standard deviations. The minimisation stops within 1e-6 of them (its last Gauss-Newton step
+is not taken); a contact's search adds its own 1e-13 s. So 1e-5, 1e-8 m, is what a moved problem, whose iterates round
+differently, can promise. The priors move along: that of the first position lies about its measurement, those of
+velocity and spin are isotropic about zero.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ def test_rotation_about_the_vertical(track, angle) -> None:
 
 
 def test_time_shift(track) -> None:
-    """1000 s later a stamp has 1e-13 s of rounding, 5e-13 m of a ball's path; differences dt lose 1e-11 of themselves."""
+    """1000 s later a stamp has 1e-13 s of rounding, 5e-13 m of a ball's path; a dt loses 1e-11 of itself."""
     base = estimate(track)
     later = estimate(replace(track, times=track.times + 1000.0))
     assert off(later, base.states, base) < TOLERANCE

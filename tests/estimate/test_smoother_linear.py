@@ -1,4 +1,4 @@
-"""A linear problem: the smoother is the Kalman filter with its Rauch-Tung-Striebel pass, and leave-one-out is what it says."""
+"""A linear problem: the smoother is Kalman filter and Rauch-Tung-Striebel pass, and leave-one-out is what it says."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def test_leave_one_out_with_huber(gravity_model) -> None:
 
 
 def test_leave_one_out_through_a_bounce() -> None:
-    """Not linear any more: the others' estimate moves by a part of a sigma, over which the contact bends little: 0.03."""
+    """Not linear: the others' estimate moves by a part of a sigma, over which the contact bends little: 0.03."""
     config = SimulationConfig(tracks=1, rate=50.0, seed=21, noise=MeasurementNoise(position=0.003, spin=4.0))
     track = next(simulate(config)).track
     settings = Settings(**{**vars(PLAIN), "position_noise": (0.003,) * 3, "spin_label_noise": 4.0})

@@ -1,7 +1,7 @@
 """One optimum: the smoother against scipy on the same objective, written here once more in plain numpy.
 
-Nothing of ballfg's dynamics, factors or noise is used for the reference: flight is a Runge-Kutta of its own, the contact
-time a root, the impact the law of docs/derivations/impact.md, derivatives are differences. What both share is what is
+Nothing of ballfg's dynamics, factors or noise is used for the reference: flight is a Runge-Kutta of its own, the
+contact time a root, the impact the law of docs/derivations/impact.md, derivatives are differences. What both share is
 given: the measurements, the numbers of `Settings` and of the model file, and which interval holds which contact.
 """
 

@@ -9,7 +9,13 @@ from ballfg.dynamics import EFFECTS, AnalyticModel
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.factors.kind import COEFFICIENTS, FactorKind, Rows, Values
 
-NAMES = ("flight.drag.k", "flight.magnus.k", "contact.restitution.e", "contact.friction.mu", "contact.table_height.offset")
+NAMES = (
+    "flight.drag.k",
+    "flight.magnus.k",
+    "contact.restitution.e",
+    "contact.friction.mu",
+    "contact.table_height.offset",
+)
 
 
 @pytest.fixture
@@ -74,9 +80,9 @@ STEPS = np.repeat((2e-4, 5e-4, 2e-2), 3)
 def differences() -> Callable[[Callable[[np.ndarray], np.ndarray], np.ndarray, np.ndarray], np.ndarray]:
     """Derivative (..., d) of f(x) by x (..., d) along the last axis, f row-wise, by fourth-order central differences.
 
-    Steps: 2e-4 m, 5e-4 m/s, 2e-2 rad/s, 1e-3 of a coefficient's size. Over them the motion of a ball in a frame is smooth to
-    some 1e-3 of itself, so that truncation (step^4) is below 1e-12; rounding, eps |x| / step, is about 1e-11 in
-    position and velocity and 1e-10 of the largest element after whitening.
+    Steps: 2e-4 m, 5e-4 m/s, 2e-2 rad/s, 1e-3 of a coefficient's size. Over them the motion of a ball in a frame is
+    smooth to some 1e-3 of itself, so that truncation (step^4) is below 1e-12; rounding, eps |x| / step, is about 1e-11
+    in position and velocity and 1e-10 of the largest element after whitening.
     """
 
     def jacobian(function, x: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -93,7 +99,7 @@ def differences() -> Callable[[Callable[[np.ndarray], np.ndarray], np.ndarray, n
 
 @pytest.fixture
 def check_jacobian(differences) -> Callable[[FactorKind, Values], float]:
-    """Worst error of a kind's Jacobians: each row of a block relative to its largest element (or 1e-4 of the block's)."""
+    """Worst error of a kind's Jacobians: each row of a block relative to its largest element, or 1e-4 of the block's."""
 
     def check(kind: FactorKind, values: Values) -> float:
         rows = kind.linearize(values)

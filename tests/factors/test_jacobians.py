@@ -122,12 +122,14 @@ def test_contact(case, check_jacobian) -> None:
 def test_contact_outside_its_interval(case, check_jacobian) -> None:
     """A contact a little before or after the interval is a smooth continuation; the optimiser passes through it."""
     model, coefficients = case
-    start = [STARTS[0][:2] + [0.08] + STARTS[0][3:], STARTS[1][:2] + [0.012] + STARTS[1][3:]]
+    start = [[*STARTS[0][:2], 0.08, *STARTS[0][3:]], [*STARTS[1][:2], 0.012, *STARTS[1][3:]]]
     values, times = bouncing_states(model, coefficients, start, 0.01, (0.0,))
     assert times[0, 0] > 0.01
     assert times[1, 0] < 0
     dt = np.full(2, 0.01)
-    kind = ContactFactors(model, np.array([0, 2]), dt, NOISE.flight(dt) + NOISE.contact(dt, times[:, 0]), np.zeros((2, 1)))
+    kind = ContactFactors(
+        model, np.array([0, 2]), dt, NOISE.flight(dt) + NOISE.contact(dt, times[:, 0]), np.zeros((2, 1))
+    )
     assert check_jacobian(kind, off(values)) < TOLERANCE
 
 
@@ -174,7 +176,9 @@ def test_rows_of_a_batch_are_rows_by_themselves(case) -> None:
     values, times = bouncing_states(model, coefficients, STARTS, 0.02, (0.0,))
     dt = np.full(4, 0.02)
     kinds = [
-        ContactFactors(model, 2 * np.arange(4), dt, NOISE.flight(dt) + NOISE.contact(dt, times[:, 0]), np.zeros((4, 1))),
+        ContactFactors(
+            model, 2 * np.arange(4), dt, NOISE.flight(dt) + NOISE.contact(dt, times[:, 0]), np.zeros((4, 1))
+        ),
         FlightFactors(model, np.arange(5), np.linspace(0.004, 0.01, 5), NOISE.flight(np.linspace(0.004, 0.01, 5))),
         RestFactors(model, np.arange(3), dt[:3], NOISE.flight(dt[:3]), np.zeros(3)),
         PositionFactors(np.arange(4), values.states[:4, :3] + 0.1, np.full((4, 3), 0.01)),

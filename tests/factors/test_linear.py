@@ -21,7 +21,9 @@ N = 7
 BOUNCE = 3  # the interval with a contact
 
 
-def track(model, coefficients: np.ndarray, *, loss: Loss | None = None, noise: ProcessNoise = NOISE, cut: int | None = None):
+def track(
+    model, coefficients: np.ndarray, *, loss: Loss | None = None, noise: ProcessNoise = NOISE, cut: int | None = None
+):
     """A short bouncing track with every sort of factor, at a point away from the minimum."""
     rng = np.random.default_rng(5)
     times = 0.01 * np.arange(N) + 0.002 * rng.uniform(-1, 1, N)
@@ -74,7 +76,13 @@ def least_squares(r: np.ndarray, J: np.ndarray) -> np.ndarray:
     return np.linalg.lstsq(J / scale, -r, rcond=None)[0] / scale
 
 
-CASES = [(False, None, None), (True, None, None), (True, Loss("huber", 2.0), None), (True, Loss("cauchy", 2.0), 1), (False, None, 4)]
+CASES = [
+    (False, None, None),
+    (True, None, None),
+    (True, Loss("huber", 2.0), None),
+    (True, Loss("cauchy", 2.0), 1),
+    (False, None, 4),
+]
 
 
 @pytest.fixture(params=CASES, ids=["plain", "coefficients", "huber", "cauchy-cut", "cut"])
@@ -158,7 +166,9 @@ def test_gtsam_s_cholesky_does_fail_there(model) -> None:
         for i, variables in enumerate(rows.variables.tolist()):
             terms = [(v, block[i]) for v, block in zip(variables, jacobians, strict=True)]
             flat = [x for term in terms for x in term]
-            gaussian.push_back(gtsam.JacobianFactor(*flat, -residual[i], gtsam.noiseModel.Unit.Create(len(residual[i]))))
+            gaussian.push_back(
+                gtsam.JacobianFactor(*flat, -residual[i], gtsam.noiseModel.Unit.Create(len(residual[i])))
+            )
     with pytest.raises(RuntimeError, match="Indetermin"):
         gaussian.eliminateMultifrontal()  # prefers Cholesky
 

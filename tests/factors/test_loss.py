@@ -56,12 +56,14 @@ def test_stretch_is_the_ratio_of_curvatures(name) -> None:
 def test_weighted_system_is_gradient_and_hessian(loss, differences) -> None:
     """J^T r equals the objective's gradient everywhere, J^T J its Hessian where the floor is not active.
 
-    Gradient: differences of `objective` good to 1e-8. Hessian: differences of J^T r; only of rows inside the loss's core.
+    Gradient: differences of `objective` good to 1e-8. Hessian: differences of J^T r, rows in the core only.
     """
     rng = np.random.default_rng(3)
     measured, sigma = np.zeros((6, 3)), rng.uniform(0.5, 2.0, (6, 3))
     states = np.zeros((6, 9))
-    lengths = np.array([0.3, 1.0, 1.7, 2.6, 5.0, 40.0])  # of the whitened residuals: three in the core, three in the tail
+    lengths = np.array(
+        [0.3, 1.0, 1.7, 2.6, 5.0, 40.0]
+    )  # of the whitened residuals: three in the core, three in the tail
     direction = rng.standard_normal((6, 3))
     states[:, :3] = lengths[:, None] * direction / np.linalg.norm(direction, axis=1, keepdims=True) * sigma
     kind = PositionFactors(np.arange(6), measured, sigma, loss)

@@ -20,7 +20,7 @@ def transition(dt: float) -> np.ndarray:
 
 
 def van_loan(dt: float) -> np.ndarray:
-    """Covariance of dx = A x dt + noise over dt: C. Van Loan, "Computing integrals involving the matrix exponential", 1978."""
+    """Covariance of dx = A x dt + noise over dt (C. Van Loan, Computing integrals ..., IEEE Trans. AC 23, 1978)."""
     A, density = np.zeros((9, 9)), np.zeros((9, 9))
     A[POSITION, VELOCITY] = np.eye(3)
     density[VELOCITY, VELOCITY] = NOISE.acceleration**2 * np.eye(3)
@@ -81,7 +81,9 @@ def test_whitening_survives_very_different_scales() -> None:
     np.testing.assert_allclose(root[0] @ covariance[0] @ root[0].T, np.eye(3), atol=1e-12)
 
 
-@pytest.mark.parametrize("field", ["acceleration", "spin", "contact_velocity", "contact_spin", "hit_velocity", "hit_spin"])
+@pytest.mark.parametrize(
+    "field", ["acceleration", "spin", "contact_velocity", "contact_spin", "hit_velocity", "hit_spin"]
+)
 @pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
 def test_noise_must_be_positive(field, value) -> None:
     with pytest.raises(ValueError, match=f"{field} must be positive and finite"):
