@@ -39,25 +39,29 @@ class NetworkFlight(BallModel):
         self.bounces = bounces
         sizes = (9, HIDDEN, HIDDEN, 3)
         self.layers = nn.ModuleList(nn.Linear(i, o, dtype=torch.float64) for i, o in pairwise(sizes))
+        # the tensors themselves: calling modules costs as much as the small products
+        self._stack = tuple((layer.weight, layer.bias) for layer in self.layers if isinstance(layer, nn.Linear))
         with torch.no_grad():
-            for layer in self.layers:
-                assert isinstance(layer, nn.Linear)
-                spread = 1.0 / math.sqrt(layer.in_features)
-                layer.weight.copy_(spread * torch.randn(layer.weight.shape, generator=generator, dtype=torch.float64))
-                layer.bias.zero_()
+            for weight, bias in self._stack:
+                spread = 1.0 / math.sqrt(weight.shape[1])
+                weight.copy_(spread * torch.randn(weight.shape, generator=generator, dtype=torch.float64))
+                bias.zero_()
+        scales = [1 / SPEED_SCALE] * 3 + [1 / SPIN_SCALE] * 3 + [1 / (SPEED_SCALE * SPIN_SCALE)] * 3
+        self._scale = torch.tensor(scales, dtype=torch.float64)
         self.gravity = torch.tensor([0.0, 0.0, -STANDARD_GRAVITY], dtype=torch.float64)
 
     def force(self, state: Tensor) -> Tensor:
         """(..., 3) the network's output: aerodynamic acceleration divided by `FORCE_SCALE`."""
-        velocity, spin = state[..., VELOCITY] / SPEED_SCALE, state[..., SPIN] / SPIN_SCALE
-        x = torch.cat((velocity, spin, torch.linalg.cross(spin, velocity)), dim=-1)
-        first, second, last = self.layers
-        result: Tensor = last(torch.tanh(second(torch.tanh(first(x)))))
-        return result
+        velocity, spin = state[..., VELOCITY], state[..., SPIN]
+        x = torch.cat((velocity, spin, torch.linalg.cross(spin, velocity)), dim=-1) * self._scale
+        *hidden, last = self._stack
+        for weight, bias in hidden:
+            x = torch.tanh(nn.functional.linear(x, weight, bias))
+        return nn.functional.linear(x, *last)
 
     def rates(self, state: Tensor) -> Rates:
         """Acceleration in free flight; the spin is constant."""
-        return self.gravity + FORCE_SCALE * self.force(state), None
+        return torch.add(self.gravity, self.force(state), alpha=FORCE_SCALE), None
 
     def bounce(self, state: Tensor) -> Tensor:
         """That of the other model."""

@@ -154,7 +154,7 @@ def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> _Poin
     """
     whole = point.moved(graph, step)
     gain = (point.error - whole.error) / max(step.decrease, np.finfo(float).tiny)
-    if damping > 0.0 or gain > WHOLE or not np.isfinite(whole.error):
+    if damping > 0.0 or gain > WHOLE or step.decrease > NEAR or not np.isfinite(whole.error):
         return whole
     nearer = point.moved(graph, step, 1.0 / (2.0 - gain))
     return nearer if nearer.error < min(point.error, whole.error) else whole

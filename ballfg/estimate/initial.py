@@ -73,7 +73,7 @@ LEAST_FALL = 0.05
 def move_contacts(
     values: Values, times: Array, old: Sequence[tuple[int, float]], new: Sequence[tuple[int, float]], model: BallModel
 ) -> Values:
-    """Values to go on from when contacts have moved: a state after its contact is now before it, or the other way round.
+    """Values to go on from when contacts have moved: a state after its contact is now before it, or vice versa.
 
     Args:
         values: the states that went with the old contacts.

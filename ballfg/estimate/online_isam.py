@@ -16,12 +16,12 @@ from numpy.typing import NDArray
 
 from ballfg.dynamics.model import BallModel
 from ballfg.estimate.online_interval import FLIGHT, Interval, IntervalMaker, Motion, coefficient_count, evaluate, store
-from ballfg.estimate.problem import START_POSITION_SIGMA, UNINFORMATIVE_SPIN, coefficient_means
+from ballfg.estimate.problem import coefficient_means, start_priors
 from ballfg.estimate.settings import Settings
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
 from ballfg.factors.kind import FactorKind
 from ballfg.factors.position import PositionFactors
-from ballfg.factors.prior import coefficient_prior, spin_prior, state_prior
+from ballfg.factors.prior import coefficient_prior
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 Array = NDArray[np.float64]
@@ -37,6 +37,7 @@ POSITION_THRESHOLD = 0.5
 """Measurement standard deviations. Flight does not depend on the position; a robust loss's weight does."""
 COEFFICIENT_THRESHOLD = 0.5
 """Prior standard deviations. The coefficients touch every factor: moving them relinearises the whole window."""
+_UNIT3 = gtsam.noiseModel.Unit.Create(3)
 WILDFIRE = 1e-7
 """m, m/s, rad/s. Back-substitution stops where the solution changes by less."""
 
@@ -168,15 +169,9 @@ class IncrementalWindow:
         """A sample that nothing predicts: its state has a wide prior of its own."""
         state = np.zeros(STATE_DIM)
         state[POSITION] = sample.position
-        priors: list[FactorKind] = []
-        sigma = np.empty(STATE_DIM)
-        sigma[POSITION], sigma[VELOCITY] = START_POSITION_SIGMA, self.settings.velocity_prior
-        sigma[SPIN] = self.settings.spin_prior if sample.label is None else UNINFORMATIVE_SPIN
-        priors.append(state_prior(0, state.copy(), sigma))
         if sample.label is not None:
-            spread = np.full((1, 3), self.settings.spin_label_noise)
-            priors.append(spin_prior(np.array([0]), sample.label[None], spread, self.settings.label_loss))
             state[SPIN] = sample.label
+        priors = start_priors(0, sample.position, sample.label, self.settings)
         _, count, calls = self._relinearize(None)
         return Update(np.full(3, np.nan), count, calls, self._insert(sample, state, None, priors))
 
@@ -187,11 +182,14 @@ class IncrementalWindow:
         relinearisations, and a robust loss gets a weight near the one that it ends with.
         """
         innovation = sample.position - predicted[POSITION]
-        spread = covariance[POSITION, POSITION] + np.diag(sample.sigma**2)
-        whitened = np.linalg.solve(np.linalg.cholesky(spread), innovation)
-        weight = self.settings.loss.weight(np.array([np.linalg.norm(whitened)]))
-        spread = covariance[POSITION, POSITION] + np.diag(sample.sigma**2 / weight)
-        return predicted + covariance[:, POSITION] @ np.linalg.solve(spread, innovation), whitened
+        noise = np.diag(sample.sigma**2)
+        root = np.linalg.cholesky(covariance[POSITION, POSITION] + noise)
+        whitened = np.linalg.solve(root, innovation)
+        pull = np.linalg.solve(root.T, whitened)
+        if self.settings.loss.name != "squared":
+            weight = self.settings.loss.weight(np.array([np.linalg.norm(whitened)]))
+            pull = np.linalg.solve(covariance[POSITION, POSITION] + noise / weight, innovation)
+        return predicted + covariance[:, POSITION] @ pull, whitened
 
     def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
         """Do ahead what iSAM2 will do: move the states whose solution left the thresholds, evaluate their factors.
@@ -256,7 +254,15 @@ class IncrementalWindow:
         self._read_back()
         return int(self._result.getVariablesReeliminated())
 
-    def _position_factor(self, sample: Sample, state: int) -> gtsam.CustomFactor:
+    def _position_factor(self, sample: Sample, state: int) -> gtsam.NonlinearFactor:
+        """The observation's factor; without a robust loss it is linear, and GTSAM never has to ask for it."""
+        if self.settings.loss.name == "squared":
+            root = np.zeros((3, STATE_DIM))
+            root[:, POSITION] = np.diag(1.0 / sample.sigma)
+            factor = gtsam.JacobianFactor(STATE_KEY + state, root, sample.position / sample.sigma, _UNIT3)
+            origin = gtsam.Values()
+            origin.insert(STATE_KEY + state, np.zeros(STATE_DIM))
+            return gtsam.LinearContainerFactor(factor, origin)
         kind = PositionFactors(np.array([state]), sample.position[None], sample.sigma[None], self.settings.loss)
         return Bridge(kind, "row").factor(0)
 

@@ -149,19 +149,28 @@ def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> lis
     label = track.spin_label
     kinds: list[FactorKind] = []
     for start in starts:
-        mean, sigma = np.zeros(STATE_DIM), np.empty(STATE_DIM)
-        mean[POSITION] = track.positions[start]
-        sigma[POSITION], sigma[VELOCITY] = START_POSITION_SIGMA, settings.velocity_prior
-        sigma[SPIN] = UNINFORMATIVE_SPIN
-        kinds.append(state_prior(start, mean, sigma))
-    unlabelled = np.array(starts if label is None else starts[1:], dtype=np.int64)
-    if len(unlabelled):
-        spread = np.full((len(unlabelled), 3), settings.spin_prior)
-        kinds.append(spin_prior(unlabelled, np.zeros_like(spread), spread, settings.spin_loss))
-    if label is not None:
-        spread = np.full((1, 3), settings.spin_label_noise)
-        kinds.append(spin_prior(np.array([0]), label[None], spread, settings.label_loss))
+        kinds += start_priors(start, track.positions[start], label if start == 0 else None, settings)
     return kinds
+
+
+def start_priors(state: int, position: Array, label: Array | None, settings: Settings) -> list[FactorKind]:
+    """Priors on a state that nothing leads up to.
+
+    Args:
+        state: its index.
+        position: (3,) m, as measured.
+        label: (3,) rad/s, of the spin; None for the spin prior.
+        settings: spreads and losses.
+    """
+    mean, sigma = np.zeros(STATE_DIM), np.empty(STATE_DIM)
+    mean[POSITION] = position
+    sigma[POSITION], sigma[VELOCITY], sigma[SPIN] = START_POSITION_SIGMA, settings.velocity_prior, UNINFORMATIVE_SPIN
+    spin = np.zeros(3) if label is None else label
+    spread, loss = (
+        (settings.spin_prior, settings.spin_loss) if label is None else (settings.spin_label_noise, settings.label_loss)
+    )
+    about = spin_prior(np.array([state]), spin[None], np.full((1, 3), spread), loss)
+    return [state_prior(state, mean, sigma), about]
 
 
 UNINFORMATIVE_SPIN = 2000.0

@@ -99,7 +99,7 @@ def differences() -> Callable[[Callable[[np.ndarray], np.ndarray], np.ndarray, n
 
 @pytest.fixture
 def check_jacobian(differences) -> Callable[[FactorKind, Values], float]:
-    """Worst error of a kind's Jacobians: each row of a block relative to its largest element, or 1e-4 of the block's."""
+    """Worst error of a kind's Jacobians: each row relative to its largest element, or 1e-4 of its block's."""
 
     def check(kind: FactorKind, values: Values) -> float:
         rows = kind.linearize(values)

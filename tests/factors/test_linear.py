@@ -201,15 +201,16 @@ def test_too_few_iterations_are_a_status(problem) -> None:
     assert minimum.error <= graph.error(values)
 
 
-def test_minimum_has_no_gradient_left(problem) -> None:
-    """|J^T r| in posterior standard deviations, which is what `tolerance` (1e-6) bounds."""
+@pytest.mark.parametrize("tolerance", [1e-5, 1e-6])
+def test_minimum_has_no_gradient_left(problem, tolerance) -> None:
+    """The step that is left, in posterior standard deviations, is what `tolerance` bounds."""
     graph, values = problem
-    minimum = LevenbergMarquardt().minimize(graph, values)
+    minimum = LevenbergMarquardt(tolerance).minimize(graph, values)
     assert minimum.convergence is Convergence.CONVERGED
     r, J = dense(graph.linearize(minimum.values), minimum.values)
     left = least_squares(r, J)
-    assert np.linalg.norm(J @ left) < 1e-5
-    assert minimum.error == pytest.approx(graph.error(minimum.values), rel=1e-12)
+    assert np.linalg.norm(J @ left) < tolerance + 1e-9  # rounding of a system of condition 1e5
+    assert minimum.error == pytest.approx(graph.error(minimum.values), rel=1e-9)
     assert minimum.error < graph.error(values)
     # the gradient of the true objective, by differences along random directions
     rng = np.random.default_rng(0)
