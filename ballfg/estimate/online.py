@@ -11,7 +11,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
 from ballfg.estimate.online_events import SIGMA_FACTOR, EventTracker, contact_step, first_difference
-from ballfg.estimate.online_final import Frozen, WindowSmoother, final_estimate, freeze, unknown
+from ballfg.estimate.online_final import Frozen, final_estimate, freeze, unknown
 from ballfg.estimate.online_interval import FLIGHT, Motion, motions_of
 from ballfg.estimate.online_isam import Sample, Update
 from ballfg.estimate.online_window import Window
@@ -19,6 +19,7 @@ from ballfg.estimate.problem import trackwise_model
 from ballfg.estimate.result import Estimate, Status
 from ballfg.estimate.segmentation import physics_of
 from ballfg.estimate.settings import Settings, sample_sigmas
+from ballfg.estimate.smoother import Smoother
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Track
 
@@ -245,7 +246,7 @@ class Online(Estimator):
         ]
         whitened = np.array([state.innovation for state in states])
         assert self.window is not None
-        smoother = WindowSmoother(self.window, self.model, self.surfaces, self.settings)
+        smoother = Smoother(self.model, self.surfaces, self.settings)
         first = self.window.first
         found = self.events.segmentation(first, track.times[first:], track.positions[first:])
         result = final_estimate(smoother, self.window, track, found, self._frozen)

@@ -7,25 +7,19 @@ from dataclasses import dataclass, replace
 
 import gtsam
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from ballfg.dynamics.integrate import fly
-from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.online_events import SIGMA_FACTOR
 from ballfg.estimate.online_isam import Sample
 from ballfg.estimate.online_window import Window
-from ballfg.estimate.problem import Events, build_graph, effective_sigmas
+from ballfg.estimate.problem import effective_sigmas
 from ballfg.estimate.result import Estimate
 from ballfg.estimate.segmentation import Contact, Segmentation
 from ballfg.estimate.settings import Settings
-from ballfg.estimate.smoother import MAX_REFINEMENTS, Smoother, Solution, _places, _refined
+from ballfg.estimate.smoother import Earlier, Smoother
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
-from ballfg.factors.graph import BallGraph
 from ballfg.factors.kind import COEFFICIENTS, Array, FactorKind, Index, Values
-from ballfg.factors.prior import PriorFactors
-from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 
 
@@ -85,64 +79,13 @@ class LinearFactors(FactorKind):
         return (np.sum(parts, axis=0) - self.b)[None], tuple(block[None] for block in self.blocks)
 
 
-class WindowSmoother(Smoother):
-    """The smoother on the samples of a window: it starts at the window's estimate, and knows what left the window.
-
-    Args: window: of the online estimator.  surfaces, settings: as the smoother's.
-    """
-
-    def __init__(self, window: Window, model: BallModel, surfaces: Surfaces, settings: Settings) -> None:
-        super().__init__(model, surfaces, settings)
-        self.start = Values(window.states, window.coefficients)
-        shared = window.shared if window.first else []
-        self.summaries = [LinearFactors(factor, self.start, window.first) for factor in shared]
-
-    def _settle(self, track: Track, segmentation: Segmentation, sigma: Array) -> Solution:
-        """Minimise, move contacts to where the estimate says they are, and minimise again until they stay."""
-        events, values, seen = Events(segmentation.contacts, segmentation), self.start, {}
-        for _ in range(MAX_REFINEMENTS):
-            values = self._falling(track.times, values, events)
-            graph = with_summaries(build_graph(track, self.trackwise, events, sigma, self.settings), self.summaries)
-            solution = Solution(events, graph, self.optimizer.minimize(graph, values))
-            seen[_places(events.contacts)] = solution
-            refined = _refined(track.times, solution)
-            if _places(refined) in seen:
-                break
-            values = solution.minimum.values
-            events = Events(refined, segmentation)
-        return min(seen.values(), key=lambda s: s.minimum.error)
-
-    def _falling(self, times: Array, values: Values, events: Events) -> Values:
-        """The values, a state that rises into an interval with a contact replaced by the flight that leads to it.
-
-        A contact that moves to the next interval leaves such a state behind, and from there it is out of reach.
-        """
-        states = values.states.copy()
-        occupied = {contact.interval for contact in events.contacts}
-        for i in sorted(occupied):
-            if i > 0 and i - 1 not in occupied and states[i, VZ] > 0.0:
-                start, dt = torch.from_numpy(states[i - 1 : i]), torch.tensor([times[i] - times[i - 1]])
-                with torch.no_grad():
-                    states[i] = fly(self.model, start, dt)[0].numpy()
-        return Values(states, values.coefficients)
-
-
-def with_summaries(graph: BallGraph, summaries: Sequence[FactorKind]) -> BallGraph:
-    """The graph with what marginalised states know in place of the priors on the same variables."""
-    if not summaries:
-        return graph
-    known = {int(v) for summary in summaries for v in summary.variables[0]}
-    kept = [k for k in graph.kinds if not (isinstance(k, PriorFactors) and int(k.variables[0, 0]) in known)]
-    return BallGraph((*kept, *summaries))
-
-
 def final_estimate(
-    smoother: WindowSmoother, window: Window, track: Track, found: Segmentation, frozen: Sequence[Frozen]
+    smoother: Smoother, window: Window, track: Track, found: Segmentation, frozen: Sequence[Frozen]
 ) -> Estimate:
     """The result over a whole track.
 
     Args:
-        smoother: of the window.
+        smoother: with the window's model, surfaces and settings.
         window: after the last push.
         track: all of it.
         found: the events among the window's samples.
@@ -151,7 +94,9 @@ def final_estimate(
     first = window.first
     part = track if first == 0 else track.between(float(track.times[first]), float(track.times[-1]))
     sigma = effective_sigmas(part, found, smoother.settings)
-    late = smoother._result(part, sigma, smoother.solve(part, found, sigma))
+    values = Values(window.states, window.coefficients)
+    summaries = [LinearFactors(factor, values, first) for factor in (window.shared if first else [])]
+    late = smoother.result(part, sigma, smoother.solve(part, found, sigma, Earlier(values, summaries)))
     if not frozen:
         return late
     joints = np.array([f.joint for f in frozen])

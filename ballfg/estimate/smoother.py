@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,6 +31,8 @@ from ballfg.estimate.settings import Settings, sample_sigmas
 from ballfg.factors.covariance import Covariances, marginal_covariances
 from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum
+from ballfg.factors.kind import FactorKind, Values
+from ballfg.factors.prior import PriorFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ
 from ballfg.tracks import Track
 
@@ -52,6 +55,25 @@ class Solution:
     events: Events
     graph: BallGraph
     minimum: Minimum
+
+
+@dataclass(frozen=True)
+class Earlier:
+    """What the samples of a window owe to those that left it.
+
+    Attributes:
+        start: values to start the minimisation from.
+        summaries: factors that stand for what left; they replace priors on the same variables.
+    """
+
+    start: Values
+    summaries: Sequence[FactorKind]
+
+    def join(self, graph: BallGraph) -> BallGraph:
+        """The window's graph with the summaries in it."""
+        known = {int(v) for summary in self.summaries for v in summary.variables[0]}
+        kept = [k for k in graph.kinds if not (isinstance(k, PriorFactors) and int(k.variables[0, 0]) in known)]
+        return BallGraph((*kept, *self.summaries))
 
 
 class Smoother(Estimator):
@@ -84,7 +106,7 @@ class Smoother(Estimator):
         segmentation = self.segment(track)
         sigma = effective_sigmas(track, segmentation, self.settings)
         solution = self.solve(track, segmentation, sigma)
-        return self._result(track, sigma, solution)
+        return self.result(track, sigma, solution)
 
     def segment(self, track: Track) -> Segmentation:
         """The events in a track."""
@@ -95,25 +117,36 @@ class Smoother(Estimator):
         none = np.zeros(0, dtype=np.int64)
         return replace(found, hits=none, restarts=none, quality=np.zeros_like(found.quality))
 
-    def solve(self, track: Track, segmentation: Segmentation, sigma: Array) -> Solution:
-        """Minimise; where the motion still breaks the model by far more than its noise, a hit went unseen: mark it."""
-        solution = self._settle(track, segmentation, sigma)
+    def solve(self, track: Track, segmentation: Segmentation, sigma: Array, earlier: Earlier | None = None) -> Solution:
+        """Minimise; where the motion still breaks the model by far more than its noise, a hit went unseen: mark it.
+
+        Args:
+            track: stamps and positions.
+            segmentation: the events to start from.
+            sigma: (n, 3) m, of the positions.
+            earlier: what came before, where the track is the end of a longer one.
+        """
+        solution = self._settle(track, segmentation, sigma, earlier)
         for _ in range(MAX_UNSEEN_HITS if self.settings.find_events else 0):
             interval = _worst_break(solution)
             if interval is None:
                 break
             segmentation = replace(segmentation, hits=np.union1d(segmentation.hits, [interval]))
-            solution = self._settle(track, segmentation, sigma)
+            solution = self._settle(track, segmentation, sigma, earlier)
         return solution
 
-    def _settle(self, track: Track, segmentation: Segmentation, sigma: Array) -> Solution:
+    def _settle(self, track: Track, segmentation: Segmentation, sigma: Array, earlier: Earlier | None) -> Solution:
         """Minimise, move contacts to where the estimate says they are, and minimise again until they stay."""
         events = Events(segmentation.contacts, segmentation)
-        states = initial_states(track, events.contacts, segmentation, self.model)
-        values = initial_values(states, self.trackwise, self.settings)
+        if earlier is None:
+            states = initial_states(track, events.contacts, segmentation, self.model)
+            values = initial_values(states, self.trackwise, self.settings)
+        else:
+            values = earlier.start
         seen: dict[tuple[tuple[int, float], ...], Solution] = {}
         for _ in range(MAX_REFINEMENTS):
             graph = build_graph(track, self.trackwise, events, sigma, self.settings)
+            graph = graph if earlier is None else earlier.join(graph)
             solution = Solution(events, graph, self.optimizer.minimize(graph, values))
             seen[_places(events.contacts)] = solution
             refined = _refined(track.times, solution)
@@ -130,7 +163,8 @@ class Smoother(Estimator):
             events = Events(refined, segmentation)
         return min(seen.values(), key=lambda s: s.minimum.error)
 
-    def _result(self, track: Track, sigma: Array, solution: Solution) -> Estimate:
+    def result(self, track: Track, sigma: Array, solution: Solution) -> Estimate:
+        """What a solution says about the track."""
         minimum, segmentation = solution.minimum, solution.events.segmentation
         n, p = len(track), len(minimum.values.coefficients)
         states, contacts = minimum.values.states, _timed(track.times, solution)

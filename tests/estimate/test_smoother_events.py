@@ -315,7 +315,7 @@ def test_an_impossible_contact_is_a_status_not_an_exception(settings) -> None:
     smoother = Smoother(MODEL, TABLE, settings)
     found = replace(smoother.segment(track), contacts=(Contact(8, 0.085, -60.0),))
     sigma = effective_sigmas(track, found, settings)
-    estimate = smoother._result(track, sigma, smoother._settle(track, found, sigma))
+    estimate = smoother.result(track, sigma, smoother._settle(track, found, sigma, None))
     assert estimate.status is Status.FAILED
     assert "table height" in estimate.status.value
     assert np.isfinite(estimate.covariances).all()
