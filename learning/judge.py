@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from typing import TypeVar
 
-import joblib
 import numpy as np
-import torch
 from pydantic import BaseModel, ConfigDict
 from scipy.stats import norm
 
 from ballfg.estimate import Estimator, Status
-from ballfg.estimate.batch import FEW_TRACKS
+from ballfg.estimate.batch import map_tracks
 from ballfg.predict import predict_tracks
 from ballfg.tracks import Track
 
@@ -77,15 +76,11 @@ def judge_tracks(
 
     Returns: None for a track that cannot be judged: nothing left to predict, an estimate that failed.
     """
-    if jobs == 1 or count < FEW_TRACKS:
-        yield from (judge_track(estimator, track, observe, horizon) for track in tracks)
-        return
-    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator", pre_dispatch="4*n_jobs", batch_size=4)
-    yield from parallel(joblib.delayed(_judge)(estimator, track, observe, horizon) for track in tracks)
+    score = partial(_judge, estimator, observe, horizon)
+    return map_tracks(score, tracks, count, jobs)
 
 
-def _judge(estimator: Estimator, track: Track, observe: float, horizon: float) -> TrackScore | None:
-    torch.set_num_threads(1)  # the processes share the cores already
+def _judge(estimator: Estimator, observe: float, horizon: float, track: Track) -> TrackScore | None:
     return judge_track(estimator, track, observe, horizon)
 
 
