@@ -17,7 +17,7 @@ bench: $(READY)  ## the estimator comparison: table, results/results.json, pictu
 	else echo "no measured tracks at $(DATA)/$$set: skipped"; fi; done
 
 test: $(READY)  ## all tests that need no more than ten minutes on two cores
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: $(READY)  ## format, lint, types (of the installed package: its folders lie apart in the source tree)
 	$(BIN)/ruff format --check $(SOURCES)

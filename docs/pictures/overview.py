@@ -20,6 +20,7 @@ NINETY = 1.645  # standard deviations on either side that hold 90 %
 
 
 def main() -> None:
+    """One simulated shot: samples, the smoother's track, a prediction and how far it can be trusted."""
     torch.set_num_threads(1)
     noise = MeasurementNoise(position=0.004, outliers=0.04, outlier_size=0.06)
     config = SimulationConfig(

@@ -34,7 +34,8 @@ def test_settings_give_the_spin_of_the_simulated_launcher() -> None:
 def test_measured_labels_win_and_missing_settings_change_nothing() -> None:
     track = Track("a", np.arange(5) * 0.01, np.arange(15.0).reshape(5, 3) * 0.05)
     assert LauncherSpin(50.0, 40.0).label(track) is track
-    measured = Track("a", track.times, track.positions, labels={"spin_x": 1.0, "spin_y": 2.0, "spin_z": 3.0, "topspin": 1.0})
+    labels = {"spin_x": 1.0, "spin_y": 2.0, "spin_z": 3.0, "topspin": 1.0}
+    measured = Track("a", track.times, track.positions, labels=labels)
     assert LauncherSpin(50.0, 40.0).label(measured) is measured
 
 
