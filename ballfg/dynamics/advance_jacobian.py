@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -10,7 +11,7 @@ from torch import Tensor
 from ballfg.dynamics.contact import contact_time, fly_through_jacobian
 from ballfg.dynamics.integrate import batch_jacobian, fly_jacobian, step_count
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.rollout import MAX_CONTACTS, REST_SPEED, next_surface, place_on, roll, stays
+from ballfg.dynamics.rollout import MAX_CONTACTS, REST_SPEED, advance, next_surface, roll, stays
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import VZ
 
@@ -22,7 +23,7 @@ class Motion:
     Attributes:
         after: (1, d) the state at the end.
         jacobian: (d, d) its derivative by the state at the start, at fixed duration.
-        contacts: time since the start, s, and the surface's height, m, of each contact.
+        contacts: time since the start, s, and the surface's height, m, of each bounce; landing for good is none.
     """
 
     after: Tensor
@@ -43,22 +44,35 @@ def advance_jacobian(model: BallModel, state: Tensor, dt: float, surfaces: Surfa
     return Motion(state, jacobian, tuple(contacts))
 
 
-def _advance_step(model: BallModel, state: Tensor, h: float, surfaces: Surfaces) -> Motion:
+def _advance_step(model: BallModel, start: Tensor, h: float, surfaces: Surfaces) -> Motion:
     """One step of at most `integrate.MAX_STEP`, cut at its contacts, by the rules of `rollout`."""
-    height = surfaces.level_below(state)
-    jacobian: Tensor | None = None
+    state, height = start, surfaces.level_below(start)
+    if _stays(model, state, height, surfaces):
+        after, jacobian = batch_jacobian(partial(_rolled, model, h, height), state)
+        return Motion(after, jacobian[0], ())
+    so_far = torch.eye(state.shape[-1], dtype=state.dtype)
     contacts: list[tuple[float, float]] = []
-    elapsed, resting = 0.0, _stays(model, state, height, surfaces)
+    elapsed, flying = 0.0, torch.ones(1, dtype=torch.bool)
     while True:
-        after, step = (_rolled if resting else _flown)(model, state, h - elapsed, height)
-        height, landing = next_surface(model, state, after, height, torch.tensor([not resting]), surfaces)
+        after, jacobian = fly_jacobian(model, state, state.new_tensor([h - elapsed]))
+        height, landing = next_surface(model, state, after, height, flying, surfaces)
         if not bool(landing):
-            return Motion(after, step if jacobian is None else step @ jacobian, tuple(contacts))
-        state, step, tau = _bounced(model, state, height)
-        jacobian = step if jacobian is None else step @ jacobian
-        elapsed += tau
+            return Motion(after, jacobian[0] @ so_far, tuple(contacts))
+        tau = contact_time(model, state, height)
+        state, _, jacobian = fly_through_jacobian(model, state, tau, (height,))
+        rises = float(state[0, VZ]) >= REST_SPEED  # not so after a contact that never comes: NaN
+        if not rises or len(contacts) + 1 == MAX_CONTACTS:
+            after, jacobian = batch_jacobian(partial(_advanced, model, h, surfaces), start)
+            return Motion(after, jacobian[0], tuple(contacts))
+        so_far = jacobian[0] @ so_far
+        elapsed += float(tau)
         contacts.append((elapsed, float(height)))
-        resting = float(state[0, VZ]) < REST_SPEED or len(contacts) == MAX_CONTACTS
+
+
+def _advanced(model: BallModel, h: float, surfaces: Surfaces, state: Tensor) -> Tensor:
+    """`advance` on a batch with further leading dimensions: coming to rest is rare enough for plain autograd."""
+    flat = state.reshape(-1, state.shape[-1])
+    return advance(model, flat, torch.full_like(flat[:, 0], h), surfaces).reshape(state.shape)
 
 
 def _stays(model: BallModel, state: Tensor, height: Tensor, surfaces: Surfaces) -> bool:
@@ -66,27 +80,5 @@ def _stays(model: BallModel, state: Tensor, height: Tensor, surfaces: Surfaces) 
     return abs(float(state[0, VZ])) <= REST_SPEED and bool(stays(model, state, height, surfaces))
 
 
-def _flown(model: BallModel, state: Tensor, dt: float, height: Tensor) -> tuple[Tensor, Tensor]:
-    after, jacobian = fly_jacobian(model, state, state.new_tensor([dt]))
-    return after, jacobian[0]
-
-
-def _rolled(model: BallModel, state: Tensor, dt: float, height: Tensor) -> tuple[Tensor, Tensor]:
-    def motion(x: Tensor) -> Tensor:
-        return roll(model, x, x.new_tensor([dt]), height)
-
-    after, jacobian = batch_jacobian(motion, state)
-    return after, jacobian[0]
-
-
-def _bounced(model: BallModel, state: Tensor, height: Tensor) -> tuple[Tensor, Tensor, float]:
-    """State just after the next contact, Jacobian at that fixed time, the time since the start, s.
-
-    A ball below the surface that never comes up again (its contact time is NaN) is there already, with no speed left.
-    """
-    tau = contact_time(model, state, height)
-    if bool(tau.isnan()):
-        after, impact = batch_jacobian(model.bounce, state)
-        return place_on(model, after, height), impact[0], 0.0
-    after, _, jacobian = fly_through_jacobian(model, state, tau, (height,))
-    return after, jacobian[0], float(tau)
+def _rolled(model: BallModel, h: float, height: Tensor, state: Tensor) -> Tensor:
+    return roll(model, state, state.new_tensor([h]), height)

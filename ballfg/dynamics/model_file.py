@@ -33,7 +33,7 @@ class _UniqueKeyLoader(yaml.SafeLoader):
 
 def nominal_model(radius: float = 0.02) -> AnalyticModel:
     """The table-tennis model that ships with the package."""
-    text = resources.files("ballfg").joinpath("models/nominal.yaml").read_text(encoding="utf-8")
+    text = resources.files("ballfg.dynamics").joinpath("nominal.yaml").read_text(encoding="utf-8")
     return model_from_dict(yaml.safe_load(text), radius=radius, where="nominal.yaml")
 
 

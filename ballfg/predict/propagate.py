@@ -6,18 +6,16 @@ The mean is the rollout of the mean. The covariance goes through the derivative 
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.contact import fly_through_jacobian
-from ballfg.dynamics.integrate import batch_jacobian, fly_jacobian, step_count
+from ballfg.dynamics.advance_jacobian import advance_jacobian
+from ballfg.dynamics.integrate import fly_jacobian, step_count
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.rollout import advance, is_resting
+from ballfg.dynamics.rollout import is_resting
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
 from ballfg.predict.belief import Belief
@@ -108,35 +106,20 @@ class Propagator:
             touching = is_resting(model, mean, level) | ((model.gap(after, level) < 0) & (after[:, VZ] < 0))
         rows = touching.nonzero()[:, 0]
         if len(rows):
-            after[rows], jacobian[rows], noise[rows] = self._touch(model, mean[rows], h[rows], level[rows])
+            after[rows], jacobian[rows], noise[rows] = self._touch(model, mean[rows], h[rows])
         return _moved(belief, h, after, jacobian, noise)
 
-    def _touch(self, model: BallModel, mean: Tensor, h: Tensor, level: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean, Jacobian and noise of balls that reach a surface's level, or rest, within a step.
-
-        `advance` says what happens. Bounces have their Jacobian composed, with the time of each; what is left
-        (rest, coming to rest, rolling over an edge) goes through autograd and has no impact.
-        """
-        with torch.no_grad():
-            expected = advance(model, mean, h, self.surfaces)
-            bouncing = ~is_resting(model, mean, level)
-        after, jacobian = expected.clone(), mean.new_empty((*mean.shape, mean.shape[-1]))
+    def _touch(self, model: BallModel, mean: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Mean, Jacobian and noise of balls that reach a surface's level, or rest, within a step."""
+        after, jacobian = torch.empty_like(mean), mean.new_empty((*mean.shape, mean.shape[-1]))
         noise = torch.from_numpy(self.noise.flight(h.numpy()))
-        left = torch.ones_like(bouncing)
-        for heights in self._contacts(level):
-            rows = (left & bouncing).nonzero()[:, 0]
-            if not len(rows):
-                break
-            state, times, by_mean = fly_through_jacobian(model, mean[rows], h[rows], tuple(z[rows] for z in heights))
-            same = (state - expected[rows]).abs().amax(-1) < SAME
-            rows, times = rows[same], times[same]
-            jacobian[rows] = by_mean[same]
-            left[rows] = False
-            if len(rows) and heights:
-                noise[rows] = self._bounce_noise(model, mean[rows], h[rows], times, jacobian[rows])
-        rows = left.nonzero()[:, 0]
-        if len(rows):
-            _, jacobian[rows] = batch_jacobian(partial(_advanced, model, h[rows], self.surfaces), mean[rows])
+        for i in range(len(mean)):
+            row = slice(i, i + 1)
+            motion = advance_jacobian(model, mean[row], float(h[i]), self.surfaces)
+            after[row], jacobian[i] = motion.after, motion.jacobian
+            if motion.contacts:
+                times = mean.new_tensor([[time for time, _ in motion.contacts]])
+                noise[row] = self._bounce_noise(model, mean[row], h[row], times, jacobian[row])
         return after, jacobian, noise
 
     def _bounce_noise(self, model: BallModel, mean: Tensor, h: Tensor, times: Tensor, jacobian: Tensor) -> Tensor:
@@ -153,21 +136,9 @@ class Propagator:
             noise += torch.from_numpy(self.noise.contact(h.numpy(), time.numpy()))
         return noise
 
-    def _contacts(self, level: Tensor) -> tuple[tuple[Tensor, ...], ...]:
-        """What may happen to a ball that reaches `level` (n,) m: none beside the table, a bounce, two, the floor."""
-        lowest = self.surfaces.lowest()
-        floor = ((torch.full_like(level, lowest),),) if math.isfinite(lowest) else ()
-        return (), (level,), (level, level), *floor
-
 
 def _moved(belief: Belief, h: Tensor, after: Tensor, jacobian: Tensor, noise: Tensor) -> Belief:
     covariance = jacobian @ belief.covariance @ jacobian.transpose(-1, -2)
     covariance[:, :STATE_DIM, :STATE_DIM] += noise
     covariance = (covariance + covariance.transpose(-1, -2)) / 2  # rounding would add up
     return replace(belief, time=belief.time + h, mean=after, covariance=covariance)
-
-
-def _advanced(model: BallModel, h: Tensor, surfaces: Surfaces, mean: Tensor) -> Tensor:
-    """`advance` on a batch with further leading dimensions, for `batch_jacobian`."""
-    flat = mean.reshape(-1, mean.shape[-1])
-    return advance(model, flat, h.expand(mean.shape[:-1]).reshape(-1), surfaces).reshape(mean.shape)
