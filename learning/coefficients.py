@@ -5,13 +5,12 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ballfg.dynamics import AnalyticModel, Coefficient, Effect
+from ballfg.dynamics import AnalyticModel
 from ballfg.tracks.hints import did_you_mean
 
 Array = NDArray[np.float64]
@@ -45,22 +44,12 @@ class Chosen:
         return any(name in NEED_SPIN_LABELS for name in self.names)
 
 
-def declared(model: AnalyticModel) -> dict[str, Coefficient]:
-    """All coefficients of a model by parameter name."""
-    return {
-        f"{section}.{name}.{c.name}": c
-        for section, group in (("flight", model.flight), ("contact", model.contact))
-        for name, effect in group.items()
-        for c in cast(Effect, effect).coefficients
-    }
-
-
 def choose(model: AnalyticModel, names: Sequence[str]) -> Chosen:
     """The coefficients of some names.
 
     Raises: ValueError: a name that the model does not have, that stands twice, or whose value is as good as known.
     """
-    known = declared(model)
+    known = model.declared_coefficients()
     for name in names:
         if name not in known:
             hint = did_you_mean(name, known) or f" It has: {', '.join(known) or 'none'}."

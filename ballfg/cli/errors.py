@@ -12,8 +12,8 @@ BAD_INPUT = 2
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells have it."""
 
-USER_ERRORS = (ValueError, TypeError, FileNotFoundError, FileExistsError, NotADirectoryError, PermissionError)
-"""What a user can mend. Anything else is a fault of the program and keeps its traceback."""
+USER_ERRORS = (ValueError, TypeError, OSError)
+"""What a user can mend: input, paths, a full disk. Anything else is a fault of the program and keeps its traceback."""
 
 
 def guarded(command: Callable[[], object]) -> int:
@@ -31,7 +31,7 @@ def guarded(command: Callable[[], object]) -> int:
     except USER_ERRORS as error:
         if type(error).__name__ == "LinAlgError":  # numpy makes it a ValueError, but no user can mend it
             raise
-        return _bad_input(str(error))
+        return _bad_input(_in_words(error))
     except Exception as error:
         # errors in the use of a command: typer's own base class has moved between versions, their method has not
         message = getattr(error, "format_message", None)
@@ -41,6 +41,13 @@ def guarded(command: Callable[[], object]) -> int:
     if result == INTERRUPTED:
         return _interrupted()
     return result if isinstance(result, int) else 0
+
+
+def _in_words(error: Exception) -> str:
+    if not isinstance(error, OSError) or error.errno is None:
+        return str(error)
+    where = "a file could not be read or written" if error.filename is None else str(error.filename)
+    return f"{where}: {error.strerror}. Check the path, its permissions and the space on the disk."
 
 
 def _bad_input(message: str, context: typer.Context | None = None) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -12,54 +13,36 @@ from ballfg.cli.progress import progress
 if TYPE_CHECKING:
     from ballfg.simulate import BallKind
 
-_NOISE, _BALL, _FILES = "Noise", "Ball and launcher", "Files"
+_noise, _ball_option, _files = (
+    partial(typer.Option, rich_help_panel=panel) for panel in ("Noise", "Ball and launcher", "Files")
+)
 
 
 def simulate(
-    out: Annotated[Path, typer.Option(help="Folder of the dataset: new or empty.", rich_help_panel=_FILES)],
+    out: Annotated[Path, _files(help="Folder of the dataset: new or empty.")],
     tracks: Annotated[int, typer.Option(help="Number of tracks.")] = 717,
     seed: Annotated[int, typer.Option(help="Seed: the same one gives the same files, to the byte.")] = 0,
     rate: Annotated[float, typer.Option(help="Frames per second, Hz.")] = 100.0,
-    noise: Annotated[float, typer.Option(help="Position noise, m.", rich_help_panel=_NOISE)] = 0.003,
-    dropout: Annotated[float, typer.Option(help="Probability of a dropped frame.", rich_help_panel=_NOISE)] = 0.0,
-    jitter: Annotated[float, typer.Option(help="Jitter of the stamps, s.", rich_help_panel=_NOISE)] = 0.0,
-    outliers: Annotated[float, typer.Option(help="Probability of an outlier.", rich_help_panel=_NOISE)] = 0.0,
-    outlier_size: Annotated[
-        float, typer.Option(help="Typical distance of an outlier, m.", rich_help_panel=_NOISE)
-    ] = 0.1,
-    spin_noise: Annotated[float, typer.Option(help="Noise of the spin labels, rad/s.", rich_help_panel=_NOISE)] = 4.0,
-    spin_labels: Annotated[
-        bool, typer.Option(help="Write spin labels; the launcher's settings always are.", rich_help_panel=_NOISE)
-    ] = True,
-    process_noise: Annotated[
-        float, typer.Option(help="White acceleration in flight, m/s^1.5.", rich_help_panel=_NOISE)
-    ] = 0.0,
-    spin_process_noise: Annotated[
-        float, typer.Option(help="White angular acceleration in flight, rad/s^1.5.", rich_help_panel=_NOISE)
-    ] = 0.0,
-    contact_noise: Annotated[
-        float, typer.Option(help="Kick to the velocity after a bounce, m/s.", rich_help_panel=_NOISE)
-    ] = 0.0,
-    contact_spin_noise: Annotated[
-        float, typer.Option(help="Kick to the spin after a bounce, rad/s.", rich_help_panel=_NOISE)
-    ] = 0.0,
-    ball: Annotated[
-        str, typer.Option(help="table-tennis, tennis or a ball file (YAML).", rich_help_panel=_BALL)
-    ] = "table-tennis",
-    model: Annotated[
-        Path | None, typer.Option(help="Model file; by default the ball's own model.", rich_help_panel=_BALL)
-    ] = None,
-    settings: Annotated[
-        str, typer.Option(help="Launcher levels, as topspin=-3,sidespin=-5..5,speed=9.", rich_help_panel=_BALL)
-    ] = "",
+    noise: Annotated[float, _noise(help="Position noise, m.")] = 0.003,
+    dropout: Annotated[float, _noise(help="Probability of a dropped frame.")] = 0.0,
+    jitter: Annotated[float, _noise(help="Jitter of the stamps, s.")] = 0.0,
+    outliers: Annotated[float, _noise(help="Probability of an outlier.")] = 0.0,
+    outlier_size: Annotated[float, _noise(help="Typical distance of an outlier, m.")] = 0.1,
+    spin_noise: Annotated[float, _noise(help="Noise of the spin labels, rad/s.")] = 4.0,
+    spin_labels: Annotated[bool, _noise(help="Write spin labels; the launcher's settings always are.")] = True,
+    process_noise: Annotated[float, _noise(help="White acceleration in flight, m/s^1.5.")] = 0.0,
+    spin_process_noise: Annotated[float, _noise(help="White angular acceleration in flight, rad/s^1.5.")] = 0.0,
+    contact_noise: Annotated[float, _noise(help="Kick to the velocity after a bounce, m/s.")] = 0.0,
+    contact_spin_noise: Annotated[float, _noise(help="Kick to the spin after a bounce, rad/s.")] = 0.0,
+    ball: Annotated[str, _ball_option(help="table-tennis, tennis or a ball file (YAML).")] = "table-tennis",
+    model: Annotated[Path | None, _ball_option(help="Model file; by default the ball's own model.")] = None,
+    settings: Annotated[str, _ball_option(help="Launcher levels, as topspin=-3,sidespin=-5..5,speed=9.")] = "",
     effect: Annotated[
         list[str] | None,
-        typer.Option(help="An effect that nobody declares, as wind.x=0.3; may be repeated.", rich_help_panel=_BALL),
+        _ball_option(help="An effect that nobody declares, as wind.x=0.3; may be repeated."),
     ] = None,
-    format: Annotated[str, typer.Option(help="csv or parquet.", rich_help_panel=_FILES)] = "csv",
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace a simulated dataset.", rich_help_panel=_FILES)
-    ] = False,
+    format: Annotated[str, _files(help="csv or parquet.")] = "csv",
+    force: Annotated[bool, _files("--force", help="Replace a simulated dataset.")] = False,
 ) -> None:
     """Write synthetic tracks of a ball launcher as a dataset, with the truth beside them.
 

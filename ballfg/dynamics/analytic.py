@@ -8,7 +8,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from ballfg.dynamics.effect import BounceEffect, Effect, Flight, FlightEffect, Impact
+from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact
 from ballfg.dynamics.impact import apply_impulse
 from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
 from ballfg.state import POSITION, SPIN, VELOCITY
@@ -35,6 +35,15 @@ class AnalyticModel(BallModel):
             if effect.name in group:
                 raise ValueError(f"effects must differ; '{effect.name}' was given twice. Remove one.")
             group[effect.name] = effect
+
+    def declared_coefficients(self) -> dict[str, Coefficient]:
+        """The coefficients of all effects, for instance under `flight.drag.k`."""
+        return {
+            f"{section}.{name}.{c.name}": c
+            for section, group in (("flight", self.flight), ("contact", self.contact))
+            for name, effect in group.items()
+            for c in cast(Effect, effect).coefficients
+        }
 
     def rates(self, state: Tensor) -> Rates:
         """Acceleration and angular acceleration in free flight."""
@@ -81,15 +90,7 @@ class AnalyticModel(BallModel):
 def coefficient_sigmas(model: BallModel) -> dict[str, float]:
     """Prior standard deviations of the coefficients that are estimated with each track, by parameter name.
 
-    Args: model: an `AnalyticModel`; another model declares no spread and gives an empty mapping.
+    Args: model: one that declares nothing of its parameters gives an empty mapping.
     Returns: for instance {"flight.drag.k": 0.035}; coefficients that do not vary are left out.
     """
-    if not isinstance(model, AnalyticModel):
-        return {}
-    sigmas = {}
-    for section, group in (("flight", model.flight), ("contact", model.contact)):
-        for name, module in group.items():
-            for c in cast(Effect, module).coefficients:
-                if c.varies:
-                    sigmas[f"{section}.{name}.{c.name}"] = c.sigma
-    return sigmas
+    return {name: c.sigma for name, c in model.declared_coefficients().items() if c.varies}

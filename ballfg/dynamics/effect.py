@@ -35,8 +35,20 @@ class Coefficient:
     """Differs from ball to ball or day to day by more than one track needs to tell: estimated with each track."""
 
 
-TINY_SPEED = 1e-12
-"""m/s. Below it the speed is constant to autograd."""
+TINY_LENGTH = 1e-12
+"""In the vector's own unit. Below it a length is constant to autograd."""
+
+
+def length(vector: Tensor) -> Tensor:
+    """(..., 1) lengths of vectors (..., 3), twice differentiable at zero; the gradient there is zero."""
+    if torch.is_grad_enabled():  # the norm's own second derivative is NaN at zero
+        return vector.square().sum(-1, keepdim=True).clamp_min(TINY_LENGTH**2).sqrt()
+    return torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
+
+
+def vector(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+    """(3,) or (..., 3) vectors from three coefficients, each of shape () or (..., 1)."""
+    return torch.cat(torch.broadcast_tensors(*(c if c.dim() else c.unsqueeze(-1) for c in (x, y, z))), dim=-1)
 
 
 class Flight:
@@ -59,11 +71,7 @@ class Flight:
     def speed(self) -> Tensor:
         """(..., 1) m/s."""
         if self._speed is None:
-            if torch.is_grad_enabled():  # the norm's own second derivative is NaN at rest
-                square = self.velocity.square().sum(-1, keepdim=True)
-                self._speed = square.clamp_min(TINY_SPEED**2).sqrt()
-            else:
-                self._speed = torch.linalg.vector_norm(self.velocity, dim=-1, keepdim=True)
+            self._speed = length(self.velocity)
         return self._speed
 
 

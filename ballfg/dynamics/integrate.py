@@ -2,7 +2,7 @@
 
 The Jacobian is that of the discrete step, not of the differential equation: torch autograd gives the derivative of the
 model's rates at the four stages in one batch, and the chain rule through the stages does the rest. It costs
-about half of what autograd through the whole step costs (docs/benchmarks.md).
+about half of what autograd through the whole step costs.
 """
 
 from __future__ import annotations
@@ -68,7 +68,12 @@ def step_count(dt: Tensor) -> int:
         longest = float(dt.detach().abs().nan_to_num(nan=0.0, posinf=math.inf).max())
     if math.isinf(longest):
         raise ValueError("dt must be finite; got inf. Check the times.")
-    return max(1, math.ceil(longest / MAX_STEP - 1e-9))
+    return steps_over(longest)
+
+
+def steps_over(duration: float) -> int:
+    """Number of equal steps, each at most `MAX_STEP` to rounding, that a duration (s) needs; at least one."""
+    return max(1, math.ceil(duration / MAX_STEP - 1e-9))
 
 
 def fly(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:

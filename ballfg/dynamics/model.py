@@ -10,6 +10,7 @@ from typing import Final, TypeVar
 import torch
 from torch import Tensor, nn
 
+from ballfg.dynamics.effect import Coefficient
 from ballfg.dynamics.impact import slip_velocity
 from ballfg.state import SPIN, STANDARD_GRAVITY, VELOCITY, Z
 
@@ -54,6 +55,13 @@ class BallModel(nn.Module, ABC):
     def parameter_count(self) -> int:
         """Number of the model's parameters."""
         return sum(p.numel() for p in self.parameters())
+
+    def declared_coefficients(self) -> dict[str, Coefficient]:
+        """What is declared of the model's scalar parameters - unit, bounds, prior - by name as in `named_parameters()`.
+
+        Parameters without a declaration (a network's weights) are not in it; by default none is.
+        """
+        return {}
 
     @abstractmethod
     def rates(self, state: Tensor) -> Rates:

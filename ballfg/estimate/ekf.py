@@ -21,8 +21,8 @@ from ballfg.estimate.problem import coefficient_means, trackwise_model
 from ballfg.estimate.result import Array, Estimate, Status, leave_one_out
 from ballfg.estimate.rts import FilterRecord, fly_back, rts_smooth
 from ballfg.estimate.segmentation import Contact, Quality
-from ballfg.estimate.settings import Settings, sample_sigmas
-from ballfg.estimate.sliding_window import WINDOW, SlidingWindow, first_pair, spin_start
+from ballfg.estimate.settings import Settings, sample_sigmas, spin_start
+from ballfg.estimate.sliding_window import WINDOW, SlidingWindow, first_pair
 from ballfg.state import POSITION, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
 from ballfg.tracks import Track
 
@@ -193,7 +193,7 @@ class _Run:
 
     def prior(self, i: int) -> tuple[Array, Array]:
         """What is known at sample i from it alone: mean (d,) and covariance (d, d)."""
-        spin, spin_sigma = spin_start(self.track, self.settings)
+        spin, spin_sigma = spin_start(self.track.spin_label, self.settings)
         mean = np.concatenate((self.track.positions[i], np.zeros(3), spin, self.means))
         sigma = (
             self.sigma[i],

@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.integrate import MAX_STEP
+from ballfg.dynamics.integrate import steps_over
 from ballfg.dynamics.model import BallModel
 from ballfg.estimate.segmentation import Segmentation
 from ballfg.factors.bridge import Bridge, checked
@@ -79,7 +79,7 @@ class Interval:
         self.index = int(kind.variables[0, 0])
         self.bridge = Bridge(kind, on_miss="row")
         self.slot: int | None = None
-        steps = 1 if motion.heights else math.ceil(float(kind.dt[0]) / MAX_STEP - 1e-9)
+        steps = 1 if motion.heights else steps_over(float(kind.dt[0]))
         self.group = (type(kind), len(motion.heights), steps)
 
 

@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.integrate import MAX_STEP
+from ballfg.dynamics.integrate import steps_over
 from ballfg.dynamics.model import BallModel
 from ballfg.estimate.segmentation import Contact, Quality, Segmentation
-from ballfg.estimate.settings import Settings, sample_sigmas
+from ballfg.estimate.settings import Settings, sample_sigmas, spin_start
 from ballfg.factors.dynamics import ContactFactors, FlightFactors, RestFactors
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.kind import FactorKind, Values
@@ -101,7 +101,7 @@ def _dynamics(times: Array, model: BallModel, events: Events, settings: Settings
         elif np.isfinite(resting[i]):
             groups["rest", 0].append(i)
         else:
-            groups["flight", int(np.ceil(dt[i] / MAX_STEP - 1e-9))].append(i)
+            groups["flight", steps_over(float(dt[i]))].append(i)
     kinds: list[FactorKind] = []
     for (motion, _), members in groups.items():
         rows = np.array(members)
@@ -165,10 +165,8 @@ def start_priors(state: int, position: Array, label: Array | None, settings: Set
     mean, sigma = np.zeros(STATE_DIM), np.empty(STATE_DIM)
     mean[POSITION] = position
     sigma[POSITION], sigma[VELOCITY], sigma[SPIN] = START_POSITION_SIGMA, settings.velocity_prior, UNINFORMATIVE_SPIN
-    spin = np.zeros(3) if label is None else label
-    spread, loss = (
-        (settings.spin_prior, settings.spin_loss) if label is None else (settings.spin_label_noise, settings.label_loss)
-    )
+    spin, spread = spin_start(label, settings)
+    loss = settings.spin_loss if label is None else settings.label_loss
     about = spin_prior(np.array([state]), spin[None], np.full((1, 3), spread), loss)
     return [state_prior(state, mean, sigma), about]
 

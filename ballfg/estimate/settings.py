@@ -77,6 +77,11 @@ def uncertain(model: BallModel, **changes: object) -> Settings:
     return Settings(coefficients=coefficient_sigmas(model), process=MEASURED, **changes)  # type: ignore[arg-type]
 
 
+def spin_start(label: NDArray[np.float64] | None, settings: Settings) -> tuple[NDArray[np.float64], float]:
+    """Mean (3,) and standard deviation per axis, rad/s, of the spin at a start: those of the label or the prior."""
+    return (np.zeros(3), settings.spin_prior) if label is None else (label, settings.spin_label_noise)
+
+
 def sample_sigmas(settings: Settings, count: int, own: NDArray[np.float64] | None) -> NDArray[np.float64]:
     """(n, 3) m, the caller's to change: a track's own sigmas where it has them, else the settings'."""
     return np.broadcast_to(np.array(settings.position_noise), (count, 3)).copy() if own is None else own.copy()

@@ -17,7 +17,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
 from ballfg.estimate.result import Array, Estimate, Status
-from ballfg.estimate.settings import Settings, sample_sigmas
+from ballfg.estimate.settings import sample_sigmas, spin_start
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
 from ballfg.tracks import Track
 
@@ -59,8 +59,7 @@ class SlidingWindow(Estimator):
         states = np.zeros((n, STATE_DIM))
         states[:, POSITION] = track.positions
         states[:, VELOCITY] = (track.positions - track.positions[first]) / span[:, None]
-        label = track.spin_label
-        states[:, SPIN] = 0.0 if label is None else label
+        states[:, SPIN], _ = spin_start(track.spin_label, self.settings)
         bounced = may_touch(track.times, track.positions, self.surfaces, self.model.radius)
         covariances = _measurement_covariance(sigma, first, span)
         covariances[:, SPIN, SPIN] = self._spin_covariance(track, bounced)
@@ -80,16 +79,10 @@ class SlidingWindow(Estimator):
 
     def _spin_covariance(self, track: Track, bounced: NDArray[np.bool_]) -> Array:
         """(n, 3, 3): prior or label, the random walk since, and an unknown change once the ball may have bounced."""
-        mean_sigma = spin_start(track, self.settings)[1]
-        variance = mean_sigma**2 + self.settings.process.spin**2 * (track.times - track.times[0])
+        _, start = spin_start(track.spin_label, self.settings)
+        variance = start**2 + self.settings.process.spin**2 * (track.times - track.times[0])
         variance = variance + self.settings.spin_prior**2 * np.logical_or.accumulate(bounced)
         return np.asarray(variance[:, None, None] * np.eye(3))
-
-
-def spin_start(track: Track, settings: Settings) -> tuple[Array, float]:
-    """Mean (3,) and standard deviation per axis, rad/s, of the spin at a track's first sample: label or prior."""
-    label = track.spin_label
-    return (np.zeros(3), settings.spin_prior) if label is None else (label, settings.spin_label_noise)
 
 
 def may_touch(times: Array, positions: Array, surfaces: Surfaces, radius: float) -> NDArray[np.bool_]:

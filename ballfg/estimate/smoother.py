@@ -112,10 +112,7 @@ class Smoother(Estimator):
         """The events in a track."""
         sigma = sample_sigmas(self.settings, len(track), track.sigmas)
         found = segment(track.times, track.positions, sigma, surfaces=self.surfaces, physics=self.physics)
-        if self.settings.find_events:
-            return found
-        none = np.zeros(0, dtype=np.int64)
-        return replace(found, hits=none, restarts=none, quality=np.zeros_like(found.quality))
+        return found if self.settings.find_events else found.only_contacts()
 
     def solve(self, track: Track, segmentation: Segmentation, sigma: Array, earlier: Earlier | None = None) -> Solution:
         """Minimise; where the motion still breaks the model by far more than its noise, a hit went unseen: mark it.

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 import torch
@@ -17,14 +16,6 @@ from ballfg.estimate.result import Estimate
 from ballfg.state import STATE_DIM
 
 Array = NDArray[np.float64]
-
-
-class _Bounded(Protocol):
-    """What names the range of its numbers, as an `Effect` does."""
-
-    name: str
-    low: float
-    high: float
 
 
 @dataclass(frozen=True)
@@ -115,11 +106,7 @@ def _held(mean: Array, covariance: Array, low: Array, high: Array) -> Array:
 
 def _bounds(model: BallModel, names: tuple[str, ...]) -> tuple[Array, Array]:
     """(p,) smallest and (p,) largest values that the effects of a model accept; infinite where none is declared."""
-    ranges = np.tile([-np.inf, np.inf], (len(names), 1))
-    for row, name in zip(ranges, names, strict=True):
-        owner, _, own = name.rpartition(".")
-        declared: Sequence[_Bounded] = getattr(model.get_submodule(owner), "coefficients", ())
-        for c in declared:
-            if c.name == own:
-                row[:] = c.low, c.high
-    return ranges[:, 0], ranges[:, 1]
+    declared = model.declared_coefficients()
+    low = [declared[name].low if name in declared else -np.inf for name in names]
+    high = [declared[name].high if name in declared else np.inf for name in names]
+    return np.array(low), np.array(high)

@@ -11,7 +11,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from ballfg.dynamics.contact import contact_time
@@ -22,6 +24,8 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.predict.belief import Belief
 from ballfg.predict.propagate import Propagator
 from ballfg.state import POSITION, STATE_DIM, VZ
+
+Array = NDArray[np.float64]
 
 EventFunction = Callable[[Tensor], Tensor]
 """(..., d) states to (..., 1) values; the event is where the value falls through zero."""
@@ -48,8 +52,8 @@ class Crossing:
 
     time: float
     time_sigma: float
-    state: Tensor
-    covariance: Tensor
+    state: Array
+    covariance: Array
 
 
 def apex(propagator: Propagator, belief: Belief, horizon: float = 3.0, *, after: float = -math.inf) -> Crossing | None:
@@ -87,7 +91,7 @@ def next_contact(
 def plane_crossing(
     propagator: Propagator,
     belief: Belief,
-    normal: Tensor,
+    normal: ArrayLike | Tensor,
     offset: float,
     horizon: float = 3.0,
     *,
@@ -102,15 +106,15 @@ def plane_crossing(
     Returns: None if the ball does not get there within the horizon. A ball that starts on the plane has crossed it.
     Raises: ValueError: for another normal or offset.
     """
-    normal = torch.as_tensor(normal, dtype=torch.float64)
-    if normal.shape != (3,) or not bool(normal.isfinite().all()) or not bool(normal.any()):
-        raise ValueError(f"normal must be three finite numbers, not all zero; got {normal.tolist()}")
+    direction = torch.as_tensor(normal, dtype=torch.float64)
+    if direction.shape != (3,) or not bool(direction.isfinite().all()) or not bool(direction.any()):
+        raise ValueError(f"normal must be three finite numbers, not all zero; got {direction.tolist()}")
     if not math.isfinite(offset):
         raise ValueError(f"offset must be finite; got {offset:g}")
-    length = float(normal.square().sum().sqrt())
+    length = float(direction.square().sum().sqrt())
 
     def distance(state: Tensor) -> Tensor:
-        return ((state[..., POSITION] * normal).sum(-1, keepdim=True) - offset) / length
+        return ((state[..., POSITION] * direction).sum(-1, keepdim=True) - offset) / length
 
     return next_crossing(propagator, belief, distance, horizon, after=after, either_way=True)
 
@@ -239,4 +243,5 @@ def _projected(there: Belief, event: EventFunction, rates: RateFunction) -> Cros
         time_sigma = math.sqrt(max(float(time_by_state @ covariance @ time_by_state.T), 0.0))
         covariance = projection @ covariance @ projection.T
         covariance = (covariance + covariance.T) / 2
-    return Crossing(float(there.time), time_sigma, mean[0, :STATE_DIM], covariance[:STATE_DIM, :STATE_DIM])
+    state = mean[0, :STATE_DIM].detach().numpy().copy()
+    return Crossing(float(there.time), time_sigma, state, covariance[:STATE_DIM, :STATE_DIM].detach().numpy().copy())

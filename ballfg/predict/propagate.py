@@ -9,7 +9,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from ballfg.dynamics.advance_jacobian import advance_jacobian
@@ -21,8 +23,7 @@ from ballfg.factors.noise import ProcessNoise
 from ballfg.predict.belief import Belief
 from ballfg.state import STATE_DIM, VZ
 
-SAME = 1e-6
-"""m, m/s, rad/s. Two ways to a state that agree to this had the same events."""
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,9 @@ class Prediction:
         covariances: (n, k, 9, 9) of the states; no measurement noise in it.
     """
 
-    times: Tensor
-    states: Tensor
-    covariances: Tensor
+    times: Array
+    states: Array
+    covariances: Array
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class Propagator:
     surfaces: Surfaces
     noise: ProcessNoise
 
-    def rollout(self, belief: Belief, times: Tensor) -> Prediction:
+    def rollout(self, belief: Belief, times: ArrayLike | Tensor) -> Prediction:
         """The states at given times.
 
         Args:
@@ -60,16 +61,17 @@ class Propagator:
             times: (n, k) s on each ball's clock, or (k,) for all; not decreasing, not before the belief.
         Raises: ValueError: if the shape is another, or a time lies before the one before it.
         """
-        if times.dim() == 1:
-            times = times.expand(len(belief), -1)
+        stamps = torch.as_tensor(times, dtype=torch.float64)
+        if stamps.dim() == 1:
+            stamps = stamps.expand(len(belief), -1)
         states, covariances = [], []
-        for later in self.walk(belief, times):
-            states.append(later.mean[:, :STATE_DIM])
-            covariances.append(later.covariance[:, :STATE_DIM, :STATE_DIM])
-        return Prediction(times, torch.stack(states, dim=1), torch.stack(covariances, dim=1))
+        for later in self.walk(belief, stamps):
+            states.append(later.mean[:, :STATE_DIM].detach().numpy())
+            covariances.append(later.covariance[:, :STATE_DIM, :STATE_DIM].detach().numpy())
+        return Prediction(stamps.numpy().copy(), np.stack(states, axis=1), np.stack(covariances, axis=1))
 
     def walk(self, belief: Belief, times: Tensor) -> Iterator[Belief]:
-        """The beliefs at given times, one after the other; arguments and errors as for `rollout`."""
+        """The beliefs at given times (n, k) s, one after the other; errors as for `rollout`."""
         if times.dim() != 2 or len(times) != len(belief) or times.shape[1] == 0:
             raise ValueError(f"times must have shape ({len(belief)}, k) with k >= 1; got {tuple(times.shape)}")
         steps = torch.diff(times, dim=-1, prepend=belief.time[:, None])

@@ -126,10 +126,12 @@ class TableWriter:
                 self._parquet.close()
         finally:
             self._parquet, self._pending = None, []
-            if self._file is not None:
-                self._file.close()
-            self._file = None
-            self._temporary.unlink(missing_ok=True)
+            file, self._file = self._file, None
+            try:
+                if file is not None:
+                    file.close()  # on a full disk this raises too
+            finally:
+                self._temporary.unlink(missing_ok=True)
 
 
 def _batch(columns: Mapping[str, ArrayLike]) -> pa.RecordBatch:

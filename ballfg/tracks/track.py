@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 SPIN_LABELS = ("spin_x", "spin_y", "spin_z")
-AXES = "xyz"
 
 Label = float | str
 FloatArray = NDArray[np.float64]

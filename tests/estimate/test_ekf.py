@@ -179,9 +179,10 @@ def test_rts_pass_is_the_dense_batch_solution(linear):
         ((0, 0, 0.0201, 1, 0.5, -0.15, 0, 60, 20), 0.06),
         ((0, 0, 0.02, 1, 0.5, 0.0, 0, 60, 20), 0.03),
         ((0, 0, 0.018, 5, 0.5, -2, 10, 60, 20), 0.01),
+        ((0, 0, 0.006, 1, 0.5, -0.1, 10, 60, 20), 0.01),
         ((0.99, 0, 0.04, 5, 0.5, -3.0, 0, 60, 20), 0.4),
     ],
-    ids=["flight", "contact", "gap", "into rest", "rolling", "below", "past the edge"],
+    ids=["flight", "contact", "gap", "into rest", "rolling", "below", "below for good", "past the edge"],
 )
 def test_motion_is_the_rollout_and_its_jacobian(start, dt):
     model = nominal_model()

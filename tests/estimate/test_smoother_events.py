@@ -189,8 +189,8 @@ def test_a_hit_that_the_segmentation_missed_is_marked(settings) -> None:
 
 @pytest.mark.parametrize(
     "bad",
-    [[0], [-1], [40], [10, 40, 41, 60], [0, 25, 50, 75]],
-    ids=["first", "last", "one", "four", "every-25th"],
+    [[0], [1], [2], [-1], [40], [10, 40, 41, 60], [0, 25, 50, 75]],
+    ids=["first", "second", "third", "last", "one", "four", "every-25th"],
 )
 @pytest.mark.parametrize("size", [0.05, 0.1])
 def test_outliers_are_set_aside(bad, size, settings) -> None:
@@ -214,6 +214,19 @@ def test_a_shifted_run_is_set_aside(settings) -> None:
     estimate = estimate_of(states, positions, settings)
     assert estimate.status is Status.OK
     assert set(range(55, 63)) <= set(np.flatnonzero(estimate.quality).tolist())
+    honest(estimate, states)
+
+
+def test_a_shifted_run_across_a_bounce_is_set_aside(settings) -> None:
+    states = truth_at(LATER)
+    positions, bounce = measured(states), bounces(states)[0]
+    run = slice(bounce - 3, bounce + 5)
+    positions[run] += (0.03, -0.02, 0.04)
+    estimate = estimate_of(states, positions, settings, LATER)
+    assert estimate.status is Status.OK
+    assert intervals(estimate) == bounces(states)
+    assert len(estimate.hits) == 0
+    assert set(range(80)[run]) <= set(np.flatnonzero(estimate.quality).tolist())
     honest(estimate, states)
 
 

@@ -197,6 +197,7 @@ def test_every_track_bounces(solved) -> None:
 def test_same_minimum(solved) -> None:
     """Required: 1e-6 m and 1e-5 m/s. Spin follows to 1e-3 rad/s, 2e-4 of its label's sigma."""
     off = np.array([np.abs(estimate.states - x).max(axis=0) for estimate, _, _, x, _ in solved])
+    print(f"{len(solved)} tracks: {off[:, :3].max():.1e} m, {off[:, 3:6].max():.1e} m/s, {off[:, 6:].max():.1e} rad/s")
     assert off[:, :3].max() < 1e-6
     assert off[:, 3:6].max() < 1e-5
     assert off[:, 6:].max() < 1e-3

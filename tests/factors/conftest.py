@@ -117,6 +117,7 @@ def check_jacobian(differences) -> Callable[[FactorKind, Values], float]:
             per_row, per_block = np.abs(expected).max(axis=2), np.abs(expected).max(axis=(1, 2))
             scale = np.maximum(per_row, 1e-4 * per_block[:, None])[..., None]
             worst = max(worst, float((np.abs(given - expected) / scale).max()))
+        print(f"{type(kind).__name__}: {worst:.1e}")  # shown by -s
         return worst
 
     return check

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, Effect, Flight, FlightEffect, model_from_dict, nominal_model
+from ballfg.dynamics.model import substitute
 from ballfg.simulate import UNDECLARED, MeasurementNoise, SimulatedTrack, SimulationConfig, parse_effects, simulate
 from ballfg.simulate.composition import true_model
 from ballfg.simulate.undeclared import MeasurementEffect
@@ -74,7 +75,8 @@ def test_measurement_effects_leave_the_truth_alone(name: str, plain: list[Simula
 def test_own_effects_do_nothing_at_their_defaults(name: str) -> None:
     effect = UNDECLARED[name]()
     if isinstance(effect, MeasurementEffect):
-        np.testing.assert_array_equal(effect.positions(STATE, lambda s, t: s * np.nan).detach(), STATE[:, :3])
+        with torch.no_grad():  # as in a simulation: where derivatives are wanted, the motion is asked at zero too
+            np.testing.assert_array_equal(effect.positions(STATE, lambda s, t: s * np.nan), STATE[:, :3])
     else:
         model = nominal_model()
         changed = true_model(model, [effect])
@@ -181,3 +183,50 @@ def test_an_effect_on_something_absent_is_refused() -> None:
 def test_bad_effect_texts(texts: list[str], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         parse_effects(texts)
+
+
+@pytest.mark.parametrize("name", ["wind", "gust_region", "drag_speed", "drag_spin", "magnus_saturation", "pull"])
+def test_derivatives_of_air_effects_are_finite_without_spin_and_at_rest(name: str) -> None:
+    model = true_model(nominal_model(), [UNDECLARED[name]()])
+    states = STATE.repeat(3, 1)
+    states[0, 6:] = 0.0
+    states[1, 3:6] = 0.0
+    states[2, 3:] = 0.0
+    states.requires_grad_()
+    acceleration, _ = model.rates(states)
+    inputs = (states, *(p for parameter, p in model.named_parameters() if f".{name}." in parameter))
+    first = torch.autograd.grad(acceleration.square().sum(), inputs, create_graph=True)
+    second = torch.autograd.grad(sum(g.sum() for g in first), inputs, allow_unused=True)
+    assert all(bool(g.isfinite().all()) for g in (*first, *second) if g is not None)
+
+
+@pytest.mark.parametrize("name", [n for n in UNDECLARED if not issubclass(UNDECLARED[n], MeasurementEffect)])
+def test_coefficients_may_differ_from_row_to_row(name: str) -> None:
+    coefficients = UNDECLARED[name].coefficients
+    model = true_model(nominal_model(), [UNDECLARED[name]()])
+    group = "flight" if issubclass(UNDECLARED[name], FlightEffect) else "contact"
+    states = STATE * torch.tensor([[1.0], [0.8], [1.1]], dtype=torch.float64) * FALLING
+    share = torch.tensor([[0.1], [0.2], [0.4]], dtype=torch.float64)
+    for c in coefficients:
+        rows = c.default + share * min(c.sigma or 1.0, c.high - c.default)
+        together = substitute(model, {f"{group}.{name}.{c.name}": rows})
+        for i in range(3):
+            alone = substitute(model, {f"{group}.{name}.{c.name}": rows[i, 0]})
+            one = states[i : i + 1]
+            torch.testing.assert_close(together.rates(states)[0][i], alone.rates(one)[0][0])
+            torch.testing.assert_close(together.bounce(states)[i], alone.bounce(one)[0])
+
+
+FALLING = torch.tensor([1.0, 1, 1, 1, 1, -1, 1, 1, 1], dtype=torch.float64)
+
+
+def test_time_offset_has_a_derivative_at_zero() -> None:
+    effect = UNDECLARED["time_offset"]()
+    assert isinstance(effect, MeasurementEffect)
+    seen = effect.positions(STATE, lambda states, later: states + later[:, None] * velocities(states))
+    (slope,) = torch.autograd.grad(seen[0, 2], [effect.z])
+    assert float(slope) == pytest.approx(float(STATE[0, 5]))
+
+
+def velocities(states: Tensor) -> Tensor:
+    return torch.cat((states[:, 3:6], torch.zeros_like(states[:, :6])), dim=-1)

@@ -81,6 +81,19 @@ def test_an_exception_leaves_what_was_there(tmp_path, ending, error):
     assert path.read_text() == "old"
 
 
+@pytest.mark.parametrize("ending", [".csv", ".parquet"])
+def test_a_full_disk_leaves_nothing_behind(tmp_path, ending):
+    resource = pytest.importorskip("resource")
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (4096, before[1]))  # writing more raises an OSError
+        with pytest.raises(OSError, match="too large"), TableWriter(tmp_path / f"a{ending}") as table:
+            table.write({"x": np.random.default_rng(0).normal(size=10_000)})
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_name_appears_only_at_the_end(tmp_path):
     path = tmp_path / "a.csv"
     with TableWriter(path) as table:

@@ -8,7 +8,7 @@ from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect
 
 
 class Drag(FlightEffect):
-    """a = -k |v| v, with k = rho Cd A / (2 m): 0.14 1/m for Cd = 0.49; fits of real tracks give 0.08 to 0.15."""
+    """a = -k |v| v, with k = rho Cd A / (2 m): 0.14 1/m for Cd = 0.49; fits of real tracks give 0.08 to 0.16."""
 
     name = "drag"
     sentence = "Quadratic air drag with a constant coefficient."

@@ -8,7 +8,7 @@ from ballfg.dynamics.effect import BounceEffect, Coefficient, Impact
 
 
 class Restitution(BounceEffect):
-    """v_n' = -e v_n with a constant e: 0.85 to 0.94 for a 40 mm ball on a table."""
+    """v_n' = -e v_n with a constant e: 0.85 to 0.95 for a 40 mm ball on a table (docs/physics.md)."""
 
     name = "restitution"
     sentence = "Constant coefficient of restitution along the normal."

@@ -10,7 +10,7 @@ from ballfg.dynamics.effect import BounceEffect, Coefficient
 class TableHeight(BounceEffect):
     """Surfaces lie `offset` above their declared height.
 
-    In measured tracks the bounce lies 2 to 6 mm lower than a rigid ball on the declared table would (docs/physics.md):
+    In measured tracks the bounce lies 2 to 4 mm lower than a rigid ball on the declared table would (docs/physics.md):
     calibration, and the ball's compression during a contact of about 1 ms.
     """
 

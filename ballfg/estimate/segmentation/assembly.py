@@ -57,17 +57,20 @@ def shifted(events: Sequence[Event], samples: int, level: float) -> NDArray[np.b
     """(samples,) whether a sample's offset differs by more than `level` m from the most common one of its segment.
 
     Which of two offsets is the true one cannot be seen within a segment; the tracker is taken to be right for most of
-    the time. A shift in the interval of a contact is left out: its jump is the contact's own as well.
+    the time. A lone shift in the interval of a contact is left out: its jump is the contact's own as well.
     """
     jumps = np.zeros((samples, 3))
-    contacts = set(intervals_of(events, EventKind.CONTACT))
-    for event in events:
-        if event.kind is EventKind.SHIFT and event.offset is not None and event.index not in contacts:
-            jumps[event.index + 1] += event.offset
+    shifts = [event for event in events if event.kind is EventKind.SHIFT]
+    contacts = intervals_of(events, EventKind.CONTACT) if shifts else []
+    for event in shifts:
+        jumps[event.index + 1] += event.offset
     marked = np.zeros(samples, dtype=bool)
     cuts = [0, *(i + 1 for i in intervals_of(events, *BREAKS)), samples]
     for first, stop in pairwise(cuts):
+        inside = [event.index for event in shifts if first <= event.index + 1 < stop]
+        if not inside or (len(inside) == 1 and inside[0] in contacts):
+            continue
         offsets = np.cumsum(jumps[first:stop], axis=0)
-        offsets -= np.median(offsets, axis=0) if stop > first else 0.0
+        offsets -= np.median(offsets, axis=0)
         marked[first:stop] = np.linalg.norm(offsets, axis=1) > level
     return marked

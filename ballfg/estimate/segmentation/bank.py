@@ -27,6 +27,7 @@ class Bank:
         surface: (h,) index of the surface on which the ball rests, or `FLYING`.
         score: (h,) nats, log evidence less the prices of events; a constant per sample is left out.
         age: (h,) samples used since the last event.
+        shift: (h, 3) m, by which the tracker is believed to be off; `mean` is what it sees, surfaces appear so moved.
         tips: (h,) the last `Node` of each hypothesis, or None.
     """
 
@@ -35,6 +36,7 @@ class Bank:
     surface: IntArray
     score: FloatArray
     age: IntArray
+    shift: FloatArray
     tips: NDArray[np.object_]
 
     def __len__(self) -> int:
@@ -45,10 +47,21 @@ class Bank:
         """Rows of the hypotheses that rest on a surface."""
         return (self.surface != FLYING).nonzero()[0]
 
+    @property
+    def all_flying(self) -> bool:
+        """Whether no hypothesis rests: quicker than `resting` for the few rows there are."""
+        return self.surface.tolist() == [FLYING] * len(self)
+
     def take(self, rows: IntArray | list[int]) -> Bank:
         """A copy of some hypotheses."""
         return Bank(
-            self.mean[rows], self.cov[rows], self.surface[rows], self.score[rows], self.age[rows], self.tips[rows]
+            self.mean[rows],
+            self.cov[rows],
+            self.surface[rows],
+            self.score[rows],
+            self.age[rows],
+            self.shift[rows],
+            self.tips[rows],
         )
 
     def take_best(self) -> Bank:
@@ -70,5 +83,6 @@ def concatenate(banks: Sequence[Bank]) -> Bank:
         np.concatenate([b.surface for b in banks]),
         np.concatenate([b.score for b in banks]),
         np.concatenate([b.age for b in banks]),
+        np.concatenate([b.shift for b in banks]),
         np.concatenate([b.tips for b in banks]),
     )

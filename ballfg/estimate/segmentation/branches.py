@@ -14,6 +14,8 @@ from ballfg.estimate.segmentation.scene import Scene
 
 SHORTEST_STEP = 1e-3
 """s. An event is not made dearer than this by stamps that lie closer."""
+SHIFTED_PREDICTIONS = 3
+"""How many of the best predictions are tried with a shift: where it coincides with a bounce, that is the second or third."""
 
 
 def fresh(position: FloatArray, position_variance: FloatArray | float, scene: Scene) -> Bank:
@@ -23,7 +25,15 @@ def fresh(position: FloatArray, position_variance: FloatArray | float, scene: Sc
     cov[0, :, 0, 0] = position_variance
     cov[0, :, 1, 1] = scene.settings.velocity_spread**2
     cov[0, :, 2, 2] = scene.settings.slack**2
-    return Bank(mean, cov, np.array([FLYING]), np.zeros(1), np.zeros(1, dtype=np.int64), np.array([None], dtype=object))
+    return Bank(
+        mean,
+        cov,
+        surface=np.array([FLYING]),
+        score=np.zeros(1),
+        age=np.zeros(1, dtype=np.int64),
+        shift=np.zeros((1, 3)),
+        tips=np.array([None], dtype=object),
+    )
 
 
 def starts(
@@ -73,11 +83,14 @@ def hits(best: Bank, position: FloatArray, dt: float, scene: Scene, interval: in
 def shifts(
     predicted: Bank, position: FloatArray, sigma: FloatArray, dt: float, scene: Scene, interval: int, time: float
 ) -> list[Bank]:
-    """The two best predictions, with the measurements jumping by an unknown offset."""
+    """The best predictions, with the measurements jumping by an unknown offset: off from now on, or until now.
+
+    Which of the two shows at the next surface only.
+    """
     settings = scene.settings
     if dt >= settings.short_gap:
         return []
-    bank = predicted.take(np.argsort(-predicted.score, kind="stable")[:2])
+    bank = predicted.take(np.argsort(-predicted.score, kind="stable")[:SHIFTED_PREDICTIONS])
     bank.cov[:, :, 0, 0] += settings.shift_spread**2
     bank.score = bank.score - _rarity(settings.shift_rate, dt) - settings.shift_cost
     bank.age = np.zeros(len(bank), dtype=np.int64)
@@ -85,16 +98,18 @@ def shifts(
         innovation = position - bank.mean[row, :, 0]
         # the shift's expectation, not the innovation: after a gap most of that is the path's own uncertainty
         offset = innovation * settings.shift_spread**2 / (bank.cov[row, :, 0, 0] + sigma**2)
+        bank.shift[row] += offset
         bank.add_event(row, Event(EventKind.SHIFT, interval, time, offset=offset))
-    return [bank]
+    right = bank.take(np.arange(len(bank)))
+    right.shift[:] = 0.0
+    return [bank, right]
 
 
 def departures(predicted: Bank, dt: float, scene: Scene, interval: int, time: float) -> list[Bank]:
     """The best resting prediction, in the air from now on."""
-    rows = predicted.resting
-    if len(rows) == 0:
+    if predicted.all_flying:
         return []
-    bank = predicted.take(rows).take_best()
+    bank = predicted.take(predicted.resting).take_best()
     height = scene.height(int(bank.surface[0]))
     lift(bank, scene)
     bank.score = bank.score - _rarity(scene.settings.hit_rate, dt) - scene.settings.leave_cost
@@ -109,7 +124,7 @@ def _rested(bank: Bank, position: FloatArray, scene: Scene, interval: int, time:
     for surface in (np.abs(position[2] - scene.centres) < scene.settings.rest_range).nonzero()[0]:
         down = bank.take([0])
         put_down(down, np.array([surface]), scene)
-        down.score = down.score - scene.settings.rest_cost
+        down.score = down.score - scene.settings.start_at_rest_cost
         down.tips[0] = Node(Event(EventKind.REST, interval, time, scene.height(int(surface))), bank.tips[0])
         rested.append(down)
     return rested

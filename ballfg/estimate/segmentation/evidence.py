@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ballfg.estimate.segmentation.bank import Bank, FloatArray
+from ballfg.estimate.segmentation.bank import Bank, FloatArray, IntArray, concatenate
 from ballfg.estimate.segmentation.events import Event, EventKind
 from ballfg.estimate.segmentation.scene import Scene
 from ballfg.estimate.segmentation.settings import SegmentationSettings
@@ -13,10 +13,16 @@ GOOD, WIDE, OUTLIER = range(3)
 """The components of the noise, as in `Scene.log_shares`."""
 
 
+NONE = np.zeros(0, dtype=np.int64)
+"""No rows."""
+
+
 def update(
     bank: Bank, position: FloatArray, sigma: FloatArray, scene: Scene, sample: int, time: float
 ) -> tuple[Bank, FloatArray]:
     """Takes a sample into every hypothesis: its most likely noise component, the Kalman update, the evidence.
+
+    Where the prediction is too vague to tell, the sample is also tried as an outlier: those hypotheses come last.
 
     Constants that all hypotheses share (3/2 log 2 pi) are left out of the score.
 
@@ -30,40 +36,71 @@ def update(
     Returns: the updated hypotheses, and (h,) the squared whitened innovation, as of a good sample.
     """
     settings = scene.settings
-    noise = sigma**2 + (settings.stamp_jitter * bank.mean[:, :, 1]) ** 2
     innovation = position - bank.mean[:, :, 0]
     known = bank.cov[:, :, 0, 0]
     S = np.empty((3, *innovation.shape))
-    S[GOOD] = known + noise
-    S[WIDE] = known + settings.wide_factor**2 * noise
-    S[OUTLIER] = known + settings.outlier_spread**2
-    whitened = innovation**2 / S
-    evidence = scene.log_shares[:, None] - 0.5 * (whitened + np.log(S)).sum(-1)
-    component = evidence.argmax(0)
-    rows = np.arange(len(component))
-    gain = bank.cov[..., 0] / S[component, rows][..., None]  # (h, axis, 3)
-    gain[component == OUTLIER] = 0.0
+    noise = settings.stamp_jitter * bank.mean[:, :, 1]
+    noise *= noise
+    noise += sigma * sigma
+    np.add(known, noise, out=S[GOOD])
+    noise *= settings.wide_factor**2
+    np.add(known, noise, out=S[WIDE])
+    np.add(known, settings.outlier_spread**2, out=S[OUTLIER])
+    whitened = innovation * innovation / S
+    evidence = scene.log_shares[:, None] - 0.5 * np.add.reduce(whitened + np.log(S), axis=-1)
+    component, rows, source = evidence.argmax(0), np.arange(len(bank)), bank
+    best = evidence[component, rows]
+    doubtful = _doubtful(bank.score, evidence[OUTLIER], best, settings)
+    if len(doubtful):
+        source = concatenate([bank, bank.take(doubtful)])
+        rows = np.concatenate([rows, doubtful])
+        component = np.concatenate([component, np.full(len(doubtful), OUTLIER)])
+        innovation, best = innovation[rows], evidence[component, rows]
+    gain = source.cov[..., 0] / S[component, rows][..., None]  # (h, axis, 3)
+    components = component.tolist()
+    used = component != OUTLIER
+    if OUTLIER in components:
+        gain[~used] = 0.0
     updated = Bank(
-        mean=bank.mean + gain * innovation[..., None],
-        cov=bank.cov - gain[..., :, None] * bank.cov[..., 0, None, :],
-        surface=bank.surface,
-        score=bank.score + evidence[component, rows],
-        age=bank.age + (component != OUTLIER),
-        tips=bank.tips.copy(),
+        mean=source.mean + gain * innovation[..., None],
+        cov=source.cov - gain[..., :, None] * source.cov[..., 0, None, :],
+        surface=source.surface,
+        score=source.score + best,
+        age=source.age + used,
+        shift=source.shift,
+        tips=source.tips.copy(),
     )
-    for row in component.nonzero()[0]:
-        kind = EventKind.WIDE if component[row] == WIDE else EventKind.OUTLIER
-        updated.add_event(int(row), Event(kind, sample, time))
-    return updated, whitened[GOOD].sum(-1)
+    for row, kind in enumerate(components):
+        if kind != GOOD:
+            updated.add_event(row, Event(EventKind.WIDE if kind == WIDE else EventKind.OUTLIER, sample, time))
+    return updated, np.add.reduce(whitened[GOOD], axis=-1)[rows]
+
+
+def _doubtful(score: FloatArray, outlier: FloatArray, best: FloatArray, settings: SegmentationSettings) -> IntArray:
+    """Rows that take the sample for the ball, but barely rather than for an outlier: later samples have to decide.
+
+    That is so where little is known of where the ball is: its second sample, the first ones after a hit or a gap.
+    Explanations that are far behind already are not multiplied.
+
+    Args: score: (h,) before the sample.  outlier: (h,) evidence of the sample as an outlier.  best: (h,) as what fits.
+    """
+    margin = best - outlier
+    if float(margin.min()) >= settings.outlier_doubt:
+        return NONE
+    doubtful = (margin > 0.0) & (margin < settings.outlier_doubt)
+    doubtful &= score + outlier > (score + best).max() - settings.doubt_margin
+    return doubtful.nonzero()[0]
 
 
 def prune(bank: Bank, settings: SegmentationSettings) -> Bank:
     """The hypotheses worth keeping, best first.
 
     Hypotheses whose last event is old predict the same from now on if they are in the same mode, so the best of them
-    stands for all (the Viterbi step).
+    stands for all (the Viterbi step). A tracker that has been shifted for as long is believed.
     """
     if len(bank) == 1:
+        if bank.age[0] >= settings.mature:
+            bank.shift[:] = 0.0
         return bank
     order = np.argsort(-bank.score, kind="stable")
     score, surface = bank.score[order], bank.surface[order]
@@ -71,4 +108,6 @@ def prune(bank: Bank, settings: SegmentationSettings) -> Bank:
     mature = keep & (bank.age[order] >= settings.mature)
     for mode in set(surface[mature].tolist()):
         keep[(mature & (surface == mode)).nonzero()[0][1:]] = False
-    return bank.take(order[keep][: settings.most])
+    kept = bank.take(order[keep][: settings.most])
+    kept.shift[kept.age >= settings.mature] = 0.0
+    return kept

@@ -30,46 +30,42 @@ def fly(mean: FloatArray, cov: FloatArray, dt: FloatArray, scene: Scene) -> tupl
     loss = scene.physics.drag * np.sqrt(np.einsum("ha,ha->h", velocity, velocity)) * dt
     loss = np.minimum(np.maximum(loss, -STRONGEST_DRAG), STRONGEST_DRAG)
     half = 0.5 * dt * dt
-    F = np.zeros((len(dt), 3, 3))
-    F[:, 0, 0] = F[:, 2, 2] = 1.0
-    F[:, 0, 1] = dt * (1.0 - 0.5 * loss)
-    F[:, 0, 2] = half
-    F[:, 1, 1] = 1.0 - loss
-    F[:, 1, 2] = dt
-    after = mean @ F.transpose(0, 2, 1)
+    F = np.zeros((len(dt), 1, 3, 3))
+    flat = F.reshape(-1, 9)
+    flat[:, 0] = flat[:, 8] = 1.0
+    flat[:, 1] = dt * (1.0 - 0.5 * loss)
+    flat[:, 2] = half
+    flat[:, 4] = 1.0 - loss
+    flat[:, 5] = dt
+    Ft = F.swapaxes(2, 3)
+    after = mean @ Ft[:, 0]
     after[:, 2, 0] -= scene.physics.gravity * half
     after[:, 2, 1] -= scene.physics.gravity * dt
-    F = F[:, None]
-    return after, F @ cov @ F.transpose(0, 1, 3, 2) + process_noise(dt, scene)[:, None]
+    return after, F @ cov @ Ft + process_noise(dt, scene)[:, None]
 
 
 def process_noise(dt: FloatArray, scene: Scene) -> FloatArray:
     """(h, 3, 3) random walks of velocity and slack over steps of dt (h,) s, the same on each axis."""
-    step = np.abs(dt)
-    walk = scene.settings.velocity_drift**2 * step
-    Q = np.zeros((len(dt), 3, 3))
-    Q[:, 1, 1] = walk
-    Q[:, 0, 1] = Q[:, 1, 0] = 0.5 * walk * step
-    Q[:, 0, 0] = walk * step * step / 3.0
-    Q[:, 2, 2] = scene.settings.slack_drift**2 * step
-    return Q
+    step = np.abs(dt)[:, None, None]
+    first, second, third = scene.drift
+    return step * (first + step * (second + step * third))
 
 
 def carry(bank: Bank, dt: float, scene: Scene) -> Bank:
     """All hypotheses after dt s without an event: the flying fly, the resting stay down."""
-    mean, cov = fly(bank.mean, bank.cov, np.full(len(bank), dt), scene)
-    down = bank.resting
-    if len(down):
+    mean, cov = fly(bank.mean, bank.cov, np.array([dt] * len(bank)), scene)
+    if not bank.all_flying:
+        down = bank.resting
         mean[down, 2] = bank.mean[down, 2]
         cov[down, 2] = bank.cov[down, 2]
-    return Bank(mean, cov, bank.surface, bank.score, bank.age, bank.tips)
+    return Bank(mean, cov, bank.surface, bank.score, bank.age, bank.shift, bank.tips)
 
 
 def put_down(bank: Bank, surfaces: IntArray, scene: Scene) -> None:
     """Makes every hypothesis of a bank one that rests on a surface (h,); changes the bank."""
     bank.surface = surfaces
     bank.mean[:, 2] = 0.0
-    bank.mean[:, 2, 0] = scene.centres[surfaces]
+    bank.mean[:, 2, 0] = scene.centres[surfaces] + bank.shift[:, 2]
     bank.mean[:, :2, 2] = 0.0
     bank.cov[:, 2] = 0.0
     bank.cov[:, 2, 0, 0] = REST_SIGMA**2

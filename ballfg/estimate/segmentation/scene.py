@@ -21,6 +21,7 @@ class Scene:
         centres: (s,) m, height of the ball's centre when it touches each surface, table first.
         restitution_sigmas: (s,).
         log_shares: (3,) log prior of good, wide and outlying samples.
+        drift: (3, 3, 3) process noise of (p, v, b) per dt, dt^2, dt^3.
     """
 
     physics: SegmentationPhysics
@@ -29,6 +30,7 @@ class Scene:
     centres: FloatArray = field(init=False)
     restitution_sigmas: FloatArray = field(init=False)
     log_shares: FloatArray = field(init=False)
+    drift: FloatArray = field(init=False)
 
     def __post_init__(self) -> None:
         heights = np.array(self.surfaces.heights())
@@ -38,6 +40,12 @@ class Scene:
         object.__setattr__(self, "restitution_sigmas", sigmas)
         wide, out = self.settings.wide_share, self.settings.outlier_share
         object.__setattr__(self, "log_shares", np.log([1.0 - wide - out, wide, out]))
+        drift = np.zeros((3, 3, 3))
+        walk = self.settings.velocity_drift**2
+        drift[0, 1, 1], drift[0, 2, 2] = walk, self.settings.slack_drift**2
+        drift[1, 0, 1] = drift[1, 1, 0] = walk / 2.0
+        drift[2, 0, 0] = walk / 3.0
+        object.__setattr__(self, "drift", drift)
 
     def height(self, surface: int) -> float:
         """m, declared height of a surface."""

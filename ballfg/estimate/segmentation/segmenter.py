@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.segmentation import branches
-from ballfg.estimate.segmentation.bank import Bank, FloatArray, concatenate
+from ballfg.estimate.segmentation.bank import FLYING, Bank, FloatArray, concatenate
 from ballfg.estimate.segmentation.events import Event, EventKind, Node, contains, make_final, open_nodes
 from ballfg.estimate.segmentation.evidence import prune, update
 from ballfg.estimate.segmentation.physics import SegmentationPhysics
@@ -87,14 +87,14 @@ class Segmenter:
         """The hypotheses after the next sample, not pruned, from those before it, best first."""
         scene, sample, dt = self._scene, self._count, time - self._time
         settings = scene.settings
-        best = bank.take([0])
         if dt > settings.longest_gap:
-            tip = Node(Event(EventKind.RESTART, sample - 1, time), best.tips[0])
-            return branches.starts(tip, float(best.score[0]), position, sigma, scene, sample, time)
+            tip = Node(Event(EventKind.RESTART, sample - 1, time), bank.tips[0])
+            return branches.starts(tip, float(bank.score[0]), position, sigma, scene, sample, time)
         predicted = self._predict(bank, dt)
         updated, surprise = update(predicted, position, sigma, scene, sample, time)
         extra = branches.departures(predicted, dt, scene, sample - 1, time)
-        if surprise[updated.score.argmax()] > settings.surprise or len(best.resting):
+        if surprise[updated.score.argmax()] > settings.surprise or bank.surface[0] != FLYING:
+            best = bank.take([0])
             extra += branches.hits(best, position, dt, scene, sample - 1, time)
             extra += branches.shifts(predicted, position, sigma, dt, scene, sample - 1, time)
         if not extra:
@@ -133,6 +133,6 @@ class Segmenter:
 
 def _triple(name: str, value: ArrayLike) -> NDArray[np.float64]:
     array = np.asarray(value, dtype=np.float64)
-    if array.shape != (3,) or not np.isfinite(array).all():
+    if array.shape != (3,) or not all(map(math.isfinite, array.tolist())):
         raise ValueError(f"{name} must be three finite numbers in m; got {value!r}. Drop samples without a position.")
     return array

@@ -23,6 +23,11 @@ class SegmentationSettings:
     """m. Standard deviation of outliers about the ball."""
     outlier_share: float = 0.01
     """Prior share of outliers."""
+    outlier_doubt: float = 10.0
+    """nats. A sample that is the ball by less than this is tried as an outlier, too. Where the path is known to some
+    millimetres the difference is 18, at the second sample of a track 8."""
+    doubt_margin: float = 25.0
+    """nats. Only where that leaves the hypothesis less than this behind the best."""
 
     # flight, apart from gravity and drag: spin, wind and a wrong drag act as a slowly drifting acceleration
     slack: float = 4.0
@@ -57,6 +62,9 @@ class SegmentationSettings:
     """m/s. A ball that lands more slowly may stay down."""
     rest_cost: float = 1.2
     """nats."""
+    start_at_rest_cost: float = 7.0
+    """nats, of a rest at a start or after a hit, where no landing was seen: two samples near a surface gain as much by
+    chance, ten give a rest away."""
     rest_range: float = 0.02
     """m. A first sample, or one after a hit, this close to a surface may be that of a resting ball."""
     leave_cost: float = 5.0

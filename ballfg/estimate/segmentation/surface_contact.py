@@ -16,6 +16,8 @@ SLOWEST_CLOSING = 0.2
 """m/s. Bounds the time margin of a slow contact."""
 POSITION_JITTER = 1e-3
 """m, by which the horizontal position is less certain after a contact."""
+KNOWN_SPEED = 1.0
+"""m/s. A path whose vertical speed is less certain, as after a single sample, is not said to land slowly."""
 BOUNCE_JITTER = 0.03
 """m/s, of the normal velocity after a bounce, whatever its speed."""
 SLIDE_JITTER = 0.05
@@ -44,25 +46,26 @@ def step(bank: Bank, dt: float, scene: Scene, interval: int, start: float, *, st
         if len(rows):
             times = times[rows]
             landed = _touch(bank.take(rows), times, surface, scene, interval, start)
-            slow = np.flatnonzero(speeds[rows] < scene.settings.rest_speed)
+            slow = np.flatnonzero((speeds[rows] < scene.settings.rest_speed) & (landed.cov[:, 2, 1, 1] < KNOWN_SPEED**2))
             if len(slow):
                 branches.append(_stay(landed.take(slow), dt - times[slow], surface, scene, interval, start + dt))
             branches.append(_bounce(landed, dt - times, surface, scene))
     return concatenate(branches)
 
 
-def _near(after: Bank, scene: Scene) -> NDArray[np.intp]:
+def _near(after: Bank, scene: Scene) -> list[int]:
     """The surfaces that some hypothesis, flown on without contact, would have met by now or within the window."""
     mean = after.mean[:, 2]
-    low = mean[:, 0] + scene.settings.contact_window * np.minimum(mean[:, 1], -SLOWEST_CLOSING)
-    return np.flatnonzero(low.min() < scene.centres)
+    low = mean[:, 0] - after.shift[:, 2] + scene.settings.contact_window * np.minimum(mean[:, 1], -SLOWEST_CLOSING)
+    lowest = float(low.min())
+    return [surface for surface, centre in enumerate(scene.centres.tolist()) if lowest < centre]
 
 
 def _meetings(
     bank: Bank, surface: int, dt: float, scene: Scene, *, strict: bool
 ) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
     """Time (h,) s and speed (h,) m/s at which each mean path comes down to a surface, and whether it is to be tried."""
-    height = bank.mean[:, 2, 0] - scene.centres[surface]
+    height = bank.mean[:, 2, 0] - bank.shift[:, 2] - scene.centres[surface]
     rise = bank.mean[:, 2, 1]
     gravity = scene.physics.gravity
     velocity = bank.mean[:, :, 1]
@@ -71,7 +74,7 @@ def _meetings(
     speed = np.sqrt(np.maximum(rise * rise + 2.0 * pull * height, 0.0))  # zero where the path stays below
     time = (rise + speed) / pull
     ok = (bank.surface == FLYING) & (speed > LEAST_FALL)
-    ok &= scene.reaches(surface, bank.mean[:, :2, 0] + bank.mean[:, :2, 1] * time[:, None])
+    ok &= scene.reaches(surface, bank.mean[:, :2, 0] - bank.shift[:, :2] + bank.mean[:, :2, 1] * time[:, None])
     if strict:
         ok &= (time >= 0.0) & (time < dt)
     else:
@@ -107,7 +110,7 @@ def _bounce(bank: Bank, rest_of_step: FloatArray, surface: int, scene: Scene) ->
     keep = 1.0 - np.minimum(friction / sliding, settings.most_slowing)
     mean[:, :2, 1] *= keep[:, None]
     mean[:, 2, 1] = e * speed
-    mean[:, 2, 0] = scene.centres[surface]
+    mean[:, 2, 0] = scene.centres[surface] + bank.shift[:, 2]
     # the Jacobian is diagonal: (1, keep, 1) along the surface, (-e, -e, 1) along its normal, for late or early paths
     J = np.ones((len(bank), 3, 3))
     J[:, :2, 1] = keep[:, None]

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from ballfg.dynamics.effect import Coefficient, Flight
+from ballfg.dynamics.effect import Coefficient, Flight, length
 from ballfg.simulate.undeclared.base import AirEffect
 
 
@@ -22,5 +21,5 @@ class DragSpin(AirEffect):
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2 on top of the declared drag; S |v| = R |w| has no pole at rest."""
-        surface_speed = self._radius * torch.linalg.vector_norm(flight.spin, dim=-1, keepdim=True)
+        surface_speed = self._radius * length(flight.spin)
         return -(self._coefficient("drag", "k") * self.gain * surface_speed) * flight.velocity

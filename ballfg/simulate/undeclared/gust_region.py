@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.effect import Coefficient, Flight
+from ballfg.dynamics.effect import Coefficient, Flight, vector
 from ballfg.simulate.undeclared.base import AirEffect
 
 
@@ -31,7 +31,7 @@ class GustRegion(AirEffect):
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2 by which the moving air changes the declared forces."""
-        center = torch.stack((self.center_x, self.center_y, self.center_z), dim=-1)
+        center = vector(self.center_x, self.center_y, self.center_z)
         distance = (flight.position - center).square().sum(-1, keepdim=True)
         share = torch.exp(-distance / (2 * self.size.square()))
-        return self._moving_air(flight, share * torch.stack((self.x, self.y, self.z), dim=-1))
+        return self._moving_air(flight, share * vector(self.x, self.y, self.z))

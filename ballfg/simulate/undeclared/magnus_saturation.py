@@ -7,7 +7,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.effect import Coefficient, Flight
+from ballfg.dynamics.effect import Coefficient, Flight, length
 from ballfg.simulate.undeclared.base import AirEffect
 
 TINY_SPEED: Final = 1e-9
@@ -31,7 +31,7 @@ class MagnusSaturation(AirEffect):
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2 on top of the declared Magnus force: k (spin x v) (1 / (1 + strength S) - 1)."""
-        surface_speed = self._radius * torch.linalg.vector_norm(flight.spin, dim=-1, keepdim=True)
+        surface_speed = self._radius * length(flight.spin)
         lost = self.strength * surface_speed
         share = lost / (flight.speed + lost).clamp_min(TINY_SPEED)
         return -(self._coefficient("magnus", "k") * share) * torch.linalg.cross(flight.spin, flight.velocity)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect
+from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect, vector
 
 
 class Pull(FlightEffect):
@@ -28,5 +27,5 @@ class Pull(FlightEffect):
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2 toward the place; zero in it."""
-        way = torch.stack((self.x, self.y, self.z), dim=-1) - flight.position
+        way = vector(self.x, self.y, self.z) - flight.position
         return self.strength * way / (way.square().sum(-1, keepdim=True) + self.soft.square()).sqrt()

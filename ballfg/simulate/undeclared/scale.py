@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from ballfg.dynamics.effect import Coefficient
+from ballfg.dynamics.effect import Coefficient, vector
 from ballfg.simulate.undeclared.base import Advance, MeasurementEffect
 
 
@@ -21,4 +20,4 @@ class Scale(MeasurementEffect):
 
     def positions(self, states: Tensor, advance: Advance) -> Tensor:
         """(n, 3) m, stretched."""
-        return states[:, :3] * (1.0 + torch.stack((self.x, self.y, self.z)))
+        return states[:, :3] * (1.0 + vector(self.x, self.y, self.z))

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
 
-from ballfg.dynamics.effect import Coefficient, Flight
+from ballfg.dynamics.effect import Coefficient, Flight, vector
 from ballfg.simulate.undeclared.base import AirEffect
 
 
@@ -24,4 +23,4 @@ class Wind(AirEffect):
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2 by which the moving air changes the declared forces."""
-        return self._moving_air(flight, torch.stack((self.x, self.y, self.z), dim=-1))
+        return self._moving_air(flight, vector(self.x, self.y, self.z))

@@ -44,6 +44,59 @@ def test_an_outlier_in_the_first_sample(n):
         assert len(result.hits) == 0
 
 
+@pytest.mark.parametrize("bad", [[1], [2], [3], [0, 2], [1, 2]], ids=str)
+@pytest.mark.parametrize("size", [0.05, 0.15, 0.3])
+def test_outliers_among_the_first_samples(bad, size):
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        positions = PARABOLA + rng.normal(0, 0.0015, (60, 3))
+        direction = rng.normal(size=(len(bad), 3))
+        positions[bad] += size * direction / np.linalg.norm(direction, axis=1, keepdims=True)
+        result = found(T, positions)
+        assert len(result.hits) == 0
+        assert (result.quality[bad] >= Quality.WIDE).all()
+        assert set(np.flatnonzero(~result.usable)) <= set(bad)
+
+
+@pytest.mark.parametrize("after", range(4))
+def test_an_outlier_after_a_restart(after):
+    rng = np.random.default_rng(after)
+    positions = np.concatenate([PARABOLA, PARABOLA]) + rng.normal(0, 0.0015, (120, 3))
+    positions[60 + after] += [0.1, -0.05, 0.1]
+    result = found(np.concatenate([T, T + 1.0]), positions)
+    assert result.hits.tolist() == result.restarts.tolist() == [59]
+    assert np.flatnonzero(~result.usable).tolist() == [60 + after]
+
+
+@pytest.mark.parametrize("n", range(2, 9))
+def test_a_ball_that_leaves_the_table_is_not_taken_for_one_that_rests(n):
+    rests = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        rise = rng.choice([0.0, 0.002, 0.005, 0.01]) + rng.uniform(0.6, 3) * T[:n] - 4.9 * T[:n] ** 2
+        path = np.stack([0 * T[:n], 3 * T[:n], 0.77 + rise], axis=1)
+        rests += len(found(T[:n], path + rng.normal(0, 0.0015, (n, 3))).rests)
+    assert rests <= 1
+
+
+def test_three_samples_about_a_bounce_are_not_a_rest():
+    rests = 0
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        height = 0.77 + rng.uniform(1, 3) * np.abs(T[:3] - rng.uniform(0.2, 0.8) / 180)
+        path = np.stack([0 * T[:3], 3 * T[:3], height], axis=1) + rng.normal(0, 0.0015, (3, 3))
+        rests += len(found(T[:3], path).rests)
+    assert rests <= 1
+
+
+def test_a_ball_that_lies_still_is_a_rest_after_a_few_samples():
+    rests = 0
+    for seed in range(40):
+        still = np.tile([0.1, 0.2, 0.77], (8, 1)) + np.random.default_rng(seed).normal(0, 0.0015, (8, 3))
+        rests += len(found(T[:8], still).rests)
+    assert rests >= 38
+
+
 def test_only_the_rising_part():
     assert len(found(T[:30], PARABOLA[:30]).hits) == 0
 

@@ -112,6 +112,41 @@ def test_runs_shifted_by_an_offset_are_marked_and_are_no_hits(rallies, match):
     assert false <= 0.05 * planted
 
 
+@pytest.mark.parametrize("run", [3, 6, 20])
+@pytest.mark.parametrize("size", [0.035, 0.08])
+def test_a_shifted_run_across_a_contact_loses_nothing(rallies, match, run, size):
+    counts, planted = np.zeros(4, dtype=int), 0
+    for seed, truth in enumerate(rallies):
+        rng = np.random.default_rng(seed)
+        free = [c for c in truth.contacts if 25 < c < 310 and all(abs(c - hit) > 60 for hit in truth.hits)]
+        for contact in free:
+            positions = truth.measured(rng)
+            direction = rng.normal(size=3)
+            first = contact - int(rng.integers(0, run - 1))
+            positions[first : first + run] += size * direction / np.linalg.norm(direction)
+            found = segmented(truth, truth.times, positions)
+            early = [c for c in truth.contacts if c < 355]
+            counts += [
+                *match([c.interval for c in found.contacts if c.interval < 355], early),
+                *match(found.hits.tolist(), truth.hits, 2),
+            ]
+            planted += 1
+    assert planted >= 10
+    assert counts[:2].max() <= 1
+    assert counts[2:].tolist() == [0, 0]
+
+
+def test_an_outlier_right_after_a_hit(rallies, match):
+    for after in (1, 2, 3):
+        for seed, truth in enumerate(rallies):
+            positions = truth.measured(np.random.default_rng(seed))
+            positions[truth.hits[0] + after] += [0.1, -0.03, 0.05]
+            found = segmented(truth, truth.times, positions)
+            assert len(found.hits) == 1
+            assert match(found.hits.tolist(), truth.hits, 2) == (0, 0)
+            assert found.quality[truth.hits[0] + after] >= Quality.WIDE
+
+
 @pytest.mark.parametrize(("every", "rate"), [(2, 90), (3, 60), (6, 30)])
 def test_slow_trackers(rallies, match, every, rate):
     thinned = compare(rallies, match, lambda truth, rng: (truth.times[::every], truth.measured(rng)[::every]))
