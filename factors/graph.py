@@ -41,6 +41,7 @@ class Convergence(enum.Enum):
     """How a minimisation ended."""
 
     CONVERGED = "converged"
+    AT_KINK = "no step reduces the objective: the minimum lies where a loss or the friction bends"
     STUCK = "no step reduces the objective further although the gradient is not zero"
     TOO_MANY_ITERATIONS = "the iteration limit was reached"
     NOT_FINITE = "the objective is not finite at the start"
@@ -137,7 +138,7 @@ class LevenbergMarquardt:
                 damping, growth = damping * (0.1 if gain > WHOLE else 0.5), 10.0
                 damping = 0.0 if damping < self.first_damping else damping
             elif length < AT_KINK:
-                return Minimum(point.values, point.error, step, Convergence.CONVERGED, iteration)
+                return Minimum(point.values, point.error, step, Convergence.AT_KINK, iteration)
             elif damping > MOST_DAMPING:
                 return Minimum(point.values, point.error, _try_solve(point, 0.0), Convergence.STUCK, iteration)
             else:

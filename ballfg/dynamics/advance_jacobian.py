@@ -59,8 +59,10 @@ def _advance_step(model: BallModel, start: Tensor, h: float, surfaces: Surfaces)
         if not bool(landing):
             return Motion(after, jacobian[0] @ so_far, tuple(contacts))
         tau = contact_time(model, state, height)
-        state, _, jacobian = fly_through_jacobian(model, state, tau, (height,))
-        rises = float(state[0, VZ]) >= REST_SPEED  # not so after a contact that never comes: NaN
+        rises = not bool(tau.isnan())  # NaN: below the surface and never up again
+        if rises:
+            state, _, jacobian = fly_through_jacobian(model, state, tau, (height,))
+            rises = float(state[0, VZ]) >= REST_SPEED
         if not rises or len(contacts) + 1 == MAX_CONTACTS:
             after, jacobian = batch_jacobian(partial(_advanced, model, h, surfaces), start)
             return Motion(after, jacobian[0], tuple(contacts))

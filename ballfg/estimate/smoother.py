@@ -265,7 +265,8 @@ def _status(minimum: Minimum, samples: int) -> Status:
         return Status.FAILED
     if samples < 2:
         return Status.NO_VELOCITY
-    return Status.OK if minimum.convergence is Convergence.CONVERGED else Status.NOT_CONVERGED
+    at_minimum = minimum.convergence in (Convergence.CONVERGED, Convergence.AT_KINK)
+    return Status.OK if at_minimum else Status.NOT_CONVERGED
 
 
 def _prior_covariances(n: int, p: int, sigma: Array, settings: Settings) -> Covariances:
