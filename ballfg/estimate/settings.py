@@ -52,8 +52,10 @@ class Settings:
     model explains."""
 
     def __post_init__(self) -> None:
-        if len(self.position_noise) != 3 or not all(np.isfinite(s) and s > 0 for s in self.position_noise):
-            raise ValueError(f"position_noise must be three positive numbers in m; got {self.position_noise}")
+        if np.shape(self.position_noise) != (3,) or not all(np.isfinite(s) and s > 0 for s in self.position_noise):
+            raise ValueError(
+                f"position_noise must be three positive numbers in m; got {self.position_noise}. Give one per axis."
+            )
         for name in ("spin_prior", "spin_label_noise", "velocity_prior"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ValueError(f"{name} must be positive and finite; got {getattr(self, name)}")

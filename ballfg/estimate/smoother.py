@@ -141,6 +141,7 @@ class Smoother(Estimator):
         else:
             values = earlier.start
         seen: dict[tuple[tuple[int, float], ...], Solution] = {}
+        settled: tuple[Solution, ...] = ()
         for _ in range(MAX_REFINEMENTS):
             graph = build_graph(track, self.trackwise, events, sigma, self.settings)
             graph = graph if earlier is None else earlier.join(graph)
@@ -148,9 +149,10 @@ class Smoother(Estimator):
             seen[_places(events.contacts)] = solution
             refined = _refined(track.times, solution)
             if _places(refined) == _places(events.contacts):
-                unseen = _contacts_at_ends(track.times, solution, self.trackwise, self.surfaces)
-                if not unseen:
-                    return solution
+                unseen = () if settled else _contacts_at_ends(track.times, solution, self.trackwise, self.surfaces)
+                if not unseen:  # a contact that only the end of the track suggests must also explain it better
+                    return min((*settled, solution), key=lambda s: s.minimum.error)
+                settled = (solution,)
                 refined = tuple(sorted((*refined, *unseen), key=lambda c: c.time))
             if _places(refined) in seen:
                 break

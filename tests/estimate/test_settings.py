@@ -15,7 +15,9 @@ from ballfg.tracks import Track, read_dataset
 NONE = np.zeros(0, dtype=np.int64)
 
 
-@pytest.mark.parametrize("noise", [(0.001, 0.001), (0.001, 0.0, 0.001), (0.001, np.nan, 0.001), (1.0, 1.0, -1.0)])
+@pytest.mark.parametrize(
+    "noise", [0.003, (0.001, 0.001), (0.001, 0.0, 0.001), (0.001, np.nan, 0.001), (1.0, 1.0, -1.0)]
+)
 def test_position_noise_is_three_positive_numbers(noise) -> None:
     with pytest.raises(ValueError, match="position_noise must be three positive numbers in m"):
         Settings(position_noise=noise)

@@ -72,3 +72,13 @@ def test_launched_balls(name) -> None:
         assert all(estimate.times[0] <= t <= estimate.times[-1] for t in times)
         for contact in estimate.contacts:  # down before it, up after it
             assert estimate.states[contact.interval, 5] < 0.0 < estimate.states[contact.interval + 1, 5]
+
+
+def test_a_contact_at_the_end_must_explain_the_track_better() -> None:
+    """The last sample of this track lies 13 mm below the table; a second bounce there would explain it worse."""
+    if not (DATA / "spindoe").is_dir():
+        pytest.skip(f"no measured tracks at {DATA / 'spindoe'}; set BALLFG_DATA to the folder that holds it")
+    dataset = read_dataset(DATA / "spindoe")
+    model = nominal_model(dataset.info.ball.radius)
+    smoother = Smoother(model, dataset_surfaces(dataset), dataset_settings(dataset, model))
+    assert len(smoother.estimate(dataset.track("002")).contacts) == 1

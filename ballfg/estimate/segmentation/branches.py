@@ -15,7 +15,7 @@ from ballfg.estimate.segmentation.scene import Scene
 SHORTEST_STEP = 1e-3
 """s. An event is not made dearer than this by stamps that lie closer."""
 SHIFTED_PREDICTIONS = 3
-"""How many of the best predictions are tried with a shift: where it coincides with a bounce, that is the second or third."""
+"""How many of the best predictions are tried with a shift; beside a bounce the right one may be the third."""
 
 
 def fresh(position: FloatArray, position_variance: FloatArray | float, scene: Scene) -> Bank:

@@ -46,7 +46,9 @@ def step(bank: Bank, dt: float, scene: Scene, interval: int, start: float, *, st
         if len(rows):
             times = times[rows]
             landed = _touch(bank.take(rows), times, surface, scene, interval, start)
-            slow = np.flatnonzero((speeds[rows] < scene.settings.rest_speed) & (landed.cov[:, 2, 1, 1] < KNOWN_SPEED**2))
+            slow = np.flatnonzero(
+                (speeds[rows] < scene.settings.rest_speed) & (landed.cov[:, 2, 1, 1] < KNOWN_SPEED**2)
+            )
             if len(slow):
                 branches.append(_stay(landed.take(slow), dt - times[slow], surface, scene, interval, start + dt))
             branches.append(_bounce(landed, dt - times, surface, scene))
