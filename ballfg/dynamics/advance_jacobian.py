@@ -11,7 +11,7 @@ from torch import Tensor
 from ballfg.dynamics.contact import contact_time, fly_through_jacobian
 from ballfg.dynamics.integrate import batch_jacobian, fly_jacobian, step_count
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.rollout import MAX_CONTACTS, REST_SPEED, advance, next_surface, roll, stays
+from ballfg.dynamics.rollout import LONGEST_MOTION, MAX_CONTACTS, REST_SPEED, advance, next_surface, roll, stays
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import VZ
 
@@ -34,6 +34,7 @@ class Motion:
 @torch.no_grad()
 def advance_jacobian(model: BallModel, state: Tensor, dt: float, surfaces: Surfaces) -> Motion:
     """`rollout.advance` of one state (1, d) over dt s, with its Jacobian: flight, contacts, rest."""
+    dt = min(dt, LONGEST_MOTION)
     steps = step_count(torch.tensor([dt]))
     jacobian = torch.eye(state.shape[-1], dtype=state.dtype)
     contacts: list[tuple[float, float]] = []

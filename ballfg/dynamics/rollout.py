@@ -6,12 +6,15 @@ What is defined where nature is not asked:
   takes off again.
 - A ball that starts a little below a surface (its centre above it) and moves down bounces at the moment at which it
   went through; one that moves up leaves. One that can no longer come up is put on the surface, at rest.
+- Over more than `LONGEST_MOTION` the ball stays where it was by then.
 - A ball whose centre starts below the table's surface is beside the table; the floor is what it falls on.
 - Whether a ball meets the table is decided by its centre's place over it at the moment of contact; edges are not hit. A
   ball that rolls over the edge falls from the end of the integration step in which it does.
 """
 
 from __future__ import annotations
+
+import math
 
 import torch
 from torch import Tensor
@@ -27,6 +30,8 @@ REST_SPEED = 0.05
 REST_GAP = 1e-5
 """m. A ball this close to a surface and slower than half of `REST_SPEED` rests on it. A ball that left at `REST_SPEED`
 or faster is never both, so that a hop is the same motion however its time is cut."""
+LONGEST_MOTION = 20.0
+"""s. A ball that nobody touches lies still by then; over a longer interval it is taken to stay where it is."""
 MAX_CONTACTS = 32
 """In one step of 20 ms a ball that leaves at `REST_SPEED` under its weight alone bounces at most twice."""
 
@@ -71,8 +76,11 @@ def advance(model: BallModel, state: Tensor, dt: Tensor, surfaces: Surfaces) -> 
     Returns: (n, 9), differentiable in the state and the parameters, through the contact times too.
     Raises: ValueError: if a dt is negative or not a number.
     """
-    if not bool((dt >= 0).all()):
-        raise ValueError(f"dt must be a number, not negative; got {float(dt.min()):g} s. Sort the times.")
+    if not bool(((dt >= 0) & (dt < math.inf)).all()):
+        raise ValueError(
+            f"dt must be finite and not negative; got {float(dt.min()):g} to {float(dt.max()):g} s. Sort the times."
+        )
+    dt = dt.clamp_max(LONGEST_MOTION)
     steps = step_count(dt)
     for _ in range(steps):
         state = _advance_step(model, state, dt / steps, surfaces)

@@ -131,7 +131,7 @@ def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coeffici
     Args:
         intervals: k of them.
         start: (k, 9) states at which they begin.
-        after: (k, 9) states at which they end.
+        after: (l, 9) states at which the first l of them end; what the others lack is for `store` to put.
         coefficients: (p,).
     Returns: for each interval the propagated state and its Jacobian side by side, (9, 1 + 9 + p); number of calls.
     Raises: ValueError: if the model gives something that is not finite.
@@ -146,10 +146,14 @@ def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coeffici
         point[:, :STATE_DIM], point[:, STATE_DIM:] = start[members], coefficients
         moved, jacobian = batch.propagate(torch.from_numpy(point), slice(None))
         pieces = np.concatenate((moved.numpy()[:, :STATE_DIM, None], jacobian.numpy()[:, :STATE_DIM]), axis=2)
-        answers = _whitened(batch, pieces, start[members], after[members], coefficients)
         for row, k in enumerate(members):
             result[k] = pieces[row]
-            _keep(intervals[k], answers, row)
+        count = sum(k < len(after) for k in members)  # the first ones: members ascend
+        if count:
+            ended = members[:count]
+            answers = _whitened(batch, pieces[:count], start[ended], after[ended], coefficients)
+            for row, k in enumerate(ended):
+                _keep(intervals[k], answers, row)
     return result, len(groups)
 
 
@@ -163,7 +167,7 @@ Answers = tuple[tuple[Array, ...], Array, tuple[Array, ...]]
 
 
 def _whitened(batch: DynamicsFactors, pieces: Array, start: Array, after: Array, coefficients: Array) -> Answers:
-    root = batch.whitening
+    root = batch.whitening[: len(pieces)]
     residual = (root @ (after - pieces[:, :, 0])[..., None])[..., 0]
     by_start = -(root @ pieces[:, :, 1:])
     inputs: tuple[Array, ...] = (start, after)

@@ -183,9 +183,9 @@ class IncrementalWindow:
         """
         innovation = sample.position - predicted[POSITION]
         noise = np.diag(sample.sigma**2)
-        root = np.linalg.cholesky(covariance[POSITION, POSITION] + noise)
-        whitened = np.linalg.solve(root, innovation)
-        pull = np.linalg.solve(root.T, whitened)
+        inverse = np.linalg.inv(np.linalg.cholesky(covariance[POSITION, POSITION] + noise))
+        whitened = inverse @ innovation
+        pull = whitened @ inverse
         if self.settings.loss.name != "squared":
             weight = self.settings.loss.weight(np.array([np.linalg.norm(whitened)]))
             pull = np.linalg.solve(covariance[POSITION, POSITION] + noise / weight, innovation)
@@ -211,8 +211,7 @@ class IncrementalWindow:
         ends = [k + 1 for k in begins]
         if new is not None:
             touched.append(new)
-            begins.append(len(self.theta) - 1)
-            ends.append(len(self.theta) - 1)  # a stand-in: `store` puts the right one
+            begins.append(len(self.theta) - 1)  # its end comes out of this call: `store` puts it
         if not touched:
             return np.empty(0), 0, 0
         pieces, calls = evaluate(touched, self.theta[begins], self.theta[ends], self.coefficient_theta)

@@ -17,7 +17,7 @@ from torch import Tensor
 from ballfg.dynamics.advance_jacobian import advance_jacobian
 from ballfg.dynamics.integrate import fly_jacobian, step_count
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.rollout import is_resting
+from ballfg.dynamics.rollout import LONGEST_MOTION, is_resting
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
 from ballfg.predict.belief import Belief
@@ -86,12 +86,17 @@ class Propagator:
 
         Raises: ValueError: if a dt is negative, infinite or not a number.
         """
-        if not bool((dt >= 0).all()):
-            raise ValueError(f"dt must be a number, not negative; got {float(dt.min()):g} s")
-        count = step_count(dt)
+        if not bool(((dt >= 0) & dt.isfinite()).all()):
+            raise ValueError(f"dt must be finite and not negative; got {float(dt.min()):g} to {float(dt.max()):g} s")
+        moving = dt.clamp_max(LONGEST_MOTION)
+        count = step_count(moving)
         for _ in range(count):
-            belief = self._step(belief, dt / count)
-        return belief
+            belief = self._step(belief, moving / count)
+        staying = dt - moving
+        if not bool((staying > 0).any()):
+            return belief
+        noise = torch.from_numpy(self.noise.flight(staying.numpy()))
+        return _moved(belief, staying, belief.mean, torch.eye(belief.mean.shape[-1], dtype=dt.dtype), noise)
 
     def in_flight(self, belief: Belief, dt: Tensor) -> Belief:
         """The belief after dt (n,) s of free flight; surfaces are not there."""

@@ -11,7 +11,7 @@ from scipy.integrate import solve_ivp
 
 from ballfg.dynamics import Surfaces, advance, fly, fly_through, rollout, substitute
 from ballfg.dynamics.impact import slip_velocity
-from ballfg.dynamics.rollout import MAX_CONTACTS, REST_SPEED, is_resting, place_on, roll
+from ballfg.dynamics.rollout import LONGEST_MOTION, MAX_CONTACTS, REST_SPEED, is_resting, place_on, roll
 
 R = 0.02
 TABLE_ONLY = Surfaces(0.0)
@@ -334,9 +334,10 @@ def test_empty_batch(model):
     assert advance(model, nothing, nothing[:, 0], TABLE_ONLY).shape == (0, 9)
 
 
-@pytest.mark.parametrize("dt", [-0.01, math.nan])
+@pytest.mark.parametrize("dt", [-0.01, math.nan, math.inf])
 def test_bad_dt_is_refused(model, states, dt):
-    with pytest.raises(ValueError, match=r"dt must be a number, not negative; got (-0\.01|nan) s\. Sort the times\."):
+    got = r"got (-0\.01|nan|0\.01) to (0\.01|nan|inf) s"
+    with pytest.raises(ValueError, match=rf"dt must be finite and not negative; {got}\. Sort the times\."):
         advance(model, states(2), seconds(0.01, dt), TABLE_ONLY)
 
 
@@ -356,3 +357,13 @@ def test_rollout_takes_common_times_and_own_times(model, states):
         assert torch.equal(own[0, 1], own[0, 2])
         common = rollout(model, state[1:], times[1], TABLE_ONLY)
     torch.testing.assert_close(own[1:], common, rtol=0, atol=1e-9)
+
+
+def test_a_ball_stays_where_it_is_after_the_longest_motion(model) -> None:
+    start = torch.tensor([[0.0, 0.0, 0.3, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0]], dtype=torch.float64)
+    surfaces = Surfaces(0.0)
+    with torch.no_grad():
+        by_then = advance(model, start, torch.tensor([LONGEST_MOTION], dtype=torch.float64), surfaces)
+        later = advance(model, start, torch.tensor([1e6], dtype=torch.float64), surfaces)
+    torch.testing.assert_close(later, by_then, rtol=0.0, atol=0.0)
+    assert by_then[0, 3:6].norm() < 0.05  # it hardly moves any more
