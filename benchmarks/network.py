@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 
 import torch
@@ -19,6 +20,8 @@ SPIN_SCALE = 100.0
 """rad/s that the network sees as one."""
 FORCE_SCALE = 10.0
 """m/s^2, the network's output of one."""
+SCALES = torch.tensor([SPEED_SCALE] * 3 + [SPIN_SCALE] * 3 + [SPEED_SCALE * SPIN_SCALE] * 3, dtype=torch.float64)
+GRAVITY = torch.tensor([0.0, 0.0, -STANDARD_GRAVITY], dtype=torch.float64)
 FIT_SAMPLES = 2000
 FIT_ITERATIONS = 600
 """Of L-BFGS; the fit then is off by about a twentieth of the aerodynamic acceleration."""
@@ -27,45 +30,43 @@ FIT_ITERATIONS = 600
 class NetworkFlight(BallModel):
     """Flight by gravity plus a 9-80-80-3 tanh network of velocity, spin and spin x velocity (7,523 parameters).
 
-    Bounces are another model's. The parameters are frozen: the benchmark estimates states, it learns nothing.
+    Bounces are another model's. Scales of inputs and output, and gravity, are folded into the first and the last layer.
 
     Args:
         bounces: what a bounce does; its radius and inertia are taken too.
-        generator: draws the start weights.
+        layers: linear layers from 9 scaled inputs to 3 scaled accelerations, tanh between them.
     """
 
-    def __init__(self, bounces: BallModel, generator: torch.Generator) -> None:
+    def __init__(self, bounces: BallModel, layers: Sequence[nn.Linear]) -> None:
         super().__init__(bounces.radius, bounces.inertia_factor)
         self.bounces = bounces
-        sizes = (9, HIDDEN, HIDDEN, 3)
-        self.layers = nn.ModuleList(nn.Linear(i, o, dtype=torch.float64) for i, o in pairwise(sizes))
-        # the tensors themselves: calling modules costs as much as the small products
-        self._stack = tuple((layer.weight, layer.bias) for layer in self.layers if isinstance(layer, nn.Linear))
-        with torch.no_grad():
-            for weight, bias in self._stack:
-                spread = 1.0 / math.sqrt(weight.shape[1])
-                weight.copy_(spread * torch.randn(weight.shape, generator=generator, dtype=torch.float64))
-                bias.zero_()
-        scales = [1 / SPEED_SCALE] * 3 + [1 / SPIN_SCALE] * 3 + [1 / (SPEED_SCALE * SPIN_SCALE)] * 3
-        self._scale = torch.tensor(scales, dtype=torch.float64)
-        self.gravity = torch.tensor([0.0, 0.0, -STANDARD_GRAVITY], dtype=torch.float64)
-
-    def force(self, state: Tensor) -> Tensor:
-        """(..., 3) the network's output: aerodynamic acceleration divided by `FORCE_SCALE`."""
-        velocity, spin = state[..., VELOCITY], state[..., SPIN]
-        x = torch.cat((velocity, spin, torch.linalg.cross(spin, velocity)), dim=-1) * self._scale
-        *hidden, last = self._stack
-        for weight, bias in hidden:
-            x = torch.tanh(nn.functional.linear(x, weight, bias))
-        return nn.functional.linear(x, *last)
+        weights = [layer.weight.detach().clone() for layer in layers]
+        biases = [layer.bias.detach().clone() for layer in layers]
+        weights[0] /= SCALES
+        weights[-1] *= FORCE_SCALE
+        biases[-1] = FORCE_SCALE * biases[-1] + GRAVITY
+        self.weights = nn.ParameterList(weights).requires_grad_(False)
+        self.biases = nn.ParameterList(biases).requires_grad_(False)
+        # the tensors themselves: asking modules for them costs as much as the small products
+        self._hidden = tuple(zip(weights[:-1], biases[:-1], strict=True))
+        self._last = (weights[-1], biases[-1])
 
     def rates(self, state: Tensor) -> Rates:
         """Acceleration in free flight; the spin is constant."""
-        return torch.add(self.gravity, self.force(state), alpha=FORCE_SCALE), None
+        x = features(state)
+        for weight, bias in self._hidden:
+            x = torch.tanh(nn.functional.linear(x, weight, bias))
+        return nn.functional.linear(x, *self._last), None
 
     def bounce(self, state: Tensor) -> Tensor:
         """That of the other model."""
         return self.bounces.bounce(state)
+
+
+def features(state: Tensor) -> Tensor:
+    """(..., 9) what the network sees of a state: velocity, spin, spin x velocity."""
+    velocity, spin = state[..., VELOCITY], state[..., SPIN]
+    return torch.cat((velocity, spin, torch.linalg.cross(spin, velocity)), dim=-1)
 
 
 def fitted_network(model: AnalyticModel, iterations: int = FIT_ITERATIONS) -> NetworkFlight:
@@ -74,26 +75,39 @@ def fitted_network(model: AnalyticModel, iterations: int = FIT_ITERATIONS) -> Ne
     An unfitted network would make an ill-posed problem, on which a solver's time says nothing.
     """
     generator = torch.Generator().manual_seed(0)
-    network = NetworkFlight(model, generator)
+    layers = _random_layers(generator)
+    first, second, last = layers
+    network = nn.Sequential(first, nn.Tanh(), second, nn.Tanh(), last)
     state = torch.zeros((FIT_SAMPLES, STATE_DIM), dtype=torch.float64)
     state[:, VELOCITY] = SPEED_SCALE * torch.randn((FIT_SAMPLES, 3), generator=generator, dtype=torch.float64)
     state[:, SPIN] = SPIN_SCALE * torch.randn((FIT_SAMPLES, 3), generator=generator, dtype=torch.float64)
     with torch.no_grad():
-        target = (model.rates(state)[0] - network.gravity) / FORCE_SCALE
+        target = (model.rates(state)[0] - GRAVITY) / FORCE_SCALE
+    seen = features(state) / SCALES
     optimizer = torch.optim.LBFGS(
-        network.layers.parameters(), max_iter=iterations, history_size=30, line_search_fn="strong_wolfe"
+        network.parameters(), max_iter=iterations, history_size=30, line_search_fn="strong_wolfe"
     )
 
     def loss() -> Tensor:
         optimizer.zero_grad()
-        value: Tensor = (network.force(state) - target).square().mean()
+        value: Tensor = (network(seen) - target).square().mean()
         value.backward()
         return value
 
     optimizer.step(loss)
-    return network.requires_grad_(False)
+    return NetworkFlight(model, layers)
+
+
+def _random_layers(generator: torch.Generator) -> list[nn.Linear]:
+    layers = [nn.Linear(i, o, dtype=torch.float64) for i, o in pairwise((9, HIDDEN, HIDDEN, 3))]
+    with torch.no_grad():
+        for layer in layers:
+            spread = 1.0 / math.sqrt(layer.in_features)
+            layer.weight.copy_(spread * torch.randn(layer.weight.shape, generator=generator, dtype=torch.float64))
+            layer.bias.zero_()
+    return layers
 
 
 def parameter_count(network: NetworkFlight) -> int:
     """Weights and biases of the network."""
-    return sum(p.numel() for p in network.layers.parameters())
+    return sum(p.numel() for p in (*network.weights, *network.biases))

@@ -10,7 +10,7 @@ import torch
 from ballfg.benchmarks import speed
 from ballfg.benchmarks.estimators import Size, describe, run_synthetic
 from ballfg.benchmarks.measured import WHOLE, Measured, _add_smoothing, prediction_rmse
-from ballfg.benchmarks.network import fitted_network, parameter_count
+from ballfg.benchmarks.network import GRAVITY, fitted_network, parameter_count
 from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.speed import problem_model, run_speed
 from ballfg.benchmarks.synthetic import fair_protocol
@@ -84,7 +84,7 @@ def test_network_is_the_same_each_time_and_close_to_the_model() -> None:
     scale = torch.tensor([1.0] * 3 + [4.0] * 3 + [60.0] * 3, dtype=torch.float64)
     state = scale * torch.randn((500, 9), generator=rng, dtype=torch.float64)
     with torch.no_grad():
-        force = model.rates(state)[0] - one.gravity
+        force = model.rates(state)[0] - GRAVITY
         error = one.rates(state)[0] - model.rates(state)[0]
     assert error.square().mean().sqrt() < 0.1 * force.square().mean().sqrt()
 
