@@ -188,7 +188,8 @@ class IncrementalWindow:
         pull = whitened @ inverse
         if self.settings.loss.name != "squared":
             weight = self.settings.loss.weight(np.array([np.linalg.norm(whitened)]))
-            pull = np.linalg.solve(covariance[POSITION, POSITION] + noise / weight, innovation)
+            spread = covariance[POSITION, POSITION] + noise / weight
+            pull = np.asarray(np.linalg.solve(spread, innovation), dtype=np.float64)
         return predicted + covariance[:, POSITION] @ pull, whitened
 
     def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
