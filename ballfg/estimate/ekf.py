@@ -11,12 +11,14 @@ from typing import Literal
 import numpy as np
 import torch
 from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF
+from numpy.typing import NDArray
 from scipy.stats import chi2
 
 from ballfg.dynamics.advance_jacobian import Motion, advance_jacobian
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
+from ballfg.estimate.near_contact import widen_near_contacts
 from ballfg.estimate.problem import coefficient_means, trackwise_model
 from ballfg.estimate.result import Array, Estimate, Status, leave_one_out
 from ballfg.estimate.rts import FilterRecord, fly_back, rts_smooth
@@ -34,6 +36,8 @@ HIT_POSITION = 1.0
 """m, standard deviation of the position after a hit: it starts anew at the measurement."""
 WIDE_VELOCITY = 1.0
 """m/s. While the velocity is less well known, a step is linearised at the velocity that its sample suggests."""
+LEAST_USED = 0.5
+"""Share of samples that must have passed the gate for the filter to have followed the ball."""
 NEAR_SURFACE = 0.05
 """m. Samples this close to a surface need not lie on one parabola with others: there may be a bounce."""
 
@@ -148,18 +152,23 @@ class ExtendedKalmanFilter(Estimator):
         return self._result(track, run, mean, covariance, whitened)
 
     def _result(self, track: Track, run: _Run, mean: Array, covariance: Array, whitened: Array) -> Estimate:
+        states = mean[:, :STATE_DIM]
+        contacts = tuple(contact for i in sorted(run.record.contacts) for contact in run.record.contacts[i])
+        honest = widen_near_contacts(
+            track.times, states, covariance[:, :STATE_DIM, :STATE_DIM], contacts, self.model, self.surfaces
+        )
         return Estimate(
             name=track.name,
             times=track.times,
-            states=mean[:, :STATE_DIM],
-            covariances=covariance[:, :STATE_DIM, :STATE_DIM],
-            status=Status.OK if run.record.used.sum() > 1 else Status.NO_VELOCITY,
+            states=states,
+            covariances=honest,
+            status=_status(run.record.used),
             whitened=whitened,
             coefficient_names=tuple(self.settings.coefficients),
             coefficients=mean[-1, STATE_DIM:],
             coefficient_covariance=covariance[-1, STATE_DIM:, STATE_DIM:],
             cross_covariances=covariance[:, :STATE_DIM, STATE_DIM:],
-            contacts=tuple(contact for i in sorted(run.record.contacts) for contact in run.record.contacts[i]),
+            contacts=contacts,
             hits=np.array(run.record.hits, dtype=np.int64),
             quality=run.record.quality,
         )
@@ -170,6 +179,13 @@ class ExtendedKalmanFilter(Estimator):
         mean, covariance = (np.stack(part) for part in zip(*pairs, strict=True))
         result = self._result(track, run, mean, covariance, np.full((len(track), 3), np.nan))
         return replace(result, status=Status.FAILED)
+
+
+def _status(used: NDArray[np.bool_]) -> Status:
+    """A filter that set aside most of what it saw has lost the ball, or was told wrong things about it."""
+    if used.sum() < 2:
+        return Status.NO_VELOCITY
+    return Status.OK if used.mean() >= LEAST_USED else Status.NOT_CONVERGED
 
 
 class _Run:

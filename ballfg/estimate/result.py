@@ -24,7 +24,7 @@ class Status(enum.Enum):
 
     OK = "converged"
     NOT_CONVERGED = (
-        "the minimisation did not converge; the states are the best point reached. Check the table height and the "
+        "no estimate explains the samples; the states are the best that was reached. Check the table height and the "
         "noise settings, or look at the track for events that the model cannot explain"
     )
     NO_VELOCITY = (
