@@ -14,6 +14,7 @@ from ballfg.benchmarks.metrics import Figure
 from ballfg.benchmarks.network import fitted_network, parameter_count
 from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.step_noise import StepNoise
+from ballfg.benchmarks.synthetic import gaussian_settings
 from ballfg.benchmarks.timing import Stopwatch, quartiles
 from ballfg.cli.progress import progress
 from ballfg.dynamics import AnalyticModel, BallModel, Surfaces, fly_jacobian, model_from_dict, nominal_model, rollout
@@ -25,7 +26,6 @@ from ballfg.factors.bridge import nonlinear_graph, to_gtsam
 from ballfg.factors.covariance import marginal_covariances
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.kind import Values
-from ballfg.factors.loss import Loss
 from ballfg.predict import Belief, Propagator
 from ballfg.state import POSITION
 from ballfg.tracks import SPIN_LABELS, Dataset, Track
@@ -87,16 +87,7 @@ def problem_track(model: BallModel) -> Track:
 
 def problem_settings(coefficients: dict[str, float] | None = None) -> Settings:
     """1 mm and 1 cm/s of process noise a step, squared losses; optionally coefficients estimated with the track."""
-    return Settings(
-        position_noise=(NOISE,) * 3,
-        process=StepNoise(),
-        spin_label_noise=LABEL_NOISE,
-        loss=Loss("squared"),
-        spin_loss=Loss("squared"),
-        label_loss=Loss("squared"),
-        find_events=False,
-        coefficients=coefficients or {},
-    )
+    return gaussian_settings(NOISE, StepNoise(), LABEL_NOISE, coefficients)
 
 
 def _problem(smoother: Smoother, track: Track) -> tuple[BallGraph, Values]:

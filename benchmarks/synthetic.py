@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,6 +74,28 @@ class Protocol:
     tracks: list[Case]
 
 
+def gaussian_settings(
+    position: float, process: ProcessNoise, spin_label: float, coefficients: Mapping[str, float] | None = None
+) -> Settings:
+    """Settings for noise that is Gaussian and as declared: squared losses, nothing to look for but contacts.
+
+    Args:
+        position: m.  process: of the motion.  spin_label: rad/s.
+        coefficients: prior standard deviations of those that are estimated with each track; none if left out.
+    """
+    squared = Loss("squared")
+    return Settings(
+        position_noise=(position,) * 3,
+        process=process,
+        spin_label_noise=spin_label,
+        loss=squared,
+        spin_loss=squared,
+        label_loss=squared,
+        find_events=False,
+        coefficients=coefficients or {},
+    )
+
+
 def paper_protocol(count: int, seed: int) -> Protocol:
     """Free flights of the analytic model from random states; everyone knows the true dynamics and the true spin.
 
@@ -84,15 +107,7 @@ def paper_protocol(count: int, seed: int) -> Protocol:
     """
     model, surfaces = nominal_model(), Surfaces(-1e3)
     noise = StepNoise(spin=KNOWN_SPIN, step_position=PAPER_NOISE, step_velocity=PAPER_NOISE)
-    settings = Settings(
-        position_noise=(PAPER_NOISE,) * 3,
-        process=noise,
-        spin_label_noise=KNOWN_SPIN,
-        loss=Loss("squared"),
-        spin_loss=Loss("squared"),
-        label_loss=Loss("squared"),
-        find_events=False,
-    )
+    settings = gaussian_settings(PAPER_NOISE, noise, KNOWN_SPIN)
     rng = np.random.default_rng([seed, 1])
     return Protocol("paper", model, surfaces, settings, _free_flights(model, surfaces, count, rng))
 
@@ -135,15 +150,7 @@ def fair_protocol(count: int, seed: int, name: str = "fair") -> Protocol:
             contact_spin=process.contact_spin,
         ),
     )
-    settings = Settings(
-        position_noise=(FAIR_NOISE,) * 3,
-        process=process,
-        spin_label_noise=FAIR_SPIN_NOISE,
-        loss=Loss("squared"),
-        spin_loss=Loss("squared"),
-        label_loss=Loss("squared"),
-        find_events=False,
-    )
+    settings = gaussian_settings(FAIR_NOISE, process, FAIR_SPIN_NOISE)
     cases = [
         Case(s.track, s.true_states, away_from_bounces(s.true_times, s.true_states, kind.model, kind.surfaces))
         for s in simulate(config)

@@ -53,10 +53,10 @@ class Minimum:
 
     Attributes:
         values: the point.
-        error: objective there.
-        step: the undamped linear solution there: its Bayes net holds the covariances.
+        error: objective there; after a last step that was taken without another look, what the step promised.
+        step: the last undamped linear solution, there or one step before: its Bayes net holds the covariances.
         convergence: why it stopped.
-        iterations: number of linearisations.
+        iterations: number of linear solutions.
     """
 
     values: Values

@@ -10,9 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
+from ballfg.estimate.motion import FLIGHT, Motion, motions_of
 from ballfg.estimate.online_events import SIGMA_FACTOR, EventTracker, contact_step, first_difference
 from ballfg.estimate.online_final import Frozen, final_estimate, freeze, unknown
-from ballfg.estimate.online_interval import FLIGHT, Motion, motions_of
 from ballfg.estimate.online_isam import Sample, Update
 from ballfg.estimate.online_window import Window
 from ballfg.estimate.problem import trackwise_model

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimate.online_interval import Motion
+from ballfg.estimate.motion import Motion
 from ballfg.estimate.online_isam import Sample
 from ballfg.estimate.problem import QUALITY_SIGMA
 from ballfg.estimate.segmentation import Event, EventKind, Segmentation, SegmentationPhysics, Segmenter

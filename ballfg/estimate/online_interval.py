@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -14,49 +13,13 @@ from numpy.typing import NDArray
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.integrate import steps_over
 from ballfg.dynamics.model import BallModel
-from ballfg.estimate.segmentation import Segmentation
+from ballfg.estimate.motion import FLIGHT, Motion
 from ballfg.factors.bridge import Bridge, checked
 from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors
 from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Motion:
-    """How the ball gets from one sample to the next.
-
-    Attributes:
-        heights: m, the surfaces met, in order.
-        times: s since the interval's start, when they are met, as far as known when the factor was made.
-        rest: m, the surface on which the ball lies all the time; None if it does not.
-        hit: something hits the ball at an unknown moment.
-        linked: False where nothing is known of what happened; the next state starts anew.
-    """
-
-    heights: tuple[float, ...] = ()
-    times: tuple[float, ...] = ()
-    rest: float | None = None
-    hit: bool = False
-    linked: bool = True
-
-    def same(self, other: Motion) -> bool:
-        """Whether both are the same events, at whatever moments."""
-        mine = (self.heights, self.rest, self.hit, self.linked)
-        return mine == (other.heights, other.rest, other.hit, other.linked)
-
-    def covariance(self, dt: Array, noise: ProcessNoise) -> Array:
-        """(1, 9, 9) process noise over dt (1,) s; the same as in `ballfg.estimate.problem`."""
-        covariance = noise.flight(dt)
-        for time in self.times:
-            covariance += noise.contact(dt, np.array([time]))
-        if self.hit:
-            covariance += noise.hit(dt)
-        return covariance
-
-
-FLIGHT = Motion()
 
 
 class Interval:
@@ -192,34 +155,6 @@ def _merged(kinds: Sequence[DynamicsFactors]) -> DynamicsFactors:
         if hasattr(batch, name):
             setattr(batch, name, np.concatenate([getattr(kind, name) for kind in kinds]))
     return batch
-
-
-def motions_of(segmentation: Segmentation, times: Array) -> list[Motion]:
-    """The motion of every interval of a track or window.
-
-    Args: segmentation: of n samples.  times: (n,) s.
-    """
-    count = len(times) - 1
-    heights: list[list[tuple[float, float]]] = [[] for _ in range(count)]
-    for contact in sorted(segmentation.contacts, key=lambda c: c.time):
-        if 0 <= contact.interval < count:
-            heights[contact.interval].append((contact.height, contact.time - float(times[contact.interval])))
-    rests: dict[int, float] = {}
-    for rest in segmentation.rests:
-        rests.update(dict.fromkeys(range(max(rest.first, 0), min(rest.last, count - 1) + 1), rest.height))
-    hits, restarts = set(segmentation.hits.tolist()), set(segmentation.restarts.tolist())
-    return [
-        Motion(
-            heights=tuple(h for h, _ in met),
-            times=tuple(t for _, t in met),
-            rest=None if met else rests.get(i),
-            hit=i in hits,
-            linked=i not in restarts,
-        )
-        if met or i in rests or i in hits or i in restarts
-        else FLIGHT
-        for i, met in enumerate(heights)
-    ]
 
 
 def coefficient_count(model: BallModel) -> int:

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.dynamics.model import BallModel
-from ballfg.estimate.online_interval import FLIGHT, Interval, IntervalMaker, Motion, coefficient_count, evaluate, store
+from ballfg.estimate.motion import FLIGHT, Motion
+from ballfg.estimate.online_interval import Interval, IntervalMaker, coefficient_count, evaluate, store
 from ballfg.estimate.problem import coefficient_means, start_priors
 from ballfg.estimate.settings import Settings
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge

@@ -8,7 +8,7 @@ it) gets none. Every sample gets a position factor, the first state of each link
 from __future__ import annotations
 
 from collections import defaultdict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.integrate import steps_over
 from ballfg.dynamics.model import BallModel
+from ballfg.estimate.motion import motions_of
 from ballfg.estimate.segmentation import Contact, Quality, Segmentation
 from ballfg.estimate.settings import Settings, sample_sigmas, spin_start
 from ballfg.factors.dynamics import ContactFactors, FlightFactors, RestFactors
@@ -89,58 +90,32 @@ def contact_kinds(graph: BallGraph) -> list[ContactFactors]:
 def _dynamics(times: Array, model: BallModel, events: Events, settings: Settings) -> list[FactorKind]:
     """One factor per linked interval, in batches that share a motion and a number of integration steps."""
     dt = np.diff(times)
-    covariance = _process_covariance(times, dt, events, settings)
-    in_interval = contacts_by_interval(events.contacts)
-    resting = _rest_heights(events.segmentation, len(dt))
-    linked = np.ones(len(dt), dtype=bool)
-    linked[events.segmentation.restarts] = False
+    motions = motions_of(replace(events.segmentation, contacts=events.contacts), times)
+    covariance = settings.process.flight(dt)
     groups: defaultdict[tuple[str, int], list[int]] = defaultdict(list)
-    for i in np.flatnonzero(linked).tolist():
-        if i in in_interval:
-            groups["contact", len(in_interval[i])].append(i)
-        elif np.isfinite(resting[i]):
+    for i, motion in enumerate(motions):
+        if motion.times or motion.hit:
+            covariance[i] = motion.covariance(dt[i : i + 1], settings.process)[0]
+        if not motion.linked:
+            continue
+        if motion.heights:
+            groups["contact", len(motion.heights)].append(i)
+        elif motion.rest is not None:
             groups["rest", 0].append(i)
         else:
             groups["flight", steps_over(float(dt[i]))].append(i)
     kinds: list[FactorKind] = []
-    for (motion, _), members in groups.items():
+    for (motion_kind, _), members in groups.items():
         rows = np.array(members)
-        if motion == "contact":
-            heights = np.array([[c.height for c in in_interval[i]] for i in members])
+        if motion_kind == "contact":
+            heights = np.array([motions[i].heights for i in members])
             kinds.append(ContactFactors(model, rows, dt[rows], covariance[rows], heights))
-        elif motion == "rest":
-            kinds.append(RestFactors(model, rows, dt[rows], covariance[rows], resting[rows]))
+        elif motion_kind == "rest":
+            resting = np.array([motions[i].rest for i in members])
+            kinds.append(RestFactors(model, rows, dt[rows], covariance[rows], resting))
         else:
             kinds.append(FlightFactors(model, rows, dt[rows], covariance[rows]))
     return kinds
-
-
-def contacts_by_interval(contacts: tuple[Contact, ...]) -> dict[int, list[Contact]]:
-    """Contacts of each interval, in time order."""
-    found: dict[int, list[Contact]] = {}
-    for contact in sorted(contacts, key=lambda c: (c.interval, c.time)):
-        found.setdefault(contact.interval, []).append(contact)
-    return found
-
-
-def _rest_heights(segmentation: Segmentation, intervals: int) -> Array:
-    heights = np.full(intervals, np.nan)
-    for rest in segmentation.rests:
-        heights[rest.first : rest.last + 1] = rest.height
-    return heights
-
-
-def _process_covariance(times: Array, dt: Array, events: Events, settings: Settings) -> Array:
-    """(n - 1, 9, 9): free flight, plus a kick for each contact, plus a jump at an unknown time for a hit."""
-    noise = settings.process
-    covariance = noise.flight(dt)
-    for contact in events.contacts:
-        i = slice(contact.interval, contact.interval + 1)
-        time = np.array([contact.time]) - times[i]
-        covariance[i] += noise.contact(dt[i], time)
-    hits = events.segmentation.hits
-    covariance[hits] += noise.hit(dt[hits])
-    return covariance
 
 
 def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> list[FactorKind]:

@@ -57,7 +57,7 @@ class Estimate:
         hits: intervals (between samples i and i+1) in which something hit the ball.
         quality: (n,) `segmentation.Quality` of each sample.
         error: objective at the minimum; NaN for methods without one.
-        iterations: linearisations of a minimisation, 0 for methods without one.
+        iterations: linear solutions of a minimisation, 0 for methods without one.
     """
 
     name: str

@@ -14,13 +14,12 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
 from ballfg.estimate.initial import initial_states, move_contacts
+from ballfg.estimate.motion import contacts_by_interval
 from ballfg.estimate.near_contact import widen_near_contacts
 from ballfg.estimate.problem import (
-    START_POSITION_SIGMA,
     Events,
     build_graph,
     contact_kinds,
-    contacts_by_interval,
     effective_sigmas,
     initial_values,
     trackwise_model,
@@ -46,6 +45,9 @@ MAX_UNSEEN_HITS = 8
 """How many hits the estimate may add to those that the segmentation found; measured logs needed three at most."""
 BROKEN = 8.0
 """Norm of a whitened dynamics residual (9 dimensions) beyond which its interval hides a hit; chance: one in 1e9."""
+
+LEAST_POSITION_SIGMA = 0.05
+"""m. A position in a track that no graph explains is not trusted better than that."""
 
 
 @dataclass(frozen=True)
@@ -273,12 +275,9 @@ def _status(minimum: Minimum, samples: int) -> Status:
 
 def _prior_covariances(n: int, p: int, sigma: Array, settings: Settings) -> Covariances:
     """What is known of each state by itself, where the graph could not be solved."""
-    states = np.zeros((n, STATE_DIM, STATE_DIM))
-    for block, spread in ((POSITION, np.maximum(sigma, START_POSITION_SIGMA * 0.01)), (VELOCITY, None), (SPIN, None)):
-        width = settings.velocity_prior if block == VELOCITY else settings.spin_prior
-        diagonal = spread if spread is not None else np.full((n, 3), width)
-        axes = np.arange(block.start, block.stop)
-        states[:, axes, axes] = diagonal**2
-    return Covariances(
-        states, np.diag([s**2 for s in settings.coefficients.values()]).reshape(p, p), np.zeros((n, 9, p))
-    )
+    spread = np.empty((n, STATE_DIM))
+    spread[:, POSITION] = np.maximum(sigma, LEAST_POSITION_SIGMA)
+    spread[:, VELOCITY], spread[:, SPIN] = settings.velocity_prior, settings.spin_prior
+    states = spread[..., None] ** 2 * np.eye(STATE_DIM)
+    coefficients = np.diag([s**2 for s in settings.coefficients.values()]).reshape(p, p)
+    return Covariances(states, coefficients, np.zeros((n, STATE_DIM, p)))

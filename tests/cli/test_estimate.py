@@ -13,8 +13,10 @@ import pyarrow.parquet as pq
 import pytest
 
 from ballfg.cli import progress as progress_module
+from ballfg.cli.estimate import Method
 from ballfg.cli.main import run
 from ballfg.cli.progress import progress
+from ballfg.estimate import ESTIMATORS
 from ballfg.simulate import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset
 
@@ -293,3 +295,8 @@ def test_the_start_does_not_count_as_work(clock: Clock, capsys: pytest.CaptureFi
     lines = capsys.readouterr().err.splitlines()
     assert lines[:2] == ["1 of 88 tracks estimated", "21 of 88 tracks estimated, 34 s left"]
     assert len(lines) == 5
+
+
+def test_methods_are_the_estimators() -> None:
+    """The option names them without importing them, so that --help stays quick."""
+    assert {method.value for method in Method} == set(ESTIMATORS)

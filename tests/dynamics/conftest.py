@@ -11,19 +11,8 @@ from ballfg.dynamics.model import Rates
 
 
 @pytest.fixture
-def model() -> AnalyticModel:
-    """Every effect at once, away from its defaults."""
-    values = {
-        "gravity": {"g": 9.79},
-        "drag": {"k": 0.13},
-        "magnus": {"k": 0.0031},
-        "spin_decay": {"rate": 0.3},
-        "restitution": {"e": 0.91},
-        "friction": {"mu": 0.22},
-        "tangential_restitution": {"e_t": 0.2},
-        "table_height": {"offset": -0.004},
-    }
-    return AnalyticModel([EFFECTS[name](**v) for name, v in values.items()])
+def model(every_effect: AnalyticModel) -> AnalyticModel:
+    return every_effect
 
 
 @pytest.fixture

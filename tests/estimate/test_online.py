@@ -11,9 +11,9 @@ from torch import nn
 
 from ballfg.dynamics import BallModel, Surfaces, nominal_model, rollout
 from ballfg.estimate import online_isam
+from ballfg.estimate.motion import FLIGHT, Motion
 from ballfg.estimate.online import Online
 from ballfg.estimate.online_events import contact_step
-from ballfg.estimate.online_interval import FLIGHT, Motion
 from ballfg.estimate.result import Status
 from ballfg.estimate.settings import Settings, uncertain
 from ballfg.estimate.smoother import Smoother

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from ballfg.dynamics import EFFECTS, AnalyticModel
+from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.factors.kind import COEFFICIENTS, FactorKind, Rows, Values
 
@@ -19,19 +19,8 @@ NAMES = (
 
 
 @pytest.fixture
-def model() -> AnalyticModel:
-    """Every effect at once, away from its defaults."""
-    values = {
-        "gravity": {"g": 9.79},
-        "drag": {"k": 0.13},
-        "magnus": {"k": 0.0031},
-        "spin_decay": {"rate": 0.3},
-        "restitution": {"e": 0.91},
-        "friction": {"mu": 0.22},
-        "tangential_restitution": {"e_t": 0.2},
-        "table_height": {"offset": -0.004},
-    }
-    return AnalyticModel([EFFECTS[name](**v) for name, v in values.items()])
+def model(every_effect: AnalyticModel) -> AnalyticModel:
+    return every_effect
 
 
 @pytest.fixture

@@ -1,0 +1,23 @@
+"""What several rooms' tests share."""
+
+from __future__ import annotations
+
+import pytest
+
+from ballfg.dynamics import EFFECTS, AnalyticModel
+
+
+@pytest.fixture
+def every_effect() -> AnalyticModel:
+    """Every effect at once, away from its defaults."""
+    values = {
+        "gravity": {"g": 9.79},
+        "drag": {"k": 0.13},
+        "magnus": {"k": 0.0031},
+        "spin_decay": {"rate": 0.3},
+        "restitution": {"e": 0.91},
+        "friction": {"mu": 0.22},
+        "tangential_restitution": {"e_t": 0.2},
+        "table_height": {"offset": -0.004},
+    }
+    return AnalyticModel([EFFECTS[name](**v) for name, v in values.items()])
