@@ -7,19 +7,21 @@ a surface. A hit is a flight whose process noise contains the hit.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Hashable
 from functools import partial
+from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.contact import fly_through_jacobian
-from ballfg.dynamics.integrate import batch_jacobian, fly_jacobian
+from ballfg.dynamics.contact import fly_through, fly_through_jacobian
+from ballfg.dynamics.integrate import batch_jacobian, fly, fly_jacobian, steps_over
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.rollout import roll
-from ballfg.factors.kind import COEFFICIENTS, Array, FactorKind, Index, Values
-from ballfg.factors.noise import whitening
+from ballfg.factors.kind import COEFFICIENTS, Array, FactorKind, Index, Noise, Values
+from ballfg.factors.noise import Kicks, whitening, whitening_tensor
 from ballfg.state import STATE_DIM
 
 
@@ -31,9 +33,15 @@ class DynamicsFactors(FactorKind):
         states: (m,) indices i; each factor ties state i to state i + 1.
         dt: (m,) s.
         covariance: (m, 9, 9) of the process noise gathered over dt.
+        kicks: what that covariance is made of, for those who learn it; free flight by default.
     """
 
-    def __init__(self, model: BallModel, states: Index, dt: Array, covariance: Array) -> None:
+    costly: ClassVar[bool] = True
+    row_arrays: ClassVar[tuple[str, ...]] = ("variables", "dt", "whitening", "kick_times", "hit")
+
+    def __init__(
+        self, model: BallModel, states: Index, dt: Array, covariance: Array, kicks: Kicks | None = None
+    ) -> None:
         states = np.asarray(states, dtype=np.int64)
         columns = [states, states + 1]
         if isinstance(model, AugmentedModel):
@@ -44,10 +52,39 @@ class DynamicsFactors(FactorKind):
         self.model = model
         self.dt = dt
         self.whitening = whitening(covariance)
+        kicks = kicks or Kicks.none(len(states))
+        self.kick_times, self.hit = kicks.times, kicks.hit
 
     @abstractmethod
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
         """F and its Jacobian: augmented states (k, 9 + p) to (k, 9 + p) and (k, 9 + p, 9 + p)."""
+
+    @abstractmethod
+    def moved(self, state: Tensor) -> Tensor:
+        """F of all rows, (m, 9 + p) to (m, 9 + p), differentiable in the states and the model's parameters."""
+
+    @property
+    def group(self) -> Hashable:
+        """Besides the usual: the model, and how many contacts and kicks there are in an interval."""
+        return (*super().group, id(self.model), self.kick_times.shape[1])  # type: ignore[misc]
+
+    def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
+        """(m, 9) whitened residuals in torch."""
+        start = inputs[0] if len(inputs) == 2 else torch.cat((inputs[0], inputs[2]), dim=-1)
+        offset = inputs[1] - self.moved(start)[:, :STATE_DIM]
+        return (torch.from_numpy(self.whitening) @ offset.unsqueeze(-1)).squeeze(-1)
+
+    def rewhitening(self, noise: Noise) -> Tensor | None:
+        """(m, 9, 9) the new whitening times the inverse of the old one."""
+        if noise.process is None:
+            return None
+        basis = torch.from_numpy(Kicks(self.kick_times, self.hit).basis(self.dt))
+        covariance = torch.tensordot(noise.process.square(), basis, dims=([0], [1]))
+        return whitening_tensor(covariance) @ torch.linalg.inv(torch.from_numpy(self.whitening))
+
+    def log_spread(self) -> float:
+        """Half the log determinants of all covariances."""
+        return -float(np.log(np.diagonal(self.whitening, axis1=1, axis2=2)).sum())
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, 9) and Jacobians (k, 9, 9), (k, 9, 9) and, with coefficients, (k, 9, p)."""
@@ -68,6 +105,15 @@ class FlightFactors(DynamicsFactors):
         """Flight over dt."""
         return fly_jacobian(self.model, state, torch.from_numpy(self.dt[rows]))
 
+    def moved(self, state: Tensor) -> Tensor:
+        """Flight over dt."""
+        return fly(self.model, state, torch.from_numpy(self.dt))
+
+    @property
+    def group(self) -> Hashable:
+        """Besides: the number of integration steps."""
+        return (*super().group, steps_over(float(self.dt.max())))  # type: ignore[misc]
+
 
 class ContactFactors(DynamicsFactors):
     """Flight with contacts in the interval, at surfaces that are named; how many is the same for all rows.
@@ -75,23 +121,37 @@ class ContactFactors(DynamicsFactors):
     Args: heights: (m, c) m, the surface of each of c contacts, in order.
     """
 
-    def __init__(self, model: BallModel, states: Index, dt: Array, covariance: Array, heights: Array) -> None:
-        super().__init__(model, states, dt, covariance)
+    row_arrays: ClassVar[tuple[str, ...]] = (*DynamicsFactors.row_arrays, "heights")
+
+    def __init__(
+        self,
+        model: BallModel,
+        states: Index,
+        dt: Array,
+        covariance: Array,
+        heights: Array,
+        kicks: Kicks | None = None,
+    ) -> None:
+        super().__init__(model, states, dt, covariance, kicks)
         self.heights = heights
 
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
         """Flight, impact, flight."""
-        after, _, jacobian = self._through(state, rows)
+        heights = tuple(torch.from_numpy(column) for column in self.heights[rows].T.copy())
+        after, _, jacobian = fly_through_jacobian(self.model, state, torch.from_numpy(self.dt[rows]), heights)
         return after, jacobian
 
-    def _through(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor, Tensor]:
-        heights = tuple(torch.from_numpy(column) for column in self.heights[rows].T.copy())
-        return fly_through_jacobian(self.model, state, torch.from_numpy(self.dt[rows]), heights)
+    def moved(self, state: Tensor) -> Tensor:
+        """Flight, impact, flight."""
+        heights = tuple(torch.from_numpy(column) for column in self.heights.T.copy())
+        return fly_through(self.model, state, torch.from_numpy(self.dt), heights)[0]
 
     def contact_times(self, values: Values) -> Array:
         """(m, c) s since the start of each interval; NaN where the ball never gets to the surface."""
         start = np.concatenate([values.gather(v) for v in (self.variables[:, 0], *self.variables[:, 2:].T)], axis=-1)
-        return self._through(torch.from_numpy(start), slice(None))[1].numpy()
+        heights = tuple(torch.from_numpy(column) for column in self.heights.T.copy())
+        with torch.no_grad():
+            return fly_through(self.model, torch.from_numpy(start), torch.from_numpy(self.dt), heights)[1].numpy()
 
 
 class RestFactors(DynamicsFactors):
@@ -100,14 +160,28 @@ class RestFactors(DynamicsFactors):
     Args: heights: (m,) m of the surfaces.
     """
 
-    def __init__(self, model: BallModel, states: Index, dt: Array, covariance: Array, heights: Array) -> None:
-        super().__init__(model, states, dt, covariance)
+    row_arrays: ClassVar[tuple[str, ...]] = (*DynamicsFactors.row_arrays, "heights")
+
+    def __init__(
+        self,
+        model: BallModel,
+        states: Index,
+        dt: Array,
+        covariance: Array,
+        heights: Array,
+        kicks: Kicks | None = None,
+    ) -> None:
+        super().__init__(model, states, dt, covariance, kicks)
         self.heights = heights
 
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
         """Rolling over dt; the surface holds the ball's height and stops its vertical motion."""
         dt, height = torch.from_numpy(self.dt[rows]), torch.from_numpy(self.heights[rows])
         return batch_jacobian(partial(_rolled, self.model, dt, height), state)
+
+    def moved(self, state: Tensor) -> Tensor:
+        """Rolling over dt."""
+        return _rolled(self.model, torch.from_numpy(self.dt), torch.from_numpy(self.heights), state)
 
 
 def _rolled(model: BallModel, dt: Tensor, height: Tensor, state: Tensor) -> Tensor:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ballfg.factors.kind import FactorKind, Rows, Values
 from ballfg.factors.linear import Step, solve
+from ballfg.factors.search import Search, run
 
 
 @dataclass(frozen=True)
@@ -88,11 +89,14 @@ class _Point:
     linearized: Sequence[Rows]
     error: float
 
-    def moved(self, graph: BallGraph, step: Step, share: float = 1.0) -> _Point:
+    def moved(self, graph: BallGraph, step: Step, share: float = 1.0) -> Search[_Point]:
         """The point a step, or a share of it, further on."""
-        values = self.values.moved(share * step.states, share * step.coefficients)
-        linearized = graph.linearize(values)
-        return _Point(values, linearized, objective(linearized))
+        return _point(graph, self.values.moved(share * step.states, share * step.coefficients))
+
+
+def _point(graph: BallGraph, values: Values) -> Search[_Point]:
+    linearized = yield graph, values
+    return _Point(values, linearized, objective(linearized))
 
 
 @dataclass(frozen=True)
@@ -111,15 +115,18 @@ class LevenbergMarquardt:
     first_damping: float = 1e-8
 
     def minimize(self, graph: BallGraph, values: Values) -> Minimum:
-        """Minimise a graph's objective from a starting point.
+        """Minimise a graph's objective from a starting point; see `search`."""
+        return run(self.search(graph, values))
+
+    def search(self, graph: BallGraph, values: Values) -> Search[Minimum]:
+        """Minimise a graph's objective from a starting point, asking for linearisations (`ballfg.factors.search`).
 
         Each iteration tries the Gauss-Newton step; where it does not reduce the objective, lambda grows until a
         step does. The length of an undamped step in the metric of J^T J, |J d|, is the distance to the minimum in
         posterior standard deviations: free of units, and what `tolerance` bounds. When the lengths fall so quickly that
         the next step would be within the tolerance, the present one is the last.
         """
-        linearized = graph.linearize(values)
-        point = _Point(values, linearized, objective(linearized))
+        point = yield from _point(graph, values)
         if not np.isfinite(point.error):
             return Minimum(values, point.error, None, Convergence.NOT_FINITE, 1)
         damping, growth, last = 0.0, 10.0, np.inf
@@ -131,7 +138,7 @@ class LevenbergMarquardt:
             if step is not None and RATE_MARGIN * length * (length / last) < self.tolerance and np.isfinite(last):
                 moved = point.values.moved(step.states, step.coefficients)
                 return Minimum(moved, point.error - step.decrease, step, Convergence.CONVERGED, iteration)
-            trial = None if step is None else _tried(graph, point, step, damping)
+            trial = None if step is None else (yield from _tried(graph, point, step, damping))
             if step is not None and trial is not None and trial.error <= point.error * (1 + 1e-12):
                 gain = (point.error - trial.error) / max(step.decrease, np.finfo(float).tiny)
                 point, last = trial, length if gain > WHOLE else np.inf
@@ -147,17 +154,17 @@ class LevenbergMarquardt:
         return Minimum(point.values, point.error, final, Convergence.TOO_MANY_ITERATIONS, self.max_iterations)
 
 
-def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> _Point:
+def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> Search[_Point]:
     """Where a step leads: all of it, or a share where an undamped one brought less than half of its promise.
 
     Where the objective bends r times as much along the step as the linear model says (friction between slip and grip
     does), the whole step brings (2 - r) of its promise and 1 / r of it is best. Whole steps then creep or diverge.
     """
-    whole = point.moved(graph, step)
+    whole = yield from point.moved(graph, step)
     gain = (point.error - whole.error) / max(step.decrease, np.finfo(float).tiny)
     if damping > 0.0 or gain > WHOLE or step.decrease > NEAR or not np.isfinite(whole.error):
         return whole
-    nearer = point.moved(graph, step, 1.0 / (2.0 - gain))
+    nearer = yield from point.moved(graph, step, 1.0 / (2.0 - gain))
     return nearer if nearer.error < min(point.error, whole.error) else whole
 
 

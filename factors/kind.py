@@ -3,15 +3,22 @@
 GTSAM asks one factor at a time; torch is quick only on batches. So factors of one sort are one object here. It computes
 whitened residuals and Jacobians of any of its rows in one call. The solver of this package takes those arrays
 as they are (`ballfg.factors.linear`); GTSAM's own solvers see one CustomFactor per row (`ballfg.factors.bridge`).
+
+What is learned through an estimate needs the same residuals once more, as a torch function of everything that can be
+learned: the values, the model's parameters, the noise.
 """
 
 from __future__ import annotations
 
+import copy
 from abc import ABC, abstractmethod
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
+from typing import ClassVar, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ballfg.factors.loss import Loss
 
@@ -66,6 +73,21 @@ class Rows:
         return float(self.loss.value(np.linalg.norm(self.residual, axis=-1)).sum())
 
 
+@dataclass(frozen=True)
+class Noise:
+    """Noise that is learned, as tensors; None where it is what the factors were built with.
+
+    Attributes:
+        process: (7,) the numbers of `ballfg.factors.noise.PROCESS_NOISE`.
+        position: () standard deviation of every measured position in multiples of what the factors were built with.
+        spin: () the same for what labels or launcher settings say of the spin.
+    """
+
+    process: Tensor | None = None
+    position: Tensor | None = None
+    spin: Tensor | None = None
+
+
 class FactorKind(ABC):
     """m factors of one sort, each between the same number of variables.
 
@@ -73,7 +95,13 @@ class FactorKind(ABC):
         variables: (m, a) numbers of the variables of each factor: a state's index or `COEFFICIENTS`.
         dim: dimension of a residual.
         loss: the loss on the norm of a whitened residual.
+        row_arrays: names of the attributes that hold one entry a factor.
+        costly: whether an evaluation is a torch call, worth sharing between graphs.
     """
+
+    costly: ClassVar[bool] = False
+
+    row_arrays: ClassVar[tuple[str, ...]] = ("variables",)
 
     def __init__(self, variables: Index, dim: int, loss: Loss | None = None) -> None:
         self.variables = np.asarray(variables, dtype=np.int64)
@@ -93,8 +121,53 @@ class FactorKind(ABC):
         Returns: residuals (k, dim) and a Jacobians (k, dim, d).
         """
 
+    def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
+        """(m, dim) the whitened residuals of all rows, differentiable in the inputs and in the model.
+
+        Only a gradient through the estimate asks for them; `compute` is what estimation needs.
+
+        Args: inputs: for each of the a variables the values (m, d).
+        Raises: NotImplementedError: if the kind has none.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} has no residual in torch, so no gradient can pass through an estimate with it. "
+            "Write its method `residual` (docs/custom_factors.md)."
+        )
+
+    def rewhitening(self, noise: Noise) -> Tensor | None:
+        """What turns whitened residuals into residuals whitened with learned noise, differentiable in that.
+
+        Returns: (m, dim, dim) lower triangular, or () a common factor; None where nothing is learned of this noise.
+        """
+        return None
+
+    def log_spread(self) -> float:
+        """Half the log determinants of the covariances that residuals are whitened with, of all rows together.
+
+        Zero for kinds whose noise is never learned.
+        """
+        return 0.0
+
+    @property
+    def group(self) -> Hashable:
+        """Kinds with equal groups can be merged (see `merge`)."""
+        return (type(self), self.dim, self.variables.shape[1], self.loss)
+
     def linearize(self, values: Values) -> Rows:
         """All factors at a point."""
         inputs = tuple(values.gather(column) for column in self.variables.T)
         residual, jacobians = self.compute(slice(None), inputs)
         return Rows(self.variables, residual, jacobians, self.loss)
+
+
+K = TypeVar("K", bound=FactorKind)
+
+
+def merge(kinds: Sequence[K]) -> K:
+    """One kind with the rows of several of the same group, in order; variable numbers stay what they were."""
+    if len(kinds) == 1:
+        return kinds[0]
+    whole = copy.copy(kinds[0])
+    for name in whole.row_arrays:
+        setattr(whole, name, np.concatenate([getattr(kind, name) for kind in kinds]))
+    return whole

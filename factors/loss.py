@@ -7,7 +7,9 @@ from typing import Literal
 
 import gtsam
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 Array = NDArray[np.float64]
 
@@ -41,6 +43,16 @@ class Loss:
         if self.name == "cauchy":
             return np.asarray(0.5 * self.scale**2 * np.log1p((norm / self.scale) ** 2))
         return np.asarray(0.5 * norm**2)
+
+    def of_square(self, square: Tensor) -> Tensor:
+        """(...) rho in torch as a function of the squared norm; twice differentiable at zero too."""
+        if self.name == "huber":
+            far = square > self.scale**2
+            norm = torch.where(far, square, self.scale**2).sqrt()
+            return torch.where(far, self.scale * (norm - 0.5 * self.scale), 0.5 * square)
+        if self.name == "cauchy":
+            return 0.5 * self.scale**2 * torch.log1p(square / self.scale**2)
+        return 0.5 * square
 
     def weight(self, norm: Array) -> Array:
         """(n,) factor on the squared residual in iteratively reweighted least squares: rho'(d) / d."""

@@ -6,10 +6,12 @@ the covariance q^2 [[dt^3/3, dt^2/2], [dt^2/2, dt]]; spin is a random walk. So a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
@@ -75,6 +77,50 @@ class ProcessNoise:
         return reach @ reach.swapaxes(-1, -2)
 
 
+PROCESS_NOISE = tuple(field.name for field in fields(ProcessNoise))
+"""Its numbers, in the order in which `variances` and `Kicks.basis` hold them."""
+
+
+@dataclass(frozen=True)
+class Kicks:
+    """What happens to a ball within m intervals, as far as the process noise has to know.
+
+    Attributes:
+        times: (m, c) s since the interval's start, of c contacts in each.
+        hit: (m,) bool, whether something hits the ball at an unknown moment.
+    """
+
+    times: Array
+    hit: NDArray[np.bool_]
+
+    @staticmethod
+    def none(count: int) -> Kicks:
+        """Free flight in all intervals."""
+        return Kicks(np.zeros((count, 0)), np.zeros(count, dtype=bool))
+
+    def __getitem__(self, rows: NDArray[np.int64] | slice) -> Kicks:
+        return Kicks(self.times[rows], self.hit[rows])
+
+    def basis(self, dt: Array) -> Array:
+        """(m, 7, 9, 9) what a unit of each number of `PROCESS_NOISE` adds to the covariance over dt (m,) s.
+
+        The covariance is linear in the squares of those numbers, which is what a gradient with respect to them needs.
+        """
+        basis = np.zeros((len(dt), len(PROCESS_NOISE), STATE_DIM, STATE_DIM))
+        basis[:, 0] = _white_acceleration(dt, 1.0, 0.0)
+        basis[:, 1] = _white_acceleration(dt, 0.0, 1.0)
+        for time in self.times.T:
+            basis[:, 2] += ProcessNoise.kick(dt, time, (1.0, 1.0, 1.0), 0.0)
+            basis[:, 3] += ProcessNoise.kick(dt, time, (1.0, 1.0, 0.0), 0.0)
+            basis[:, 4] += ProcessNoise.kick(dt, time, (0.0, 0.0, 0.0), 1.0)
+        if self.hit.any():
+            for time in (np.zeros_like(dt), dt):
+                half = 0.5 * self.hit[:, None, None]
+                basis[:, 5] += half * ProcessNoise.kick(dt, time, (1.0, 1.0, 1.0), 0.0)
+                basis[:, 6] += half * ProcessNoise.kick(dt, time, (0.0, 0.0, 0.0), 1.0)
+        return basis
+
+
 def _white_acceleration(dt: Array, acceleration: float, spin: float) -> Array:
     covariance = np.zeros((len(dt), STATE_DIM, STATE_DIM))
     eye, t = np.eye(3), dt[:, None, None]
@@ -91,3 +137,11 @@ def whitening(covariance: Array) -> Array:
     scale = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     correlation = covariance / (scale[..., :, None] * scale[..., None, :])
     return np.linalg.inv(np.linalg.cholesky(correlation)) / scale[..., None, :]
+
+
+def whitening_tensor(covariance: Tensor) -> Tensor:
+    """`whitening` in torch, differentiable."""
+    scale = covariance.diagonal(dim1=-2, dim2=-1).sqrt()
+    root = torch.linalg.cholesky(covariance / (scale.unsqueeze(-1) * scale.unsqueeze(-2)))
+    eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype).expand_as(covariance)
+    return torch.linalg.solve_triangular(root, eye, upper=False) / scale.unsqueeze(-2)

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import ClassVar
 
-from ballfg.factors.kind import Array, FactorKind, Index
+import numpy as np
+import torch
+from torch import Tensor
+
+from ballfg.factors.kind import Array, FactorKind, Index, Noise
 from ballfg.factors.loss import Loss
 from ballfg.state import POSITION, STATE_DIM
 
@@ -18,6 +22,8 @@ class PositionFactors(FactorKind):
         sigma: (m, 3) m, standard deviation per axis.
         loss: a robust one where tracks carry outliers.
     """
+
+    row_arrays: ClassVar[tuple[str, ...]] = ("variables", "measured", "information_root", "_jacobian")
 
     def __init__(self, states: Index, measured: Array, sigma: Array, loss: Loss | None = None) -> None:
         super().__init__(np.asarray(states)[:, None], 3, loss)
@@ -36,3 +42,15 @@ class PositionFactors(FactorKind):
         """Whitened residuals (k, 3) and Jacobians (k, 3, 9)."""
         residual = (inputs[0][:, POSITION] - self.measured[rows]) * self.information_root[rows]
         return residual, (self._jacobian[rows],)
+
+    def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
+        """(m, 3) whitened residuals in torch."""
+        return (inputs[0][:, POSITION] - torch.from_numpy(self.measured)) * torch.from_numpy(self.information_root)
+
+    def rewhitening(self, noise: Noise) -> Tensor | None:
+        """One factor for all axes of all samples."""
+        return None if noise.position is None else 1.0 / noise.position
+
+    def log_spread(self) -> float:
+        """Sum of the logarithms of all standard deviations."""
+        return -float(np.log(self.information_root).sum())

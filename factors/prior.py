@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
+from typing import ClassVar
 
-from ballfg.factors.kind import COEFFICIENTS, Array, FactorKind, Index
+import numpy as np
+import torch
+from torch import Tensor
+
+from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.factors.kind import COEFFICIENTS, Array, FactorKind, Index, Noise
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, STATE_DIM
 
@@ -18,6 +23,8 @@ class PriorFactors(FactorKind):
         information_root: (m, r, d) matrices W.
     """
 
+    row_arrays: ClassVar[tuple[str, ...]] = ("variables", "mean", "information_root")
+
     def __init__(self, variables: Index, mean: Array, information_root: Array, loss: Loss | None = None) -> None:
         super().__init__(np.asarray(variables)[:, None], information_root.shape[1], loss)
         self.mean = mean
@@ -28,6 +35,47 @@ class PriorFactors(FactorKind):
         root = self.information_root[rows]
         return np.einsum("nij,nj->ni", root, inputs[0] - self.mean[rows]), (root,)
 
+    def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
+        """(m, r) whitened residuals in torch."""
+        return self._whitened(inputs[0] - torch.from_numpy(self.mean))
+
+    def _whitened(self, offset: Tensor) -> Tensor:
+        return (torch.from_numpy(self.information_root) @ offset.unsqueeze(-1)).squeeze(-1)
+
+
+class SpinLabelFactors(PriorFactors):
+    """What labels say of some spins: a prior whose standard deviation can be learned."""
+
+    def rewhitening(self, noise: Noise) -> Tensor | None:
+        """One factor for all axes of all labels."""
+        return None if noise.spin is None else 1.0 / noise.spin
+
+    def log_spread(self) -> float:
+        """Sum of the logarithms of all standard deviations."""
+        return -float(np.log(np.diagonal(self.information_root[:, :, SPIN], axis1=1, axis2=2)).sum())
+
+
+class CoefficientPriorFactors(PriorFactors):
+    """The coefficients of a track lie about the model's own values.
+
+    Args: model: with the coefficients.  sigma: (p,) standard deviations.
+    """
+
+    def __init__(self, model: AugmentedModel, sigma: Array) -> None:
+        _check_sigma(sigma)
+        self.model = model
+        mean = self._means().detach().numpy()
+        super().__init__(np.array([COEFFICIENTS]), mean[None], np.diag(1.0 / sigma)[None])
+
+    def _means(self) -> Tensor:
+        """(p,) the model's own values, as its parameters are now."""
+        parameters = dict(self.model.model.named_parameters())
+        return torch.stack([parameters[name] for name in self.model.names])
+
+    def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
+        """(m, p) whitened residuals in torch, differentiable in the model's own values too."""
+        return self._whitened(inputs[0] - self._means())
+
 
 def state_prior(state: int, mean: Array, sigma: Array) -> PriorFactors:
     """Prior on one state: mean (9,) and standard deviations (9,)."""
@@ -36,13 +84,23 @@ def state_prior(state: int, mean: Array, sigma: Array) -> PriorFactors:
 
 
 def spin_prior(states: Index, spin: Array, sigma: Array, loss: Loss | None = None) -> PriorFactors:
-    """Priors on the spin of some states, from labels or launcher settings: spin (m, 3) and sigma (m, 3) rad/s."""
+    """Priors on the spin of some states: spin (m, 3) and sigma (m, 3) rad/s."""
+    return PriorFactors(states, *_about_spin(spin, sigma), loss)
+
+
+def spin_label(states: Index, spin: Array, sigma: Array, loss: Loss | None = None) -> SpinLabelFactors:
+    """The same from labels: spin (m, 3) and sigma (m, 3) rad/s."""
+    return SpinLabelFactors(states, *_about_spin(spin, sigma), loss)
+
+
+def _about_spin(spin: Array, sigma: Array) -> tuple[Array, Array]:
+    """Mean (m, 9) and root information (m, 3, 9) of priors on spins."""
     _check_sigma(sigma)
-    mean = np.zeros((len(states), STATE_DIM))
+    mean = np.zeros((len(spin), STATE_DIM))
     mean[:, SPIN] = spin
-    root = np.zeros((len(states), 3, STATE_DIM))
+    root = np.zeros((len(spin), 3, STATE_DIM))
     root[:, :, SPIN] = np.eye(3) / sigma[:, :, None]
-    return PriorFactors(states, mean, root, loss)
+    return mean, root
 
 
 def coefficient_prior(mean: Array, sigma: Array) -> PriorFactors:

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
+from ballfg.learning.train_config import SplitConfig
 from ballfg.tracks import Dataset, Track
 
 LABEL = "split"
-FIT, JUDGE = "train", "test"
-"""Values of the label `split`; tracks with another value take no part."""
+FIT, JUDGE, VALIDATE = "train", "test", "validation"
+"""Values of the label `split`: a calibration judges by the tests, a training validates and leaves the tests alone."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +77,38 @@ def split_tracks(dataset: Dataset, how: Literal["random", "label"], seed: int, *
             f"a calibration needs 2 tracks to fit and 1 to judge; got {len(fit)} and {len(judge)}. Add some."
         )
     return Split(fit, judge, left_out, digest.hexdigest())
+
+
+def training_split(
+    tracks: Sequence[tuple[int, Track]], config: SplitConfig, seed: int
+) -> tuple[list[int], list[int]]:
+    """Numbers of the tracks that train and of those that validate, in order; other tracks take no part.
+
+    Args:
+        tracks: each with the number of its dataset; `alternate` counts in each dataset by itself.
+        config: how.
+        seed: of the random split.
+
+    Raises: ValueError: if no track trains.
+    """
+    if config.by == "none":
+        chosen = [FIT] * len(tracks)
+    elif config.by == "label":
+        chosen = [str(track.labels.get(LABEL)) for _, track in tracks]
+    elif config.by == "alternate":
+        counts: Counter[int] = Counter()
+        chosen = []
+        for number, _ in tracks:
+            chosen.append(VALIDATE if counts[number] % 2 else FIT)
+            counts[number] += 1
+    else:
+        order = np.random.default_rng(seed).permutation(len(tracks))
+        validating = set(order[: round(config.validation * len(tracks))].tolist())
+        chosen = [VALIDATE if k in validating else FIT for k in range(len(tracks))]
+    parts = [[k for k, part in enumerate(chosen) if part == wanted] for wanted in (FIT, VALIDATE)]
+    if not parts[0]:
+        raise ValueError(f"split must leave tracks to train on; got none of {len(tracks)}. Check split.by and the data.")
+    return parts[0], parts[1]
 
 
 def tracks_of(dataset: Dataset, names: tuple[str, ...]) -> Iterator[Track]:

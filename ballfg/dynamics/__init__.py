@@ -1,18 +1,23 @@
-"""How a ball moves: the contract, physical effects, integration with exact contacts, rollouts, model files."""
+"""How a ball moves: the contract, physical effects, learned models, exact contacts, rollouts, model files."""
 
 from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.dynamics.architecture import Architecture
 from ballfg.dynamics.contact import contact_time, fly_through, fly_through_jacobian
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact
 from ballfg.dynamics.effects.registry import EFFECTS
 from ballfg.dynamics.integrate import fly, fly_jacobian
+from ballfg.dynamics.learned import LearnedModel, build
 from ballfg.dynamics.model import BallModel, substitute
 from ballfg.dynamics.model_file import load_model, model_from_dict, model_to_dict, nominal_model, save_model
 from ballfg.dynamics.rollout import advance, rollout
+from ballfg.dynamics.spin_embedding import SpinEmbedding
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.dynamics.trained import Trained
 
 __all__ = [
     "EFFECTS",
     "AnalyticModel",
+    "Architecture",
     "BallModel",
     "BounceEffect",
     "Coefficient",
@@ -20,8 +25,12 @@ __all__ = [
     "Flight",
     "FlightEffect",
     "Impact",
+    "LearnedModel",
+    "SpinEmbedding",
     "Surfaces",
+    "Trained",
     "advance",
+    "build",
     "contact_time",
     "fly",
     "fly_jacobian",

@@ -42,10 +42,17 @@ def rk4_step(rates: RateFunction, state: Tensor, h: Tensor) -> Tensor:
     return _stages(rates, state, h)[0]
 
 
-def _stages(rates: RateFunction, state: Tensor, h: Tensor) -> tuple[Tensor, tuple[Tensor, ...]]:
+def rk4_from(rates: RateFunction, state: Tensor, slope: Tensor, h: Tensor) -> Tensor:
+    """`rk4_step` where the derivative at the start, (..., 9), is known already."""
+    return _stages(rates, state, h, slope)[0]
+
+
+def _stages(
+    rates: RateFunction, state: Tensor, h: Tensor, slope: Tensor | None = None
+) -> tuple[Tensor, tuple[Tensor, ...]]:
     """The state after a step, and the four states at which the rates were taken."""
     half = h / 2
-    k1 = derivative(rates, state)
+    k1 = derivative(rates, state) if slope is None else slope
     x2 = torch.addcmul(state, half, k1)
     k2 = derivative(rates, x2)
     x3 = torch.addcmul(state, half, k2)

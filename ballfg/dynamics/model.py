@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Final, TypeVar
+from typing import TYPE_CHECKING, Final, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -13,6 +13,9 @@ from torch import Tensor, nn
 from ballfg.dynamics.effect import Coefficient
 from ballfg.dynamics.impact import slip_velocity
 from ballfg.state import SPIN, STANDARD_GRAVITY, VELOCITY, Z
+
+if TYPE_CHECKING:
+    from ballfg.dynamics.trained import Trained
 
 THIN_SHELL: Final = 2.0 / 3.0
 """Moment of inertia of a thin spherical shell divided by m R^2."""
@@ -38,6 +41,11 @@ class BallModel(nn.Module, ABC):
     States are (..., 9) float64 (see `ballfg.state`). Rates are a pair: acceleration (..., 3) m/s^2, and angular
     acceleration (..., 3) rad/s^2 or None where the spin is constant (a third of a Jacobian's cost is saved then).
     All methods are batched over leading dimensions and differentiable, in the state and in the parameters.
+
+    Attributes:
+        radius: m.
+        inertia_factor: moment of inertia divided by m R^2.
+        trained: the noise and the launcher that were learned together with the model; None where nothing was.
     """
 
     def __init__(self, radius: float, inertia_factor: float = THIN_SHELL) -> None:
@@ -50,6 +58,7 @@ class BallModel(nn.Module, ABC):
             )
         self.radius = float(radius)
         self.inertia_factor = float(inertia_factor)
+        self.trained: Trained | None = None
 
     @functools.cached_property
     def parameter_count(self) -> int:

@@ -1,4 +1,4 @@
-"""Model files: which effects a model declares, with the values of their coefficients, as YAML."""
+"""Model files: which effects a model declares, with the values of their coefficients, and what is learned, as YAML."""
 
 from __future__ import annotations
 
@@ -14,21 +14,12 @@ import yaml
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.registry import effect_class
-from ballfg.dynamics.model import THIN_SHELL
+from ballfg.dynamics.learned import LearnedModel
+from ballfg.dynamics.learned_file import has_learned_part, read_learned, remove_others, write_learned
+from ballfg.dynamics.model import THIN_SHELL, BallModel
+from ballfg.dynamics.yaml_file import read_yaml
 
 SECTIONS = ("flight", "bounce", "measurement", "learned")
-
-
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """The safe loader, which takes the last of two equal keys in silence; this one refuses them."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """The mapping. Raises: ConstructorError: if a key comes twice."""
-        keys = [key.value for key, _ in node.value]
-        for key, _ in node.value:
-            if keys.count(key.value) > 1:
-                raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' stands twice", key.start_mark)
-        return super().construct_mapping(node, deep)
 
 
 def nominal_model(radius: float = 0.02) -> AnalyticModel:
@@ -37,40 +28,46 @@ def nominal_model(radius: float = 0.02) -> AnalyticModel:
     return model_from_dict(yaml.safe_load(text), radius=radius, where="nominal.yaml")
 
 
-def load_model(path: str | Path, *, radius: float = 0.02, inertia_factor: float = THIN_SHELL) -> AnalyticModel:
+def load_model(path: str | Path, *, radius: float = 0.02, inertia_factor: float = THIN_SHELL) -> BallModel:
     """Read a model file.
 
     Args:
         path: YAML file with the sections `flight`, `bounce`, `measurement`, `learned` (docs/models.md).
         radius: m, of the ball, usually from the dataset.
         inertia_factor: moment of inertia divided by m R^2.
+    Returns: the analytic model where `learned` is null; else what the folder holds, a `LearnedModel` or an analytic
+        model with what was learned beside it (`trained`).
     Raises:
-        FileNotFoundError: if there is no such file.
+        FileNotFoundError: if there is no such file, or not the folder that it names.
         ValueError: if it is not YAML, or names a section, effect or coefficient that does not exist, or a value
-            outside its bounds.
+            outside its bounds; or if the folder does not hold a learned part of this version.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"model file {path} does not exist; a model is one YAML file")
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8"), Loader=_UniqueKeyLoader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        reason = " ".join(str(error).split())
-        raise ValueError(f"{path}: not readable as YAML ({reason})") from error
-    return model_from_dict(content, radius=radius, inertia_factor=inertia_factor, where=str(path))
+    content = read_yaml(path)
+    learned = content.get("learned") if isinstance(content, Mapping) else None
+    if learned is None:
+        return model_from_dict(content, radius=radius, inertia_factor=inertia_factor, where=str(path))
+    if not isinstance(learned, str) or not learned:
+        raise ValueError(f"{path}: section 'learned' must be null or the name of a folder; got {learned!r}")
+    analytic = model_from_dict(
+        {**content, "learned": None}, radius=radius, inertia_factor=inertia_factor, where=str(path)
+    )
+    return read_learned(path.parent / learned, analytic)
 
 
 def model_from_dict(
     content: Any, *, radius: float = 0.02, inertia_factor: float = THIN_SHELL, where: str = "model"
 ) -> AnalyticModel:
-    """The model that a parsed model file describes; `where` stands in error messages."""
+    """The model that a parsed model file without a learned part describes; `where` stands in error messages."""
     if not isinstance(content, Mapping):
         raise ValueError(f"{where}: a model is a mapping with the sections {', '.join(SECTIONS)}; got {content!r}")
     for section in content:
         if section not in SECTIONS:
             raise ValueError(f"{where}: unknown section '{section}'{_nearest(section, SECTIONS)}")
     if content.get("learned") is not None:
-        raise ValueError(f"{where}: section 'learned' must be null; this version reads analytic models only")
+        raise ValueError(f"{where}: section 'learned' must be null; only a file tells where a learned part lies")
     if content.get("measurement"):
         raise ValueError(f"{where}: section 'measurement' must be empty; this version has no measurement effects")
     effects: list[Effect] = []
@@ -104,7 +101,7 @@ def _nearest(name: object, known: tuple[str, ...]) -> str:
 
 
 def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
-    """What a model file says about this model."""
+    """What a model file says about this model's effects."""
 
     def section(group: Mapping[str, object]) -> dict[str, dict[str, float]]:
         effects = {name: cast(Effect, effect) for name, effect in group.items()}
@@ -118,9 +115,28 @@ def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
     }
 
 
-def save_model(model: AnalyticModel, path: str | Path) -> None:
-    """Write a model file; the final name appears only once the file is whole."""
+def save_model(model: BallModel, path: str | Path) -> None:
+    """Write a model file, and beside it the folder of its learned part if it has one.
+
+    The final names appear only once file and folder are whole; the folder of an earlier model of that name is removed.
+
+    Raises: TypeError: if the model is neither analytic nor learned, or corrects one that is not analytic.
+    """
     path = Path(path)
+    content = model_to_dict(_analytic_part(model))
+    if has_learned_part(model):
+        content["learned"] = write_learned(model, path.parent, path.stem)
     part = path.with_name(path.name + ".part")
-    part.write_text(yaml.safe_dump(model_to_dict(model), sort_keys=False), encoding="utf-8")
+    part.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
     os.replace(part, path)
+    remove_others(path.parent, path.stem, keep=content["learned"])
+
+
+def _analytic_part(model: BallModel) -> AnalyticModel:
+    """The effects that the file declares: none beside a learned model without a base."""
+    part = model.base if isinstance(model, LearnedModel) else model
+    if isinstance(model, LearnedModel) and part is None:
+        return AnalyticModel((), radius=model.radius, inertia_factor=model.inertia_factor)
+    if not isinstance(part, AnalyticModel):
+        raise TypeError(f"model must be analytic, learned, or learned on an analytic one; got {type(part).__name__}.")
+    return part

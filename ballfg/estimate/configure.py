@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import islice
 
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimate.launcher import Launcher
 from ballfg.estimate.position_noise import estimate_position_noise
-from ballfg.estimate.settings import Settings, uncertain
-from ballfg.tracks import Dataset
+from ballfg.estimate.settings import MEASURED, Settings, uncertain
+from ballfg.tracks import Dataset, DatasetInfo
 
 TRACKS_FOR_NOISE = 50
 """How many tracks the measurement noise is estimated from, when a dataset does not state it."""
@@ -18,16 +20,29 @@ def dataset_settings(dataset: Dataset, model: BallModel) -> Settings:
     """Settings for measured tracks.
 
     The position noise is the dataset's; where it states none, it is estimated from the scatter of the first tracks
-    about short polynomials. The model's coefficients are estimated with each track, within their priors.
+    about short polynomials. The coefficients of an analytic model are estimated with each track, within their priors; a
+    trained model is taken as it is, with the noise and the launcher that were learned together with it.
     """
-    info = dataset.info
+    info, trained = dataset.info, model.trained
     if info.position_noise is not None:
         noise = (info.position_noise,) * 3
     else:
         x, y, z = estimate_position_noise(islice(iter(dataset), TRACKS_FOR_NOISE)).tolist()
         noise = (x, y, z)
     spin = {} if info.spin_noise is None else {"spin_label_noise": info.spin_noise}
-    return uncertain(model, position_noise=noise, **spin)
+    if trained is None:
+        return uncertain(model, position_noise=noise, **spin)
+    x, y, z = (trained.position_scale * sigma for sigma in noise)
+    process = replace(MEASURED, **trained.process_noise)
+    return Settings(position_noise=(x, y, z), process=process, launcher=launcher_of(info, model), **spin)
+
+
+def launcher_of(info: DatasetInfo, model: BallModel) -> Launcher | None:
+    """What a trained model knows of a dataset's launcher; a track without the label `group` is of the dataset's own."""
+    trained = model.trained
+    if trained is None or trained.launcher is None or trained.spin_noise is None:
+        return None
+    return Launcher(trained.launcher, trained.spin_noise, {"group": info.name})
 
 
 def dataset_surfaces(dataset: Dataset) -> Surfaces:

@@ -137,7 +137,7 @@ class ExtendedKalmanFilter(Estimator):
 
         Coefficients are those of the last sample; cross covariances tie each state to the coefficients at that state.
         """
-        run = _Run(self, track)
+        run = _Run(self, self.settings.told(track))
         record = run.record
         if not run.finite():
             return self._failed(track, run)

@@ -238,6 +238,7 @@ class Online(Estimator):
         innovations of the pushes.
         """
         self.reset()
+        track = self.settings.told(track)
         self._frozen = []
         sigma = sample_sigmas(self.settings, len(track), track.sigmas)
         states = [

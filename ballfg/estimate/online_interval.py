@@ -16,6 +16,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.estimate.motion import FLIGHT, Motion
 from ballfg.factors.bridge import Bridge, checked
 from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors
+from ballfg.factors.kind import merge
 from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
@@ -104,7 +105,7 @@ def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coeffici
         groups.setdefault(interval.group, []).append(k)
     result: list[Array] = [np.empty(0)] * len(intervals)
     for members in groups.values():
-        batch = _merged([intervals[k].kind for k in members])
+        batch = merge([intervals[k].kind for k in members])
         point = np.empty((len(members), STATE_DIM + len(coefficients)))
         point[:, :STATE_DIM], point[:, STATE_DIM:] = start[members], coefficients
         moved, jacobian = batch.propagate(torch.from_numpy(point), slice(None))
@@ -144,17 +145,6 @@ def _whitened(batch: DynamicsFactors, pieces: Array, start: Array, after: Array,
 def _keep(interval: Interval, answers: Answers, row: int) -> None:
     inputs, residual, blocks = answers
     interval.bridge.keep(0, tuple([x[row] for x in inputs]), residual[row], tuple([j[row] for j in blocks]))
-
-
-def _merged(kinds: Sequence[DynamicsFactors]) -> DynamicsFactors:
-    """One batch out of kinds that share a motion."""
-    if len(kinds) == 1:
-        return kinds[0]
-    batch = copy.copy(kinds[0])
-    for name in ("variables", "dt", "whitening", "heights"):
-        if hasattr(batch, name):
-            setattr(batch, name, np.concatenate([getattr(kind, name) for kind in kinds]))
-    return batch
 
 
 def coefficient_count(model: BallModel) -> int:

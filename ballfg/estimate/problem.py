@@ -22,8 +22,10 @@ from ballfg.estimate.settings import Settings, sample_sigmas, spin_start
 from ballfg.factors.dynamics import ContactFactors, FlightFactors, RestFactors
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.kind import FactorKind, Values
+from ballfg.factors.launcher import LauncherSpinFactors
+from ballfg.factors.noise import Kicks
 from ballfg.factors.position import PositionFactors
-from ballfg.factors.prior import coefficient_prior, spin_prior, state_prior
+from ballfg.factors.prior import CoefficientPriorFactors, PriorFactors, spin_label, spin_prior, state_prior
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 
@@ -76,9 +78,7 @@ def build_graph(track: Track, model: BallModel, events: Events, sigma: Array, se
     kinds += _dynamics(track.times, model, events, settings)
     kinds += _priors(track, events.segmentation, settings)
     if isinstance(model, AugmentedModel):
-        kinds.append(
-            coefficient_prior(coefficient_means(model.model, settings), np.array(list(settings.coefficients.values())))
-        )
+        kinds.append(CoefficientPriorFactors(model, np.array(list(settings.coefficients.values()))))
     return BallGraph(tuple(kinds))
 
 
@@ -107,24 +107,37 @@ def _dynamics(times: Array, model: BallModel, events: Events, settings: Settings
     kinds: list[FactorKind] = []
     for (motion_kind, _), members in groups.items():
         rows = np.array(members)
+        kicks = Kicks(
+            np.array([motions[i].times for i in members]),
+            np.array([motions[i].hit for i in members]),
+        )
         if motion_kind == "contact":
             heights = np.array([motions[i].heights for i in members])
-            kinds.append(ContactFactors(model, rows, dt[rows], covariance[rows], heights))
+            kinds.append(ContactFactors(model, rows, dt[rows], covariance[rows], heights, kicks))
         elif motion_kind == "rest":
             resting = np.array([motions[i].rest for i in members])
-            kinds.append(RestFactors(model, rows, dt[rows], covariance[rows], resting))
+            kinds.append(RestFactors(model, rows, dt[rows], covariance[rows], resting, kicks))
         else:
-            kinds.append(FlightFactors(model, rows, dt[rows], covariance[rows]))
+            kinds.append(FlightFactors(model, rows, dt[rows], covariance[rows], kicks))
     return kinds
 
 
 def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> list[FactorKind]:
-    """Wide priors on the first state of each piece; on its spin the label, where there is one, or the spin prior."""
-    starts = [0, *(int(i) + 1 for i in segmentation.restarts)]
-    label = track.spin_label
+    """Wide priors on the first state of each piece, and what is known of its spin.
+
+    Of the first one that is the label, where there is one, or what the launcher's settings say; else the spin prior.
+    """
     kinds: list[FactorKind] = []
-    for start in starts:
-        kinds += start_priors(start, track.positions[start], label if start == 0 else None, settings)
+    launch = None if settings.launcher is None else settings.launcher.settings(track)
+    if settings.launcher is not None and launch is not None:
+        spread = np.full((1, 3), settings.launcher.sigma)
+        embedding, loss = settings.launcher.embedding, settings.label_loss
+        kinds.append(LauncherSpinFactors(np.array([0]), launch[None], embedding, spread, loss))
+        kinds.append(_wide_prior(0, track.positions[0], settings))
+    else:
+        kinds += start_priors(0, track.positions[0], track.spin_label, settings)
+    for interval in segmentation.restarts:
+        kinds += start_priors(int(interval) + 1, track.positions[int(interval) + 1], None, settings)
     return kinds
 
 
@@ -137,13 +150,20 @@ def start_priors(state: int, position: Array, label: Array | None, settings: Set
         label: (3,) rad/s, of the spin; None for the spin prior.
         settings: spreads and losses.
     """
+    spin, spread = spin_start(label, settings)
+    where, spreads = np.array([state]), np.full((1, 3), spread)
+    if label is None:
+        about = spin_prior(where, spin[None], spreads, settings.spin_loss)
+    else:
+        about = spin_label(where, spin[None], spreads, settings.label_loss)
+    return [_wide_prior(state, position, settings), about]
+
+
+def _wide_prior(state: int, position: Array, settings: Settings) -> PriorFactors:
     mean, sigma = np.zeros(STATE_DIM), np.empty(STATE_DIM)
     mean[POSITION] = position
     sigma[POSITION], sigma[VELOCITY], sigma[SPIN] = START_POSITION_SIGMA, settings.velocity_prior, UNINFORMATIVE_SPIN
-    spin, spread = spin_start(label, settings)
-    loss = settings.spin_loss if label is None else settings.label_loss
-    about = spin_prior(np.array([state]), spin[None], np.full((1, 3), spread), loss)
-    return [state_prior(state, mean, sigma), about]
+    return state_prior(state, mean, sigma)
 
 
 UNINFORMATIVE_SPIN = 2000.0

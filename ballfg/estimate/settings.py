@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,10 @@ from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.model import BallModel
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
+
+if TYPE_CHECKING:
+    from ballfg.estimate.launcher import Launcher
+    from ballfg.tracks import Track
 
 
 @dataclass(frozen=True)
@@ -47,6 +52,9 @@ class Settings:
     label_loss: Loss = field(default_factory=lambda: Loss("cauchy", 3.0))
     """Loss on a spin label: labels were seen to contradict the flight."""
 
+    launcher: Launcher | None = None
+    """Tells the spin of tracks without a spin label from their launcher settings."""
+
     find_events: bool = True
     """Look for hits, outliers and tracker shifts. False: the track is one undisturbed flight with contacts that the
     model explains."""
@@ -62,6 +70,10 @@ class Settings:
         for name, sigma in self.coefficients.items():
             if not (np.isfinite(sigma) and sigma > 0):
                 raise ValueError(f"coefficients['{name}'] must be a positive standard deviation; got {sigma}")
+
+    def told(self, track: Track) -> Track:
+        """The track with a spin label made from its launcher settings, where they tell the spin."""
+        return track if self.launcher is None else self.launcher.label(track)
 
 
 MEASURED = ProcessNoise(contact_tangential=0.2, contact_spin=10.0)

@@ -51,7 +51,7 @@ class SlidingWindow(Estimator):
 
     def estimate(self, track: Track) -> Estimate:
         """The states of a track; a single sample has no velocity and the status says so."""
-        n = len(track)
+        n, track = len(track), self.settings.told(track)
         sigma = sample_sigmas(self.settings, n, track.sigmas)
         first = np.maximum(np.arange(n) - WINDOW + 1, 0)
         span = track.times - track.times[first]

@@ -32,6 +32,7 @@ from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum
 from ballfg.factors.kind import FactorKind, Values
 from ballfg.factors.prior import PriorFactors
+from ballfg.factors.search import Search, run
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ
 from ballfg.tracks import Track
 
@@ -101,7 +102,6 @@ class Smoother(Estimator):
         super().__init__(model, surfaces, settings)
         self.trackwise = trackwise_model(model, settings)
         self.optimizer = optimizer or LevenbergMarquardt()
-        self.physics = physics_of(model)
 
     def estimate(self, track: Track) -> Estimate:
         """The states of a track, one per stamp, with the covariances of the Laplace approximation."""
@@ -113,7 +113,8 @@ class Smoother(Estimator):
     def segment(self, track: Track) -> Segmentation:
         """The events in a track."""
         sigma = sample_sigmas(self.settings, len(track), track.sigmas)
-        found = segment(track.times, track.positions, sigma, surfaces=self.surfaces, physics=self.physics)
+        physics = physics_of(self.model)
+        found = segment(track.times, track.positions, sigma, surfaces=self.surfaces, physics=physics)
         return found if self.settings.find_events else found.only_contacts()
 
     def solve(self, track: Track, segmentation: Segmentation, sigma: Array, earlier: Earlier | None = None) -> Solution:
@@ -125,20 +126,28 @@ class Smoother(Estimator):
             sigma: (n, 3) m, of the positions.
             earlier: what came before, where the track is the end of a longer one.
         """
-        solution = self._settle(track, segmentation, sigma, earlier)
+        return run(self.search(track, segmentation, sigma, earlier))
+
+    def search(
+        self, track: Track, segmentation: Segmentation, sigma: Array, earlier: Earlier | None = None
+    ) -> Search[Solution]:
+        """`solve`, asking for linearisations, so that several tracks can be solved together."""
+        solution = yield from self._settle(track, segmentation, sigma, earlier)
         for _ in range(MAX_UNSEEN_HITS if self.settings.find_events else 0):
             interval = _worst_break(solution)
             if interval is None:
                 break
             segmentation = replace(segmentation, hits=np.union1d(segmentation.hits, [interval]))
-            solution = self._settle(track, segmentation, sigma, earlier)
+            solution = yield from self._settle(track, segmentation, sigma, earlier)
         return solution
 
-    def _settle(self, track: Track, segmentation: Segmentation, sigma: Array, earlier: Earlier | None) -> Solution:
+    def _settle(
+        self, track: Track, segmentation: Segmentation, sigma: Array, earlier: Earlier | None
+    ) -> Search[Solution]:
         """Minimise, move contacts to where the estimate says they are, and minimise again until they stay."""
         events = Events(segmentation.contacts, segmentation)
         if earlier is None:
-            states = initial_states(track, events.contacts, segmentation, self.model)
+            states = initial_states(self.settings.told(track), events.contacts, segmentation, self.model)
             values = initial_values(states, self.trackwise, self.settings)
         else:
             values = earlier.start
@@ -147,7 +156,8 @@ class Smoother(Estimator):
         for _ in range(MAX_REFINEMENTS):
             graph = build_graph(track, self.trackwise, events, sigma, self.settings)
             graph = graph if earlier is None else earlier.join(graph)
-            solution = Solution(events, graph, self.optimizer.minimize(graph, values))
+            minimum = yield from self.optimizer.search(graph, values)
+            solution = Solution(events, graph, minimum)
             seen[_places(events.contacts)] = solution
             refined = _refined(track.times, solution)
             if _places(refined) == _places(events.contacts):

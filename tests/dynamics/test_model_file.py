@@ -106,8 +106,9 @@ def test_missing_file(tmp_path):
         ("flight: {friction: {}}\nbounce: {}", r"there is no flight effect 'friction'"),
         (
             "flight: {}\nbounce: {}\nlearned: {x: 1}",
-            r"section 'learned' must be null; this version reads analytic models",
+            r"section 'learned' must be null or the name of a folder; got \{'x': 1\}$",
         ),
+        ("flight: {}\nbounce: {}\nlearned: ''", r"section 'learned' must be null or the name of a folder; got ''$"),
         ("flight: {}\nbounce: {}\nmeasurement: {x: 1}", r"section 'measurement' must be empty; this version has no"),
         ("flight: !!python/object/apply:os.getcwd []\nbounce: {}", r"not readable as YAML"),
     ],
@@ -118,6 +119,11 @@ def test_what_is_wrong_is_said(write, text, message):
         load_model(path)
     assert str(error.value).startswith(f"{path}: ")
     assert "\n" not in str(error.value)
+
+
+def test_a_learned_part_needs_a_file():
+    with pytest.raises(ValueError, match=r"^model: section 'learned' must be null; only a file tells where a learned"):
+        model_from_dict({"flight": {}, "bounce": {}, "learned": "folder"})
 
 
 def test_where_stands_in_front():

@@ -12,6 +12,7 @@ import yaml
 
 from ballfg.cli.main import run as ballfg
 from ballfg.dynamics import load_model
+from ballfg.learning import calibration_checkpoint as checkpoints
 from ballfg.learning import folder as files
 from ballfg.learning.cli import run
 from ballfg.learning.coefficients import values_of
@@ -29,7 +30,7 @@ def status(*words: object, command: Any = run) -> int:
 @pytest.fixture(scope="module")
 def config(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("config") / "calibrate.yaml"
-    path.write_text("seed: 1\n")
+    path.write_text("kind: calibrate\nseed: 1\n")
     return path
 
 
@@ -45,7 +46,7 @@ def names(folder: Path) -> list[str]:
 
 
 def test_a_run_writes_all_its_files(finished: Path, few_tracks: Path, tmp_path: Path) -> None:
-    assert names(finished) == sorted(files.FILES)
+    assert names(finished) == sorted(files.CALIBRATION)
     resolved = yaml.safe_load((finished / "config.yaml").read_text())
     assert (resolved["seed"], resolved["max_iterations"], resolved["data"]) == (1, 2, str(few_tracks))
     assert {"python", "ballfg", "torch", "gtsam"} <= set(json.loads((finished / "versions.json").read_text()))
@@ -65,14 +66,14 @@ def test_a_run_writes_all_its_files(finished: Path, few_tracks: Path, tmp_path: 
 
 
 def interrupt_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
-    real = files.write_checkpoint
+    real = checkpoints.write_checkpoint
 
     def write(folder: Path, problem: Any, done: list[Any]) -> None:
         real(folder, problem, done)
         if len(done) == steps:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(files, "write_checkpoint", write)
+    monkeypatch.setattr(checkpoints, "write_checkpoint", write)
 
 
 def test_ctrl_c_keeps_the_checkpoint_and_a_resumed_run_ends_the_same(
@@ -92,7 +93,7 @@ def test_ctrl_c_keeps_the_checkpoint_and_a_resumed_run_ends_the_same(
     assert "iteration 2" in said.out
     for name in ("checkpoint.json", "report.json", "model.yaml"):
         assert (out / name).read_bytes() == (finished / name).read_bytes(), name
-    assert names(out) == sorted(files.FILES)
+    assert names(out) == sorted(files.CALIBRATION)
 
 
 def test_resume_refuses_another_run(
@@ -108,6 +109,9 @@ def test_resume_refuses_another_run(
         ((*given, "--resume", out, "seed=2"), "'seed' was 1 and is 2"),
         ((config, *SHORT, "--data", no_spin_labels, "--resume", out), "was made from another dataset"),
         ((*given, "--resume", out, f"model={model}"), "was started from another model"),
+        ((config, *given[1:], "--resume", out, "kind=mlp"), "unknown key 'max_iterations'"),
+        ((config, "--data", few_tracks, "--resume", out, "kind=mlp"), "'kind' was 'calibrate' and is 'mlp'"),
+        ((*given, "--data", few_tracks, "--resume", out), "'data' must be a valid string"),
         ((*given, "--resume", tmp_path / "none"), "needs the folder of an earlier run"),
         ((*given, "--resume", out, "--out", tmp_path / "else"), "must name one folder"),
         ((*given, "--out", out), f"continue that run with --resume {out}"),
@@ -132,6 +136,7 @@ def test_bad_input_is_one_line_and_writes_nothing(
         ((config, "--out", out, "--data", tmp_path / "none"), "none does not"),
         ((tmp_path / "none.yaml", "--out", out), "none.yaml does not exist"),
         ((config, "sed=1", "--out", out), "Did you mean 'seed'?"),
+        ((config, "--out", out, "--data", "a", "kind=mpl"), "'kind' must be 'a-tune'"),
         ((config, "model=none.yaml", "--data", few_tracks, "--out", out), "model file none.yaml does not exist"),
         ((config, "coefficients=[flight.magnus.k]", "--data", no_spin_labels, "--out", out), "spin labels"),
         ((config, "split=label", "--data", few_tracks, "--out", out), "needs a column 'split'"),
@@ -157,7 +162,7 @@ def test_a_crash_while_writing_leaves_the_earlier_file(tmp_path: Path, monkeypat
 
 def test_help_has_an_example_and_does_not_wait(capsys: pytest.CaptureFixture[str]) -> None:
     assert status("--help") == 0
-    assert "Example: ballfg-train calibrate.yaml --data" in " ".join(capsys.readouterr().out.split())
+    assert "Example: ballfg-train train.yaml --data" in " ".join(capsys.readouterr().out.split())
     heavy = ("torch", "gtsam", "numpy", "pydantic", "matplotlib")
     code = f"import sys, ballfg.learning.cli; sys.exit(any(name in sys.modules for name in {heavy}))"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

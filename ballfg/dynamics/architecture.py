@@ -1,0 +1,59 @@
+"""What a learned model is made of, as numbers that a file can hold."""
+
+from __future__ import annotations
+
+from typing import Annotated, Final, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Kind = Literal["mlp", "mlp+gs", "skip+gs", "mnn+gs"]
+
+DEFAULT_SIZES: Final[dict[Kind, tuple[int, int, int]]] = {
+    "mlp": (39, 40, 3),
+    "mlp+gs": (39, 40, 3),
+    "skip+gs": (39, 40, 2),
+    "mnn+gs": (54, 55, 4),
+}
+"""Width of the flight network, width of the contact network, depth: 7,320 to 7,327 parameters, and 6
+more for a launcher with two settings."""
+
+
+class Architecture(BaseModel):
+    """The networks of a learned model. `Architecture.of(kind)` has each kind's default sizes."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+    kind: Kind
+    """mlp sees raw velocity and spin; the others see Gram-Schmidt features."""
+    width_flight: Annotated[int, Field(ge=1)]
+    """Hidden units of the flight network."""
+    width_contact: Annotated[int, Field(ge=1)]
+    """Hidden units of the contact network."""
+    depth: Annotated[int, Field(ge=1)]
+    """Hidden layers (mlp), blocks (skip), or repetitions of the one layer (mnn) of each network."""
+    residual: bool = False
+    """The networks correct another model; false: they are all there is."""
+    spin_rate: bool = False
+    """The flight network also gives the angular acceleration; false: the spin is constant in flight (or the base's)."""
+
+    @classmethod
+    def of(
+        cls,
+        kind: Kind,
+        *,
+        width_flight: int | None = None,
+        width_contact: int | None = None,
+        depth: int | None = None,
+        residual: bool = False,
+        spin_rate: bool = False,
+    ) -> Architecture:
+        """An architecture in which sizes that are not given are the kind's default ones."""
+        flight, contact, steps = DEFAULT_SIZES[kind]
+        return cls(
+            kind=kind,
+            width_flight=flight if width_flight is None else width_flight,
+            width_contact=contact if width_contact is None else width_contact,
+            depth=steps if depth is None else depth,
+            residual=residual,
+            spin_rate=spin_rate,
+        )

@@ -1,0 +1,103 @@
+"""The MNN written out: with N steps it is a polynomial of degree N + 1, whose coefficients follow from the weights.
+
+For many states with few features that costs a small part of running the network, derivatives included: the wide hidden
+states are gone through once, for the coefficients, instead of once for each state. Derivation in
+docs/derivations/mnn.md.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from itertools import combinations_with_replacement
+
+import torch
+from torch import Tensor
+
+Weights = tuple[Tensor, Tensor]
+"""Of a linear layer: weight (outputs, inputs), bias (outputs,)."""
+
+
+def expand(first: Weights, step: Weights, last: Weights, depth: int) -> Tensor:
+    """Coefficients (outputs, m) of the monomials of degree `depth` + 1 in (1, features), in the order of `_monomials`.
+
+    Args: first, step, last: layers of the network h_0 = first(x), h_k = h_0 step(h_{k-1}) + h_{k-1}, y = last(h_N).
+    """
+    start = torch.cat((first[1].unsqueeze(-1), first[0]), dim=-1)  # (width, 1 + features): degree one
+    hidden = start
+    for table, size in _tables(start.shape[-1], depth).raised:
+        stepped = step[0] @ hidden
+        stepped = torch.cat((stepped[:, :1] + step[1].unsqueeze(-1), stepped[:, 1:]), dim=-1)
+        product = (start.unsqueeze(-1) * stepped.unsqueeze(-2)).flatten(-2)
+        raised = hidden.new_zeros(hidden.shape[0], size)
+        hidden = raised.index_add(1, table.flatten(), product).index_add(1, table[0], hidden)
+    result = last[0] @ hidden
+    return torch.cat((result[:, :1] + last[1].unsqueeze(-1), result[:, 1:]), dim=-1)
+
+
+def evaluate(coefficients: Tensor, features: Tensor, depth: int) -> Tensor:
+    """Values (..., outputs) of polynomials at features (..., f).
+
+    Monomials of half the degree on either side of a matrix: fewer numbers than all monomials.
+    """
+    tables = _tables(features.shape[-1] + 1, depth)
+    one = torch.nn.functional.pad(features, (1, 0), value=1.0)
+    powers = [one]
+    for low, high in tables.powers:
+        powers.append(powers[-1].index_select(-1, low) * one.index_select(-1, high))
+    left, right = powers[tables.left], powers[-1]
+    matrix = coefficients[:, tables.pairs] * tables.shares  # (outputs, left, right)
+    outputs, m, n = matrix.shape
+    partial = (left @ matrix.transpose(0, 1).reshape(m, outputs * n)).unflatten(-1, (outputs, n))
+    return (partial * right.unsqueeze(-2)).sum(-1)
+
+
+def evaluation_cost(features: int, outputs: int, depth: int) -> int:
+    """Multiplications that `evaluate` takes for each state, but for the few of the monomials."""
+    return outputs * _tables(features + 1, depth).pairs.numel()
+
+
+@dataclass(frozen=True)
+class _Tables:
+    """Where products of monomials are found.
+
+    Attributes:
+        raised: for degree k = 1, 2, ...: (variables, m_k), number of each monomial times each variable in degree k + 1,
+            and how many monomials there are in degree k + 1.
+        powers: for degree k = 2, 3, ...: monomial of degree k - 1 and variable that each of degree k is a product of.
+        left: which of the powers stands left of the matrix; the last one stands right.
+        pairs: (left, right), number of their product in the full degree.
+        shares: (left, right), one over the number of pairs that give the same product.
+    """
+
+    raised: tuple[tuple[Tensor, int], ...]
+    powers: tuple[tuple[Tensor, Tensor], ...]
+    left: int
+    pairs: Tensor
+    shares: Tensor
+
+
+@functools.cache
+def _tables(variables: int, depth: int) -> _Tables:
+    number = [{m: i for i, m in enumerate(_monomials(variables, k))} for k in range(depth + 2)]
+    raised = tuple(
+        (
+            torch.tensor([[number[k + 1][tuple(sorted((*m, v)))] for m in number[k]] for v in range(variables)]),
+            len(number[k + 1]),
+        )
+        for k in range(1, depth + 1)
+    )
+    degree = depth + 1
+    high = (degree + 1) // 2
+    powers = tuple(
+        (torch.tensor([number[k - 1][m[:-1]] for m in number[k]]), torch.tensor([m[-1] for m in number[k]]))
+        for k in range(2, high + 1)
+    )
+    pairs = torch.tensor([[number[degree][tuple(sorted(a + b))] for b in number[high]] for a in number[degree - high]])
+    counts = torch.bincount(pairs.flatten())
+    return _Tables(raised, powers, degree - high - 1, pairs, (1.0 / counts.double())[pairs])
+
+
+def _monomials(variables: int, degree: int) -> list[tuple[int, ...]]:
+    """Monomials by the variables they multiply, the power of the first variable first."""
+    return list(combinations_with_replacement(range(variables), degree))

@@ -1,0 +1,73 @@
+"""Augmentation: the same shot seen from another place, by a turn about the vertical and a horizontal shift."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+SHIFT = 1.0
+"""m, largest shift along x and along y: of the size of a table, so that no place in the room stays special."""
+
+
+def augmentation(seed: int, epoch: int, track: int) -> tuple[Tensor, Tensor]:
+    """The turn and shift of one track in one epoch; they depend on nothing else, whatever the batch or the process.
+
+    Height is never shifted: the table stays where it is.
+
+    Args:
+        seed: of the run, >= 0.
+        epoch: >= 0.
+        track: number of the track, >= 0.
+
+    Returns: (angle, shift): () rad, uniform in [-pi, pi); (2,) m along x and y, uniform in [-SHIFT, SHIFT). float64.
+
+    Raises: ValueError: a negative number.
+    """
+    for name, number in (("seed", seed), ("epoch", epoch), ("track", track)):
+        if number < 0:
+            raise ValueError(f"{name} must be at least 0; got {number}. Count from 0.")
+    draw = np.random.default_rng([seed, epoch, track]).uniform(-1.0, 1.0, 3)
+    return torch.tensor(math.pi * draw[0], dtype=torch.float64), torch.from_numpy(SHIFT * draw[1:])
+
+
+def apply(positions: Tensor, angle: Tensor, shift: Tensor) -> Tensor:
+    """Positions turned about the world's z axis, then shifted.
+
+    Args:
+        positions: (..., 3) m.
+        angle: (...) rad, broadcast against the leading dimensions: (b, 1) for (b, n, 3) positions of b tracks.
+        shift: (..., 2) m, likewise.
+
+    Returns: (..., 3) m.
+    """
+    return rotate(positions, angle) + torch.cat([shift, torch.zeros_like(shift[..., :1])], dim=-1)
+
+
+def rotate(vectors: Tensor, angle: Tensor) -> Tensor:
+    """Vectors - velocity, spin, acceleration - turned about the vertical; a shift does not touch them.
+
+    Args:
+        vectors: (..., 3), any unit.
+        angle: (...) rad, as in `apply`.
+
+    Returns: (..., 3).
+    """
+    cos, sin = torch.cos(angle), torch.sin(angle)
+    x, y, z = vectors.unbind(-1)
+    return torch.stack([cos * x - sin * y, sin * x + cos * y, z], dim=-1)
+
+
+def undo(positions: Tensor, angle: Tensor, shift: Tensor) -> Tensor:
+    """The inverse of `apply`.
+
+    Args:
+        positions: (..., 3) m, seen from the other place.
+        angle: (...) rad, as in `apply`.
+        shift: (..., 2) m, likewise.
+
+    Returns: (..., 3) m.
+    """
+    return rotate(positions - torch.cat([shift, torch.zeros_like(shift[..., :1])], dim=-1), -angle)

@@ -1,0 +1,192 @@
+"""Processes that train one model: what they add up, tell each other, and that all end together.
+
+A process is a rank. Tracks are dealt out by number, whatever the batch, so that what a rank remembers of a track stays
+with it. A single process is the case of one rank: nothing is sent, the numbers are the same up to rounding.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import traceback
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import FrameType
+from typing import Any, Literal, TypeVar
+
+import torch
+import torch.distributed as dist
+
+# its functions have the group that is there at the first import for a default: after `init` they would keep it alive
+import torch.distributed.nn.functional
+from torch import Tensor
+
+T = TypeVar("T")
+TOLD_BY_FIRST = 1
+"""Exit status of a process that ends without a word, since the first one says why."""
+
+
+@dataclass(frozen=True)
+class Trouble:
+    """What ended a rank's work, in words that travel."""
+
+    rank: int
+    what: Literal["interrupt", "input", "fault"]
+    text: str
+
+    @classmethod
+    def of(cls, rank: int, error: BaseException) -> Trouble:
+        """What to tell the others of an exception."""
+        if isinstance(error, KeyboardInterrupt):
+            return cls(rank, "interrupt", "")
+        if isinstance(error, (ValueError, TypeError, OSError)):
+            return cls(rank, "input", str(error))
+        return cls(rank, "fault", "".join(traceback.format_exception(error)))
+
+    def exception(self) -> BaseException:
+        """What the first rank raises for another one."""
+        if self.what == "interrupt":
+            return KeyboardInterrupt()
+        if self.what == "input":
+            return ValueError(self.text)
+        return RuntimeError(f"process {self.rank} failed:\n{self.text}")
+
+
+@dataclass
+class Ranks:
+    """This process among those that train.
+
+    Attributes:
+        rank: number of this process, from 0.  size: how many there are.
+    """
+
+    rank: int = 0
+    size: int = 1
+    _working: bool = False
+    _interrupted: bool = False
+
+    @property
+    def first(self) -> bool:
+        """Whether this is the one that writes and prints."""
+        return self.rank == 0
+
+    def own(self, tracks: Sequence[int]) -> list[int]:
+        """Those of some tracks that are this rank's, in their order."""
+        return [track for track in tracks if track % self.size == self.rank]
+
+    def sum(self, values: Tensor) -> Tensor:
+        """(n,) sum over ranks of (n,) float64 values: taken in the order of the ranks, so the same bits everywhere."""
+        if self.size == 1:
+            return values
+        parts = [torch.empty_like(values) for _ in range(self.size)]
+        dist.all_gather(parts, values)
+        return torch.stack(parts).sum(dim=0)
+
+    def gather(self, value: T) -> list[T]:
+        """What each rank has, on every rank."""
+        if self.size == 1:
+            return [value]
+        values: list[Any] = [None] * self.size
+        dist.all_gather_object(values, value)
+        return values
+
+    def from_first(self, work: Callable[[], T]) -> T:
+        """What `work` gives on the first rank, on every rank; the others do not run it. Raises: as `together`."""
+        box: list[Any] = [self.together(lambda: work() if self.first else None)]
+        if self.size > 1:
+            dist.broadcast_object_list(box, src=0)
+        return box[0]
+
+    def together(self, work: Callable[[], T]) -> T:
+        """Run this rank's share of the work. When it fails or is interrupted on one rank, it ends on all of them.
+
+        Raises: whatever `work` raises, on its rank; on the first rank the same in kind for another rank's; SystemExit
+            on the ranks that need say nothing since the first one does.
+        """
+        if self.size == 1:
+            return work()
+        result, error = None, None
+        try:
+            with self._interruptible():
+                result = work()
+        except (Exception, KeyboardInterrupt) as raised:
+            error = raised
+        told: list[Trouble | None] = [None] * self.size
+        dist.all_gather_object(told, None if error is None else Trouble.of(self.rank, error))
+        trouble = next((each for each in told if each is not None), None)
+        if trouble is not None and not self.first:
+            raise SystemExit(TOLD_BY_FIRST) from error
+        if error is not None:
+            raise error
+        if trouble is not None:
+            raise trouble.exception()
+        return result  # type: ignore[return-value]
+
+    @contextmanager
+    def _interruptible(self) -> Iterator[None]:
+        """Ctrl-C counts here; elsewhere, while ranks wait for each other, it is kept until the next time."""
+        self._working = True
+        try:
+            if self._interrupted:
+                raise KeyboardInterrupt
+            yield
+        finally:
+            self._working = False
+
+    def _on_interrupt(self, _signal: int, _frame: FrameType | None) -> None:
+        if self._working:
+            self._working = False  # a terminal and a parent may both send it: once is enough
+            raise KeyboardInterrupt
+        self._interrupted = True
+
+
+class SharedMemory:
+    """What all ranks together remember, when each keeps the tracks that it owns up to date.
+
+    After a run is resumed, every rank holds the memory of all tracks, and what it holds of other ranks' tracks grows
+    old. So a rank tells only what it has changed.
+    """
+
+    def __init__(self, given: Mapping[str, Tensor] | None = None) -> None:
+        self.given = {name: tensor.clone() for name, tensor in (given or {}).items()}
+
+    def gather(self, ranks: Ranks, own: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """The memory of all ranks, on every rank. Args: own: what this rank holds."""
+        known = self.given
+        changed = {
+            name: tensor for name, tensor in own.items() if name not in known or not torch.equal(tensor, known[name])
+        }
+        forgotten = [name for name in known if name not in own]
+        merged = dict(known)
+        for theirs, gone in ranks.gather((changed, forgotten)):
+            merged |= theirs
+            for name in gone:
+                del merged[name]
+        return merged
+
+
+@contextmanager
+def join_ranks() -> Iterator[Ranks]:
+    """Take part in what torchrun, or `launch`, has started; a single rank where neither did.
+
+    Environment: WORLD_SIZE, RANK, MASTER_ADDR, MASTER_PORT as torchrun sets them. The backend is gloo, on CPUs.
+    """
+    torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
+    if not started_by_launcher():
+        yield Ranks()
+        return
+    dist.init_process_group("gloo", init_method="env://")
+    ranks: Ranks = Ranks(dist.get_rank(), dist.get_world_size())
+    before = signal.signal(signal.SIGINT, ranks._on_interrupt) if ranks.size > 1 else None
+    try:
+        yield ranks
+    finally:
+        if before is not None:
+            signal.signal(signal.SIGINT, before)
+        dist.destroy_process_group()
+
+
+def started_by_launcher() -> bool:
+    """Whether this process is one of several that a launcher has started."""
+    return "RANK" in os.environ and "WORLD_SIZE" in os.environ

@@ -1,0 +1,156 @@
+"""The gradient through a solver, by the implicit function theorem.
+
+A point x* with g(x*, theta) = 0, g the derivative of an objective by x, moves with the parameters theta as
+dx*/dtheta = -H^-1 dg/dtheta, H = dg/dx. What an outer loss L says of x* becomes a gradient of theta by
+lambda = H^-1 dL/dx*, dL/dtheta = -lambda^T dg/dtheta: one linear solution, whatever the solver did to get there.
+
+A method is called with what it needs, each by itself: the solve, the stationarity condition, the linear solver, and the
+parameters.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import torch
+from torch import Tensor
+
+Solve = Callable[[], Tensor]
+"""Gives the point (n,), without a graph. Raises what it likes when it finds none."""
+Stationarity = Callable[[Tensor], Tensor]
+"""g: from a point (n,) that requires a gradient, the objective's derivative (n,), itself differentiable in the point and
+in the parameters."""
+
+
+class LinearSolver(Protocol):
+    """Solves with the Hessian, or with an approximation of it."""
+
+    def __call__(self, product: Callable[[Tensor], Tensor], right: Tensor) -> Tensor:
+        """x with product(x) = right."""
+        ...
+
+    def precondition(self, vector: Tensor) -> Tensor:
+        """The Gauss-Newton solution of a right side."""
+        ...
+
+
+class GradientMethod(ABC):
+    """How an outer loss on a solution becomes a gradient of the parameters."""
+
+    @abstractmethod
+    def __call__(
+        self, solve: Solve, stationarity: Stationarity, linear_solver: LinearSolver, parameters: Sequence[Tensor]
+    ) -> Tensor:
+        """The solution (n,), differentiable in the parameters.
+
+        Args:
+            solve: finds the point.
+            stationarity: what is zero there.
+            linear_solver: for the Hessian.
+            parameters: leaves that may receive a gradient.
+        """
+
+
+class ImplicitGradient(GradientMethod):
+    """Exact: the full Hessian, by products that autograd computes.
+
+    Memory does not depend on how many iterations the solver took. The backward pass raises what the linear solver
+    raises when the point is not a minimum.
+    """
+
+    def __call__(
+        self, solve: Solve, stationarity: Stationarity, linear_solver: LinearSolver, parameters: Sequence[Tensor]
+    ) -> Tensor:
+        """The solution (n,), differentiable in the parameters."""
+        return _attached(solve(), stationarity, linear_solver, parameters, exact=True)
+
+
+class GaussNewtonGradient(GradientMethod):
+    """Approximate: the Gauss-Newton matrix in place of the Hessian; wrong by as much as residuals bend and losses do."""
+
+    def __call__(
+        self, solve: Solve, stationarity: Stationarity, linear_solver: LinearSolver, parameters: Sequence[Tensor]
+    ) -> Tensor:
+        """The solution (n,), with an approximate derivative by the parameters."""
+        return _attached(solve(), stationarity, linear_solver, parameters, exact=False)
+
+
+class UnrolledGradient(GradientMethod):
+    """For reference: differentiates through iterations x <- x - M g(x), M the Gauss-Newton inverse at the solution.
+
+    Tends to the exact gradient with the number of iterations; memory and time grow with it.
+
+    Args: iterations: how many are unrolled.
+    """
+
+    def __init__(self, iterations: int = 30) -> None:
+        if iterations < 1:
+            raise ValueError(f"iterations must be at least 1; got {iterations}. 30 are usually enough.")
+        self.iterations = iterations
+
+    def __call__(
+        self, solve: Solve, stationarity: Stationarity, linear_solver: LinearSolver, parameters: Sequence[Tensor]
+    ) -> Tensor:
+        """The solution (n,), differentiable in the parameters as far as the iterations carry it."""
+        point = solve().detach().requires_grad_(True)
+        for _ in range(self.iterations):
+            point = point - _Preconditioned.apply(stationarity(point), linear_solver)
+        return point
+
+
+class _Preconditioned(torch.autograd.Function):
+    """A constant symmetric matrix times a vector."""
+
+    @staticmethod
+    def forward(ctx: Any, vector: Tensor, linear_solver: LinearSolver) -> Tensor:
+        ctx.linear_solver = linear_solver
+        return linear_solver.precondition(vector)
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
+        return ctx.linear_solver.precondition(upstream[0]), None
+
+
+def _attached(
+    point: Tensor, stationarity: Stationarity, linear_solver: LinearSolver, parameters: Sequence[Tensor], *, exact: bool
+) -> Tensor:
+    wanted = [p for p in parameters if p.requires_grad]
+    attached: Tensor = _Solution.apply(point.detach(), stationarity, linear_solver, exact, *wanted)
+    return attached
+
+
+class _Solution(torch.autograd.Function):
+    """A solved point whose derivative by the parameters is that of the stationarity condition."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        point: Tensor,
+        stationarity: Stationarity,
+        linear_solver: LinearSolver,
+        exact: bool,
+        *parameters: Tensor,
+    ) -> Tensor:
+        ctx.stationarity, ctx.linear_solver, ctx.exact = stationarity, linear_solver, exact
+        ctx.save_for_backward(point, *parameters)
+        return point.clone()
+
+    @staticmethod
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
+        point, *parameters = ctx.saved_tensors
+        leaf = point.detach().requires_grad_(True)
+        with torch.enable_grad():
+            condition = ctx.stationarity(leaf)
+
+        def product(vector: Tensor) -> Tensor:
+            (image,) = torch.autograd.grad(condition, leaf, vector, retain_graph=True)
+            return image
+
+        if ctx.exact:
+            multiplier = ctx.linear_solver(product, upstream[0])
+        else:
+            multiplier = ctx.linear_solver.precondition(upstream[0])
+        gradients = torch.autograd.grad(condition, parameters, -multiplier, allow_unused=True)
+        return None, None, None, None, *gradients

@@ -1,0 +1,102 @@
+"""Several training processes on this machine, started as torchrun would start them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Callable
+from multiprocessing.sharedctypes import Synchronized
+from typing import Any
+
+from torch.distributed import TCPStore
+from torch.multiprocessing import get_context
+from torch.multiprocessing.spawn import ProcessContext, ProcessExitedException, start_processes
+
+HOST = "127.0.0.1"
+GRACE = 60.0
+"""s that interrupted processes have to end by themselves: a solve in compiled code ends before it hears of Ctrl-C."""
+WITHOUT_A_WORD = -1
+"""Stands for the exit status of a process that has none yet."""
+LAST_WORDS = 10.0
+"""s that the others have to say what happened once one of them has died."""
+
+
+def launch(processes: int, work: Callable[..., int], *arguments: Any) -> int:
+    """Run `work` in several processes that `join_ranks` makes one group of.
+
+    Args:
+        processes: how many.
+        work: a function of a module; takes `arguments`, which can be pickled, and returns an exit status.
+
+    Returns: what `work` returned in the first process.
+    Raises:
+        ChildProcessError: if a process was killed.
+        KeyboardInterrupt: after Ctrl-C, if the first process ended before it could return.
+    """
+    store = TCPStore(HOST, 0, is_master=True, wait_for_workers=False)
+    status = get_context("spawn").Value("i", WITHOUT_A_WORD)
+    group = start_processes(_take_part, (processes, store.port, status, work, arguments), nprocs=processes, join=False)
+    try:
+        _wait(group)
+    except ProcessExitedException as error:
+        raise ChildProcessError(
+            f"training process {error.error_index} was ended from outside ({error.signal_name or error.exit_code}). "
+            "Memory may have run out: set workers lower, and continue with --resume."
+        ) from None
+    if status.value == WITHOUT_A_WORD:  # torch ends a process that is interrupted while it starts, and says nothing
+        raise KeyboardInterrupt
+    return status.value
+
+
+def _take_part(
+    rank: int,
+    processes: int,
+    port: int,
+    status: Synchronized[int],
+    work: Callable[..., int],
+    arguments: tuple[Any, ...],
+) -> None:
+    """What a started process does: the environment of torchrun, then the work."""
+    os.environ.update(
+        RANK=str(rank),
+        LOCAL_RANK=str(rank),
+        WORLD_SIZE=str(processes),
+        MASTER_ADDR=HOST,
+        MASTER_PORT=str(port),
+        TORCHELASTIC_USE_AGENT_STORE=str(True),  # the parent holds the store: its port cannot be taken meanwhile
+        TORCHELASTIC_RESTART_COUNT="0",
+    )
+    try:
+        found = work(*arguments)
+    except SystemExit:  # the first process says why
+        return
+    if rank == 0:
+        status.value = found
+
+
+def _wait(group: ProcessContext) -> None:
+    """Until all have ended; Ctrl-C is handed on, and who does not follow in time is killed."""
+    deadline: float | None = None
+    while True:
+        try:
+            left = None if deadline is None else deadline - time.monotonic()
+            if left is not None and left <= 0.0:
+                _kill(group)
+                return
+            if group.join(left, grace_period=LAST_WORDS):
+                return
+        except KeyboardInterrupt:
+            if deadline is not None:
+                _kill(group)
+                raise
+            deadline = time.monotonic() + GRACE
+            for process in group.processes:
+                if process.is_alive():
+                    os.kill(process.pid, signal.SIGINT)
+
+
+def _kill(group: ProcessContext) -> None:
+    for process in group.processes:
+        process.kill()
+        process.join()

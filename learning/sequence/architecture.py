@@ -1,0 +1,60 @@
+"""Which sequence model, of which size; and how one is made."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import torch
+
+from ballfg.learning.sequence.data import Example
+from ballfg.learning.sequence.diffusion import DiffusionModel
+from ballfg.learning.sequence.frame import Frame
+from ballfg.learning.sequence.lstm import LstmModel
+from ballfg.learning.sequence.model import SequenceModel
+
+SequenceKind = Literal["lstm", "diffusion"]
+DEFAULT_WIDTH: dict[SequenceKind, int] = {"lstm": 96, "diffusion": 64}
+"""By validation on simulated tracks."""
+_MODELS: dict[SequenceKind, type[LstmModel] | type[DiffusionModel]] = {"lstm": LstmModel, "diffusion": DiffusionModel}
+
+
+@dataclass(frozen=True)
+class SequenceArchitecture:
+    """Kind and size.
+
+    Attributes:
+        kind: lstm or diffusion.
+        width: of the hidden states; diffusion: channels of the denoiser. A multiple of 8, for the attention heads.
+
+    Raises: ValueError: an unknown kind, or a width that is not a positive multiple of 8.
+    """
+
+    kind: SequenceKind
+    width: int
+
+    def __post_init__(self) -> None:
+        if self.kind not in _MODELS:
+            raise ValueError(f"kind must be one of {', '.join(get_args(SequenceKind))}; got {self.kind!r}. Rename it.")
+        if isinstance(self.width, bool) or not isinstance(self.width, int) or self.width < 8 or self.width % 8:
+            raise ValueError(f"width must be a positive multiple of 8; got {self.width!r}. Round it.")
+
+    @classmethod
+    def of(cls, kind: SequenceKind) -> SequenceArchitecture:
+        """The default of a kind. Raises: ValueError: an unknown kind."""
+        return cls(kind, DEFAULT_WIDTH.get(kind, 0))
+
+    def empty(self, settings: int, points: int) -> SequenceModel:
+        """A model whose weights and scales are still to be loaded."""
+        return _MODELS[self.kind](settings, points, self.width)
+
+    def untrained(self, examples: Sequence[Example], seed: int) -> SequenceModel:
+        """A model with the scales of some examples and initial weights from the seed. Global randomness stays."""
+        settings = len(examples[0].settings)
+        points = Frame(settings).fit(examples)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(seed)
+            model = self.empty(settings, points)
+        model.frame.fit(examples)
+        return model

@@ -1,0 +1,141 @@
+"""Tracks as padded tensors: what was observed of each, what the launcher was told, and what is asked."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike
+from torch import Tensor
+from torch.nn.utils.rnn import pad_sequence
+
+from ballfg.learning.augment import apply
+from ballfg.tracks import Track
+
+LEAST_OBSERVED = 2
+"""Fewest observations that tell a direction."""
+
+
+@dataclass(frozen=True)
+class Example:
+    """One track, cut where its observed part ends. Times count from the last observed sample.
+
+    Attributes:
+        observed_times: (n,) s, increasing to 0.
+        observed: (n, 3) m, world frame.
+        settings: (k,) the launcher's settings as numbers.
+        times: (m,) s, increasing and positive: where the rest is asked.
+        rest: (m, 3) m, what was measured there; nan where nothing was.
+    """
+
+    observed_times: Tensor
+    observed: Tensor
+    settings: Tensor
+    times: Tensor
+    rest: Tensor
+
+    def seen_from(self, angle: Tensor, shift: Tensor) -> Example:
+        """The same shot from another place (`augment.apply`): () rad, (2,) m. Launcher settings stay as they are."""
+        return replace(self, observed=apply(self.observed, angle, shift), rest=apply(self.rest, angle, shift))
+
+
+@dataclass(frozen=True)
+class Batch:
+    """Some examples side by side, padded at their ends: times by the last one, positions by zero.
+
+    Attributes:
+        observed_times: (b, n) s.
+        observed: (b, n, 3) m.
+        observed_count: (b,) int64, samples that are not padding.
+        settings: (b, k).
+        times: (b, m) s.
+        rest: (b, m, 3) m.
+        asked: (b, m) bool, false in the padding.
+    """
+
+    observed_times: Tensor
+    observed: Tensor
+    observed_count: Tensor
+    settings: Tensor
+    times: Tensor
+    rest: Tensor
+    asked: Tensor
+
+    @property
+    def last_observed(self) -> Tensor:
+        """(b, 3) m, the last observed position of each track."""
+        rows = torch.arange(len(self.observed))
+        return self.observed[rows, self.observed_count - 1]
+
+    @property
+    def seen(self) -> Tensor:
+        """(b, n) bool, false in the padding of the observed part."""
+        return torch.arange(self.observed.shape[1]) < self.observed_count[:, None]
+
+
+def example(track: Track, observed: int, settings: Tensor, times: ArrayLike | None = None) -> Example:
+    """Cut a track after its first `observed` samples.
+
+    Args:
+        track: at least `observed` samples.
+        observed: >= 2.
+        settings: (k,) of this track's launcher.
+        times: (m,) s in the track's own time, increasing, later than the last observed sample; None: the stamps of
+            the rest, with what was measured there.
+
+    Raises: ValueError: too few samples, nothing to predict, or times that do not increase from the last observed one.
+    """
+    if not LEAST_OBSERVED <= observed <= len(track):
+        raise ValueError(
+            f"observed must lie in {LEAST_OBSERVED} .. {len(track)}, the samples of track {track.name!r}; got "
+            f"{observed}. Observe fewer samples or leave the track out."
+        )
+    origin = float(track.times[observed - 1])
+    if times is None:
+        asked, rest = track.times[observed:], track.positions[observed:]
+    else:
+        asked = np.asarray(times, dtype=np.float64)
+        rest = np.full((*asked.shape, 3), np.nan)
+    _check_asked(track.name, asked, origin)
+    return Example(
+        observed_times=torch.from_numpy(track.times[:observed] - origin),
+        observed=torch.from_numpy(track.positions[:observed]),
+        settings=settings.detach().to(torch.float64),
+        times=torch.from_numpy(asked - origin),
+        rest=torch.from_numpy(rest),
+    )
+
+
+def _check_asked(name: str, asked: np.ndarray, origin: float) -> None:
+    if asked.ndim != 1 or len(asked) == 0:
+        raise ValueError(
+            f"times of track {name!r} must have shape (m,) with m >= 1; got {asked.shape}. "
+            "Ask for a time after the observed part, or observe fewer samples."
+        )
+    steps = np.diff(asked, prepend=origin)
+    if not (steps > 0).all():
+        at = int(np.flatnonzero(~(steps > 0))[0])
+        raise ValueError(
+            f"times of track {name!r} must increase from the last observed stamp {origin:g} s; times[{at}]="
+            f"{asked[at]:g}. Sort them and drop what is observed."
+        )
+
+
+def collate(examples: Sequence[Example]) -> Batch:
+    """Examples as one batch, in their order. At least one; all with settings of the same length."""
+    counts = torch.tensor([len(item.observed_times) for item in examples])
+    asked = torch.tensor([len(item.times) for item in examples])
+    times = pad_sequence([item.times for item in examples], batch_first=True)
+    mask = torch.arange(times.shape[1]) < asked[:, None]
+    last = times.gather(1, asked[:, None] - 1)
+    return Batch(
+        observed_times=pad_sequence([item.observed_times for item in examples], batch_first=True),
+        observed=pad_sequence([item.observed for item in examples], batch_first=True),
+        observed_count=counts,
+        settings=torch.stack([item.settings for item in examples]),
+        times=torch.where(mask, times, last),
+        rest=pad_sequence([item.rest for item in examples], batch_first=True),
+        asked=mask,
+    )

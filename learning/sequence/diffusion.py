@@ -1,0 +1,115 @@
+"""Conditional diffusion baseline: from noise to the rest of a track, told what was observed.
+
+The network predicts the clean path at every noise level. Levels reach pure noise, so that nothing of the answer leaks
+into training. Source: J. Ho, A. Jain, P. Abbeel 2020 (training); J. Song, C. Meng, S. Ermon 2021 (sampling without
+noise); S. Lin et al. 2024 (zero terminal signal-to-noise ratio).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ballfg.learning.sequence.data import Batch
+from ballfg.learning.sequence.denoiser import Denoiser
+from ballfg.learning.sequence.encoder import Encoder
+from ballfg.learning.sequence.frame import Frame
+from ballfg.learning.sequence.model import Draw, SequenceModel
+
+LEVELS = 1000
+"""Noise levels; the last is pure noise."""
+DRAWS = 2
+"""Noise levels that a track is trained on per epoch: its observations are read once for all of them."""
+PURE = 0.2
+"""Share of the draws that are at pure noise: sampling starts there, and its first step decides most."""
+STEPS = 10
+"""Of sampling."""
+START_SEED = 0
+"""Of the noise that every sampling starts from."""
+NOISE_STREAM = 1
+"""Sets the noise apart from the augmentation of the same seed, epoch and track."""
+
+
+def noise_schedule() -> Any:
+    """The levels: cosine, from nearly clean to pure noise. Raises: ImportError: without the package diffusers."""
+    try:
+        from diffusers import DDIMScheduler
+    except ImportError as error:
+        raise ImportError(
+            f"diffusion needs the package diffusers, which is missing ({error}). Run: pip install diffusers."
+        ) from error
+    return DDIMScheduler(
+        num_train_timesteps=LEVELS,
+        beta_schedule="squaredcos_cap_v2",
+        prediction_type="sample",
+        rescale_betas_zero_snr=True,
+        timestep_spacing="trailing",
+        clip_sample=False,
+    )
+
+
+class DiffusionModel(SequenceModel):
+    """Encoder, denoiser and noise schedule.
+
+    Args:
+        settings: length of the launcher's settings.
+        points: of the grid.
+        width: channels of the denoiser; the encoder and the condition are wider in proportion.
+    """
+
+    def __init__(self, settings: int, points: int, width: int) -> None:
+        super().__init__()
+        self.points = points
+        self.frame = Frame(settings)
+        condition = 2 * width
+        self.encoder = Encoder(settings, 3 * width // 2, layers=2)
+        self.bridge = nn.Sequential(
+            nn.Linear(3 * width // 2 + settings, condition), nn.SiLU(), nn.Linear(condition, condition)
+        )
+        self.denoiser = Denoiser(width, condition)
+        self.schedule = noise_schedule()
+
+    def losses(self, batch: Batch, draws: Sequence[Draw]) -> tuple[Tensor, Tensor]:
+        """Mean squared error of the denoised paths, over the grid points that were measured and over the draws."""
+        points = self.points_asked(batch)
+        clean, known = self.frame.on_grid(self.frame.inward(batch.rest, batch), batch, points)
+        clean = clean.float()
+        levels, noise = self._draw(draws, points)
+        noisy = self.schedule.add_noise(clean.repeat_interleave(DRAWS, dim=0), noise, levels)
+        told = self._condition(batch).repeat_interleave(DRAWS, dim=0)
+        denoised = self.denoiser(noisy, levels, told).unflatten(0, (-1, DRAWS))
+        error = (denoised - clean[:, None]).square().sum(-1).mean(dim=1) * known
+        losses = error.sum(1) / known.sum(1).clamp(min=1)
+        return losses, self.path(denoised.detach().mean(dim=1), batch)
+
+    def predict(self, batch: Batch) -> Tensor:
+        """The path that sampling without noise leads to from one fixed start; see `SequenceModel`."""
+        generator = torch.Generator().manual_seed(START_SEED)
+        start = torch.randn(self.points, 3, generator=generator)[: self.points_asked(batch)]
+        told = self._condition(batch)
+        path = start.expand(len(told), -1, -1)
+        self.schedule.set_timesteps(STEPS)
+        for level in self.schedule.timesteps:
+            clean = self.denoiser(path, level.expand(len(told)), told)
+            path = self.schedule.step(clean, level, path, eta=0.0).prev_sample
+        return self.path(path, batch)
+
+    def _condition(self, batch: Batch) -> Tensor:
+        """(b, c) what was observed and set."""
+        read = self.encoder(batch, self.frame)
+        told: Tensor = self.bridge(torch.cat([read, self.frame.settings(batch).float()], dim=-1))
+        return told
+
+    def _draw(self, draws: Sequence[Draw], points: int) -> tuple[Tensor, Tensor]:
+        """Levels (b DRAWS,) and noise (b DRAWS, points, 3), the draws of a track side by side."""
+        levels, noise = [], []
+        for draw in draws:
+            generator = np.random.default_rng([*draw, NOISE_STREAM])
+            level = generator.integers(LEVELS, size=DRAWS)
+            levels.append(np.where(generator.random(DRAWS) < PURE, LEVELS - 1, level))
+            noise.append(generator.standard_normal((DRAWS, self.points, 3), dtype=np.float32)[:, :points])
+        return torch.from_numpy(np.concatenate(levels)), torch.from_numpy(np.concatenate(noise))

@@ -1,0 +1,131 @@
+"""The frame in which sequence models see tracks: places relative to the last observed one, all of order one.
+
+Only shifts and scales: no direction is singled out and nothing is extrapolated. Height keeps its origin, since the
+table lies at one height for all tracks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from ballfg.learning.sequence.data import Batch, Example, collate
+
+LARGEST_GAP = 2.5
+"""Steps between two measured samples beyond which a straight line tells nothing: a bounce may hide there."""
+ROUND = 1e-6
+"""Share of a step by which stamps may miss the grid and still count as on it: stamps are written with few decimals."""
+
+
+class Frame(nn.Module):
+    """Scales of a dataset, and the regular grid of times on which its future is predicted.
+
+    All are buffers: they are kept with a model's weights.
+
+    Attributes:
+        step: () s between grid times; the grid is step, 2 step ... points * step after the last observed sample.
+        horizontal: () m, unit of x and y.
+        height: (2,) m, origin and unit of z.
+        settings_mean, settings_unit: (k,) of the launcher's settings.
+    """
+
+    step: Tensor
+    horizontal: Tensor
+    height: Tensor
+    settings_mean: Tensor
+    settings_unit: Tensor
+
+    def __init__(self, settings: int) -> None:
+        super().__init__()
+        self.register_buffer("step", torch.ones((), dtype=torch.float64))
+        self.register_buffer("horizontal", torch.ones((), dtype=torch.float64))
+        self.register_buffer("height", torch.tensor([0.0, 1.0], dtype=torch.float64))
+        self.register_buffer("settings_mean", torch.zeros(settings, dtype=torch.float64))
+        self.register_buffer("settings_unit", torch.ones(settings, dtype=torch.float64))
+
+    def fit(self, examples: Sequence[Example]) -> int:
+        """Take the scales of some examples.
+
+        Returns: the number of grid points that reach to the end of the longest.
+
+        Raises: ValueError: if nothing moves, so that there is no scale.
+        """
+        batch = collate(examples)
+        intervals = torch.cat([item.observed_times.diff() for item in examples])
+        self.step.copy_(intervals.median())
+        away = (batch.rest - batch.last_observed[:, None])[batch.asked]
+        self.horizontal.copy_(away[:, :2].square().mean().sqrt())
+        z = torch.cat([batch.rest[..., 2][batch.asked], batch.observed[..., 2][batch.seen]])
+        self.height.copy_(torch.stack([z.mean(), z.std()]))
+        if not (self.units > 0).all():
+            raise ValueError(f"tracks must move horizontally and in height; their scales are {self.units.tolist()} m.")
+        self.settings_mean.copy_(batch.settings.mean(dim=0))
+        spread = (batch.settings - self.settings_mean).square().mean(dim=0).sqrt()
+        self.settings_unit.copy_(torch.where(spread > 0, spread, torch.ones_like(spread)))
+        return math.ceil(float(batch.times.max() / self.step) - ROUND)
+
+    @property
+    def units(self) -> Tensor:
+        """(3,) m, units of x, y and z."""
+        return torch.stack([self.horizontal, self.horizontal, self.height[1]])
+
+    def origin(self, batch: Batch) -> Tensor:
+        """(b, 3) m: x and y of the last observed sample, z of the frame."""
+        last = batch.last_observed
+        return torch.cat([last[:, :2], self.height[0].expand(len(last), 1)], dim=-1)
+
+    def inward(self, positions: Tensor, batch: Batch) -> Tensor:
+        """World positions (b, m, 3) m as the network sees them."""
+        return (positions - self.origin(batch)[:, None]) / self.units
+
+    def outward(self, local: Tensor, batch: Batch) -> Tensor:
+        """The inverse of `inward`."""
+        return local * self.units + self.origin(batch)[:, None]
+
+    def settings(self, batch: Batch) -> Tensor:
+        """(b, k) settings of order one; those that never change are 0."""
+        return (batch.settings - self.settings_mean) / self.settings_unit
+
+    def at_times(self, path: Tensor, times: Tensor) -> Tensor:
+        """A path on the grid, at any times: straight between its points, straight on beyond the last.
+
+        Args:
+            path: (b, points + 1, 3) at 0, step, 2 step ...
+            times: (b, m) s, >= 0.
+
+        Returns: (b, m, 3).
+        """
+        place = times / self.step
+        cell = place.floor().long().clamp(max=path.shape[1] - 2)
+        weight = (place - cell)[..., None].to(path.dtype)
+        index = cell[..., None].expand(-1, -1, path.shape[-1])
+        return (1 - weight) * path.gather(1, index) + weight * path.gather(1, index + 1)
+
+    def on_grid(self, local: Tensor, batch: Batch, points: int) -> tuple[Tensor, Tensor]:
+        """What was measured, on the grid: straight between samples.
+
+        Args:
+            local: (b, m, 3) the rest, as from `inward`.
+            batch: whose times these are.
+            points: of the grid.
+
+        Returns: (values (b, points, 3), known (b, points) bool); a point is unknown beyond the last sample and inside
+            a gap of more than LARGEST_GAP steps.
+        """
+        start = self.inward(batch.last_observed[:, None], batch)
+        values = torch.cat([start, local], dim=1)
+        knots = torch.cat([torch.zeros_like(batch.times[:, :1]), batch.times], dim=1)
+        grid = (torch.arange(1, points + 1, dtype=knots.dtype) * self.step).expand(len(knots), points).contiguous()
+        slack = ROUND * self.step
+        sorting = torch.where(torch.cat([batch.asked[:, :1], batch.asked], dim=1), knots, torch.inf)
+        right = torch.searchsorted(sorting, grid - slack).clamp(1, knots.shape[1] - 1)
+        low, high = knots.gather(1, right - 1), knots.gather(1, right)
+        measured = torch.minimum((grid - low).abs(), (grid - high).abs()) <= slack
+        between = (grid < batch.times[:, -1:]) & (high - low <= LARGEST_GAP * self.step)
+        known = measured | between
+        weight = torch.where(known, (grid - low) / (high - low).clamp(min=slack), torch.zeros_like(grid))[..., None]
+        index = right[..., None].expand(-1, -1, 3)
+        return (1 - weight) * values.gather(1, index - 1) + weight * values.gather(1, index), known

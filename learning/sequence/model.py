@@ -1,0 +1,55 @@
+"""The contract of a sequence model: from the observed part of tracks to the rest, no estimator, no dynamics."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor, nn
+
+from ballfg.learning.sequence.data import Batch
+from ballfg.learning.sequence.frame import ROUND, Frame
+
+Draw = tuple[int, int, int]
+"""Seed, epoch and track: what the randomness of one track's loss comes from."""
+
+
+class SequenceModel(nn.Module, ABC):
+    """A network with the frame it works in. Networks compute in float32, positions outside are float64.
+
+    No track's result depends on the others in its batch, beyond rounding.
+
+    Attributes:
+        frame: scales and grid.
+        points: number of grid points that are predicted.
+    """
+
+    frame: Frame
+    points: int
+
+    @abstractmethod
+    def losses(self, batch: Batch, draws: Sequence[Draw]) -> tuple[Tensor, Tensor]:
+        """What training takes the gradient of.
+
+        Args:
+            batch: with a measured rest.
+            draws: one for each track.
+
+        Returns: (losses, positions): (b,) differentiable, in squared units of the frame; (b, m, 3) m what the model
+            held for the rest while it was trained on it, without gradient.
+        """
+
+    @abstractmethod
+    def predict(self, batch: Batch) -> Tensor:
+        """(b, m, 3) m, world positions at the times asked. The same batch gives the same bytes."""
+
+    def points_asked(self, batch: Batch) -> int:
+        """Grid points that reach to the last time asked, `points` at most."""
+        return max(1, min(self.points, math.ceil(float(batch.times.max() / self.frame.step) - ROUND)))
+
+    def path(self, grid: Tensor, batch: Batch) -> Tensor:
+        """World positions (b, m, 3) m at the times asked, from local positions (b, p, 3) on the grid's first points."""
+        start = self.frame.inward(batch.last_observed[:, None], batch)
+        return self.frame.outward(self.frame.at_times(torch.cat([start, grid.double()], dim=1), batch.times), batch)

@@ -1,0 +1,112 @@
+"""A trained sequence model for use: predictions from tracks, and its folder on disk."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+
+from ballfg.learning.sequence.architecture import SequenceArchitecture
+from ballfg.learning.sequence.data import collate, example
+from ballfg.learning.sequence.files import read_folder, write_folder
+from ballfg.learning.sequence.launcher import LauncherSettings
+from ballfg.learning.sequence.model import SequenceModel
+from ballfg.tracks import Track
+
+CHUNK = 256
+"""Tracks that are predicted at once: bounds the memory."""
+
+
+class SequencePredictor:
+    """Predicts the rest of tracks from their first samples.
+
+    A prediction reaches as far as the longest rest in training; beyond that it goes straight on.
+
+    Args:
+        architecture: of the model.
+        launcher: which labels are settings, as in training.
+        model: trained.
+    """
+
+    def __init__(self, architecture: SequenceArchitecture, launcher: LauncherSettings, model: SequenceModel) -> None:
+        self.architecture = architecture
+        self.launcher = launcher
+        self.model = model
+
+    @property
+    def parameter_count(self) -> int:
+        """Trainable numbers; scales are not among them."""
+        return sum(parameter.numel() for parameter in self.model.parameters())
+
+    def predict(self, track: Track, observed: int, times: ArrayLike) -> NDArray[np.float64]:
+        """Positions of one track.
+
+        Args:
+            track: its first `observed` samples and its labels are used, nothing else.
+            observed: >= 2.
+            times: (k,) s in the track's own time, increasing, later than the last observed sample.
+
+        Returns: (k, 3) m.
+
+        Raises: ValueError: too few samples, launcher settings that are missing or unknown, or bad times.
+        """
+        return self.predict_many([track], [observed], [times])[0]
+
+    def predict_many(
+        self, tracks: Sequence[Track], observed: Sequence[int], times: Sequence[ArrayLike]
+    ) -> list[NDArray[np.float64]]:
+        """The same for many tracks: one entry of `observed` and `times` each.
+
+        Raises: ValueError: as `predict`.
+        """
+        examples = [
+            example(track, count, self.launcher.of(track), asked)
+            for track, count, asked in zip(tracks, observed, times, strict=True)
+        ]
+        predicted: list[NDArray[np.float64]] = []
+        for first in range(0, len(examples), CHUNK):
+            batch = collate(examples[first : first + CHUNK])
+            with torch.no_grad():
+                positions = self.model.predict(batch)
+            predicted += [row[mask].numpy() for row, mask in zip(positions, batch.asked, strict=True)]
+        return predicted
+
+    def save(self, folder: str | Path) -> None:
+        """Write `config.yaml` and `weights.safetensors`; the folder appears once it is whole.
+
+        Raises: ValueError: if the folder exists.
+        """
+        config = {
+            "kind": self.architecture.kind,
+            "width": self.architecture.width,
+            "points": self.model.points,
+            "labels": list(self.launcher.labels),
+            "categories": {label: list(values) for label, values in self.launcher.categories.items()},
+        }
+        write_folder(Path(folder), config, self.model.state_dict())
+
+    @classmethod
+    def load(cls, folder: str | Path) -> SequencePredictor:
+        """Read what `save` wrote; predictions are the same to the last bit.
+
+        Raises:
+            FileNotFoundError: the folder or one of its files is missing.
+            ValueError: a file is damaged, or weights do not go with the config.
+        """
+        config, weights = read_folder(Path(folder))
+        architecture = SequenceArchitecture(config.kind, config.width)
+        launcher = LauncherSettings(config.labels, config.categories)
+        model = architecture.empty(launcher.size, config.points)
+        expected = {name: (tuple(value.shape), value.dtype) for name, value in model.state_dict().items()}
+        got = {name: (tuple(value.shape), value.dtype) for name, value in weights.items()}
+        wrong = sorted(name for name in expected.keys() | got.keys() if expected.get(name) != got.get(name))
+        if wrong:
+            raise ValueError(
+                f"weights in {folder} must be those of the model in its config; '{wrong[0]}' is "
+                f"{got.get(wrong[0], 'missing')}, not {expected.get(wrong[0], 'part of it')}. Save the model again."
+            )
+        model.load_state_dict(weights)
+        return cls(architecture, launcher, model)

@@ -1,0 +1,114 @@
+"""A sequence model with its tracks, as the training loop takes it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from torch import Tensor
+
+from ballfg.learning.augment import augmentation
+from ballfg.learning.sequence.architecture import SequenceArchitecture
+from ballfg.learning.sequence.data import Batch, Example, collate, example
+from ballfg.learning.sequence.launcher import LauncherSettings
+from ballfg.learning.sequence.model import SequenceModel
+from ballfg.learning.sequence.predictor import SequencePredictor
+from ballfg.learning.trainee import BatchLoss, Trainee
+from ballfg.tracks import Track
+
+
+class SequenceTrainee(Trainee):
+    """Trains an LSTM or diffusion model to predict the unobserved rest of tracks.
+
+    A track that cannot be used - too short, launcher settings missing - is reported as failed whenever it is asked for.
+
+    Args:
+        tracks: all parts.
+        observed: how many samples are observed of each.
+        train: numbers of the tracks whose scales the model takes; at least one that can be used.
+        architecture: kind and size.
+        launcher: which labels are settings.
+        seed: of initial weights, augmentation and diffusion noise, >= 0.
+        augment: turn and shift training tracks.
+
+    Raises: ValueError: if no track of the training part can be used.
+    """
+
+    module: SequenceModel
+
+    def __init__(
+        self,
+        tracks: Sequence[Track],
+        observed: Sequence[int],
+        train: Sequence[int],
+        *,
+        architecture: SequenceArchitecture,
+        launcher: LauncherSettings,
+        seed: int,
+        augment: bool,
+    ) -> None:
+        self._names = [track.name for track in tracks]
+        self._examples: dict[int, Example] = {}
+        self._unusable: dict[int, str] = {}
+        for number, (track, count) in enumerate(zip(tracks, observed, strict=True)):
+            try:
+                self._examples[number] = example(track, count, launcher.of(track))
+            except ValueError as error:
+                self._unusable[number] = str(error)
+        usable = [self._examples[number] for number in train if number in self._examples]
+        if not usable:
+            reason = next((self._unusable[number] for number in train), "it is empty")
+            raise ValueError(f"train must hold a track with observations and a rest; got none ({reason})")
+        self.module = architecture.untrained(usable, seed)
+        self._architecture, self._launcher = architecture, launcher
+        self._seed = seed
+        self._augment = augment
+
+    def loss(self, tracks: Sequence[int], epoch: int) -> BatchLoss:
+        """Sum of the tracks' losses, in squared units of the frame; lstm: squared error, diffusion: denoising.
+
+        `squared_error` is that of the positions predicted in training; diffusion: of the denoised paths.
+        """
+        numbers = [number for number in tracks if number in self._examples]
+        if not numbers:
+            return self._nothing(tracks)
+        examples = [self._seen(number, epoch) for number in numbers]
+        batch = collate(examples)
+        losses, positions = self.module.losses(batch, [(self._seed, epoch, number) for number in numbers])
+        return self._batch_loss(tracks, losses.double(), positions, batch)
+
+    def judge(self, tracks: Sequence[int]) -> BatchLoss:
+        """Mean squared error of true predictions, diffusion: sampled; the sum over tracks, in squared units."""
+        numbers = [number for number in tracks if number in self._examples]
+        if not numbers:
+            return self._nothing(tracks)
+        batch = collate([self._examples[number] for number in numbers])
+        with torch.no_grad():
+            positions = self.module.predict(batch)
+        error = ((positions - batch.rest) / self.module.frame.units).square().sum(-1) * batch.asked
+        return self._batch_loss(tracks, error.sum(1) / batch.asked.sum(1), positions, batch)
+
+    def predictor(self) -> SequencePredictor:
+        """The model as it is now, for use."""
+        return SequencePredictor(self._architecture, self._launcher, self.module)
+
+    def _seen(self, number: int, epoch: int) -> Example:
+        if not self._augment:
+            return self._examples[number]
+        return self._examples[number].seen_from(*augmentation(self._seed, epoch, number))
+
+    def _batch_loss(self, tracks: Sequence[int], losses: Tensor, positions: Tensor, batch: Batch) -> BatchLoss:
+        squares = (positions - batch.rest)[batch.asked].square().sum()
+        return BatchLoss(
+            total=losses.sum(),
+            tracks=len(losses),
+            squared_error=float(squares),
+            points=int(batch.asked.sum()),
+            failed=self._failed(tracks),
+        )
+
+    def _nothing(self, tracks: Sequence[int]) -> BatchLoss:
+        return BatchLoss(torch.zeros((), dtype=torch.float64), 0, 0.0, 0, self._failed(tracks))
+
+    def _failed(self, tracks: Sequence[int]) -> tuple[tuple[str, str], ...]:
+        return tuple((self._names[number], self._unusable[number]) for number in tracks if number in self._unusable)

@@ -1,0 +1,102 @@
+"""Shots to learn from: what of a track is observed, what is to be predicted, and the events in it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimate import Settings, Smoother
+from ballfg.estimate.problem import effective_sigmas
+from ballfg.estimate.segmentation import Segmentation
+from ballfg.tracks import Track
+
+Array = NDArray[np.float64]
+
+LEAST_OBSERVED = 5
+"""Samples that an estimate needs."""
+LEAST_PREDICTED = 3
+"""Samples that a prediction is judged on."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One track, cut into what is observed and what is predicted.
+
+    Attributes:
+        track: as far as the ball flies undisturbed: up to its first hit.
+        observed: number of samples that the estimate sees; they come first.
+        usable: (n,) bool, samples that measure the ball.
+        segmentation: events of the observed part.
+        settings: of the estimator, before anything is learned.
+        surfaces: what the ball may bounce on.
+    """
+
+    track: Track
+    observed: int
+    usable: NDArray[np.bool_]
+    segmentation: Segmentation
+    settings: Settings
+    surfaces: Surfaces
+
+    @property
+    def name(self) -> str:
+        """The track's name."""
+        return self.track.name
+
+    @property
+    def seen(self) -> Track:
+        """The observed part."""
+        return part(self.track, self.observed)
+
+    def sigmas(self) -> Array:
+        """(observed, 3) m, of the observed positions."""
+        return effective_sigmas(self.seen, self.segmentation, self.settings)
+
+
+def part(track: Track, count: int) -> Track:
+    """The first samples of a track."""
+    sigmas = None if track.sigmas is None else track.sigmas[:count]
+    return replace(track, times=track.times[:count], positions=track.positions[:count], sigmas=sigmas)
+
+
+def shots_of(
+    tracks: Iterable[Track],
+    model: BallModel,
+    surfaces: Surfaces,
+    settings: Settings,
+    *,
+    samples: int | None,
+    seconds: float | None,
+) -> Iterator[tuple[Track, Shot | str]]:
+    """Each track with its shot, or the reason why it gives none.
+
+    Args:
+        tracks: whole.
+        model: finds the events; an analytic one will do.
+        surfaces: what the ball may bounce on.
+        settings: of the estimator.
+        samples: how many are observed; or
+        seconds: for how long is observed.
+    """
+    smoother = Smoother(model, surfaces, settings)
+    for track in tracks:
+        yield track, _shot(track, smoother, samples, seconds)
+
+
+def _shot(track: Track, smoother: Smoother, samples: int | None, seconds: float | None) -> Shot | str:
+    whole = smoother.segment(track)
+    end = int(whole.hits[0]) + 1 if len(whole.hits) else len(track)
+    track, usable = part(track, end), whole.usable[:end]
+    observed = samples if seconds is None else int(np.searchsorted(track.times, track.times[0] + seconds, side="right"))
+    assert observed is not None
+    if observed < LEAST_OBSERVED or usable[:observed].sum() < LEAST_OBSERVED:
+        return f"fewer than {LEAST_OBSERVED} usable samples are observed"
+    if usable[observed:].sum() < LEAST_PREDICTED:
+        return f"fewer than {LEAST_PREDICTED} usable samples follow the observed part before the ball is hit"
+    seen = part(track, observed)
+    return Shot(track, observed, usable, smoother.segment(seen), smoother.settings, smoother.surfaces)

@@ -1,0 +1,112 @@
+"""What both models promise, trained or not."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+import torch
+
+from ballfg.learning.sequence.architecture import SequenceArchitecture, SequenceKind
+from ballfg.learning.sequence.data import Example, collate, example
+from ballfg.learning.sequence.launcher import LauncherSettings
+from ballfg.learning.sequence.model import SequenceModel
+from ballfg.tracks import Track
+
+LABELS = ("topspin", "sidespin", "speed")
+FLOAT32 = 1e-5
+"""m, what float32 leaves of a position over some tens of steps."""
+
+kinds = pytest.mark.parametrize("kind", ["lstm", "diffusion"])
+
+
+def examples_of(tracks: Sequence[Track], observed: int = 25) -> list[Example]:
+    launcher = LauncherSettings(LABELS)
+    return [example(track, observed, launcher.of(track)) for track in tracks]
+
+
+def untrained(kind: SequenceKind, tracks: Sequence[Track], seed: int = 0, width: int = 16) -> SequenceModel:
+    return SequenceArchitecture(kind, width).untrained(examples_of(tracks), seed)
+
+
+def predicted(model: SequenceModel, examples: Sequence[Example]) -> torch.Tensor:
+    with torch.no_grad():
+        return model.predict(collate(examples))
+
+
+@kinds
+def test_a_padded_batch_gives_what_single_tracks_give(kind: SequenceKind, tracks: list[Track]) -> None:
+    model = untrained(kind, tracks)
+    examples = [cut for observed in (25, 31, 12) for cut in examples_of(tracks[:3], observed)]
+    together = predicted(model, examples)
+    for row, alone in enumerate(examples):
+        assert together.shape[1] >= len(alone.times)
+        single = predicted(model, [alone])[0]
+        torch.testing.assert_close(together[row, : len(single)], single, rtol=0, atol=FLOAT32)
+
+
+@kinds
+def test_losses_do_not_depend_on_the_batch(kind: SequenceKind, tracks: list[Track]) -> None:
+    model = untrained(kind, tracks)
+    examples = examples_of(tracks[:4])
+    draws = [(0, 5, number) for number in range(4)]
+    together, positions = model.losses(collate(examples), draws)
+    for row, alone in enumerate(examples):
+        single, path = model.losses(collate([alone]), draws[row : row + 1])
+        torch.testing.assert_close(together[row : row + 1], single, rtol=1e-5, atol=0)
+        torch.testing.assert_close(positions[row, : path.shape[1]], path[0], rtol=0, atol=FLOAT32)
+
+
+@kinds
+def test_a_prediction_does_not_depend_on_which_other_times_are_asked(kind: SequenceKind, tracks: list[Track]) -> None:
+    model = untrained(kind, tracks)
+    full = examples_of(tracks[:1])[0]
+    kept = torch.tensor([2, 3, 7, 12])
+    few = dataclasses.replace(full, times=full.times[kept], rest=full.rest[kept])
+    torch.testing.assert_close(predicted(model, [few])[0], predicted(model, [full])[0, kept], rtol=0, atol=FLOAT32)
+
+
+@kinds
+def test_a_horizontal_shift_moves_the_prediction_with_it(kind: SequenceKind, tracks: list[Track]) -> None:
+    model = untrained(kind, tracks)
+    cut = examples_of(tracks[:1])[0]
+    shift = torch.tensor([0.7, -1.3], dtype=torch.float64)
+    moved = predicted(model, [cut.seen_from(torch.zeros((), dtype=torch.float64), shift)])
+    expected = predicted(model, [cut]) + torch.tensor([0.7, -1.3, 0.0])
+    torch.testing.assert_close(moved, expected, rtol=0, atol=FLOAT32)
+
+
+@kinds
+def test_dropped_frames_are_taken(kind: SequenceKind, tracks: list[Track]) -> None:
+    model = untrained(kind, tracks)
+    whole = tracks[0]
+    kept = np.delete(np.arange(len(whole)), [4, 5, 11, 30, 31, 32, 33])
+    dropped = Track(whole.name, whole.times[kept], whole.positions[kept], labels=whole.labels)
+    cut = example(dropped, 25 - 3, LauncherSettings(LABELS).of(dropped))
+    losses, positions = model.losses(collate([cut]), [(0, 0, 0)])
+    assert torch.isfinite(losses).all()
+    assert torch.isfinite(positions).all()
+    losses.sum().backward()
+    assert all(torch.isfinite(p.grad).all() for p in model.parameters() if p.grad is not None)
+
+
+@kinds
+def test_weights_come_from_the_seed_and_leave_global_randomness_alone(kind: SequenceKind, tracks: list[Track]) -> None:
+    torch.manual_seed(1)
+    before = torch.random.get_rng_state()
+    one, same, other = untrained(kind, tracks, 3), untrained(kind, tracks, 3), untrained(kind, tracks, 4)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert all(torch.equal(a, b) for a, b in zip(one.parameters(), same.parameters(), strict=True))
+    assert any(not torch.equal(a, b) for a, b in zip(one.parameters(), other.parameters(), strict=True))
+    cut = examples_of(tracks[:2])
+    assert torch.equal(predicted(one, cut), predicted(same, cut))
+
+
+def test_diffusion_noise_comes_from_seed_epoch_and_track(tracks: list[Track]) -> None:
+    model = untrained("diffusion", tracks)
+    batch = collate(examples_of(tracks[:1]))
+    losses = [float(model.losses(batch, [draw])[0].detach()) for draw in [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]]
+    assert len(set(losses)) == 4
+    assert float(model.losses(batch, [(0, 0, 0)])[0].detach()) == losses[0]

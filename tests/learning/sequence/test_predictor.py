@@ -1,0 +1,117 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from safetensors.torch import load_file, save_file
+
+from ballfg.learning.sequence import LauncherSettings, SequenceArchitecture, SequencePredictor
+from ballfg.learning.sequence.architecture import SequenceKind
+from ballfg.learning.sequence.data import example
+from ballfg.tracks import Track
+
+LABELS = ("topspin", "sidespin", "speed")
+kinds = pytest.mark.parametrize("kind", ["lstm", "diffusion"])
+
+
+def predictor_of(
+    kind: SequenceKind, tracks: list[Track], launcher: LauncherSettings | None = None
+) -> SequencePredictor:
+    launcher = LauncherSettings(LABELS) if launcher is None else launcher
+    architecture = SequenceArchitecture(kind, 16)
+    examples = [example(track, 25, launcher.of(track)) for track in tracks]
+    return SequencePredictor(architecture, launcher, architecture.untrained(examples, seed=0))
+
+
+@kinds
+def test_saved_and_loaded_predicts_the_same_bits(kind: SequenceKind, tracks: list[Track], tmp_path: Path) -> None:
+    predictor = predictor_of(kind, tracks)
+    predictor.save(tmp_path / "model")
+    loaded = SequencePredictor.load(tmp_path / "model")
+    track = tracks[0]
+    asked = track.times[25:] + 1e-3
+    assert np.array_equal(loaded.predict(track, 25, asked), predictor.predict(track, 25, asked))
+    assert loaded.parameter_count == predictor.parameter_count
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["model"]
+
+
+def test_text_labels_are_kept(tracks: list[Track], tmp_path: Path) -> None:
+    labelled = [
+        Track(t.name, t.times, t.positions, labels={"group": "ab"[i % 2], "speed": t.labels["speed"]})
+        for i, t in enumerate(tracks)
+    ]
+    launcher = LauncherSettings(("group", "speed"), {"group": ("a", "b")})
+    assert launcher.of(labelled[1]).tolist() == [0.0, 1.0, labelled[1].labels["speed"]]
+    predictor_of("lstm", labelled, launcher).save(tmp_path / "model")
+    assert SequencePredictor.load(tmp_path / "model").launcher == launcher
+
+
+def test_many_are_predicted_as_one_by_one(tracks: list[Track]) -> None:
+    predictor = predictor_of("lstm", tracks)
+    observed = [20, 31, 25]
+    asked = [track.times[count:][:: i + 1] for i, (track, count) in enumerate(zip(tracks, observed, strict=False))]
+    many = predictor.predict_many(tracks[:3], observed, asked)
+    for track, count, times, got in zip(tracks, observed, asked, many, strict=False):
+        assert got.shape == (len(times), 3)
+        np.testing.assert_allclose(got, predictor.predict(track, count, times), rtol=0, atol=1e-5)
+
+
+def test_nothing_after_the_observed_part_is_used(tracks: list[Track]) -> None:
+    predictor, track = predictor_of("diffusion", tracks), tracks[0]
+    cut = Track(track.name, track.times[:25], track.positions[:25], labels=track.labels)
+    asked = track.times[25:]
+    assert np.array_equal(predictor.predict(cut, 25, asked), predictor.predict(track, 25, asked))
+
+
+def test_a_track_without_settings_is_refused(tracks: list[Track]) -> None:
+    track = Track("bare", tracks[0].times, tracks[0].positions)
+    with pytest.raises(ValueError, match=r"labels of track 'bare' must be known launcher settings; got .*None"):
+        predictor_of("lstm", tracks).predict(track, 25, track.times[25:])
+
+
+def test_without_labels_observations_are_enough(tracks: list[Track]) -> None:
+    predictor = predictor_of("lstm", tracks, LauncherSettings())
+    bare = Track("bare", tracks[0].times, tracks[0].positions)
+    assert np.isfinite(predictor.predict(bare, 25, bare.times[25:])).all()
+
+
+def test_an_existing_folder_is_not_overwritten(tracks: list[Track], tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"folder must be new; .* exists"):
+        predictor_of("lstm", tracks).save(tmp_path)
+
+
+def test_missing_and_damaged_files_are_named(tracks: list[Track], tmp_path: Path) -> None:
+    folder = tmp_path / "model"
+    with pytest.raises(
+        FileNotFoundError, match=r"must hold config.yaml and weights.safetensors; config.yaml is missing"
+    ):
+        SequencePredictor.load(folder)
+    predictor_of("lstm", tracks).save(folder)
+    config, weights = folder / "config.yaml", folder / "weights.safetensors"
+    text, tensors = config.read_text(), load_file(weights)
+
+    config.write_text(yaml.safe_dump(yaml.safe_load(text) | {"kind": "gru"}))
+    with pytest.raises(ValueError, match=r"config.yaml: not the config of a sequence model"):
+        SequencePredictor.load(folder)
+    config.write_text(yaml.safe_dump(yaml.safe_load(text) | {"width": 24}))
+    with pytest.raises(ValueError, match=r"weights in .* must be those of the model in its config; 'bridge.bias' is"):
+        SequencePredictor.load(folder)
+    config.write_text(text)
+    save_file({name: value for name, value in tensors.items() if name != "frame.step"}, weights)
+    with pytest.raises(ValueError, match=r"'frame.step' is missing"):
+        SequencePredictor.load(folder)
+    save_file(tensors | {"extra": torch.zeros(1)}, weights)
+    with pytest.raises(ValueError, match=r"'extra' is .*, not part of it"):
+        SequencePredictor.load(folder)
+    weights.write_bytes(b"not numbers")
+    with pytest.raises(ValueError, match=r"weights.safetensors: not readable as safetensors"):
+        SequencePredictor.load(folder)
+
+
+@pytest.mark.parametrize(("kind", "width", "message"), [("gru", 16, "kind must be one of"), ("lstm", 12, "width must")])
+def test_an_architecture_checks_itself(kind: SequenceKind, width: int, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        SequenceArchitecture(kind, width)
