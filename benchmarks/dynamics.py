@@ -13,9 +13,10 @@ import joblib
 import numpy as np
 import torch
 
-from ballfg.benchmarks.dynamics_contenders import METHODS, TIMED, Contender, GraphContender, Job
+from ballfg.benchmarks.dynamics_contenders import TIMED, Contender, GraphContender, Job
 from ballfg.benchmarks.dynamics_fan import fan_of
 from ballfg.benchmarks.dynamics_measured import measured_task
+from ballfg.benchmarks.dynamics_methods import METHODS
 from ballfg.benchmarks.dynamics_metrics import score_path
 from ballfg.benchmarks.dynamics_record import Record, read_record, task_digest
 from ballfg.benchmarks.dynamics_rows import add_rows

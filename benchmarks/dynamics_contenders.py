@@ -160,10 +160,3 @@ def truth_contender(job: Job) -> GraphContender:
         )
     settings = replace(task.settings, process=NO_NOISE)
     return GraphContender(job.method, task.truth, task.surfaces, settings, label_of(task))
-
-
-METHODS: Final = {
-    "truth": Method(truth_contender, trained=False, needs_truth=True),
-    "nominal": Method(nominal_contender, trained=False),
-}
-"""Every method by name, in the order of the table."""

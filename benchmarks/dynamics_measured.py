@@ -53,6 +53,8 @@ def measured_task(dataset: Dataset, jobs: int, tracks: int | None = None) -> Tas
         # a learned model has no coefficients to estimate with each track: to be equal, no model has
         settings=replace(given, coefficients={}),
         launcher=None,
+        launcher_labels=("group",),
+        observe={"seconds": OBSERVE},
         truth=None,
         train=tuple(shots[::2]),
         validation=tuple(shots[1::2]),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -17,6 +18,7 @@ Array = NDArray[np.float64]
 
 APEXES: Final = ("before_1", "1_2", "2_3")
 """The flights whose highest point is judged: before the first bounce, between the first two, between the next two."""
+VALIDATE_ONE_IN: Final = 10
 SPLIT_LABEL: Final = "split"
 """The label in a written task that says which part a track belongs to."""
 
@@ -61,6 +63,8 @@ class Task:
         surfaces: what every model is told to bounce on.
         settings: of the estimator, the same for every model but for noise that a model has learned.
         launcher: spin per level for models that do not learn it; None where the tracks have no levels.
+        launcher_labels: labels from which trained models learn the spin.
+        observe: what is observed of a shot, as a training config says it.
         truth: the true dynamics; None for measured tracks.
         train: shots to learn from.  validation: shots to judge by.
     """
@@ -70,17 +74,23 @@ class Task:
     surfaces: Surfaces
     settings: Settings
     launcher: LauncherSpin | None
+    launcher_labels: tuple[str, ...]
+    observe: Mapping[str, float]
     truth: BallModel | None
     train: tuple[Shot, ...]
     validation: tuple[Shot, ...]
 
     def write(self, folder: Path) -> None:
-        """Write the tracks of both parts as a dataset whose label `split` says train or validation.
+        """Write the tracks of both parts as a dataset whose label `split` says train, validation or test.
+
+        One in ten of the shots to learn from validates: it decides which weights are kept. The shots to judge by are
+        tests, which no training looks at.
 
         Raises: FileNotFoundError: if the folder's parent does not exist.
         """
-        parts = ((self.train, "train"), (self.validation, "validation"))
-        tracks = [
-            replace(s.track, labels={**s.track.labels, SPLIT_LABEL: part}) for shots, part in parts for s in shots
+        parts = [
+            "validation" if k % VALIDATE_ONE_IN == VALIDATE_ONE_IN - 1 else "train" for k in range(len(self.train))
         ]
+        labelled = [*zip(self.train, parts, strict=True), *((shot, "test") for shot in self.validation)]
+        tracks = [replace(s.track, labels={**s.track.labels, SPLIT_LABEL: part}) for s, part in labelled]
         write_dataset(folder, self.info, sorted(tracks, key=lambda track: track.name), "parquet")

@@ -31,7 +31,7 @@ def run(search: Search[R]) -> R:
         while True:
             graph, values = search.send(graph.linearize(values))
     except StopIteration as end:
-        return end.value  # type: ignore[no-any-return]
+        return end.value
 
 
 def run_together(searches: Sequence[Search[R]]) -> list[R]:
@@ -79,12 +79,15 @@ def _evaluate(kinds: Sequence[FactorKind], points: Sequence[Values]) -> list[Row
     """Kinds of one group, each linearised at its own point."""
     if len(kinds) == 1:
         return [kinds[0].linearize(points[0])]
-    gathered = [[values.gather(column) for column in kind.variables.T] for kind, values in zip(kinds, points, strict=True)]
+    gathered = [
+        [values.gather(column) for column in kind.variables.T] for kind, values in zip(kinds, points, strict=True)
+    ]
     inputs = tuple(np.concatenate(pieces) for pieces in zip(*gathered, strict=True))
     residual, jacobians = merge(kinds).compute(slice(None), inputs)
     ends = np.cumsum([len(kind) for kind in kinds])[:-1]
     residuals = np.split(residual, ends)
     blocks = [np.split(jacobian, ends) for jacobian in jacobians]
     return [
-        Rows(kind.variables, residuals[i], tuple(block[i] for block in blocks), kind.loss) for i, kind in enumerate(kinds)
+        Rows(kind.variables, residuals[i], tuple(block[i] for block in blocks), kind.loss)
+        for i, kind in enumerate(kinds)
     ]

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from ballfg.dynamics import BallModel, load_model, nominal_model, save_model
+from ballfg.dynamics import BallModel, save_model
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.architecture import Architecture
 from ballfg.dynamics.learned import build as build_model
@@ -19,6 +19,7 @@ from ballfg.dynamics.trained import Trained
 from ballfg.estimate import Settings, dataset_settings, dataset_surfaces
 from ballfg.estimate.launcher import Launcher
 from ballfg.factors.noise import ProcessNoise
+from ballfg.learning.coefficients import analytic_model
 from ballfg.learning.end_to_end import EndToEnd
 from ballfg.learning.folder import MODEL
 from ballfg.learning.implicit import GaussNewtonGradient, GradientMethod, ImplicitGradient, UnrolledGradient
@@ -114,11 +115,7 @@ def _analytic(config: TrainConfig, datasets: Sequence[Dataset]) -> AnalyticModel
     radii = {dataset.info.ball.radius for dataset in datasets}
     if len(radii) > 1:
         raise ValueError(f"data must be of one kind of ball; got radii {sorted(radii)} m. Train a model for each.")
-    radius = radii.pop()
-    model = nominal_model(radius) if config.model is None else load_model(config.model, radius=radius)
-    if not isinstance(model, AnalyticModel):
-        raise ValueError(f"model must be analytic; {config.model} has a learned part. Leave it out, or --resume.")
-    return model
+    return analytic_model(config.model, radii.pop())
 
 
 def _model(config: TrainConfig, analytic: AnalyticModel) -> BallModel:

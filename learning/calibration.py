@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from ballfg.dynamics import load_model, nominal_model, save_model
+from ballfg.dynamics import save_model
 from ballfg.learning import calibration_checkpoint as checkpoints
 from ballfg.learning import folder as files
 from ballfg.learning.calibrate import Problem, Step, calibrate, has_ended, population_settings, pose, score
-from ballfg.learning.coefficients import with_values
+from ballfg.learning.coefficients import analytic_model, with_values
 from ballfg.learning.config import CalibrationConfig
 from ballfg.learning.judge import Watch, summary
 from ballfg.learning.picture import draw
@@ -55,9 +55,7 @@ def _pose(config: CalibrationConfig, jobs: int) -> Problem:
     dataset = read_dataset(config.data)
     for note in dataset.notes:
         print(f"note: {note}", file=sys.stderr)
-    radius = dataset.info.ball.radius
-    model = nominal_model(radius) if config.model is None else load_model(config.model, radius=radius)
-    return pose(dataset, model, config, config.jobs or jobs)
+    return pose(dataset, analytic_model(config.model, dataset.info.ball.radius), config, config.jobs or jobs)
 
 
 def _steps(problem: Problem, steps: list[Step], folder: Path, watch: Watch[Any]) -> None:

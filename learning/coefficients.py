@@ -10,13 +10,24 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ballfg.dynamics import AnalyticModel
+from ballfg.dynamics import AnalyticModel, load_model, nominal_model
 from ballfg.tracks.hints import did_you_mean
 
 Array = NDArray[np.float64]
 
 NEED_SPIN_LABELS = ("flight.magnus.k", "flight.spin_decay.rate")
 """Act through the spin alone: without measured spin, only its product with the coefficient shows."""
+
+
+def analytic_model(path: str | None, radius: float) -> AnalyticModel:
+    """The analytic model of a file, or the nominal one for None; radius in m.
+
+    Raises: ValueError: if the file's model has a learned part.
+    """
+    model = nominal_model(radius) if path is None else load_model(path, radius=radius)
+    if not isinstance(model, AnalyticModel):
+        raise ValueError(f"model must be analytic; {path} has a learned part. Give its base, or leave it out.")
+    return model
 
 
 @dataclass(frozen=True)

@@ -20,15 +20,15 @@ from torch import Tensor
 Solve = Callable[[], Tensor]
 """Gives the point (n,), without a graph. Raises what it likes when it finds none."""
 Stationarity = Callable[[Tensor], Tensor]
-"""g: from a point (n,) that requires a gradient, the objective's derivative (n,), itself differentiable in the point and
-in the parameters."""
+"""g: from a point (n,) that requires a gradient, the objective's derivative (n,), itself differentiable in the point
+and in the parameters."""
 
 
 class LinearSolver(Protocol):
     """Solves with the Hessian, or with an approximation of it."""
 
     def __call__(self, product: Callable[[Tensor], Tensor], right: Tensor) -> Tensor:
-        """x with product(x) = right."""
+        """X with product(x) = right."""
         ...
 
     def precondition(self, vector: Tensor) -> Tensor:
@@ -68,7 +68,7 @@ class ImplicitGradient(GradientMethod):
 
 
 class GaussNewtonGradient(GradientMethod):
-    """Approximate: the Gauss-Newton matrix in place of the Hessian; wrong by as much as residuals bend and losses do."""
+    """Approximate: the Gauss-Newton matrix in place of the Hessian; wrong by what residuals and losses bend."""
 
     def __call__(
         self, solve: Solve, stationarity: Stationarity, linear_solver: LinearSolver, parameters: Sequence[Tensor]

@@ -67,5 +67,3 @@ def _mean_square(rows: Rows, posterior: Posterior, track: int) -> Array:
         for b, right in enumerate(rows.jacobians):
             total += left @ posterior.joint(track, rows.variables[:, a], rows.variables[:, b]) @ right.swapaxes(-1, -2)
     return np.asarray(total)
-
-

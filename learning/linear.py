@@ -1,8 +1,9 @@
 """Solving with the exact Hessian: conjugate gradients, preconditioned with GTSAM's Gauss-Newton factorisation.
 
-The Hessian of a batch of tracks is block diagonal, one block a track. All blocks are solved in lockstep: one product with
-the whole Hessian serves all of them, step lengths are each track's own. The Gauss-Newton matrix R^T R, which GTSAM has
-factorised on the way to the minimum, differs from a block by the curvature of the residuals alone: a few steps are enough.
+The Hessian of a batch of tracks is block diagonal, one block a track. All blocks are solved in lockstep: one product
+with the whole Hessian serves all of them, step lengths are each track's own. The Gauss-Newton matrix R^T R, which GTSAM
+has factorised on the way to the minimum, differs from a block by the curvature of the residuals alone: a few steps are
+enough.
 """
 
 from __future__ import annotations
@@ -77,7 +78,10 @@ class GaussNewtonFactors:
 
     def log_determinants(self) -> Array:
         """(t,) log det R."""
-        blocks = np.abs(np.diagonal(self.inverse, axis1=-2, axis2=-1)), np.abs(np.diagonal(self.last, axis1=-2, axis2=-1))
+        blocks = (
+            np.abs(np.diagonal(self.inverse, axis1=-2, axis2=-1)),
+            np.abs(np.diagonal(self.last, axis1=-2, axis2=-1)),
+        )
         return np.asarray(-np.log(blocks[0]).sum((1, 2)) - np.log(blocks[1]).sum(1))
 
     def solve(self, vector: Tensor) -> Tensor:
@@ -120,7 +124,7 @@ class ConjugateGradients:
     Args:
         factors: the preconditioner.
         owners: (n,) the block that each number of a vector belongs to.
-        tolerance: stop when every block's residual, in the preconditioner's metric, is this small against the right side.
+        tolerance: stop when each block's residual is this small against the right side, in the preconditioner's metric.
         max_iterations: products with the Hessian.
     """
 
@@ -139,7 +143,7 @@ class ConjugateGradients:
         return self.factors.solve(vector)
 
     def __call__(self, product: Product, right: Tensor) -> Tensor:
-        """x with H x = right.
+        """X with H x = right.
 
         Args: product: H times a vector (n,).  right: (n,).
         Raises: NotAMinimum: H bends downwards somewhere, or the iteration does not arrive.
@@ -165,7 +169,7 @@ class ConjugateGradients:
             new = self._dot(residual, conditioned)
             ratio = torch.where(active, new / size.where(active, torch.ones_like(size)), 0.0)[self.owners]
             direction, size = conditioned + ratio * direction, new
-        late = (size > goal).nonzero()[:, 0].tolist()
+        late = (~(size <= goal)).nonzero()[:, 0].tolist()  # NaN too
         raise NotAMinimum(
             f"the Hessian of {len(late)} tracks could not be solved in {self.max_iterations} steps: it is far from the "
             "Gauss-Newton matrix. Solve the estimate more tightly, or use GaussNewtonGradient.",

@@ -58,10 +58,10 @@ def pretrain(model: LearnedModel, teacher: BallModel, seed: int, iterations: int
         value = value + ((bounced - after)[:, SPIN] / SPIN_UNIT).square().mean()
         if spin_rate is not None and rates[1] is not None:
             value = value + ((spin_rate - rates[1]) / SPIN_UNIT).square().mean()
-        value.backward()  # type: ignore[no-untyped-call]
+        value.backward()
         return value
 
-    optimizer.step(loss)  # type: ignore[no-untyped-call]
+    optimizer.step(loss)
     return float(loss().detach()) ** 0.5
 
 

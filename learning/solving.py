@@ -155,7 +155,8 @@ class BatchSolver:
         return smoother.search(track, replace(segmentation, contacts=contacts), sigma, Earlier(values, ()))
 
     def _smoother(self, shot: Shot) -> Smoother:
-        settings = self.learnables.noise.settings(shot.settings)
+        # hits were looked for once, in the shots: what a model in training cannot explain yet is no hit
+        settings = replace(self.learnables.noise.settings(shot.settings), find_events=False)
         return Smoother(self.model, shot.surfaces, settings, TIGHT)
 
     @property

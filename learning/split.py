@@ -79,9 +79,7 @@ def split_tracks(dataset: Dataset, how: Literal["random", "label"], seed: int, *
     return Split(fit, judge, left_out, digest.hexdigest())
 
 
-def training_split(
-    tracks: Sequence[tuple[int, Track]], config: SplitConfig, seed: int
-) -> tuple[list[int], list[int]]:
+def training_split(tracks: Sequence[tuple[int, Track]], config: SplitConfig, seed: int) -> tuple[list[int], list[int]]:
     """Numbers of the tracks that train and of those that validate, in order; other tracks take no part.
 
     Args:
@@ -107,7 +105,9 @@ def training_split(
         chosen = [VALIDATE if k in validating else FIT for k in range(len(tracks))]
     parts = [[k for k, part in enumerate(chosen) if part == wanted] for wanted in (FIT, VALIDATE)]
     if not parts[0]:
-        raise ValueError(f"split must leave tracks to train on; got none of {len(tracks)}. Check split.by and the data.")
+        raise ValueError(
+            f"split must leave tracks to train on; got none of {len(tracks)}. Check split.by and the data."
+        )
     return parts[0], parts[1]
 
 

@@ -53,7 +53,7 @@ class Trainee(ABC):
         """Parameter groups for a torch optimizer, each with `name` and a `scale` on the learning rate."""
         return [{"name": "all", "params": list(self.module.parameters()), "scale": 1.0}]
 
-    def after_step(self) -> None:
+    def after_step(self) -> None:  # noqa: B027 - most models have no bounds
         """Bring parameters back into their bounds after an optimizer's step; none by default."""
 
     def memory(self) -> dict[str, Tensor]:

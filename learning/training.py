@@ -43,6 +43,8 @@ def run_training(
     with join_ranks() as ranks:
         ranks.from_first(lambda: files.check(folder, config, resume=resume))
         trainee, train, validation = ranks.together(lambda: _built(ranks, config, build))
+        # on machines of other kinds too, all begin with the same weights, bit for bit
+        trainee.module.load_state_dict(ranks.from_first(trainee.module.state_dict))
         checkpoint = ranks.from_first(lambda: read_checkpoint(folder) if resume else None)
         task = Task(trainee, tuple(train), tuple(validation), config, ranks, watch)
         training = ranks.together(lambda: Training(task, checkpoint))

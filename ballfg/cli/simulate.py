@@ -83,11 +83,13 @@ def simulate(
 
 def _ball(name: str, model: Path | None) -> BallKind:
     """The ball, with the model of a file in place of its own if there is one."""
-    from ballfg.dynamics import load_model
+    from ballfg.dynamics import AnalyticModel, load_model
     from ballfg.simulate import ball_kind, with_model
 
     kind = ball_kind(name)
     if model is None:
         return kind
     loaded = load_model(model, radius=kind.ball.radius, inertia_factor=kind.model.inertia_factor)
+    if not isinstance(loaded, AnalyticModel):
+        raise ValueError(f"--model must be analytic to simulate with; {model} has a learned part. Give another one.")
     return with_model(kind, loaded)

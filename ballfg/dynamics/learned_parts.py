@@ -120,7 +120,7 @@ class RawContact(nn.Module):
 
     Args:
         kind, width, depth: of the network.
-        radius: m.
+        radius: m; not used: raw velocity and spin are all that the network sees.
         first: restitution of the guess; 1 where the guess is another model's bounce.
         generator: of the first weights.
     """

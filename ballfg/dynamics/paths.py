@@ -1,10 +1,10 @@
 """Rollouts of many balls at many times, arc by arc: the same motion as `rollout`, in far fewer steps.
 
-`rollout` steps from stamp to stamp. Here the balls fly in common steps of `MAX_STEP`, each from its own last contact on; the
-states at the stamps come from a Hermite polynomial through the ends of the step in which they lie, with the position's
-second derivatives, so that nothing of the integration's accuracy is lost (docs/derivations/integration.md). A contact is
-solved once an arc, for all balls together. What does not simply fly and bounce (rest, rolling, a ball lost below a
-surface) is handed to `rollout`.
+`rollout` steps from stamp to stamp. Here the balls fly in common steps of `MAX_STEP`, each from its own last contact
+on; the states at the stamps come from a Hermite polynomial through the ends of the step in which they lie, with the
+position's second derivatives, so that nothing of the integration's accuracy is lost (docs/derivations/integration.md).
+A contact is solved once an arc, for all balls together. What does not simply fly and bounce (rest, rolling, a ball lost
+below a surface) is handed to `rollout`.
 """
 
 from __future__ import annotations
@@ -128,7 +128,8 @@ def _fly_arc(model: BallModel, state: Tensor, left: Tensor, surfaces: Surfaces) 
     resting = stays(model, state.detach(), surfaces.level_below(state.detach()), surfaces)
     done = resting.clone()
     landed, step, level = torch.zeros_like(done), torch.zeros_like(done, dtype=torch.long), torch.zeros_like(left)
-    nodes, slopes, h = [state], [], torch.full_like(state[:, :1], MAX_STEP)
+    nodes, h = [state], torch.full_like(state[:, :1], MAX_STEP)
+    slopes: list[Tensor] = []
     while not slopes or not bool(done.all()):
         slope = derivative(model.rates, state)
         after = rk4_from(model.rates, state, slope, h)
@@ -145,7 +146,7 @@ def _fly_arc(model: BallModel, state: Tensor, left: Tensor, surfaces: Surfaces) 
 
 
 def _land(model: BallModel, arc: _Arc, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """States (m, 9) just after the contacts, their times (m,) s since the arc's start, whether (m,) the ball stays there."""
+    """States (m, 9) just after the contacts, times (m,) s since the arc's start, whether (m,) the ball stays there."""
     tau, bounced = arc.nodes.new_zeros(len(start)), start
     ends_here = torch.zeros_like(arc.landed)
     if not bool(arc.landed.any()):

@@ -7,9 +7,11 @@ from itertools import islice
 
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.dynamics.trained import Trained
 from ballfg.estimate.launcher import Launcher
 from ballfg.estimate.position_noise import estimate_position_noise
 from ballfg.estimate.settings import MEASURED, Settings, uncertain
+from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
 from ballfg.tracks import Dataset, DatasetInfo
 
 TRACKS_FOR_NOISE = 50
@@ -29,12 +31,25 @@ def dataset_settings(dataset: Dataset, model: BallModel) -> Settings:
     else:
         x, y, z = estimate_position_noise(islice(iter(dataset), TRACKS_FOR_NOISE)).tolist()
         noise = (x, y, z)
-    spin = {} if info.spin_noise is None else {"spin_label_noise": info.spin_noise}
     if trained is None:
-        return uncertain(model, position_noise=noise, **spin)
-    x, y, z = (trained.position_scale * sigma for sigma in noise)
-    process = replace(MEASURED, **trained.process_noise)
-    return Settings(position_noise=(x, y, z), process=process, launcher=launcher_of(info, model), **spin)
+        settings = uncertain(model, position_noise=noise)
+    else:
+        x, y, z = (trained.position_scale * sigma for sigma in noise)
+        settings = Settings(
+            position_noise=(x, y, z), process=learned_process(trained), launcher=launcher_of(info, model)
+        )
+    return settings if info.spin_noise is None else replace(settings, spin_label_noise=info.spin_noise)
+
+
+def learned_process(trained: Trained) -> ProcessNoise:
+    """The process noise that was learned; what was not is as usual. Raises: ValueError: a number of another name."""
+    unknown = sorted(set(trained.process_noise) - set(PROCESS_NOISE))
+    if unknown:
+        known = ", ".join(PROCESS_NOISE)
+        raise ValueError(
+            f"process_noise must name numbers of the process noise, {known}; got '{unknown[0]}'. Rename it."
+        )
+    return replace(MEASURED, **trained.process_noise)
 
 
 def launcher_of(info: DatasetInfo, model: BallModel) -> Launcher | None:

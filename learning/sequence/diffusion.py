@@ -28,8 +28,10 @@ PURE = 0.2
 """Share of the draws that are at pure noise: sampling starts there, and its first step decides most."""
 STEPS = 10
 """Of sampling."""
+SAMPLES = 4
+"""Paths whose mean is the prediction: on simulated tracks the error is 7 % below one path's; eight gain no more."""
 START_SEED = 0
-"""Of the noise that every sampling starts from."""
+"""Of the noise that samplings start from, the same for every track."""
 NOISE_STREAM = 1
 """Sets the noise apart from the augmentation of the same seed, epoch and track."""
 
@@ -87,16 +89,16 @@ class DiffusionModel(SequenceModel):
         return losses, self.path(denoised.detach().mean(dim=1), batch)
 
     def predict(self, batch: Batch) -> Tensor:
-        """The path that sampling without noise leads to from one fixed start; see `SequenceModel`."""
+        """The mean of the paths that sampling without noise leads to from fixed starts; see `SequenceModel`."""
         generator = torch.Generator().manual_seed(START_SEED)
-        start = torch.randn(self.points, 3, generator=generator)[: self.points_asked(batch)]
-        told = self._condition(batch)
-        path = start.expand(len(told), -1, -1)
+        starts = torch.randn(SAMPLES, self.points, 3, generator=generator)[:, : self.points_asked(batch)]
+        told = self._condition(batch).repeat_interleave(SAMPLES, dim=0)
+        path = starts.repeat(len(batch.times), 1, 1)
         self.schedule.set_timesteps(STEPS)
         for level in self.schedule.timesteps:
             clean = self.denoiser(path, level.expand(len(told)), told)
             path = self.schedule.step(clean, level, path, eta=0.0).prev_sample
-        return self.path(path, batch)
+        return self.path(path.unflatten(0, (-1, SAMPLES)).mean(dim=1), batch)
 
     def _condition(self, batch: Batch) -> Tensor:
         """(b, c) what was observed and set."""

@@ -16,7 +16,7 @@ from ballfg.learning.sequence.launcher import LauncherSettings
 from ballfg.learning.sequence.model import SequenceModel
 from ballfg.tracks import Track
 
-CHUNK = 256
+CHUNK = 64
 """Tracks that are predicted at once: bounds the memory."""
 
 
@@ -24,6 +24,7 @@ class SequencePredictor:
     """Predicts the rest of tracks from their first samples.
 
     A prediction reaches as far as the longest rest in training; beyond that it goes straight on.
+    Frames may be dropped, but the observed part should last as long as in training: a model has learned no other.
 
     Args:
         architecture: of the model.

@@ -33,7 +33,7 @@ def trained():
     embedding = SpinEmbedding(("topspin", "group"), {"group": ("flat", "böck")})
     torch.nn.init.normal_(embedding.weight, generator=torch.Generator().manual_seed(1))
     noise = {"acceleration": 0.1 / 3, "contact_velocity": 0.07}
-    return Trained(noise, (1e-3 / 3, 2e-3, 3e-3), embedding, 7.0 / 3)
+    return Trained(noise, 4.0 / 3, embedding, 7.0 / 3)
 
 
 @pytest.fixture

@@ -71,10 +71,6 @@ class FallingBalls(Trainee):
     def loss(self, tracks: Sequence[int], epoch: int) -> BatchLoss:
         if "slow" in self.words:
             time.sleep(0.1)
-        if "broken-2" in self.words and 2 in tracks:
-            raise ValueError("track 2 must be whole; it is not. Repair it.")
-        if "bug-3" in self.words and 3 in tracks:
-            raise RuntimeError("a bug at track 3")
         if "infinite" in self.words and epoch >= 1:
             return BatchLoss(self.module.drag * np.inf, len(tracks), 1.0, 1)
         failed = [track for track in tracks if f"failing-{track}" in self.words]

@@ -74,7 +74,7 @@ def test_overrides_reach_into_sections(tmp_path: Path) -> None:
         ("data: 3", "'data' must be a list; got 3"),
         ("observe: {samples: 20, seconds: 0.3}", "'observe' must have exactly one of samples and seconds"),
         ("observe: {samples: null}", "'observe' must have exactly one of samples and seconds"),
-        ("model: a.yaml", "'model' plays no part in kind 'mnn+gs' without architecture.residual. Leave it out."),
+        ("{kind: lstm, model: a.yaml}", "'model' plays no part in kind 'lstm'. Leave it out."),
         ("{kind: lstm, gradient: unrolled}", "'gradient' plays no part in kind 'lstm'. Leave it out."),
         ("{kind: a-tune, architecture: {depth: 3}}", "'architecture' plays no part in kind 'a-tune'. Leave it out."),
         ("split: {validation: 1.0}", "'split.validation' must be less than 1; got 1.0"),

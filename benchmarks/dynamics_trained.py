@@ -1,0 +1,142 @@
+"""The trained contenders: one training config each, equal in everything that is not the method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.benchmarks.dynamics_contenders import Contender, GraphContender, Job
+from ballfg.benchmarks.dynamics_task import Task
+from ballfg.dynamics import BallModel, load_model
+from ballfg.estimate import Settings
+from ballfg.estimate.configure import launcher_of, learned_process
+from ballfg.learning.build import build, export
+from ballfg.learning.folder import METRICS, MODEL
+from ballfg.learning.metrics import read_metrics
+from ballfg.learning.sequence.build import load_sequence
+from ballfg.learning.sequence.predictor import SequencePredictor
+from ballfg.learning.train_config import SEQUENCES, TrainConfig
+from ballfg.learning.training import run_training
+from ballfg.tracks import Track
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+OPTIMIZER: Final[dict[str, Any]] = {"learning_rate": 2e-3, "batch": 32, "epochs": 25, "clip": 5.0}
+"""Of all models in the factor graph."""
+SEQUENCE_OPTIMIZER: Final[dict[str, Any]] = {"learning_rate": 2e-3, "batch": 32, "epochs": 300, "clip": 1.0}
+"""Of the sequence models, whose epochs take a fiftieth of the time."""
+QUICK_EPOCHS: Final = 2
+QUICK_PRETRAIN: Final = 60
+ERROR_SCALE: Final = 0.05
+"""m. Errors beyond it count linearly: one wild track must not decide a step."""
+LIKELIHOOD: Final = 0.01
+"""Weight of the likelihood from which the noise is learned: as much as the errors count at 1 to 2 cm."""
+NOISE: Final = {
+    "acceleration": 0.3,
+    "spin": 1.0,
+    "contact_velocity": 0.05,
+    "contact_tangential": 0.1,
+    "contact_spin": 10.0,
+}
+"""Process noise that all models in the factor graph start from."""
+
+
+def trained_contender(job: Job) -> Contender:
+    """Train the method, or go on with its training, and load what was exported."""
+    data, folder = job.folder / "data", job.folder / "training"
+    job.folder.mkdir(parents=True, exist_ok=True)
+    if not data.exists():
+        job.task.write(data)
+    config = config_of(job, data)
+    begun = (folder / METRICS).is_file()
+    if not (folder / MODEL).exists() and not (folder / "model").exists():
+        with (job.folder / "log.txt").open("a") as log, redirect_stdout(log), redirect_stderr(log):
+            run_training(config, folder, begun, build, export, _unwatched)
+    seconds = sum(epoch.seconds for epoch in read_metrics(folder / METRICS))
+    if config.kind in SEQUENCES:
+        predictor = load_sequence(folder)
+        return SequenceContender(job.method, predictor.parameter_count, seconds, predictor)
+    model = load_model(folder / MODEL, radius=job.task.info.ball.radius)
+    return GraphContender(
+        name=job.method,
+        model=model,
+        surfaces=job.task.surfaces,
+        settings=learned_settings(job.task, model),
+        label=_as_it_is,
+        parameter_count=_learned_numbers(model),
+        training_seconds=seconds,
+    )
+
+
+def config_of(job: Job, data: Path) -> TrainConfig:
+    """The training of a method. Methods of one family differ in `kind` and in the augmentation that it implies."""
+    sequence = job.method.removesuffix("+aug") in SEQUENCES
+    optimizer = dict(SEQUENCE_OPTIMIZER if sequence else OPTIMIZER)
+    content: dict[str, Any] = {
+        "kind": job.method.removesuffix("+aug"),
+        "seed": job.seed,
+        "data": str(data),
+        "split": {"by": "label"},
+        "observe": dict(job.task.observe),
+        "launcher": {"labels": job.task.launcher_labels},
+        "loss": {"position_scale": ERROR_SCALE} | ({} if sequence else {"likelihood": LIKELIHOOD}),
+        "optimizer": optimizer,
+        "workers": 1,
+    }
+    if not sequence:
+        content["noise"] = NOISE
+    if job.quick:
+        optimizer["epochs"] = QUICK_EPOCHS
+        content["architecture"] = {"pretrain": QUICK_PRETRAIN} if content["kind"] not in (*SEQUENCES, "a-tune") else {}
+    return TrainConfig.model_validate(content)
+
+
+def learned_settings(task: Task, model: BallModel) -> Settings:
+    """The task's settings with the noise and the launcher that belong to a trained model."""
+    trained = model.trained
+    assert trained is not None
+    return replace(
+        task.settings,
+        process=learned_process(trained),
+        launcher=launcher_of(task.info, model),
+        coefficients={},
+    )
+
+
+def _learned_numbers(model: BallModel) -> int:
+    """The model's parameters and those of its launcher."""
+    launcher = None if model.trained is None else model.trained.launcher
+    return sum(p.numel() for part in (model, launcher) if part is not None for p in part.parameters())
+
+
+@dataclass
+class SequenceContender:
+    """A sequence model: predicts what follows the observed part, from that part alone."""
+
+    name: str
+    parameter_count: int
+    training_seconds: float
+    predictor: SequencePredictor
+
+    def predict(self, seen: Sequence[Track], times: Sequence[Array]) -> list[Array]:
+        """Positions (n, 3) m at all stamps of each track; NaN in the observed part."""
+        counts = [len(track) for track in seen]
+        rests = self.predictor.predict_many(
+            seen, counts, [stamps[count:] for stamps, count in zip(times, counts, strict=True)]
+        )
+        return [np.concatenate((np.full((count, 3), np.nan), rest)) for count, rest in zip(counts, rests, strict=True)]
+
+
+def _as_it_is(track: Track) -> Track:
+    return track
+
+
+def _unwatched(items: Iterable[T], total: int, what: str) -> Iterator[T]:
+    return iter(items)
