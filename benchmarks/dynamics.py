@@ -98,13 +98,14 @@ def collect(
     task: Task, plan: Plan, seed: int, folder: Path, jobs: int, methods: Sequence[str] = tuple(METHODS)
 ) -> list[Record]:
     """A record of each method and seed, in the order of the methods; read where it is there, made where it is not."""
-    digest = task_digest(task, plan.quick)
+    digests = {name: task_digest(task, METHODS[name].recipe(plan.quick)) for name in methods}
     folder.mkdir(parents=True, exist_ok=True)
     wanted = list(_jobs(task, plan, seed, folder, methods))
-    found = {(job.method, job.seed): read_record(record_path(job), digest) for job in wanted}
+    found = {(job.method, job.seed): read_record(record_path(job), digests[job.method]) for job in wanted}
     missing = [job for job in wanted if found[job.method, job.seed] is None]
+    missing.sort(key=lambda job: job.seed)  # all methods with one seed first: an early look compares them
     parallel = joblib.Parallel(n_jobs=min(jobs, max(len(missing), 1)), return_as="generator_unordered")
-    made = parallel(joblib.delayed(finish)(job, digest) for job in missing)
+    made = parallel(joblib.delayed(finish)(job, digests[job.method]) for job in missing)
     for record in progress(made, len(missing), "methods and seeds finished"):
         found[record.method, record.seed] = record
     return [record for record in found.values() if record is not None]

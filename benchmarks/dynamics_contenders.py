@@ -132,11 +132,13 @@ class Method:
 
     Attributes:
         make: trains it, or goes on with its training.
+        recipe: how it is trained, quickly or not, in words that change whenever that does.
         trained: whether a seed makes a difference; if not it runs once.
         needs_truth: whether it takes part on simulated tracks only.
     """
 
     make: Callable[[Job], Contender]
+    recipe: Callable[[bool], str]
     trained: bool = True
     needs_truth: bool = False
 

@@ -72,9 +72,9 @@ def read_record(path: Path, digest: str) -> Record | None:
         raise ValueError(f"{path}: must be a finished run ({error!r}). Delete it, and it is run again.") from error
 
 
-def task_digest(task: Task, quick: bool) -> str:
-    """Of everything that decides a contender's errors but its method and seed."""
-    digest = hashlib.sha256(repr((metadata.version("ballfg"), task.case, quick, task.settings)).encode())
+def task_digest(task: Task, recipe: str) -> str:
+    """Of everything that decides a contender's errors but its method and seed: the task, and how it is trained."""
+    digest = hashlib.sha256(repr((metadata.version("ballfg"), task.case, recipe, task.settings)).encode())
     for part in (task.train, task.validation):
         for shot in part:
             digest.update(

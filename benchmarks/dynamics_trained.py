@@ -21,14 +21,14 @@ from ballfg.learning.folder import METRICS, MODEL
 from ballfg.learning.metrics import read_metrics
 from ballfg.learning.sequence.build import load_sequence
 from ballfg.learning.sequence.predictor import SequencePredictor
-from ballfg.learning.train_config import SEQUENCES, TrainConfig
+from ballfg.learning.train_config import NETWORKS, SEQUENCES, TrainConfig
 from ballfg.learning.training import run_training
 from ballfg.tracks import Track
 
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-OPTIMIZER: Final[dict[str, Any]] = {"learning_rate": 2e-3, "batch": 32, "epochs": 25, "clip": 5.0}
+OPTIMIZER: Final[dict[str, Any]] = {"learning_rate": 2e-3, "batch": 32, "epochs": 16, "clip": 5.0}
 """Of all models in the factor graph."""
 SEQUENCE_OPTIMIZER: Final[dict[str, Any]] = {"learning_rate": 2e-3, "batch": 32, "epochs": 300, "clip": 1.0}
 """Of the sequence models, whose epochs take a fiftieth of the time."""
@@ -76,26 +76,36 @@ def trained_contender(job: Job) -> Contender:
 
 
 def config_of(job: Job, data: Path) -> TrainConfig:
-    """The training of a method. Methods of one family differ in `kind` and in the augmentation that it implies."""
-    sequence = job.method.removesuffix("+aug") in SEQUENCES
-    optimizer = dict(SEQUENCE_OPTIMIZER if sequence else OPTIMIZER)
-    content: dict[str, Any] = {
-        "kind": job.method.removesuffix("+aug"),
+    """The training of a job."""
+    given = {
         "seed": job.seed,
         "data": str(data),
-        "split": {"by": "label"},
         "observe": dict(job.task.observe),
         "launcher": {"labels": job.task.launcher_labels},
-        "loss": {"position_scale": ERROR_SCALE} | ({} if sequence else {"likelihood": LIKELIHOOD}),
-        "optimizer": optimizer,
-        "workers": 1,
     }
-    if not sequence:
-        content["noise"] = NOISE
-    if job.quick:
-        optimizer["epochs"] = QUICK_EPOCHS
-        content["architecture"] = {"pretrain": QUICK_PRETRAIN} if content["kind"] not in (*SEQUENCES, "a-tune") else {}
-    return TrainConfig.model_validate(content)
+    return TrainConfig.model_validate(content_of(job.method, job.quick) | given)
+
+
+def recipe(method: str, quick: bool) -> str:
+    """How a method is trained, as text."""
+    return repr(content_of(method, quick))
+
+
+def content_of(method: str, quick: bool) -> dict[str, Any]:
+    """The config of a method. Those of one family differ in `kind` and in the augmentation that it implies."""
+    kind = method.removesuffix("+aug")
+    common = {"kind": kind, "split": {"by": "label"}, "workers": 1}
+    epochs = {"epochs": QUICK_EPOCHS} if quick else {}
+    if kind in SEQUENCES:
+        return common | {"optimizer": SEQUENCE_OPTIMIZER | epochs}
+    content = common | {
+        "optimizer": OPTIMIZER | epochs,
+        "loss": {"position_scale": ERROR_SCALE, "likelihood": LIKELIHOOD},
+        "noise": NOISE,
+    }
+    if quick and kind in NETWORKS:
+        content["architecture"] = {"pretrain": QUICK_PRETRAIN}
+    return content
 
 
 def learned_settings(task: Task, model: BallModel) -> Settings:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ballfg.benchmarks.gradient_cost import time_gradients
 from ballfg.benchmarks.metrics import Figure
 from ballfg.benchmarks.network import fitted_network, parameter_count
 from ballfg.benchmarks.results import Results
@@ -19,6 +20,8 @@ from ballfg.benchmarks.timing import Stopwatch, quartiles
 from ballfg.cli.progress import progress
 from ballfg.dynamics import AnalyticModel, BallModel, Surfaces, fly_jacobian, model_from_dict, nominal_model, rollout
 from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.architecture import Architecture
+from ballfg.dynamics.learned import build
 from ballfg.estimate import Estimator, Online, Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimate.initial import initial_states
 from ballfg.estimate.problem import Events, build_graph, effective_sigmas, initial_values
@@ -26,6 +29,7 @@ from ballfg.factors.bridge import nonlinear_graph, to_gtsam
 from ballfg.factors.covariance import marginal_covariances
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.kind import Values
+from ballfg.learning.pretrain import pretrain
 from ballfg.predict import Belief, Propagator
 from ballfg.state import POSITION
 from ballfg.tracks import SPIN_LABELS, Dataset, Track
@@ -47,6 +51,8 @@ DRAG, MAGNUS = 0.112, 0.0055
 HORIZON = 0.3
 """s that are predicted, at `RATE`."""
 NO_SURFACE = Surfaces(-1e3)
+PRETRAIN = 200
+"""Iterations that fit the learned model to the analytic one; its flight is then off by 0.1 m/s^2."""
 DATASET_TRACKS = 20
 """Tracks of a dataset that are timed."""
 
@@ -61,6 +67,7 @@ def run_speed(results: Results, dataset: Dataset | None, quick: bool) -> None:
     for name, ball in progress(models.items(), len(models), "models timed"):
         _time_model(results, name, ball, track, watch)
     _time_coefficients(results, model, track, watch)
+    _time_gradients(results, model, track, watch)
     results.add(CASE, "network", "parameters", "1", parameter_count(network), 1)
     if dataset is not None:
         _time_dataset(results, dataset)
@@ -114,6 +121,14 @@ def _time_model(results: Results, name: str, model: BallModel, track: Track, wat
     add("jacobian_time_1", watch.time(lambda: fly_jacobian(model, states[:1], dt[:1])))
     _time_online(results, name, Online(model, NO_SURFACE, settings), track, watch)
     _time_prediction(results, name, smoother, track, watch)
+
+
+def _time_gradients(results: Results, model: AnalyticModel, track: Track, watch: Stopwatch) -> None:
+    """The gradient through the estimate, with the learned model that the analytic one was put into."""
+    learned = build(Architecture.of("mnn+gs"), radius=model.radius)
+    pretrain(learned, model, 0, PRETRAIN)
+    graph, values = _problem(Smoother(learned, NO_SURFACE, problem_settings()), track)
+    time_gradients(results, CASE, learned, graph, values, watch)
 
 
 def _adder(results: Results, method: str, watch: Stopwatch) -> Callable[[str, Figure], None]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from functools import partial
 from typing import ClassVar
 
@@ -44,6 +45,11 @@ class LauncherSpinFactors(FactorKind):
         self.settings = settings
         self.sigma = sigma
         self.embedding = embedding
+
+    @property
+    def group(self) -> Hashable:
+        """Besides the usual: the embedding."""
+        return (*super().group, id(self.embedding))  # type: ignore[misc]
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, 3) and Jacobians (k, 3, 9)."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from typing import ClassVar
 
 import numpy as np
@@ -66,6 +67,11 @@ class CoefficientPriorFactors(PriorFactors):
         self.model = model
         mean = self._means().detach().numpy()
         super().__init__(np.array([COEFFICIENTS]), mean[None], np.diag(1.0 / sigma)[None])
+
+    @property
+    def group(self) -> Hashable:
+        """Besides the usual: the model."""
+        return (*super().group, id(self.model))  # type: ignore[misc]
 
     def _means(self) -> Tensor:
         """(p,) the model's own values, as its parameters are now."""

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ballfg.dynamics.paths import paths
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.factors.graph import LevenbergMarquardt
 from ballfg.factors.loss import Loss
 from ballfg.learning.augment import augmentation
 from ballfg.learning.implicit import GradientMethod, ImplicitGradient
@@ -24,7 +25,7 @@ from ballfg.learning.likelihood import negative_log_likelihood
 from ballfg.learning.linear import ConjugateGradients, GaussNewtonFactors, NotAMinimum
 from ballfg.learning.objective import BatchObjective
 from ballfg.learning.shots import Shot
-from ballfg.learning.solving import BatchSolver, Pose, Solved
+from ballfg.learning.solving import TRAINING, BatchSolver, Pose, Solved
 from ballfg.learning.train_config import LossConfig
 from ballfg.learning.trainee import BatchLoss, Trainee
 from ballfg.state import POSITION
@@ -64,6 +65,7 @@ class EndToEnd(Trainee):
         method: how a loss passes through the estimate.
         seed: of the augmentation.
         augment: turn and shift the shots in training.
+        optimizer: how tightly estimates are solved.
     """
 
     def __init__(
@@ -75,11 +77,12 @@ class EndToEnd(Trainee):
         method: GradientMethod | None = None,
         seed: int = 0,
         augment: bool = False,
+        optimizer: LevenbergMarquardt = TRAINING,
     ) -> None:
         self.module = learnables
         self.learnables = learnables
         self.shots = shots
-        self.solver = BatchSolver(shots, learnables)
+        self.solver = BatchSolver(shots, learnables, optimizer)
         self.settings = loss
         self.method = method or ImplicitGradient()
         self.seed = seed

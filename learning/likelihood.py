@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.kind import Array, FactorKind, Noise, Rows, Values
+from ballfg.factors.linear import weighted
 from ballfg.factors.search import linearize_together
 from ballfg.learning.linear import GaussNewtonFactors
 from ballfg.learning.posterior import Posterior, posterior_of
@@ -60,10 +61,11 @@ def _expected(kind: FactorKind, rows: Rows, posterior: Posterior, track: int, ch
 
 
 def _mean_square(rows: Rows, posterior: Posterior, track: int) -> Array:
-    """(m, r, r) r r^T + J C J^T of each factor, residuals by their weight."""
+    """(m, r, r) r r^T + J C J^T of each factor; residuals and Jacobians with the weights that C was made with."""
     weight = rows.loss.weight(np.linalg.norm(rows.residual, axis=-1))
     total = weight[:, None, None] * rows.residual[:, :, None] * rows.residual[:, None, :]
-    for a, left in enumerate(rows.jacobians):
-        for b, right in enumerate(rows.jacobians):
+    _, jacobians = weighted(rows)
+    for a, left in enumerate(jacobians):
+        for b, right in enumerate(jacobians):
             total += left @ posterior.joint(track, rows.variables[:, a], rows.variables[:, b]) @ right.swapaxes(-1, -2)
     return np.asarray(total)

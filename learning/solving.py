@@ -21,11 +21,12 @@ from ballfg.learning.augment import apply, rotate, undo
 from ballfg.learning.learnables import Learnables
 from ballfg.learning.shots import Shot
 from ballfg.state import POSITION, SPIN, VELOCITY
+from ballfg.tracks import SPIN_LABELS, Track
 
 Array = NDArray[np.float64]
 
-TIGHT = LevenbergMarquardt(tolerance=1e-6)
-"""The gradient holds at the minimum: as tight as warm starts make cheap."""
+TRAINING = LevenbergMarquardt(tolerance=1e-4)
+"""Posterior standard deviations to the minimum: the gradient is off by as little, far less than batches scatter."""
 ACCEPTED = (Convergence.CONVERGED, Convergence.AT_KINK)
 
 
@@ -39,6 +40,14 @@ class Pose:
     def positions(self, positions: Array) -> Array:
         """(n, 3) m as seen from there."""
         return apply(torch.from_numpy(positions), self.angle, self.shift).numpy()
+
+    def track(self, track: Track) -> Track:
+        """A track as seen from there, its spin label too."""
+        labels = track.labels
+        if track.spin_label is not None:
+            spin = rotate(torch.from_numpy(track.spin_label), self.angle)
+            labels = {**labels, **dict(zip(SPIN_LABELS, spin.tolist(), strict=True))}
+        return replace(track, positions=self.positions(track.positions), labels=labels)
 
     def states(self, states: Array, *, back: bool = False) -> Array:
         """(n, 9) as seen from there; or, from there, as they were."""
@@ -112,10 +121,14 @@ class BatchSolver:
     Args:
         shots: all of them, by number.
         learnables: model, embedding, noise.
+        optimizer: how tightly estimates are solved.
     """
 
-    def __init__(self, shots: Sequence[Shot], learnables: Learnables) -> None:
+    def __init__(
+        self, shots: Sequence[Shot], learnables: Learnables, optimizer: LevenbergMarquardt = TRAINING
+    ) -> None:
         self.shots = shots
+        self.optimizer = optimizer
         self.learnables = learnables
         self.warm = WarmStarts()
 
@@ -146,7 +159,7 @@ class BatchSolver:
         sigma = shot.sigmas() * self.learnables.noise.position_scale()
         track, segmentation = shot.seen, shot.segmentation
         if pose is not None:
-            track = replace(track, positions=pose.positions(track.positions))
+            track = pose.track(track)
             sigma[:, :2] = np.sqrt(np.square(sigma[:, :2]).mean(axis=1, keepdims=True))  # a turn mixes x and y
         warm = self.warm.get(number, pose)
         if warm is None:
@@ -157,7 +170,7 @@ class BatchSolver:
     def _smoother(self, shot: Shot) -> Smoother:
         # hits were looked for once, in the shots: what a model in training cannot explain yet is no hit
         settings = replace(self.learnables.noise.settings(shot.settings), find_events=False)
-        return Smoother(self.model, shot.surfaces, settings, TIGHT)
+        return Smoother(self.model, shot.surfaces, settings, self.optimizer)
 
     @property
     def model(self) -> BallModel:
