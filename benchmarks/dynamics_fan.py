@@ -93,5 +93,6 @@ def _spin(contender: GraphContender, start: Array, topspin: int, sidespin: int) 
     times = np.arange(STRAIGHT) / RATE
     positions = start[:3] + times[:, None] * start[3:6]
     labels = {"topspin": float(topspin), "sidespin": float(sidespin), "speed": float(SPEED_LEVEL)}
-    spin = contender.label(Track("launch", times, positions, labels=labels)).spin_label
+    launch = contender.label(Track("launch", times, positions, labels=labels))
+    spin = contender.settings.told(launch).spin_label
     return np.zeros(3) if spin is None else spin

@@ -46,6 +46,11 @@ GROUP_WIDTH: Final = 0.8
 """Of a group of bars, where groups are 1 apart."""
 
 
+def colour_of(method: str) -> str:
+    """The same for a method with and without augmentation."""
+    return COLOURS.get(method.removesuffix("+aug"), OTHER)
+
+
 def rmse_picture(rows: Sequence[Row], task: Task, path: Path) -> Path:
     """Root mean square distance by method: over the track and after the observed part; dots are seeds."""
     spans = ("whole track", "after the observed part")
@@ -55,7 +60,7 @@ def rmse_picture(rows: Sequence[Row], task: Task, path: Path) -> Path:
     for axes, metric, what in zip(panels, ("track_rmse", "rest_rmse"), spans, strict=True):
         found = _of_metric(rows, task.case, metric)
         for place, (method, row) in enumerate(found.items()):
-            _bar(axes, place, GROUP_WIDTH, rows, row, COLOURS.get(method, OTHER))
+            _bar(axes, place, GROUP_WIDTH, rows, row, colour_of(method))
         axes.set_xticks(range(len(found)), list(found), rotation=30, ha="right")
         axes.set(ylabel="RMSE, mm", title=what)
         axes.grid(visible=True, axis="y", alpha=0.25)
@@ -80,14 +85,14 @@ def apex_picture(rows: Sequence[Row], task: Task, path: Path) -> Path:
             if mean is None or spread is None or mean.value is None or spread.value is None:
                 continue
             x, value, std = place + (i - (len(methods) - 1) / 2) * width, 1e3 * mean.value, 1e3 * spread.value
-            axes.bar(x, value, 0.9 * width, color=COLOURS.get(method, OTHER))
+            axes.bar(x, value, 0.9 * width, color=colour_of(method))
             axes.errorbar(x, value, [[min(std, value)], [std]], color="black", linewidth=0.8, capsize=2)
             axes.annotate(f"{value:.0f}", (x, value + std), (0, 2), textcoords="offset points", ha="center", size=8)
     counts = [max((r.n for r in _of_metric(rows, task.case, f"apex_{f}_mean").values()), default=0) for f in APEXES]
     names = [f"{FLIGHT_NAMES[flight]}\n{count} tracks" for flight, count in zip(APEXES, counts, strict=True)]
     axes.set_xticks(range(len(APEXES)), names)
     axes.set(ylabel="apex error, mm", title=f"{task.case}: apex error, mean and one standard deviation over tracks")
-    handles = [plt.Rectangle((0, 0), 1, 1, color=COLOURS.get(method, OTHER)) for method in methods]
+    handles = [plt.Rectangle((0, 0), 1, 1, color=colour_of(method)) for method in methods]
     axes.legend(handles, methods, loc="upper left", ncols=2, fontsize="small")
     axes.grid(visible=True, axis="y", alpha=0.25)
     return save(figure, path)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate import Smoother
 from ballfg.estimate.segmentation import Contact
 from ballfg.estimate.smoother import Earlier, Solution
@@ -115,6 +116,9 @@ class WarmStarts:
                 self._last[int(number)] = (tensors[name].numpy(), coefficients, contacts)
 
 
+_Smoothers = dict[tuple[int, Surfaces], Smoother]
+
+
 class BatchSolver:
     """Solves shots with the parameters as they are.
 
@@ -137,7 +141,7 @@ class BatchSolver:
 
         Args: numbers: of the shots.  poses: for those that are not seen as measured.
         """
-        smoothers: dict[int, Smoother] = {}
+        smoothers: _Smoothers = {}
         searches = [self._search(number, poses.get(number), smoothers) for number in numbers]
         solved, failed = [], []
         for number, solution in zip(numbers, run_together(searches), strict=True):
@@ -151,11 +155,12 @@ class BatchSolver:
                 failed.append((self.shots[number].name, minimum.convergence.value))
         return solved, failed
 
-    def _search(self, number: int, pose: Pose | None, smoothers: dict[int, Smoother]) -> Search[Solution]:
+    def _search(self, number: int, pose: Pose | None, smoothers: _Smoothers) -> Search[Solution]:
         shot = self.shots[number]
-        smoother = smoothers.get(id(shot.settings))
+        key = id(shot.settings), shot.surfaces
+        smoother = smoothers.get(key)
         if smoother is None:
-            smoother = smoothers[id(shot.settings)] = self._smoother(shot)
+            smoother = smoothers[key] = self._smoother(shot)
         sigma = shot.sigmas() * self.learnables.noise.position_scale()
         track, segmentation = shot.seen, shot.segmentation
         if pose is not None:

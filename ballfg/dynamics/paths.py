@@ -161,6 +161,6 @@ def _land(model: BallModel, arc: _Arc, start: Tensor) -> tuple[Tensor, Tensor, T
     stops = lost | (after[:, VZ].detach() < REST_SPEED)
     return (
         bounced.index_put((rows,), after),
-        tau.index_put((rows,), arc.step[rows] * MAX_STEP + within),
+        tau.index_put((rows,), arc.step[rows].to(within.dtype) * MAX_STEP + within),
         ends_here.index_put((rows,), stops),
     )
