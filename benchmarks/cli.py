@@ -27,6 +27,12 @@ app = typer.Typer(
 )
 
 Data = Annotated[Path | None, typer.Option("--data", help="Dataset of measured tracks; synthetic ones without it.")]
+Datasets = Annotated[
+    list[Path] | None,
+    typer.Option("--data", help="Dataset of measured tracks, several times for several; synthetic ones without it."),
+]
+Transfer = Annotated[Path | None, typer.Option(help="Dataset that the models are judged on without learning from it.")]
+TransferTracks = Annotated[int | None, typer.Option(min=1, help="Only so many of its first tracks.")]
 Out = Annotated[Path, typer.Option("--out", help="Folder for results.json and pictures.")]
 Quick = Annotated[bool, typer.Option("--quick", help="Fewer tracks or runs: a look, not a measurement.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Of every random choice.")]
@@ -53,7 +59,7 @@ def estimators(
     """
     from ballfg.benchmarks.estimators import FULL, QUICK, run_dataset, run_synthetic
 
-    results = _start("estimators", data, quick, seed)
+    results = _start("estimators", [] if data is None else [data], quick, seed)
     size, processes = QUICK if quick else FULL, jobs or default_jobs()
     if data is None:
         pictures = run_synthetic(results, _folder(out), size, processes)
@@ -65,21 +71,34 @@ def estimators(
 
 @app.command()
 def dynamics(
-    data: Data = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = None
+    data: Datasets = None,
+    transfer: Transfer = None,
+    transfer_tracks: TransferTracks = None,
+    out: Out = Path("results"),
+    quick: Quick = False,
+    seed: Seed = 0,
+    jobs: Jobs = None,
 ) -> None:
     """Dynamics models: trained on the same tracks, predicting the same others; errors over tracks and of their apexes.
 
     Without --data: 717 synthetic launcher tracks, whose truth no compared model holds. With it: learn from every second
-    measured track; of the others observe the first 0.25 s and predict the next 0.3 s. What is finished is kept in
-    OUT/runs, so that a run that was stopped goes on.
+    measured track; of the others observe the first 0.25 s and predict the next 0.3 s. Several datasets train one model.
+    What is finished is kept in OUT/runs, so that a run that was stopped goes on.
 
     Example: ballfg-bench dynamics --quick --out results/dynamics
     """
-    from ballfg.benchmarks.dynamics import FULL, QUICK, run_dynamics
+    from ballfg.benchmarks.dynamics import FULL, QUICK, Measured, run_dynamics
 
-    results = _start("dynamics", data, quick, seed)
-    dataset = None if data is None else _open(data)
-    pictures = run_dynamics(results, dataset, _folder(out), QUICK if quick else FULL, jobs or default_jobs())
+    if transfer is not None and not data:
+        raise ValueError("--transfer needs a model trained on measured tracks; got no --data. Give it, once or more.")
+    if transfer_tracks is not None and transfer is None:
+        raise ValueError("--transfer-tracks is of --transfer; got none. Give it, or leave both out.")
+    words = [] if transfer is None else ["--transfer", transfer.resolve().name]
+    words += [] if transfer_tracks is None else ["--transfer-tracks", str(transfer_tracks)]
+    results = _start("dynamics", data or [], quick, seed, words)
+    other = None if transfer is None else _open(transfer)
+    measured = Measured([_open(one) for one in data], other, transfer_tracks) if data else None
+    pictures = run_dynamics(results, measured, _folder(out), QUICK if quick else FULL, jobs or default_jobs())
     _finish(results, out, pictures)
 
 
@@ -93,20 +112,24 @@ def speed(data: Data = None, out: Out = Path("results"), quick: Quick = False, s
     """
     from ballfg.benchmarks.speed import run_speed
 
-    results = _start("speed", data, quick, seed)
+    results = _start("speed", [] if data is None else [data], quick, seed)
     run_speed(results, None if data is None else _open(data), quick)
     _finish(results, _folder(out), [])
 
 
-def _start(command: str, data: Path | None, quick: bool, seed: int) -> Results:
-    """Empty results that name the command; of a dataset's path only the folder's name is kept."""
+def _start(command: str, data: Sequence[Path], quick: bool, seed: int, more: Sequence[str] = ()) -> Results:
+    """Empty results that name the command; of a dataset's path only the folder's name is kept.
+
+    Args: more: words between the datasets and the rest.
+    """
     import torch
 
     from ballfg.benchmarks.results import Results
 
     torch.set_num_threads(1)
     words = ["ballfg-bench", command]
-    words += [] if data is None else ["--data", data.resolve().name]
+    words += [word for one in data for word in ("--data", one.resolve().name)]
+    words += more
     words += ["--quick"] if quick else []
     return Results(" ".join([*words, "--seed", str(seed)]), seed)
 

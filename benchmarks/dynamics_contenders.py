@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Final, Literal, Protocol
 
 import numpy as np
 import torch
@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 from ballfg.benchmarks.dynamics_task import Task
 from ballfg.dynamics import BallModel, Surfaces, nominal_model, rollout
-from ballfg.estimate import Settings, Smoother, Status
+from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.estimate import Estimate, Settings, Smoother, Status
 from ballfg.factors.noise import ProcessNoise
+from ballfg.predict import Belief, Propagator
 from ballfg.state import POSITION
 from ballfg.tracks import Track
 
@@ -54,7 +56,7 @@ class Contender(Protocol):
 
 @dataclass
 class GraphContender:
-    """A dynamics model in the factor graph: smooth the observed part, roll out from its first state.
+    """A dynamics model in the factor graph: smooth the observed part, predict the rest.
 
     Attributes:
         name, parameter_count, training_seconds: as of any contender.
@@ -62,6 +64,9 @@ class GraphContender:
         surfaces: on what it bounces.
         settings: of the smoother.
         label: gives a track the spin label that its launcher settings mean, if the method knows that.
+        onward: predict as `ballfg predict` does: the observed part is the smoothed one, the rest is rolled out from
+            its last state, with the coefficients that the settings let each track have. False: the whole path is rolled
+            out from the first state.
         failures: how many estimates did not converge so far.
     """
 
@@ -70,6 +75,7 @@ class GraphContender:
     surfaces: Surfaces
     settings: Settings
     label: Callable[[Track], Track]
+    onward: bool = False
     parameter_count: int = 0
     training_seconds: float = 0.0
     failures: int = 0
@@ -77,12 +83,25 @@ class GraphContender:
     def predict(self, seen: Sequence[Track], times: Sequence[Array]) -> list[Array]:
         """Positions (n, 3) m at all stamps of each track."""
         smoother = Smoother(self.model, self.surfaces, self.settings)
-        starts = np.zeros((len(seen), 9))
-        for i, track in enumerate(seen):
-            estimate = smoother.estimate(self.label(track))
-            self.failures += estimate.status is not Status.OK
-            starts[i] = estimate.states[0]
+        estimates = [smoother.estimate(self.label(track)) for track in seen]
+        self.failures += sum(estimate.status is not Status.OK for estimate in estimates)
+        if self.onward:
+            return self._onward(estimates, times)
+        starts = np.stack([estimate.states[0] for estimate in estimates])
         return self.roll(starts, [stamps - stamps[0] for stamps in times])
+
+    def _onward(self, estimates: Sequence[Estimate], times: Sequence[Array]) -> list[Array]:
+        """Smoothed positions where a track was observed, then those that follow from its last state."""
+        propagator = Propagator(self.surfaces, self.settings.process)
+        paths: list[Array] = []
+        for first in range(0, len(estimates), BLOCK):
+            block = estimates[first : first + BLOCK]
+            rests = [t[len(e.times) :] for e, t in zip(block, times[first : first + BLOCK], strict=True)]
+            belief = Belief.last(self.model, block, self.settings.coefficients)
+            states = propagator.rollout(belief, _padded(rests)).states
+            for estimate, path, rest in zip(block, states, rests, strict=True):
+                paths.append(np.concatenate((estimate.states[:, POSITION], path[: len(rest), POSITION])))
+        return paths
 
     @torch.no_grad()
     def roll(self, starts: Array, times: Sequence[Array]) -> list[Array]:
@@ -90,12 +109,16 @@ class GraphContender:
         paths: list[Array] = []
         for first in range(0, len(starts), BLOCK):
             block = times[first : first + BLOCK]
-            longest = max(map(len, block))
-            padded = torch.from_numpy(np.stack([np.pad(t, (0, longest - len(t)), mode="edge") for t in block]))
             start = torch.from_numpy(starts[first : first + BLOCK])
-            states = rollout(self.model, start, padded, self.surfaces).numpy()
+            states = rollout(self.model, start, torch.from_numpy(_padded(block)), self.surfaces).numpy()
             paths += [path[: len(t), POSITION].copy() for path, t in zip(states, block, strict=True)]
         return paths
+
+
+def _padded(times: Sequence[Array]) -> Array:
+    """(n, k) s: each ball's times, then the last of them again."""
+    longest = max(map(len, times))
+    return np.stack([np.pad(t, (0, longest - len(t)), mode="edge") for t in times])
 
 
 def label_of(task: Task) -> Callable[[Track], Track]:
@@ -109,21 +132,26 @@ def _as_it_is(track: Track) -> Track:
 
 @dataclass(frozen=True)
 class Job:
-    """One contender to be made.
+    """One method to be made and judged.
 
     Attributes:
-        task: what it learns from and is judged by.
+        tasks: what it learns from, all of it together, and is judged by, each by itself.
         method: its name in `METHODS`.
         seed: of its training.
         folder: its own, for what training writes; it may hold an unfinished training to go on with.
         quick: train just enough to see that everything works.
     """
 
-    task: Task
+    tasks: tuple[Task, ...]
     method: str
     seed: int
     folder: Path
     quick: bool
+
+    @property
+    def measured(self) -> bool:
+        """Whether the tracks are measured ones."""
+        return self.tasks[0].truth is None
 
 
 @dataclass(frozen=True)
@@ -131,31 +159,42 @@ class Method:
     """A row of the comparison.
 
     Attributes:
-        make: trains it, or goes on with its training.
-        recipe: how it is trained, quickly or not, in words that change whenever that does.
+        make: a contender for one of the job's tasks; what the method learns is learned at the first of them.
+        recipe: how a job trains it, in words that change whenever that does.
         trained: whether a seed makes a difference; if not it runs once.
-        needs_truth: whether it takes part on simulated tracks only.
+        takes_part: on which tracks: `all`, `simulated` or `measured` ones.
+        transfers: whether it can be judged on tracks of a launcher that it did not learn from.
     """
 
-    make: Callable[[Job], Contender]
-    recipe: Callable[[bool], str]
+    make: Callable[[Job, Task], Contender]
+    recipe: Callable[[Job], str]
     trained: bool = True
-    needs_truth: bool = False
+    takes_part: Literal["all", "simulated", "measured"] = "all"
+    transfers: bool = True
+
+    def fits(self, tasks: Sequence[Task]) -> bool:
+        """Whether it takes part on these tracks."""
+        return self.takes_part in ("all", "measured" if tasks[0].truth is None else "simulated")
 
 
-def nominal_contender(job: Job) -> GraphContender:
+def nominal_contender(job: Job, task: Task) -> GraphContender:
     """The nominal analytic model: what one has before any data."""
-    task = job.task
     model = nominal_model(task.info.ball.radius)
-    return GraphContender(job.method, model, task.surfaces, task.settings, label_of(task))
+    return GraphContender(job.method, model, task.surfaces, task.settings, label_of(task), job.measured)
 
 
-def truth_contender(job: Job) -> GraphContender:
+def adapting_contender(job: Job, task: Task) -> GraphContender:
+    """The nominal model with coefficients that are estimated with each track, as `ballfg predict` has it."""
+    contender = nominal_contender(job, task)
+    contender.settings = replace(task.settings, coefficients=coefficient_sigmas(contender.model))
+    return contender
+
+
+def truth_contender(job: Job, task: Task) -> GraphContender:
     """The true dynamics, with next to no process noise: what noise and spread of the launches leave unknown.
 
     Raises: ValueError: if the task is of measured tracks, whose truth nobody knows.
     """
-    task = job.task
     if task.truth is None:
         raise ValueError(
             f"method '{job.method}' needs simulated tracks; got measured ones ({task.case}). Leave it out."

@@ -94,5 +94,5 @@ def _spin(contender: GraphContender, start: Array, topspin: int, sidespin: int) 
     positions = start[:3] + times[:, None] * start[3:6]
     labels = {"topspin": float(topspin), "sidespin": float(sidespin), "speed": float(SPEED_LEVEL)}
     launch = contender.label(Track("launch", times, positions, labels=labels))
-    spin = contender.settings.told(launch).spin_label
-    return np.zeros(3) if spin is None else spin
+    label = contender.settings.spin_label(launch)
+    return np.zeros(3) if label is None else label.spin

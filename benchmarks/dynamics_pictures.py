@@ -52,12 +52,18 @@ def colour_of(method: str) -> str:
 
 
 def rmse_picture(rows: Sequence[Row], task: Task, path: Path) -> Path:
-    """Root mean square distance by method: over the track and after the observed part; dots are seeds."""
+    """Root mean square distance by method: over the track and after the observed part; dots are seeds.
+
+    Pooled over simulated tracks; of measured ones, which may hold what no model can predict, the median track.
+    """
     spans = ("whole track", "after the observed part")
     if task.truth is None:
         spans = (f"until {HORIZON:g} s after the observed part", f"the {HORIZON:g} s after the observed part")
+    metrics = ["track_rmse", "rest_rmse"]
+    if task.truth is None:
+        metrics = [f"{metric}_median" for metric in metrics]
     figure, panels = plt.subplots(1, 2, figsize=(11, 4.4), layout="constrained")
-    for axes, metric, what in zip(panels, ("track_rmse", "rest_rmse"), spans, strict=True):
+    for axes, metric, what in zip(panels, metrics, spans, strict=True):
         found = _of_metric(rows, task.case, metric)
         for place, (method, row) in enumerate(found.items()):
             _bar(axes, place, GROUP_WIDTH, rows, row, colour_of(method))
@@ -66,10 +72,9 @@ def rmse_picture(rows: Sequence[Row], task: Task, path: Path) -> Path:
         axes.grid(visible=True, axis="y", alpha=0.25)
         axes.margins(y=0.12)
     against = "true" if task.truth is not None else "measured"
+    which = f"{len(task.validation)} tracks" if task.truth is not None else f"median of {len(task.validation)} tracks"
     note = "; whiskers: lowest and highest seed" if any(row.low is not None for row in rows) else ""
-    figure.suptitle(
-        f"{task.case}: distance between predicted and {against} positions, {len(task.validation)} tracks{note}", size=11
-    )
+    figure.suptitle(f"{task.case}: distance between predicted and {against} positions, {which}{note}", size=11)
     return save(figure, path)
 
 

@@ -86,6 +86,16 @@ def task_digest(task: Task, recipe: str) -> str:
     return digest.hexdigest()
 
 
+def job_digest(task: Task, tasks: Sequence[Task], recipe: str) -> str:
+    """Of what decides the errors on one of several tasks that are learned from together.
+
+    Args: task: that is judged by.  tasks: that are learned from, where they hold shots for it.
+    """
+    own = task_digest(task, recipe)
+    others = [task_digest(other, recipe) for other in tasks if other.train and other is not task]
+    return hashlib.sha256("|".join([own, *others]).encode()).hexdigest() if others else own
+
+
 def _score_to_json(score: PathScore) -> dict[str, Any]:
     """Plain numbers; null where there is none."""
     return {

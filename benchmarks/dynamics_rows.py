@@ -9,18 +9,22 @@ import numpy as np
 from ballfg.benchmarks.dynamics_contenders import TIMED
 from ballfg.benchmarks.dynamics_metrics import PathScore, pooled_rmse
 from ballfg.benchmarks.dynamics_record import Record
-from ballfg.benchmarks.dynamics_task import APEXES
+from ballfg.benchmarks.dynamics_task import APEXES, Task
 from ballfg.benchmarks.metrics import Figure
 from ballfg.benchmarks.results import CURVE_MARK, Results
 
 
-def add_rows(results: Results, case: str, records: Sequence[Record]) -> None:
+def add_rows(results: Results, task: Task, records: Sequence[Record]) -> None:
     """The rows of one method: means over the seeds, from the lowest to the highest seed; each seed by itself at `@`.
 
     Figures that a method does not have are left out: one that predicts only what comes after the observed part has no
     error over the whole track.
     """
-    by_seed = {record.seed: {name: (unit, value, n) for name, unit, value, n in figures(record)} for record in records}
+    case, measured = task.case, task.truth is None
+    by_seed = {
+        record.seed: {name: (unit, value, n) for name, unit, value, n in figures(record, measured)}
+        for record in records
+    }
     method, first = records[0].method, next(iter(by_seed.values()))
     for name, (unit, _, n) in first.items():
         values = [found[name][1] for found in by_seed.values()]
@@ -32,8 +36,11 @@ def add_rows(results: Results, case: str, records: Sequence[Record]) -> None:
                 results.add(case, method, f"{name}{CURVE_MARK}{seed}", unit, value, n)
 
 
-def figures(record: Record) -> Iterator[tuple[str, str, float, int]]:
-    """Metric, unit, value and number of tracks of everything that is said about one contender."""
+def figures(record: Record, measured: bool) -> Iterator[tuple[str, str, float, int]]:
+    """Metric, unit, value and number of tracks of everything that is said about one contender.
+
+    On measured tracks `prediction_rmse_median` is the figure of `ballfg-bench estimators --data`, in its unit.
+    """
     scores = record.scores
     n = len(scores)
     if np.isfinite([s.track_sum for s in scores]).all():
@@ -43,7 +50,10 @@ def figures(record: Record) -> Iterator[tuple[str, str, float, int]]:
     if ahead:
         pooled = pooled_rmse([s.rest_sum for s in ahead], [s.rest_points for s in ahead])
         yield "rest_rmse", "m", pooled, len(ahead)
-        yield "rest_rmse_median", "m", float(np.median([s.rest_rmse for s in ahead])), len(ahead)
+        median = float(np.median([s.rest_rmse for s in ahead]))
+        yield "rest_rmse_median", "m", median, len(ahead)
+        if measured:
+            yield "prediction_rmse_median", "mm", 1e3 * median, len(ahead)
     yield from _apex_figures(scores)
     yield "parameters", "1", record.parameters, 1
     yield "training_time", "s", record.training_time, 1

@@ -102,7 +102,7 @@ def _problem(smoother: Smoother, track: Track) -> tuple[BallGraph, Values]:
     segmentation = smoother.segment(track)
     sigma = effective_sigmas(track, segmentation, smoother.settings)
     graph = build_graph(track, smoother.trackwise, Events((), segmentation), sigma, smoother.settings)
-    states = initial_states(track, (), segmentation, smoother.model)
+    states = initial_states(track, (), segmentation, smoother.model, smoother.settings.spin_label(track))
     return graph, initial_values(states, smoother.trackwise, smoother.settings)
 
 

@@ -19,8 +19,10 @@ from ballfg.dynamics.trained import Trained
 from ballfg.estimate import Settings, dataset_settings, dataset_surfaces
 from ballfg.estimate.launcher import Launcher
 from ballfg.factors.noise import ProcessNoise
+from ballfg.learning.anchor import Anchor
 from ballfg.learning.coefficients import analytic_model
 from ballfg.learning.end_to_end import EndToEnd
+from ballfg.learning.first_spins import begin_with_tracks
 from ballfg.learning.folder import MODEL
 from ballfg.learning.implicit import GaussNewtonGradient, GradientMethod, ImplicitGradient, UnrolledGradient
 from ballfg.learning.learnables import Learnables, NoiseScales
@@ -60,17 +62,23 @@ def build(config: TrainConfig) -> tuple[Trainee, Sequence[int], Sequence[int]]:
     train, validation = ([kept[k] for k in part if k in kept] for part in (train, validation))
     if not train:
         raise ValueError(f"data must hold a track to train on; none of {len(tracks)} can be used. See the notes above.")
+    if embedding is not None and config.launcher.start == "tracks":
+        begin_with_tracks(embedding, [shots[k] for k in train], analytic)
     if config.kind in SEQUENCES:
         launcher = LauncherSettings() if embedding is None else LauncherSettings(embedding.labels, embedding.categories)
         return build_sequence(config, shots, train, launcher), train, validation
-    noise = NoiseScales(settings[0].process, learned=config.loss.likelihood > 0.0)
+    noise = NoiseScales(
+        settings[0].process, position=config.noise.position_scale or 1.0, learned=config.loss.likelihood > 0.0
+    )
+    model = _model(config, analytic)
     trainee = EndToEnd(
         shots,
-        Learnables(_model(config, analytic), embedding, noise),
+        Learnables(model, embedding, noise),
         config.loss,
         method=GRADIENTS[config.gradient](),
         seed=config.seed,
         augment=config.augmented,
+        anchor=Anchor(model, analytic, config.seed) if config.loss.anchor > 0.0 else None,
     )
     return trainee, train, validation
 
@@ -93,7 +101,7 @@ def trained_model(trainee: EndToEnd) -> BallModel:
         process_noise={**vars(noise.start), **noise.values()},
         position_scale=noise.position_scale(),
         launcher=learnables.embedding,
-        spin_noise=None if launcher is None else launcher.sigma * noise.spin_scale(),
+        spin_noise=(settings.spin_label_noise if launcher is None else launcher.sigma) * noise.spin_scale(),
     )
     return learnables.model
 
@@ -159,8 +167,8 @@ def _settings(
     config: TrainConfig, dataset: Dataset, analytic: AnalyticModel, embedding: SpinEmbedding | None
 ) -> Settings:
     """The estimator's settings for a dataset, with the config's noise; the model is taken to be exact."""
-    given = config.noise.model_dump(exclude_none=True)
-    spin, position = given.pop("spin_label", None), given.pop("position", None)
+    given = config.noise.model_dump(exclude_none=True, exclude={"position_scale"})
+    spin = given.pop("spin_label", None)
     settings = dataset_settings(dataset, analytic)
     process: ProcessNoise = replace(settings.process, **given)
     launcher = None
@@ -171,7 +179,6 @@ def _settings(
         process=process,
         coefficients={},
         launcher=launcher,
-        position_noise=settings.position_noise if position is None else (position,) * 3,
         spin_label_noise=spin or settings.spin_label_noise,
     )
 

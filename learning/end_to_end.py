@@ -18,6 +18,7 @@ from ballfg.dynamics.paths import paths
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.graph import LevenbergMarquardt
 from ballfg.factors.loss import Loss
+from ballfg.learning.anchor import Anchor
 from ballfg.learning.augment import augmentation
 from ballfg.learning.implicit import GradientMethod, ImplicitGradient
 from ballfg.learning.learnables import Learnables
@@ -66,6 +67,7 @@ class EndToEnd(Trainee):
         seed: of the augmentation.
         augment: turn and shift the shots in training.
         optimizer: how tightly estimates are solved.
+        anchor: how far the model is from where it started; None if that does not count.
     """
 
     def __init__(
@@ -78,6 +80,7 @@ class EndToEnd(Trainee):
         seed: int = 0,
         augment: bool = False,
         optimizer: LevenbergMarquardt = TRAINING,
+        anchor: Anchor | None = None,
     ) -> None:
         self.module = learnables
         self.learnables = learnables
@@ -87,6 +90,7 @@ class EndToEnd(Trainee):
         self.method = method or ImplicitGradient()
         self.seed = seed
         self.augment = augment
+        self.anchor = anchor
         scale = None if loss.position_scale is None else loss.position_scale / LOSS_UNIT
         self.point_loss = Loss() if scale is None else Loss("huber", scale)
 
@@ -139,6 +143,8 @@ class EndToEnd(Trainee):
         if self.settings.likelihood > 0.0:
             unlikely = negative_log_likelihood(graphs, minima, factors, self.learnables.noise.noise())
             total = total + self.settings.likelihood * unlikely.sum()
+        if self.anchor is not None:
+            total = total + self.settings.anchor * len(solved) * self.anchor()
         gradients = torch.autograd.grad(total, leaves, allow_unused=True)
         surrogate = total.detach()
         for leaf, gradient in zip(leaves, gradients, strict=True):

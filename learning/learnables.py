@@ -26,19 +26,21 @@ class NoiseScales(nn.Module):
 
     Args:
         process: to start from. Numbers that are zero stay zero.
+        position: to start from, as a multiple of what datasets and tracks say.
         learned: False keeps everything where it is.
 
     Attributes:
         process: (q,) of the numbers `names`.  position, spin: () of measured positions and of spin labels.
     """
 
-    def __init__(self, process: ProcessNoise, *, learned: bool) -> None:
+    def __init__(self, process: ProcessNoise, *, position: float = 1.0, learned: bool) -> None:
         super().__init__()
         self.start = process
         self.learned = learned
         self.names = tuple(name for name in LEARNED_NOISE if getattr(process, name) > 0.0)
         self.process = nn.Parameter(torch.zeros(len(self.names), dtype=torch.float64), requires_grad=learned)
-        self.position = nn.Parameter(torch.zeros((), dtype=torch.float64), requires_grad=learned)
+        start = torch.tensor(position, dtype=torch.float64).log()
+        self.position = nn.Parameter(start, requires_grad=learned)
         self.spin = nn.Parameter(torch.zeros((), dtype=torch.float64), requires_grad=learned)
 
     def noise(self) -> Noise:
@@ -66,12 +68,11 @@ class NoiseScales(nn.Module):
 
     def settings(self, settings: Settings) -> Settings:
         """A dataset's settings with the noise as it is now."""
-        scale, spin = self.position_scale(), self.spin_scale()
-        x, y, z = settings.position_noise
+        spin = self.spin_scale()
         launcher = settings.launcher
         return replace(
             settings,
-            position_noise=(x * scale, y * scale, z * scale),
+            position_scale=self.position_scale(),
             spin_label_noise=settings.spin_label_noise * spin,
             launcher=None if launcher is None else replace(launcher, sigma=launcher.sigma * spin),
             process=replace(self.start, **self.values()),

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ballfg.dynamics.learned import LearnedModel
-from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.model import BallModel, Rates
 from ballfg.state import SPIN, STATE_DIM, VELOCITY, VZ
 
 SAMPLES: Final = 3000
@@ -40,10 +40,7 @@ def pretrain(model: LearnedModel, teacher: BallModel, seed: int, iterations: int
         iterations: of L-BFGS.
     Returns: the root mean square of the errors that are left, in their units.
     """
-    generator = torch.Generator().manual_seed(seed)
-    flying = _states(generator)
-    bouncing = _states(generator)
-    bouncing[:, VZ] = -LEAST_FALL - bouncing[:, VZ].abs()
+    flying, bouncing = random_states(seed, SAMPLES)
     with torch.no_grad():
         rates, after = teacher.rates(flying), teacher.bounce(bouncing)
     parameters = [*model.flight.parameters(), *model.contact.parameters()]
@@ -51,13 +48,7 @@ def pretrain(model: LearnedModel, teacher: BallModel, seed: int, iterations: int
 
     def loss() -> Tensor:
         optimizer.zero_grad()
-        acceleration, spin_rate = model.rates(flying)
-        bounced = model.bounce(bouncing)
-        value = ((acceleration - rates[0]) / ACCELERATION_UNIT).square().mean()
-        value = value + ((bounced - after)[:, VELOCITY] / VELOCITY_UNIT).square().mean()
-        value = value + ((bounced - after)[:, SPIN] / SPIN_UNIT).square().mean()
-        if spin_rate is not None and rates[1] is not None:
-            value = value + ((spin_rate - rates[1]) / SPIN_UNIT).square().mean()
+        value = difference(model, flying, bouncing, rates, after)
         value.backward()
         return value
 
@@ -65,9 +56,34 @@ def pretrain(model: LearnedModel, teacher: BallModel, seed: int, iterations: int
     return float(loss().detach()) ** 0.5
 
 
-def _states(generator: torch.Generator) -> Tensor:
-    """(n, 9) velocities and spins in all directions, slow and fast."""
-    state = torch.zeros((SAMPLES, STATE_DIM), dtype=torch.float64)
-    state[:, VELOCITY] = SPEED * torch.randn((SAMPLES, 3), generator=generator, dtype=torch.float64)
-    state[:, SPIN] = SPIN_SPREAD * torch.randn((SAMPLES, 3), generator=generator, dtype=torch.float64)
+def difference(model: BallModel, flying: Tensor, bouncing: Tensor, rates: Rates, after: Tensor) -> Tensor:
+    """() mean squares of what a model's flight and bounce differ by from given ones, in their units, added up.
+
+    Args:
+        model: compared.
+        flying: (n, 9).  rates: given for them.
+        bouncing: (n, 9).  after: (n, 9), given for them.
+    """
+    acceleration, spin_rate = model.rates(flying)
+    bounced = model.bounce(bouncing)
+    value = ((acceleration - rates[0]) / ACCELERATION_UNIT).square().mean()
+    value = value + ((bounced - after)[:, VELOCITY] / VELOCITY_UNIT).square().mean()
+    value = value + ((bounced - after)[:, SPIN] / SPIN_UNIT).square().mean()
+    if spin_rate is not None and rates[1] is not None:
+        value = value + ((spin_rate - rates[1]) / SPIN_UNIT).square().mean()
+    return value
+
+
+def random_states(seed: int, count: int) -> tuple[Tensor, Tensor]:
+    """Flying and falling balls (n, 9): velocities and spins in all directions, slow and fast."""
+    generator = torch.Generator().manual_seed(seed)
+    flying, falling = _states(generator, count), _states(generator, count)
+    falling[:, VZ] = -LEAST_FALL - falling[:, VZ].abs()
+    return flying, falling
+
+
+def _states(generator: torch.Generator, count: int) -> Tensor:
+    state = torch.zeros((count, STATE_DIM), dtype=torch.float64)
+    state[:, VELOCITY] = SPEED * torch.randn((count, 3), generator=generator, dtype=torch.float64)
+    state[:, SPIN] = SPIN_SPREAD * torch.randn((count, 3), generator=generator, dtype=torch.float64)
     return state

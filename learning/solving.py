@@ -128,9 +128,7 @@ class BatchSolver:
         optimizer: how tightly estimates are solved.
     """
 
-    def __init__(
-        self, shots: Sequence[Shot], learnables: Learnables, optimizer: LevenbergMarquardt = TRAINING
-    ) -> None:
+    def __init__(self, shots: Sequence[Shot], learnables: Learnables, optimizer: LevenbergMarquardt = TRAINING) -> None:
         self.shots = shots
         self.optimizer = optimizer
         self.learnables = learnables

@@ -92,6 +92,10 @@ class LauncherConfig(Section):
     labels: Names | None = None
     """Labels of the dataset with the launcher's settings, from which the initial spin is learned; null: none."""
 
+    start: Literal["names", "tracks"] = "names"
+    """Spins that learning starts from. names: what the settings `topspin` and `sidespin` usually mean, no spin for
+    others. tracks: what the analytic model `model` finds in the training tracks."""
+
 
 class LossConfig(Section):
     """What is minimised: the error of the predicted positions, and how unlikely the observations are."""
@@ -112,6 +116,10 @@ class LossConfig(Section):
     position_scale: Positive | None = None
     """m, error beyond which the loss of a predicted position grows only linearly; null: squares throughout."""
 
+    anchor: NotNegative = 0.0
+    """Weight of the mean square difference from the analytic model `model` on random flights and bounces: what no track
+    tells stays as it is there."""
+
     def horizon_at(self, epoch: int, duration: float) -> float:
         """s, how far is predicted in an epoch (from 0) when `duration` s are left of the track."""
         full = duration if self.horizon is None else min(self.horizon, duration)
@@ -124,8 +132,8 @@ class LossConfig(Section):
 class NoiseConfig(Section):
     """Initial noise of the estimator. null: the dataset's, or the package's default where it states none."""
 
-    position: Positive | None = None
-    """m, of an observed coordinate."""
+    position_scale: Positive | None = None
+    """Of an observed position, as a multiple of what its dataset says; null: 1."""
 
     acceleration: Positive | None = None
     """m/s^2/sqrt(Hz), density of the acceleration that the model lacks."""

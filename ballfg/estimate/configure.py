@@ -34,10 +34,14 @@ def dataset_settings(dataset: Dataset, model: BallModel) -> Settings:
     if trained is None:
         settings = uncertain(model, position_noise=noise)
     else:
-        x, y, z = (trained.position_scale * sigma for sigma in noise)
         settings = Settings(
-            position_noise=(x, y, z), process=learned_process(trained), launcher=launcher_of(info, model)
+            position_noise=noise,
+            position_scale=trained.position_scale,
+            process=learned_process(trained),
+            launcher=launcher_of(info, model),
         )
+        if trained.launcher is None and trained.spin_noise is not None:
+            settings = replace(settings, spin_label_noise=trained.spin_noise)
     return settings if info.spin_noise is None else replace(settings, spin_label_noise=info.spin_noise)
 
 

@@ -137,7 +137,7 @@ class ExtendedKalmanFilter(Estimator):
 
         Coefficients are those of the last sample; cross covariances tie each state to the coefficients at that state.
         """
-        run = _Run(self, self.settings.told(track))
+        run = _Run(self, track)
         record = run.record
         if not run.finite():
             return self._failed(track, run)
@@ -209,7 +209,7 @@ class _Run:
 
     def prior(self, i: int) -> tuple[Array, Array]:
         """What is known at sample i from it alone: mean (d,) and covariance (d, d)."""
-        spin, spin_sigma = spin_start(self.track.spin_label, self.settings)
+        spin, spin_sigma = spin_start(self.settings.spin_label(self.track), self.settings)
         mean = np.concatenate((self.track.positions[i], np.zeros(3), spin, self.means))
         sigma = (
             self.sigma[i],

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from ballfg.dynamics.contact import fly_through
 from ballfg.dynamics.model import BallModel
 from ballfg.estimate.segmentation import Contact, Quality, Segmentation
+from ballfg.estimate.settings import SpinLabel
 from ballfg.estimate.sliding_window import window_velocities
 from ballfg.factors.kind import Values
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
@@ -19,7 +20,13 @@ from ballfg.tracks import Track
 Array = NDArray[np.float64]
 
 
-def initial_states(track: Track, contacts: tuple[Contact, ...], segmentation: Segmentation, model: BallModel) -> Array:
+def initial_states(
+    track: Track,
+    contacts: tuple[Contact, ...],
+    segmentation: Segmentation,
+    model: BallModel,
+    label: SpinLabel | None,
+) -> Array:
     """(n, 9) states from the sliding window: measured positions, mean velocities of windows that no event cuts.
 
     The spin is the label's, or zero, up to the first contact; each contact changes it as the model says. A ball that
@@ -29,8 +36,8 @@ def initial_states(track: Track, contacts: tuple[Contact, ...], segmentation: Se
     states[:, POSITION] = _bridged_positions(track, segmentation)
     breaks = np.unique([c.interval for c in contacts] + segmentation.hits.tolist() + segmentation.restarts.tolist())
     states[:, VELOCITY] = window_velocities(track.times, states[:, POSITION], breaks.astype(np.int64))
-    if track.spin_label is not None:
-        states[:, SPIN] = track.spin_label
+    if label is not None:
+        states[:, SPIN] = label.spin
     for contact in sorted(contacts, key=lambda c: c.time):
         _start_contact(states, contact, model)
     for rest in segmentation.rests:

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from ballfg.dynamics.spin_embedding import SpinEmbedding
+from ballfg.estimate.settings import SpinLabel
 from ballfg.estimate.sliding_window import window_velocities
-from ballfg.tracks import SPIN_LABELS, Track
+from ballfg.tracks import Track
 
 FIRST_SAMPLES = 10
 """The launch direction is the mean direction of flight over so many samples."""
@@ -42,16 +43,16 @@ class Launcher:
         found = self.embedding.settings({**self.defaults, **track.labels})
         return None if found is None else found.numpy()
 
-    def label(self, track: Track) -> Track:
-        """The track with a spin label made from its settings and its first samples; itself where that is not possible.
+    def label(self, track: Track) -> SpinLabel | None:
+        """The spin that the settings and the first samples tell; None where they do not.
 
         For estimators that need the spin before they know the velocity; the smoother estimates both together.
         """
         settings = self.settings(track)
         if settings is None or len(track) < 2:
-            return track
+            return None
         first = slice(0, FIRST_SAMPLES)
         velocity = window_velocities(track.times[first], track.positions[first]).mean(axis=0)
         with torch.no_grad():
             spin = self.embedding.spin(torch.from_numpy(settings), torch.from_numpy(velocity))
-        return replace(track, labels={**track.labels, **dict(zip(SPIN_LABELS, spin.tolist(), strict=True))})
+        return SpinLabel(spin.numpy(), self.sigma)

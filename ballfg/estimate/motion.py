@@ -36,10 +36,14 @@ class Motion:
         mine = (self.heights, self.rest, self.hit, self.linked)
         return mine == (other.heights, other.rest, other.hit, other.linked)
 
+    def kick_times(self, dt: float) -> tuple[float, ...]:
+        """`times` for the process noise over dt s: in whole `KICK_PARTS`."""
+        return tuple(round(time / dt * KICK_PARTS) * dt / KICK_PARTS for time in self.times)
+
     def covariance(self, dt: Array, noise: ProcessNoise) -> Array:
         """(1, 9, 9) process noise over dt (1,) s: flight, each contact's kick, a hit at an unknown time."""
         covariance = noise.flight(dt)
-        for time in self.times:
+        for time in self.kick_times(float(dt[0])):
             covariance += noise.contact(dt, np.array([time]))
         if self.hit:
             covariance += noise.hit(dt)
@@ -47,6 +51,9 @@ class Motion:
 
 
 FLIGHT = Motion()
+KICK_PARTS = 64
+"""Of an interval, in which contact times enter the process noise. Finer, and an estimate would depend on how a
+segmentation rounds, which knows the axes of the frame: with these parts it turns with the data."""
 
 
 def motions_of(segmentation: Segmentation, times: Array) -> list[Motion]:

@@ -18,7 +18,7 @@ from ballfg.estimate.online_window import Window
 from ballfg.estimate.problem import trackwise_model
 from ballfg.estimate.result import Estimate, Status
 from ballfg.estimate.segmentation import physics_of
-from ballfg.estimate.settings import Settings, sample_sigmas
+from ballfg.estimate.settings import Settings, SpinLabel, sample_sigmas
 from ballfg.estimate.smoother import Smoother
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Track
@@ -108,7 +108,7 @@ class Online(Estimator):
         """
         return self._push(float(time), position, sigma, None)
 
-    def _push(self, time: float, position: ArrayLike, sigma: ArrayLike | None, label: Array | None) -> OnlineState:
+    def _push(self, time: float, position: ArrayLike, sigma: ArrayLike | None, label: SpinLabel | None) -> OnlineState:
         own = None if sigma is None else np.asarray(sigma, dtype=np.float64)[None]
         spread = sample_sigmas(self.settings, 1, own)[0]
         point = np.array(position, dtype=np.float64)
@@ -238,11 +238,11 @@ class Online(Estimator):
         innovations of the pushes.
         """
         self.reset()
-        track = self.settings.told(track)
         self._frozen = []
+        label = self.settings.spin_label(track)
         sigma = sample_sigmas(self.settings, len(track), track.sigmas)
         states = [
-            self._push(float(t), position, spread, track.spin_label if k == 0 else None)
+            self._push(float(t), position, spread, label if k == 0 else None)
             for k, (t, position, spread) in enumerate(zip(track.times, track.positions, sigma, strict=True))
         ]
         whitened = np.array([state.innovation for state in states])

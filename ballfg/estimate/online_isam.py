@@ -18,7 +18,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.estimate.motion import FLIGHT, Motion
 from ballfg.estimate.online_interval import Interval, IntervalMaker, coefficient_count, evaluate, store
 from ballfg.estimate.problem import coefficient_means, start_priors
-from ballfg.estimate.settings import Settings
+from ballfg.estimate.settings import Settings, SpinLabel
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
 from ballfg.factors.kind import FactorKind
 from ballfg.factors.position import PositionFactors
@@ -51,7 +51,7 @@ class Sample:
         time: s.  position: (3,) m.  stated: (3,) m, its standard deviation as stated.
         factor: multiple of that with which it takes part.
         motion: how the ball got here from the sample before.
-        label: (3,) rad/s, a spin label, on the first sample of a track.
+        label: what is known of the spin, on the first sample of a track.
         slots: where iSAM2 keeps the sample's own factors: position first, then priors.
     """
 
@@ -60,7 +60,7 @@ class Sample:
     stated: Array
     factor: float = 1.0
     motion: Motion = FLIGHT
-    label: Array | None = None
+    label: SpinLabel | None = None
     slots: tuple[int, ...] = ()
 
     @property
@@ -171,7 +171,7 @@ class IncrementalWindow:
         state = np.zeros(STATE_DIM)
         state[POSITION] = sample.position
         if sample.label is not None:
-            state[SPIN] = sample.label
+            state[SPIN] = sample.label.spin
         priors = start_priors(0, sample.position, sample.label, self.settings)
         _, count, calls = self._relinearize(None)
         return Update(np.full(3, np.nan), count, calls, self._insert(sample, state, None, priors))

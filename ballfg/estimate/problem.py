@@ -18,7 +18,7 @@ from ballfg.dynamics.integrate import steps_over
 from ballfg.dynamics.model import BallModel
 from ballfg.estimate.motion import motions_of
 from ballfg.estimate.segmentation import Contact, Quality, Segmentation
-from ballfg.estimate.settings import Settings, sample_sigmas, spin_start
+from ballfg.estimate.settings import Settings, SpinLabel, sample_sigmas, spin_start
 from ballfg.factors.dynamics import ContactFactors, FlightFactors, RestFactors
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.kind import FactorKind, Values
@@ -108,7 +108,7 @@ def _dynamics(times: Array, model: BallModel, events: Events, settings: Settings
     for (motion_kind, _), members in groups.items():
         rows = np.array(members)
         kicks = Kicks(
-            np.array([motions[i].times for i in members]),
+            np.array([motions[i].kick_times(float(dt[i])) for i in members]),
             np.array([motions[i].hit for i in members]),
         )
         if motion_kind == "contact":
@@ -135,19 +135,19 @@ def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> lis
         kinds.append(LauncherSpinFactors(np.array([0]), launch[None], embedding, spread, loss))
         kinds.append(_wide_prior(0, track.positions[0], settings))
     else:
-        kinds += start_priors(0, track.positions[0], track.spin_label, settings)
+        kinds += start_priors(0, track.positions[0], settings.spin_label(track), settings)
     for interval in segmentation.restarts:
         kinds += start_priors(int(interval) + 1, track.positions[int(interval) + 1], None, settings)
     return kinds
 
 
-def start_priors(state: int, position: Array, label: Array | None, settings: Settings) -> list[FactorKind]:
+def start_priors(state: int, position: Array, label: SpinLabel | None, settings: Settings) -> list[FactorKind]:
     """Priors on a state that nothing leads up to.
 
     Args:
         state: its index.
         position: (3,) m, as measured.
-        label: (3,) rad/s, of the spin; None for the spin prior.
+        label: what is known of the spin; None for the spin prior.
         settings: spreads and losses.
     """
     spin, spread = spin_start(label, settings)

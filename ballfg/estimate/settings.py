@@ -20,11 +20,22 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
+class SpinLabel:
+    """A spin that is known before the flight is looked at: (3,) rad/s, and its standard deviation per axis, rad/s."""
+
+    spin: NDArray[np.float64]
+    sigma: float
+
+
+@dataclass(frozen=True)
 class Settings:
     """Noise and priors, the same for all estimators, so that a comparison compares the estimators."""
 
     position_noise: tuple[float, float, float] = (0.0015, 0.0015, 0.0015)
     """m, standard deviation of a measured x, y, z, where a track does not bring its own."""
+
+    position_scale: float = 1.0
+    """By which the standard deviations of all positions are multiplied, those that a track brings too."""
 
     process: ProcessNoise = field(default_factory=ProcessNoise)
     """How far the ball strays from its model, per root second, per impact, per hit."""
@@ -64,16 +75,18 @@ class Settings:
             raise ValueError(
                 f"position_noise must be three positive numbers in m; got {self.position_noise}. Give one per axis."
             )
-        for name in ("spin_prior", "spin_label_noise", "velocity_prior"):
+        for name in ("position_scale", "spin_prior", "spin_label_noise", "velocity_prior"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ValueError(f"{name} must be positive and finite; got {getattr(self, name)}")
         for name, sigma in self.coefficients.items():
             if not (np.isfinite(sigma) and sigma > 0):
                 raise ValueError(f"coefficients['{name}'] must be a positive standard deviation; got {sigma}")
 
-    def told(self, track: Track) -> Track:
-        """The track with a spin label made from its launcher settings, where they tell the spin."""
-        return track if self.launcher is None else self.launcher.label(track)
+    def spin_label(self, track: Track) -> SpinLabel | None:
+        """What is known of a track's first spin: its label, else what its launcher settings say, else None."""
+        if track.spin_label is not None:
+            return SpinLabel(track.spin_label, self.spin_label_noise)
+        return None if self.launcher is None else self.launcher.label(track)
 
 
 MEASURED = ProcessNoise(contact_tangential=0.2, contact_spin=10.0)
@@ -91,11 +104,12 @@ def uncertain(model: BallModel, **changes: object) -> Settings:
     return Settings(coefficients=coefficient_sigmas(model), process=MEASURED, **changes)  # type: ignore[arg-type]
 
 
-def spin_start(label: NDArray[np.float64] | None, settings: Settings) -> tuple[NDArray[np.float64], float]:
+def spin_start(label: SpinLabel | None, settings: Settings) -> tuple[NDArray[np.float64], float]:
     """Mean (3,) and standard deviation per axis, rad/s, of the spin at a start: those of the label or the prior."""
-    return (np.zeros(3), settings.spin_prior) if label is None else (label, settings.spin_label_noise)
+    return (np.zeros(3), settings.spin_prior) if label is None else (label.spin, label.sigma)
 
 
 def sample_sigmas(settings: Settings, count: int, own: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """(n, 3) m, the caller's to change: a track's own sigmas where it has them, else the settings'."""
-    return np.broadcast_to(np.array(settings.position_noise), (count, 3)).copy() if own is None else own.copy()
+    """(n, 3) m, the caller's to change: a track's own sigmas where it has them, else the settings', both scaled."""
+    sigmas = np.broadcast_to(np.array(settings.position_noise), (count, 3)) if own is None else own
+    return settings.position_scale * sigmas

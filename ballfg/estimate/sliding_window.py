@@ -51,7 +51,7 @@ class SlidingWindow(Estimator):
 
     def estimate(self, track: Track) -> Estimate:
         """The states of a track; a single sample has no velocity and the status says so."""
-        n, track = len(track), self.settings.told(track)
+        n = len(track)
         sigma = sample_sigmas(self.settings, n, track.sigmas)
         first = np.maximum(np.arange(n) - WINDOW + 1, 0)
         span = track.times - track.times[first]
@@ -59,7 +59,7 @@ class SlidingWindow(Estimator):
         states = np.zeros((n, STATE_DIM))
         states[:, POSITION] = track.positions
         states[:, VELOCITY] = (track.positions - track.positions[first]) / span[:, None]
-        states[:, SPIN], _ = spin_start(track.spin_label, self.settings)
+        states[:, SPIN], _ = spin_start(self.settings.spin_label(track), self.settings)
         bounced = may_touch(track.times, track.positions, self.surfaces, self.model.radius)
         covariances = _measurement_covariance(sigma, first, span)
         covariances[:, SPIN, SPIN] = self._spin_covariance(track, bounced)
@@ -79,7 +79,7 @@ class SlidingWindow(Estimator):
 
     def _spin_covariance(self, track: Track, bounced: NDArray[np.bool_]) -> Array:
         """(n, 3, 3): prior or label, the random walk since, and an unknown change once the ball may have bounced."""
-        _, start = spin_start(track.spin_label, self.settings)
+        _, start = spin_start(self.settings.spin_label(track), self.settings)
         variance = start**2 + self.settings.process.spin**2 * (track.times - track.times[0])
         variance = variance + self.settings.spin_prior**2 * np.logical_or.accumulate(bounced)
         return np.asarray(variance[:, None, None] * np.eye(3))

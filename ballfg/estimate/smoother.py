@@ -147,7 +147,8 @@ class Smoother(Estimator):
         """Minimise, move contacts to where the estimate says they are, and minimise again until they stay."""
         events = Events(segmentation.contacts, segmentation)
         if earlier is None:
-            states = initial_states(self.settings.told(track), events.contacts, segmentation, self.model)
+            label = self.settings.spin_label(track)
+            states = initial_states(track, events.contacts, segmentation, self.model, label)
             values = initial_values(states, self.trackwise, self.settings)
         else:
             values = earlier.start

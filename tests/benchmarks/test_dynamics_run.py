@@ -11,14 +11,13 @@ from ballfg.benchmarks import dynamics
 from ballfg.benchmarks.dynamics import Plan, collect, run_dynamics
 from ballfg.benchmarks.dynamics_contenders import Job, nominal_contender, truth_contender
 from ballfg.benchmarks.dynamics_fan import fan_of
-from ballfg.benchmarks.dynamics_measured import measured_shot, measured_task
-from ballfg.benchmarks.dynamics_record import Record, read_record, task_digest
+from ballfg.benchmarks.dynamics_measured import measured_shot
+from ballfg.benchmarks.dynamics_record import read_record, task_digest
 from ballfg.benchmarks.dynamics_rows import add_rows
 from ballfg.benchmarks.dynamics_truth import synthetic_task
 from ballfg.benchmarks.results import Results
 from ballfg.estimate import Estimate, Status
-from ballfg.simulate import SimulationConfig, write_simulation
-from ballfg.tracks import Track, read_dataset
+from ballfg.tracks import Track
 
 SMALL = Plan(tracks=12, measured=None, seeds=2, quick=True)
 
@@ -52,14 +51,14 @@ def test_finished_methods_are_not_repeated(
     results, out, _ = small
     again = Results("test", 1)
 
-    def refuse(job: Job, digest: str) -> Record:
+    def refuse(job: Job) -> None:
         raise AssertionError(f"{job.method} was made again")
 
     monkeypatch.setattr(dynamics, "finish", refuse)
     run_dynamics(again, None, out, SMALL, 1)
     assert again.rows == results.rows
     with pytest.raises(AssertionError, match="was made again"):
-        collect(synthetic_task(2, 12), SMALL, 1, out / "runs", 1)  # another task
+        collect([synthetic_task(2, 12)], SMALL, 1, out / "runs", 1)  # another task
 
 
 def test_a_broken_record_is_named(small: tuple[Results, Path, list[Path]], tmp_path: Path) -> None:
@@ -95,7 +94,7 @@ def test_seeds_are_averaged_and_shown(small: tuple[Results, Path, list[Path]]) -
     assert found is not None
     slower = replace(found, seed=2, training_time=10.0)
     results = Results("test", 1)
-    add_rows(results, "synthetic", [found, slower])
+    add_rows(results, task, [found, slower])
     row = next(r for r in results.rows if r.metric == "training_time")
     assert (row.value, row.low, row.high) == (5.0, 0.0, 10.0)
     assert results.value("synthetic", "nominal", "training_time@2") == 10.0
@@ -103,18 +102,18 @@ def test_seeds_are_averaged_and_shown(small: tuple[Results, Path, list[Path]]) -
 
 def test_predictions_see_nothing_later_and_do_not_depend_on_the_batch() -> None:
     task = synthetic_task(1, 8)
-    job = Job(task, "nominal", 0, Path(), True)
+    job = Job((task,), "nominal", 0, Path(), True)
     shots = task.validation
-    together = nominal_contender(job).predict([s.seen for s in shots], [s.track.times for s in shots])
+    together = nominal_contender(job, task).predict([s.seen for s in shots], [s.track.times for s in shots])
     for shot, path in zip(shots, together, strict=True):
-        alone = nominal_contender(job).predict([shot.seen], [shot.track.times])[0]
+        alone = nominal_contender(job, task).predict([shot.seen], [shot.track.times])[0]
         np.testing.assert_allclose(alone, path, atol=1e-9)
         assert shot.seen.times[-1] == shot.track.times[79]
 
 
 def test_fan_is_a_mirror_image_in_sidespin_and_returns_from_json() -> None:
     task = synthetic_task(1, 4)
-    fan = fan_of(truth_contender(Job(task, "truth", 0, Path(), True)))
+    fan = fan_of(truth_contender(Job((task,), "truth", 0, Path(), True), task))
     assert list(fan.topspin) == list(range(-3, 6))
     assert list(fan.sidespin) == list(range(-5, 6))
     for level in range(1, 6):
@@ -127,24 +126,7 @@ def test_fan_is_a_mirror_image_in_sidespin_and_returns_from_json() -> None:
 def test_truth_needs_simulated_tracks() -> None:
     task = replace(synthetic_task(1, 4), truth=None, case="aimy")
     with pytest.raises(ValueError, match=r"needs simulated tracks; got measured ones \(aimy\)"):
-        truth_contender(Job(task, "truth", 0, Path(), True))
-
-
-def test_measured_tracks_alternate_and_have_no_truth(tmp_path: Path) -> None:
-    write_simulation(tmp_path / "set", SimulationConfig(tracks=5, seed=1))
-    results = Results("test", 0)
-    dataset = read_dataset(tmp_path / "set")
-    task = measured_task(dataset, 1)
-    assert [s.track.name for s in task.train] == ["000", "002", "004"]
-    assert [s.track.name for s in task.validation] == ["001", "003"]
-    for shot in task.validation:
-        since = shot.track.times - shot.track.times[0]
-        assert since[shot.observed - 1] == pytest.approx(0.25)
-        assert since[shot.judged - 1] == pytest.approx(0.55)
-    (tmp_path / "out").mkdir()
-    pictures = run_dynamics(results, dataset, tmp_path / "out", SMALL, 1)
-    assert {row.method for row in results.rows} == {"nominal"}
-    assert "dynamics_fan.png" not in [p.name for p in pictures]
+        truth_contender(Job((task,), "truth", 0, Path(), True), task)
 
 
 def test_a_measured_shot_ends_at_a_hit() -> None:

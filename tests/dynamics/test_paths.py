@@ -129,7 +129,9 @@ def test_rest_and_what_starts_strangely(model, table) -> None:
 def test_the_edge_of_the_table(build) -> None:
     """Two balls side by side, one comes down on the table, the other on the floor."""
     model = build(gravity={}, drag={"k": 0.1}, restitution={"e": 0.9})
-    state = torch.tensor([[0.0, 0.0, 0.3, 2.0, 0, 0, 0, 0, 0], [0.5, 0.0, 0.3, 2.5, 0, 0, 0, 0, 0]], dtype=torch.float64)
+    state = torch.tensor(
+        [[0.0, 0.0, 0.3, 2.0, 0, 0, 0, 0, 0], [0.5, 0.0, 0.3, 2.5, 0, 0, 0, 0, 0]], dtype=torch.float64
+    )
     surfaces = Surfaces(0.0, -0.76, extent=(-1.0, 1.0, -1.0, 1.0))
     assert float(apart(model, state, TIMES, surfaces).max()) < 1e-5
     with torch.no_grad():

@@ -118,7 +118,7 @@ def test_values_to_go_on_from_change_sides_with_their_contact() -> None:
     track = Track("t", TIMES, measured(states))
     bounce = bounces(states)[0]
     found = Smoother(MODEL, TABLE, EXACT).segment(track)
-    start = initial_values(initial_states(track, found.contacts, found, MODEL), MODEL, EXACT)
+    start = initial_values(initial_states(track, found.contacts, found, MODEL, None), MODEL, EXACT)
     start.states[:] = states
     forward = move_contacts(start, TIMES, ((bounce, 0.0),), ((bounce + 1, 0.0),), MODEL)
     assert forward.states[bounce + 1, 5] < 0.0  # now before the contact

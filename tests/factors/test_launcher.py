@@ -72,7 +72,7 @@ def test_what_is_refused(embedding) -> None:
         LauncherSpinFactors(one, SETTINGS[:1, :1], embedding, SIGMA[:1])
     with pytest.raises(ValueError, match=r"settings and sigma must have shapes \(1, 2\) and \(1, 3\)"):
         LauncherSpinFactors(one, SETTINGS[:1], embedding, SIGMA)
-    with pytest.raises(ValueError, match="sigma must be positive; got 0. Leave out settings that say nothing"):
+    with pytest.raises(ValueError, match=r"sigma must be positive; got 0\. Leave out settings that say nothing"):
         LauncherSpinFactors(one, SETTINGS[:1], embedding, 0.0 * SIGMA[:1])
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import pytest
 import torch
@@ -12,7 +10,7 @@ from torch import Tensor
 from ballfg.dynamics import fly_through
 from ballfg.dynamics.spin_embedding import SpinEmbedding
 from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors
-from ballfg.factors.kind import FactorKind, Noise, Rows, Values
+from ballfg.factors.kind import FactorKind, Noise, Values
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import PROCESS_NOISE, Kicks, ProcessNoise, whitening, whitening_tensor
@@ -87,7 +85,7 @@ def inputs_of(kind: FactorKind, values: Values) -> tuple[Tensor, ...]:
 
 
 def agreement(kind: FactorKind, values: Values) -> tuple[float, float]:
-    """Differences between torch and `compute`: of residuals, and of Jacobians relative to each row's largest element."""
+    """Differences of torch to `compute`: of residuals, and of Jacobians relative to each row's largest element."""
     rows = kind.linearize(values)
     inputs = inputs_of(kind, values)
     assert (np.linalg.norm(rows.residual, axis=-1) > 0.05).all(), "a zero residual hides errors"
@@ -140,7 +138,8 @@ def test_all_other_kinds(augmented) -> None:
 def test_priors_of_coefficients_follow_the_model(augmented) -> None:
     """The mean that estimation sees is the model's value when the factors were built; torch's is the model's own."""
     kind = CoefficientPriorFactors(augmented, np.full(5, 0.1))
-    gradient = torch.autograd.grad(kind.residual((torch.zeros(1, 5, dtype=torch.float64),)).sum(), augmented.parameters(), allow_unused=True)
+    residual = kind.residual((torch.zeros(1, 5, dtype=torch.float64),))
+    gradient = torch.autograd.grad(residual.sum(), augmented.parameters(), allow_unused=True)
     assert sorted(float(g) for g in gradient if g is not None) == pytest.approx([-10.0] * 5)
     own = {name: p.detach() for name, p in augmented.model.named_parameters()}
     np.testing.assert_array_equal(kind.mean[0], [own[name] for name in augmented.names])
@@ -234,7 +233,6 @@ def test_whitening_in_torch_is_whitening() -> None:
     np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12 * np.abs(expected).max())
     unit = found @ given @ found.swapaxes(-1, -2)
     np.testing.assert_allclose(unit, np.broadcast_to(np.eye(9), unit.shape), atol=1e-12)
-
 
 
 @pytest.mark.parametrize("loss", [Loss(), Loss("huber", 1.5), Loss("cauchy", 2.0)], ids=lambda loss: loss.name)

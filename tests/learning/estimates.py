@@ -21,8 +21,8 @@ from ballfg.factors.kind import Values
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.factors.search import run_together
-from ballfg.learning.implicit import GradientMethod
 from ballfg.learning.end_to_end import EndToEnd
+from ballfg.learning.implicit import GradientMethod
 from ballfg.learning.learnables import Learnables, NoiseScales
 from ballfg.learning.linear import ConjugateGradients, GaussNewtonFactors
 from ballfg.learning.objective import BatchObjective
@@ -166,7 +166,9 @@ def shots(
     return found
 
 
-def trainee(loss: LossConfig | None = None, *, model: BallModel | None = None, noise: bool = True, **options) -> EndToEnd:
+def trainee(
+    loss: LossConfig | None = None, *, model: BallModel | None = None, noise: bool = True, **options
+) -> EndToEnd:
     """Three shots, the first with launcher settings, the second with a spin label; all can be learned."""
     options = {"optimizer": TIGHT} | options
     model, tells = model or usual_ball(), launcher()

@@ -38,7 +38,7 @@ from ballfg.factors.graph import BallGraph
 from ballfg.factors.kind import Noise, Values
 from ballfg.factors.linear import solve as solve_linear
 from ballfg.factors.loss import Loss
-from ballfg.factors.noise import PROCESS_NOISE, Kicks, ProcessNoise, whitening_tensor
+from ballfg.factors.noise import Kicks, whitening_tensor
 from ballfg.factors.position import PositionFactors
 from ballfg.factors.prior import state_prior
 from ballfg.learning.implicit import GaussNewtonGradient, GradientMethod, ImplicitGradient, UnrolledGradient
@@ -87,7 +87,8 @@ def worst(
 
 def each(leaves: dict[str, Tensor]) -> tuple[dict[str, Sequence[Tensor]], list[float]]:
     """Every coefficient by itself, with a step of half a percent."""
-    return {name: [leaf] for name, leaf in leaves.items()}, [5e-3 * float(leaf.detach().abs()) for leaf in leaves.values()]
+    steps = [5e-3 * float(leaf.detach().abs()) for leaf in leaves.values()]
+    return {name: [leaf] for name, leaf in leaves.items()}, steps
 
 
 @pytest.fixture(scope="module")
@@ -100,7 +101,7 @@ def test_the_problem_is_a_hard_one(analytic: Estimates) -> None:
     for found in analytic.solve():
         assert len(found.events.contacts) == 1
         rows = [(kind.loss, kind.linearize(found.minimum.values).residual) for kind in found.graph.kinds]
-        tails = [loss.name for loss, r in rows if loss.name != "squared" and np.linalg.norm(r, axis=1).max() > loss.scale]
+        tails = [loss.name for loss, r in rows if np.linalg.norm(r, axis=1).max() > loss.scale]
         assert "huber" in tails
         assert found.minimum.error > 15.0
 
@@ -233,7 +234,7 @@ def test_a_linear_problem_has_its_closed_form(method) -> None:
     embedding = estimates.settings.launcher.embedding
     leaves = [*GRAVITY.parameters(), embedding.weight, *estimates.noise.parameters()]
     dense = least_squares(estimates, leaves)
-    torch.testing.assert_close(estimates.point() / SPREAD.repeat(14), dense.detach() / SPREAD.repeat(14), rtol=0, atol=1e-8)
+    assert float(((estimates.point() - dense.detach()) / SPREAD.repeat(14)).abs().max()) < 1e-8
     expected = torch.autograd.grad(outer(dense), leaves)
     point = estimates.attached(method, leaves)
     found = torch.autograd.grad(outer(point), leaves)
@@ -249,6 +250,7 @@ def test_a_linear_problem_has_its_closed_form(method) -> None:
 
 
 def test_unrolling_tends_to_the_exact_gradient(analytic: Estimates) -> None:
+    """By a factor of ten an iteration here: 0.1 after 2, 1e-3 after 4, 2e-7 after 8."""
     leaves = list(analytic.model.parameters())
     exact = gradients(analytic, leaves)
     errors = []
@@ -263,10 +265,11 @@ def test_unrolling_tends_to_the_exact_gradient(analytic: Estimates) -> None:
 
 
 def test_gauss_newton_is_an_approximation(analytic: Estimates) -> None:
+    """By 2 to 80 %, half of the coefficients by more than 11 %: a third of the samples lies in the losses' tails."""
     leaves = list(analytic.model.parameters())
     exact, near = gradients(analytic, leaves), gradients(analytic, leaves, GaussNewtonGradient())
     errors = [float((a / b - 1.0).abs()) for a, b in zip(near, exact, strict=True)]
-    print(errors)
+    print([f"{error:.2f}" for error in errors])  # shown by -s
     assert 0.01 < np.median(errors) < 0.3
 
 
@@ -323,9 +326,9 @@ def test_iterations_must_be_positive() -> None:
 
 
 def between(spread: float) -> tuple[BallGraph, Values]:
-    """A position seen at two places +- `spread` standard deviations off, by Cauchy's loss: zero is a minimum or a top."""
-    states, sigma = Values(np.zeros((1, 9)), np.zeros(0)), np.ones((1, 3))
-    seen = [PositionFactors(np.array([0]), np.full((1, 3), sign * spread), sigma, Loss("cauchy", 1.0)) for sign in (-1, 1)]
+    """A position seen at +- `spread` standard deviations, by Cauchy's loss: zero is a minimum or a top."""
+    states, sigma, loss = Values(np.zeros((1, 9)), np.zeros(0)), np.ones((1, 3)), Loss("cauchy", 1.0)
+    seen = [PositionFactors(np.array([0]), np.full((1, 3), sign * spread), sigma, loss) for sign in (-1, 1)]
     return BallGraph((*seen, state_prior(0, np.zeros(9), np.full(9, 30.0)))), states
 
 

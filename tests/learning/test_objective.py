@@ -74,14 +74,17 @@ def test_changed_noise_is_that_of_graphs_built_with_it(estimates) -> None:
     with torch.no_grad():
         estimates.noise.process += torch.tensor([0.1, -0.2, 0.3, -0.1, 0.2])
         process = estimates.noise.noise().process
-        value = objective(objective.layout.pack(values), Noise(process, torch.tensor(1.3), torch.tensor(0.8)))
+        value = objective(
+            objective.layout.pack(values),
+            Noise(process, torch.tensor(1.3, dtype=torch.float64), torch.tensor(0.8, dtype=torch.float64)),
+        )
         estimates.noise.position.fill_(np.log(1.3))
         estimates.noise.spin.fill_(np.log(0.8))
     anew = [s.graph.error(v) for s, v in zip(estimates.solve(), values, strict=True)]
     with torch.no_grad():
         for leaf in estimates.noise.parameters():
             leaf.zero_()
-    np.testing.assert_allclose(value.detach().numpy(), anew, rtol=1e-7)  # scales as float32 numbers
+    np.testing.assert_allclose(value.detach().numpy(), anew, rtol=1e-9)
 
 
 def test_layout_packs_and_unpacks() -> None:
@@ -121,5 +124,5 @@ def test_noise_scales_are_what_the_factors_take() -> None:
     assert settings.process.contact_spin == pytest.approx(8.0 * np.exp(12.0))
     assert settings.position_noise[2] == pytest.approx(0.003 * np.exp(-12.0))
     assert settings.process.hit_spin == NOISE.hit_spin
-    assert float(noise.position) == float(noise.spin) == 1.0
+    assert float(noise.position.detach()) == float(noise.spin.detach()) == 1.0
     assert NoiseScales(NOISE, learned=False).noise() == Noise()

@@ -49,7 +49,9 @@ def test_estimates_are_the_smoother_s() -> None:
         sigma = np.tile(settings.position_noise, (OBSERVED, 1))
         assert settings.position_noise[0] == pytest.approx(0.002 * np.exp(0.4))
         alone = smoother.solve(seen, shot.segmentation, sigma)
-        np.testing.assert_allclose(one.solution.minimum.values.states, alone.minimum.values.states, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(
+            one.solution.minimum.values.states, alone.minimum.values.states, rtol=1e-7, atol=1e-7
+        )
         np.testing.assert_array_equal(one.positions, shot.track.positions)
 
 
@@ -113,12 +115,16 @@ def test_pose_there_and_back() -> None:
     np.testing.assert_allclose(POSE.states(there, back=True), states, rtol=0, atol=1e-14)
     np.testing.assert_allclose(there[:, :3], POSE.positions(states[:, :3]), rtol=0, atol=0)
     quarter = Pose(torch.tensor(np.pi / 2, dtype=torch.float64), torch.tensor([10.0, 20.0], dtype=torch.float64))
-    np.testing.assert_allclose(quarter.states(np.arange(1.0, 10.0)[None])[0], [8, 21, 3, -5, 4, 6, -8, 7, 9], atol=1e-14)
+    np.testing.assert_allclose(
+        quarter.states(np.arange(1.0, 10.0)[None])[0], [8, 21, 3, -5, 4, 6, -8, 7, 9], atol=1e-14
+    )
 
 
 def test_a_pose_turns_the_spin_label() -> None:
     """And leaves other labels, stamps and what is not told as they are."""
-    track = Track("t", np.arange(3.0), np.ones((3, 3)), labels={"topspin": 2.0, "spin_x": 1.0, "spin_y": 2.0, "spin_z": 3.0})
+    track = Track(
+        "t", np.arange(3.0), np.ones((3, 3)), labels={"topspin": 2.0, "spin_x": 1.0, "spin_y": 2.0, "spin_z": 3.0}
+    )
     quarter = Pose(torch.tensor(np.pi / 2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64))
     seen = quarter.track(track)
     np.testing.assert_allclose(seen.spin_label, [-2.0, 1.0, 3.0], atol=1e-14)
@@ -134,7 +140,9 @@ def test_sigmas_of_a_turned_shot_do_not_depend_on_the_axes() -> None:
     batch = solver()
     sigmas = np.tile((0.001, 0.007, 0.002), (len(batch.shots[0].track), 1))
     batch.shots[0] = replace(batch.shots[0], track=replace(batch.shots[0].track, sigmas=sigmas))
-    poses = [Pose(torch.tensor(angle, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)) for angle in (0.0, 2.0)]
+    poses = [
+        Pose(torch.tensor(angle, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)) for angle in (0.0, 2.0)
+    ]
     found = []
     for pose in poses:
         batch.warm.forget(0)
