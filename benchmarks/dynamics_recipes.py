@@ -12,7 +12,13 @@ from ballfg.benchmarks.measured import HORIZON
 
 RESIDUAL: Final = "analytic+mnn"
 """The method in which a network corrects the nominal model."""
-OPTIMIZER: Final[dict[str, Any]] = {"learning_rate": 3e-3, "batch": 12, "epochs": 40, "clip": 5.0}
+OPTIMIZER: Final[dict[str, Any]] = {
+    "learning_rate": 3e-3,
+    "coefficient_step": 20.0,
+    "batch": 12,
+    "epochs": 40,
+    "clip": 5.0,
+}
 """Of the models in the factor graph."""
 ERROR_SCALE: Final = 0.03
 """m. Errors beyond it count linearly."""

@@ -115,64 +115,60 @@ class FlightFactors(DynamicsFactors):
         return (*super().group, steps_over(float(self.dt.max())))  # type: ignore[misc]
 
 
-class ContactFactors(DynamicsFactors):
+class SurfaceFactors(DynamicsFactors):
+    """Motion in which surfaces take part.
+
+    Args: heights: (m, ...) m of the surfaces.
+    """
+
+    row_arrays: ClassVar[tuple[str, ...]] = (*DynamicsFactors.row_arrays, "heights")
+
+    def __init__(
+        self,
+        model: BallModel,
+        states: Index,
+        dt: Array,
+        covariance: Array,
+        heights: Array,
+        kicks: Kicks | None = None,
+    ) -> None:
+        super().__init__(model, states, dt, covariance, kicks)
+        self.heights = heights
+
+
+class ContactFactors(SurfaceFactors):
     """Flight with contacts in the interval, at surfaces that are named; how many is the same for all rows.
 
     Args: heights: (m, c) m, the surface of each of c contacts, in order.
     """
 
-    row_arrays: ClassVar[tuple[str, ...]] = (*DynamicsFactors.row_arrays, "heights")
-
-    def __init__(
-        self,
-        model: BallModel,
-        states: Index,
-        dt: Array,
-        covariance: Array,
-        heights: Array,
-        kicks: Kicks | None = None,
-    ) -> None:
-        super().__init__(model, states, dt, covariance, kicks)
-        self.heights = heights
-
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
         """Flight, impact, flight."""
-        heights = tuple(torch.from_numpy(column) for column in self.heights[rows].T.copy())
+        heights = self._surfaces(rows)
         after, _, jacobian = fly_through_jacobian(self.model, state, torch.from_numpy(self.dt[rows]), heights)
         return after, jacobian
 
     def moved(self, state: Tensor) -> Tensor:
         """Flight, impact, flight."""
-        heights = tuple(torch.from_numpy(column) for column in self.heights.T.copy())
-        return fly_through(self.model, state, torch.from_numpy(self.dt), heights)[0]
+        return fly_through(self.model, state, torch.from_numpy(self.dt), self._surfaces(slice(None)))[0]
+
+    def _surfaces(self, rows: Index | slice) -> tuple[Tensor, ...]:
+        """c heights (k,) of some rows."""
+        return tuple(torch.from_numpy(column) for column in self.heights[rows].T.copy())
 
     def contact_times(self, values: Values) -> Array:
         """(m, c) s since the start of each interval; NaN where the ball never gets to the surface."""
         start = np.concatenate([values.gather(v) for v in (self.variables[:, 0], *self.variables[:, 2:].T)], axis=-1)
-        heights = tuple(torch.from_numpy(column) for column in self.heights.T.copy())
+        heights = self._surfaces(slice(None))
         with torch.no_grad():
             return fly_through(self.model, torch.from_numpy(start), torch.from_numpy(self.dt), heights)[1].numpy()
 
 
-class RestFactors(DynamicsFactors):
+class RestFactors(SurfaceFactors):
     """The ball rests, slides or rolls on a surface over the interval.
 
     Args: heights: (m,) m of the surfaces.
     """
-
-    row_arrays: ClassVar[tuple[str, ...]] = (*DynamicsFactors.row_arrays, "heights")
-
-    def __init__(
-        self,
-        model: BallModel,
-        states: Index,
-        dt: Array,
-        covariance: Array,
-        heights: Array,
-        kicks: Kicks | None = None,
-    ) -> None:
-        super().__init__(model, states, dt, covariance, kicks)
-        self.heights = heights
 
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
         """Rolling over dt; the surface holds the ball's height and stops its vertical motion."""

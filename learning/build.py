@@ -79,6 +79,7 @@ def build(config: TrainConfig) -> tuple[Trainee, Sequence[int], Sequence[int]]:
         seed=config.seed,
         augment=config.augmented,
         anchor=Anchor(model, analytic, config.seed) if config.loss.anchor > 0.0 else None,
+        coefficient_step=config.optimizer.coefficient_step,
     )
     return trainee, train, validation
 
@@ -101,9 +102,14 @@ def trained_model(trainee: EndToEnd) -> BallModel:
         process_noise={**vars(noise.start), **noise.values()},
         position_scale=noise.position_scale(),
         launcher=learnables.embedding,
-        spin_noise=(settings.spin_label_noise if launcher is None else launcher.sigma) * noise.spin_scale(),
+        spin_noise=_spin_noise(settings) * noise.spin_scale() if noise.learned or launcher is not None else None,
     )
     return learnables.model
+
+
+def _spin_noise(settings: Settings) -> float:
+    """rad/s, of what is said of first spins before anything is learned."""
+    return settings.spin_label_noise if settings.launcher is None else settings.launcher.sigma
 
 
 def _open(folder: str) -> Dataset:

@@ -68,6 +68,8 @@ class EndToEnd(Trainee):
         augment: turn and shift the shots in training.
         optimizer: how tightly estimates are solved.
         anchor: how far the model is from where it started; None if that does not count.
+        coefficient_step: scale of the learning rate of declared coefficients, in their prior standard deviations; None:
+            they step as a network's weights do.
     """
 
     def __init__(
@@ -81,6 +83,7 @@ class EndToEnd(Trainee):
         augment: bool = False,
         optimizer: LevenbergMarquardt = TRAINING,
         anchor: Anchor | None = None,
+        coefficient_step: float | None = None,
     ) -> None:
         self.module = learnables
         self.learnables = learnables
@@ -91,12 +94,15 @@ class EndToEnd(Trainee):
         self.seed = seed
         self.augment = augment
         self.anchor = anchor
+        self.coefficient_step = coefficient_step
         scale = None if loss.position_scale is None else loss.position_scale / LOSS_UNIT
         self.point_loss = Loss() if scale is None else Loss("huber", scale)
 
     def groups(self) -> list[dict[str, Any]]:
-        """Noise, embedding and model, each with its scale on the learning rate."""
-        return self.learnables.groups(LEARNING_RATE_SCALES)
+        """Noise, embedding, coefficients and the rest of the model, each with its scale on the learning rate."""
+        step, declared = self.coefficient_step, self.learnables.model.declared_coefficients()
+        own = () if step is None else tuple((f"model.{name}", step * c.sigma) for name, c in declared.items())
+        return self.learnables.groups((*own, *LEARNING_RATE_SCALES))
 
     def after_step(self) -> None:
         """Put coefficients and noise back into their bounds."""

@@ -21,8 +21,8 @@ SMALL = Plan(tracks=0, measured=None, seeds=1, quick=True)
 
 
 def simulated(folder: Path, name: str, tracks: int, seed: int, *, spin_labels: bool = False) -> Dataset:
-    write_simulation(folder / "made", SimulationConfig(tracks=tracks, seed=seed, spin_labels=spin_labels))
-    made = read_dataset(folder / "made")
+    write_simulation(folder / f"{name}-made", SimulationConfig(tracks=tracks, seed=seed, spin_labels=spin_labels))
+    made = read_dataset(folder / f"{name}-made")
     write_dataset(folder / name, replace(made.info, name=name), (track.until(0.7) for track in made))
     return read_dataset(folder / name)
 

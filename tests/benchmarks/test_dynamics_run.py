@@ -20,12 +20,13 @@ from ballfg.estimate import Estimate, Status
 from ballfg.tracks import Track
 
 SMALL = Plan(tracks=12, measured=None, seeds=2, quick=True)
+CONTROLS = ("truth", "nominal")
 
 
 @pytest.fixture(scope="module")
 def small(tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, Path, list[Path]]:
     results, out = Results("test", 1), tmp_path_factory.mktemp("out")
-    return results, out, run_dynamics(results, None, out, SMALL, 1)
+    return results, out, run_dynamics(results, None, out, SMALL, 1, CONTROLS)
 
 
 def test_run_has_both_controls_and_pictures(small: tuple[Results, Path, list[Path]]) -> None:
@@ -55,10 +56,10 @@ def test_finished_methods_are_not_repeated(
         raise AssertionError(f"{job.method} was made again")
 
     monkeypatch.setattr(dynamics, "finish", refuse)
-    run_dynamics(again, None, out, SMALL, 1)
+    run_dynamics(again, None, out, SMALL, 1, CONTROLS)
     assert again.rows == results.rows
     with pytest.raises(AssertionError, match="was made again"):
-        collect([synthetic_task(2, 12)], SMALL, 1, out / "runs", 1)  # another task
+        collect([synthetic_task(2, 12)], SMALL, 1, out / "runs", 1, CONTROLS)  # another task
 
 
 def test_a_broken_record_is_named(small: tuple[Results, Path, list[Path]], tmp_path: Path) -> None:
@@ -79,18 +80,18 @@ def test_digest_tells_tasks_apart() -> None:
     moved = replace(task, validation=(*task.validation[:-1], replace(task.validation[-1], observed=70)))
     settings = replace(task, settings=replace(task.settings, spin_prior=50.0))
     digests = [
-        task_digest(task, False),
-        task_digest(task, True),
-        task_digest(moved, False),
-        task_digest(settings, False),
+        task_digest(task, "long"),
+        task_digest(task, "short"),
+        task_digest(moved, "long"),
+        task_digest(settings, "long"),
     ]
     assert len(set(digests)) == 4
-    assert task_digest(synthetic_task(1, 6), False) == digests[0]
+    assert task_digest(synthetic_task(1, 6), "long") == digests[0]
 
 
 def test_seeds_are_averaged_and_shown(small: tuple[Results, Path, list[Path]]) -> None:
     task = synthetic_task(1, 12)
-    found = read_record(small[1] / "runs" / "nominal-1.json", task_digest(task, True))
+    found = read_record(small[1] / "runs" / "nominal-1.json", task_digest(task, "untrained"))
     assert found is not None
     slower = replace(found, seed=2, training_time=10.0)
     results = Results("test", 1)

@@ -142,15 +142,22 @@ def test_the_smoother_finds_the_launch_direction_with_the_spin(launcher) -> None
     assert errors[0] < 0.5 * errors[2]
 
 
-@pytest.mark.parametrize("make", [ExtendedKalmanFilter, Online, SlidingWindow])
-def test_other_estimators_take_it_as_a_label(make, launcher) -> None:
+@pytest.mark.parametrize(
+    ("make", "apart"),
+    [(ExtendedKalmanFilter, 1e-6), (SlidingWindow, 1e-6), (Online, 0.2)],
+    ids=["ekf", "window", "online"],
+)
+def test_other_estimators_take_it_as_a_label(make, apart, launcher) -> None:
+    """As well known as the launcher says, not as a spin label would be; `apart` in standard deviations.
+
+    The online estimator ends with a smoother, which finds the direction of the launch together with the spin.
+    """
     track = shot(samples=20)
-    """As well known as the launcher says, not as a spin label would be."""
     told = make(nominal_model(), TABLE, settings_with(launcher, spin_label_noise=33.0)).estimate(track)
     spin = dict(zip(SPIN_LABELS, launcher.label(track).spin.tolist(), strict=True))
     labelled = make(nominal_model(), TABLE, settings_with(None)).estimate(replace(track, labels=spin))
-    np.testing.assert_allclose(told.states, labelled.states, rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(told.sigmas, labelled.sigmas, rtol=1e-9, atol=1e-12)
+    assert np.abs((told.states - labelled.states) / labelled.sigmas).max() < apart
+    np.testing.assert_allclose(told.sigmas, labelled.sigmas, rtol=max(apart, 1e-9) / 10)
 
 
 # --- what a trained model says

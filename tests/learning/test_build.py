@@ -100,10 +100,10 @@ def test_sequence_models_see_the_same_shots(few_tracks) -> None:
 
 
 def test_noise_of_the_config(few_tracks) -> None:
-    noise = {"position": 0.004, "acceleration": 0.7, "contact_tangential": 0.0, "spin_label": 9.0}
+    noise = {"position_scale": 2.0, "acceleration": 0.7, "contact_tangential": 0.0, "spin_label": 9.0}
     trainee, *_ = build(config(few_tracks, kind="a-tune", noise=noise, loss={"likelihood": 0.5}))
     settings, scales = trainee.shots[0].settings, trainee.learnables.noise
-    assert settings.position_noise == (0.004,) * 3
+    assert scales.position_scale() == pytest.approx(2.0)
     assert settings.spin_label_noise == 9.0
     assert (settings.process.acceleration, settings.process.contact_tangential) == (0.7, 0.0)
     assert scales.learned
@@ -163,7 +163,8 @@ def test_a_trained_model_goes_out_and_into_an_estimator(no_spin_labels, tmp_path
     assert settings.coefficients == {}
     for name, value in vars(expected.process).items():
         assert getattr(settings.process, name) == pytest.approx(value, rel=1e-12), name
-    assert settings.position_noise == pytest.approx(expected.position_noise, rel=1e-12)
+    assert settings.position_noise == expected.position_noise
+    assert settings.position_scale == pytest.approx(expected.position_scale, rel=1e-12)
     assert settings.launcher.sigma == pytest.approx(FIRST_SPIN_NOISE * np.exp(-1.0), rel=1e-12)
     assert settings.launcher.defaults == {"group": dataset.info.name}
     track = next(iter(dataset))

@@ -46,8 +46,8 @@ def test_estimates_are_the_smoother_s() -> None:
         settings = noise.settings(TELLS)
         seen = replace(shot.track, times=shot.track.times[:OBSERVED], positions=shot.track.positions[:OBSERVED])
         smoother = Smoother(usual_ball(), TABLE, settings, TIGHT)
-        sigma = np.tile(settings.position_noise, (OBSERVED, 1))
-        assert settings.position_noise[0] == pytest.approx(0.002 * np.exp(0.4))
+        sigma = settings.position_scale * np.tile(settings.position_noise, (OBSERVED, 1))
+        assert sigma[0, 0] == pytest.approx(0.002 * np.exp(0.4))
         alone = smoother.solve(seen, shot.segmentation, sigma)
         np.testing.assert_allclose(
             one.solution.minimum.values.states, alone.minimum.values.states, rtol=1e-7, atol=1e-7
