@@ -80,17 +80,19 @@ class Task:
     train: tuple[Shot, ...]
     validation: tuple[Shot, ...]
 
-    def write(self, folder: Path) -> None:
+    def write(self, folder: Path, *, validate: bool = True) -> None:
         """Write the tracks of both parts as a dataset whose label `split` says train, validation or test.
 
-        One in ten of the shots to learn from validates: it decides which weights are kept. The shots to judge by are
-        tests, which no training looks at.
+        The shots to judge by are tests, which no training looks at.
 
+        Args:
+            folder: is made.
+            validate: one in ten of the shots to learn from validates: it decides which weights are kept. False: all of
+                them train, and the last weights are kept.
         Raises: FileNotFoundError: if the folder's parent does not exist.
         """
-        parts = [
-            "validation" if k % VALIDATE_ONE_IN == VALIDATE_ONE_IN - 1 else "train" for k in range(len(self.train))
-        ]
+        last = VALIDATE_ONE_IN - 1
+        parts = ["validation" if validate and k % VALIDATE_ONE_IN == last else "train" for k in range(len(self.train))]
         labelled = [*zip(self.train, parts, strict=True), *((shot, "test") for shot in self.validation)]
         tracks = [replace(s.track, labels={**s.track.labels, SPLIT_LABEL: part}) for s, part in labelled]
         write_dataset(folder, self.info, sorted(tracks, key=lambda track: track.name), "parquet")

@@ -84,7 +84,8 @@ def trained_contender(job: Job, task: Task) -> Contender:
 def _written(job: Job) -> list[Path]:
     """The datasets that a job learns from, written into its folder if they are not there yet.
 
-    The folder says what it is of: a training that was stopped goes on only with what it began with.
+    The folder says what it is of: a training that was stopped goes on only with what it began with. Measured shots are
+    too few to spare some for a choice among epochs; sequence models learn their shots by heart and need that choice.
     """
     learned = [task for task in job.tasks if task.train]
     names = ["data"] if len(learned) == 1 else [f"data-{number}" for number in range(len(learned))]
@@ -93,7 +94,7 @@ def _written(job: Job) -> list[Path]:
     if not mark.is_file():
         job.folder.mkdir(parents=True, exist_ok=True)
         for task, name in zip(learned, names, strict=True):
-            task.write(job.folder / name)
+            task.write(job.folder / name, validate=not job.measured or kind_of(job.method) in SEQUENCES)
         mark.write_text(digest, encoding="utf-8")
     elif mark.read_text(encoding="utf-8") != digest:
         raise ValueError(
@@ -124,7 +125,7 @@ def recipe(job: Job) -> str:
 
 def content_of(method: str, quick: bool, measured: bool) -> dict[str, Any]:
     """The config of a method. Those of one family differ in `kind` and in the augmentation that it implies."""
-    kind = "mnn+gs" if method == RESIDUAL else method.removesuffix("+aug")
+    kind = kind_of(method)
     common = {"kind": kind, "split": {"by": "label"}, "workers": 1}
     epochs = {"epochs": QUICK_EPOCHS} if quick else {}
     if kind in SEQUENCES:
@@ -140,6 +141,11 @@ def content_of(method: str, quick: bool, measured: bool) -> dict[str, Any]:
     if quick and kind in NETWORKS:
         content["architecture"] = content.get("architecture", {}) | {"pretrain": QUICK_PRETRAIN}
     return content
+
+
+def kind_of(method: str) -> str:
+    """The kind of a method in a training config."""
+    return "mnn+gs" if method == RESIDUAL else method.removesuffix("+aug")
 
 
 def learned_settings(task: Task, model: BallModel) -> Settings:

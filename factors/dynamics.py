@@ -17,7 +17,8 @@ from torch import Tensor
 
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.contact import fly_through, fly_through_jacobian
-from ballfg.dynamics.integrate import batch_jacobian, fly, fly_jacobian, steps_over
+from ballfg.dynamics.flight_step import flight_step
+from ballfg.dynamics.integrate import batch_jacobian, fly_jacobian, step_count, steps_over
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.rollout import roll
 from ballfg.factors.kind import COEFFICIENTS, Array, FactorKind, Index, Noise, Values
@@ -107,7 +108,12 @@ class FlightFactors(DynamicsFactors):
 
     def moved(self, state: Tensor) -> Tensor:
         """Flight over dt."""
-        return fly(self.model, state, torch.from_numpy(self.dt))
+        dt = torch.from_numpy(self.dt)
+        steps = step_count(dt)
+        h = (dt / steps).unsqueeze(-1)
+        for _ in range(steps):
+            state = flight_step(self.model, state, h)
+        return state
 
     @property
     def group(self) -> Hashable:
@@ -153,7 +159,7 @@ class ContactFactors(SurfaceFactors):
         return fly_through(self.model, state, torch.from_numpy(self.dt), self._surfaces(slice(None)))[0]
 
     def _surfaces(self, rows: Index | slice) -> tuple[Tensor, ...]:
-        """c heights (k,) of some rows."""
+        """The heights (k,) of some rows, one tensor for each of the c contacts."""
         return tuple(torch.from_numpy(column) for column in self.heights[rows].T.copy())
 
     def contact_times(self, values: Values) -> Array:

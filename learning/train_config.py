@@ -160,10 +160,6 @@ class OptimizerConfig(Section):
     learning_rate: Positive = 1e-3
     """Step size of a parameter group of scale 1."""
 
-    coefficient_step: Positive | None = None
-    """Scale of the learning rate for an analytic model's coefficients, in units of their prior standard deviations;
-    what is as good as known stays. null: coefficients step as a network's weights do, whatever their size."""
-
     schedule: Literal["constant", "cosine"] = "cosine"
     """cosine: the learning rate falls from its full value to zero at the last step."""
 
@@ -181,6 +177,10 @@ class OptimizerConfig(Section):
 
     warm_start_epochs: Annotated[int, Field(ge=0)] = 0
     """Epochs over which the learning rate rises linearly to its full value."""
+
+    coefficient_step: Positive | None = None
+    """Scale of the learning rate for an analytic model's coefficients, in units of their prior standard deviations;
+    what is as good as known stays. null: coefficients step as a network's weights do, whatever their size."""
 
 
 def _as_names(data: Any) -> Any:

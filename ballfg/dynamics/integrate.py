@@ -39,15 +39,15 @@ def derivative(rates: RateFunction, state: Tensor) -> Tensor:
 
 def rk4_step(rates: RateFunction, state: Tensor, h: Tensor) -> Tensor:
     """One Runge-Kutta step of h (..., 1) s from `state` (..., 9)."""
-    return _stages(rates, state, h)[0]
+    return stages_of(rates, state, h)[0]
 
 
 def rk4_from(rates: RateFunction, state: Tensor, slope: Tensor, h: Tensor) -> Tensor:
     """`rk4_step` where the derivative at the start, (..., 9), is known already."""
-    return _stages(rates, state, h, slope)[0]
+    return stages_of(rates, state, h, slope)[0]
 
 
-def _stages(
+def stages_of(
     rates: RateFunction, state: Tensor, h: Tensor, slope: Tensor | None = None
 ) -> tuple[Tensor, tuple[Tensor, ...]]:
     """The state after a step, and the four states at which the rates were taken."""
@@ -111,7 +111,7 @@ def fly_jacobian(model: BallModel, state: Tensor, dt: Tensor) -> tuple[Tensor, T
     jacobian: Tensor | None = None
     for _ in range(steps):
         with torch.no_grad():
-            after, stages = _stages(model.rates, state, h)
+            after, stages = stages_of(model.rates, state, h)
         step = _step_jacobian(model, stages, h)
         jacobian = step if jacobian is None else step @ jacobian
         state = after

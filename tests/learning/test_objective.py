@@ -122,7 +122,8 @@ def test_noise_scales_are_what_the_factors_take() -> None:
     expected = [getattr(settings.process, name) for name in PROCESS_NOISE]
     np.testing.assert_allclose(noise.process.detach().numpy(), expected, rtol=1e-14)
     assert settings.process.contact_spin == pytest.approx(8.0 * np.exp(12.0))
-    assert settings.position_noise[2] == pytest.approx(0.003 * np.exp(-12.0))
+    assert settings.position_noise == SETTINGS.position_noise
+    assert settings.position_scale == pytest.approx(np.exp(-12.0))
     assert settings.process.hit_spin == NOISE.hit_spin
     assert float(noise.position.detach()) == float(noise.spin.detach()) == 1.0
     assert NoiseScales(NOISE, learned=False).noise() == Noise()
