@@ -26,6 +26,7 @@ Array = NDArray[np.float64]
 COLOURS: Final = {
     "truth": "#bdbdbd",
     "nominal": "#7f7f7f",
+    "nominal+track": "#525252",
     "lstm": "#e6ab02",
     "diffusion": "#d95f02",
     "a-tune": "#a6761d",
@@ -33,6 +34,7 @@ COLOURS: Final = {
     "mlp+gs": "#66a0d8",
     "skip+gs": "#1b9e77",
     "mnn+gs": "#3b4cc0",
+    "analytic+mnn": "#08306b",
 }
 OTHER: Final = "black"
 """Of a method that has no colour of its own."""

@@ -1,4 +1,4 @@
-"""Learning from data: the coefficients of the analytic model, calibrated on a dataset of tracks.
+"""Learning: models trained through the estimator, calibration of coefficients, `ballfg-train`.
 
 `ballfg-train` is its command; docs/train.md is its guide.
 """

@@ -35,6 +35,8 @@ LOSS_UNIT: Final = 0.01
 """m. Squared errors count in its square, so that losses are of order one."""
 SOLUTION_TOLERANCE: Final = 1e-5
 """Relative error of a track's part in the gradient: far below the scatter between batches."""
+COEFFICIENT_STEP: Final = 20.0
+"""With a learning rate of 2e-3 a coefficient moves by at most 0.04 standard deviations of its prior in a step."""
 LEARNING_RATE_SCALES: Final = (("noise.", 10.0), ("embedding.", 3.0), ("model.", 1.0))
 """The noise's logarithms and the embedding's weights, of order one, move faster than a network's weights."""
 
@@ -68,8 +70,7 @@ class EndToEnd(Trainee):
         augment: turn and shift the shots in training.
         optimizer: how tightly estimates are solved.
         anchor: how far the model is from where it started; None if that does not count.
-        coefficient_step: scale of the learning rate of declared coefficients, in their prior standard deviations; None:
-            they step as a network's weights do.
+        coefficient_step: scale of the learning rate of declared coefficients, in their prior standard deviations.
     """
 
     def __init__(
@@ -83,7 +84,7 @@ class EndToEnd(Trainee):
         augment: bool = False,
         optimizer: LevenbergMarquardt = TRAINING,
         anchor: Anchor | None = None,
-        coefficient_step: float | None = None,
+        coefficient_step: float = COEFFICIENT_STEP,
     ) -> None:
         self.module = learnables
         self.learnables = learnables
@@ -100,8 +101,8 @@ class EndToEnd(Trainee):
 
     def groups(self) -> list[dict[str, Any]]:
         """Noise, embedding, coefficients and the rest of the model, each with its scale on the learning rate."""
-        step, declared = self.coefficient_step, self.learnables.model.declared_coefficients()
-        own = () if step is None else tuple((f"model.{name}", step * c.sigma) for name, c in declared.items())
+        declared = self.learnables.model.declared_coefficients()
+        own = tuple((f"model.{name}", self.coefficient_step * c.sigma) for name, c in declared.items())
         return self.learnables.groups((*own, *LEARNING_RATE_SCALES))
 
     def after_step(self) -> None:

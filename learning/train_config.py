@@ -178,9 +178,9 @@ class OptimizerConfig(Section):
     warm_start_epochs: Annotated[int, Field(ge=0)] = 0
     """Epochs over which the learning rate rises linearly to its full value."""
 
-    coefficient_step: Positive | None = None
-    """Scale of the learning rate for an analytic model's coefficients, in units of their prior standard deviations;
-    what is as good as known stays. null: coefficients step as a network's weights do, whatever their size."""
+    coefficient_step: Positive = 20.0
+    """Scale of the learning rate for declared coefficients, in units of their prior standard deviations: they are as
+    different in size as their units. What is as good as known stays."""
 
 
 def _as_names(data: Any) -> Any:

@@ -123,7 +123,8 @@ def test_written_task_reads_back_with_its_parts(task: Task, tmp_path: Path) -> N
     assert dataset.info.rate == RATE
     assert dataset.info.position_noise == NOISE
     parts = {track.name: track.labels["split"] for track in dataset}
-    assert {name for name, part in parts.items() if part == "validation"} == {s.track.name for s in task.validation}
+    assert {name for name, part in parts.items() if part == "test"} == {s.track.name for s in task.validation}
+    assert {name for name, part in parts.items() if part == "validation"} == {s.track.name for s in task.train[9::10]}
     shots = {s.track.name: s for s in (*task.train, *task.validation)}
     for track in dataset:
         np.testing.assert_array_equal(track.positions, shots[track.name].track.positions)

@@ -31,7 +31,3 @@ def test_adam_moves_each_by_the_same_share_of_its_standard_deviation(no_spin_lab
     assert moved["flight.drag.k"] == pytest.approx(0.01 * 10.0 * 0.035, rel=1e-3)
     assert moved["flight.magnus.k"] == pytest.approx(0.01 * 10.0 * 0.0008, rel=1e-3)
     assert moved["flight.gravity.g"] == 0.0  # as good as known
-
-
-def test_without_it_a_step_can_be_larger_than_the_coefficient(no_spin_labels: Path) -> None:
-    assert after_a_step(no_spin_labels)["flight.magnus.k"] == pytest.approx(0.01, rel=1e-3)  # of 0.0028
