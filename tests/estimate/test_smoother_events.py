@@ -19,6 +19,7 @@ from ballfg.estimate.result import Estimate, Status
 from ballfg.estimate.segmentation import Contact
 from ballfg.estimate.settings import Settings, uncertain
 from ballfg.estimate.smoother import Smoother
+from ballfg.factors.search import run
 from ballfg.tracks import Track
 
 SIGMA = 0.0015
@@ -328,7 +329,7 @@ def test_an_impossible_contact_is_a_status_not_an_exception(settings) -> None:
     smoother = Smoother(MODEL, TABLE, settings)
     found = replace(smoother.segment(track), contacts=(Contact(8, 0.085, -60.0),))
     sigma = effective_sigmas(track, found, settings)
-    estimate = smoother.result(track, sigma, smoother._settle(track, found, sigma, None))
+    estimate = smoother.result(track, sigma, run(smoother._settle(track, found, sigma, None)))
     assert estimate.status is Status.FAILED
     assert "table height" in estimate.status.value
     assert np.isfinite(estimate.covariances).all()

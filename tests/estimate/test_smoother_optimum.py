@@ -102,8 +102,10 @@ class Reference:
         self.contacts = {c.interval: c for c in contacts}
         self.roots = []
         for i, dt in enumerate(self.dt):
-            kick = self.contacts[i].time if i in self.contacts else None
-            left = None if kick is None else float(np.clip(track.times[i + 1] - kick, 0.0, dt))
+            left = None
+            if i in self.contacts:  # the kick's time counts in 64ths of its interval
+                share = round((self.contacts[i].time - track.times[i]) / dt * 64) / 64
+                left = float(np.clip((1.0 - share) * dt, 0.0, dt))
             self.roots.append(np.linalg.inv(np.linalg.cholesky(noise(dt, left))))
         self.prior_mean = np.concatenate((track.positions[0], np.zeros(6)))
         self.prior_sigma = np.repeat((POSITION_SIGMA, VELOCITY_SIGMA, WIDE_SPIN), 3)

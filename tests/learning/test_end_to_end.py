@@ -16,7 +16,7 @@ from ballfg.estimate import Smoother
 from ballfg.factors.graph import LevenbergMarquardt
 from ballfg.learning import end_to_end, solving
 from ballfg.learning.augment import augmentation
-from ballfg.learning.end_to_end import LOSS_UNIT, EndToEnd
+from ballfg.learning.end_to_end import COEFFICIENT_STEP, LOSS_UNIT, EndToEnd
 from ballfg.learning.implicit import GaussNewtonGradient, ImplicitGradient
 from ballfg.learning.learnables import Learnables, NoiseScales
 from ballfg.learning.linear import ConjugateGradients, NotAMinimum
@@ -383,9 +383,13 @@ def test_a_gradient_that_is_not_a_number_leaves_its_track_out(monkeypatch) -> No
 
 def test_groups_and_bounds() -> None:
     learner = trainee()
-    groups = {g["name"]: (g["scale"], len(g["params"])) for g in learner.groups()}
-    assert groups == {"noise.": (10.0, 3), "embedding.": (3.0, 1), "model.": (1.0, 8)}
     model = learner.learnables.model
+    groups = {g["name"]: (g["scale"], len(g["params"])) for g in learner.groups()}
+    coefficients = {
+        f"model.{name}": (COEFFICIENT_STEP * c.sigma, 1) for name, c in model.declared_coefficients().items()
+    }
+    assert len(coefficients) == 8
+    assert groups == {"noise.": (10.0, 3), "embedding.": (3.0, 1)} | coefficients
     with torch.no_grad():
         model.contact.restitution.e.fill_(5.0)
         learner.learnables.noise.spin.fill_(99.0)
@@ -393,7 +397,12 @@ def test_groups_and_bounds() -> None:
     high = model.declared_coefficients()["contact.restitution.e"].high
     assert float(model.contact.restitution.e.detach()) == high
     assert float(learner.learnables.noise.spin.detach()) == 12.0
-    assert {g["name"] for g in trainee(noise=False).groups()} == {"embedding.", "model."}
+    assert {g["name"] for g in trainee(noise=False).groups()} == {"embedding.", *coefficients}
+    assert {g["name"] for g in trainee(model=network(), noise=False).groups()} == {
+        "embedding.",
+        "model.offset",
+        "model.",
+    }
 
 
 def test_the_method_is_the_caller_s() -> None:
