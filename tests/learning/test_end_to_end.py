@@ -398,11 +398,8 @@ def test_groups_and_bounds() -> None:
     assert float(model.contact.restitution.e.detach()) == high
     assert float(learner.learnables.noise.spin.detach()) == 12.0
     assert {g["name"] for g in trainee(noise=False).groups()} == {"embedding.", *coefficients}
-    assert {g["name"] for g in trainee(model=network(), noise=False).groups()} == {
-        "embedding.",
-        "model.offset",
-        "model.",
-    }
+    corrected = {name.replace("model.", "model.base.") for name in coefficients}
+    assert {g["name"] for g in trainee(model=network(), noise=False).groups()} == {"embedding.", "model.", *corrected}
 
 
 def test_the_method_is_the_caller_s() -> None:
