@@ -80,6 +80,7 @@ def build(config: TrainConfig) -> tuple[Trainee, Sequence[int], Sequence[int]]:
         augment=config.augmented,
         anchor=Anchor(model, analytic, config.seed) if config.loss.anchor > 0.0 else None,
         coefficient_step=config.optimizer.coefficient_step,
+        noise_step=config.optimizer.noise_step,
     )
     return trainee, train, validation
 

@@ -37,8 +37,10 @@ SOLUTION_TOLERANCE: Final = 1e-5
 """Relative error of a track's part in the gradient: far below the scatter between batches."""
 COEFFICIENT_STEP: Final = 20.0
 """With a learning rate of 2e-3 a coefficient moves by at most 0.04 standard deviations of its prior in a step."""
-LEARNING_RATE_SCALES: Final = (("noise.", 10.0), ("embedding.", 3.0), ("model.", 1.0))
-"""The noise's logarithms and the embedding's weights, of order one, move faster than a network's weights."""
+NOISE_STEP: Final = 10.0
+"""With a learning rate of 2e-3 a standard deviation changes by at most 2 % in a step."""
+EMBEDDING_STEP: Final = 3.0
+"""The embedding's weights, of order one, move faster than a network's."""
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ class EndToEnd(Trainee):
         optimizer: how tightly estimates are solved.
         anchor: how far the model is from where it started; None if that does not count.
         coefficient_step: scale of the learning rate of declared coefficients, in their prior standard deviations.
+        noise_step: scale of the learning rate of the noise's logarithms.
     """
 
     def __init__(
@@ -85,6 +88,7 @@ class EndToEnd(Trainee):
         optimizer: LevenbergMarquardt = TRAINING,
         anchor: Anchor | None = None,
         coefficient_step: float = COEFFICIENT_STEP,
+        noise_step: float = NOISE_STEP,
     ) -> None:
         self.module = learnables
         self.learnables = learnables
@@ -96,6 +100,7 @@ class EndToEnd(Trainee):
         self.augment = augment
         self.anchor = anchor
         self.coefficient_step = coefficient_step
+        self.noise_step = noise_step
         scale = None if loss.position_scale is None else loss.position_scale / LOSS_UNIT
         self.point_loss = Loss() if scale is None else Loss("huber", scale)
 
@@ -103,7 +108,8 @@ class EndToEnd(Trainee):
         """Noise, embedding, coefficients and the rest of the model, each with its scale on the learning rate."""
         declared = self.learnables.model.declared_coefficients()
         own = tuple((f"model.{name}", self.coefficient_step * c.sigma) for name, c in declared.items())
-        return self.learnables.groups((*own, *LEARNING_RATE_SCALES))
+        rest = (("noise.", self.noise_step), ("embedding.", EMBEDDING_STEP), ("model.", 1.0))
+        return self.learnables.groups((*own, *rest))
 
     def after_step(self) -> None:
         """Put coefficients and noise back into their bounds."""

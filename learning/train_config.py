@@ -178,6 +178,9 @@ class OptimizerConfig(Section):
     warm_start_epochs: Annotated[int, Field(ge=0)] = 0
     """Epochs over which the learning rate rises linearly to its full value."""
 
+    noise_step: Positive = 10.0
+    """Scale of the learning rate for the logarithms of learned noise."""
+
     coefficient_step: Positive = 20.0
     """Scale of the learning rate for declared coefficients, in units of their prior standard deviations: they are as
     different in size as their units. What is as good as known stays."""
