@@ -118,8 +118,8 @@ class EndToEnd(Trainee):
     def loss(self, tracks: Sequence[int], epoch: int) -> BatchLoss:
         """The loss on some tracks; its gradient is ready when this returns.
 
-        `total` is linear in the parameters: its value is the loss, its derivative the loss's. So a track at which no
-        gradient exists is found, and left out, here.
+        `total` is linear in the parameters: its value is the loss, its derivative the loss's; of a likelihood in it
+        that is the derivative by the noise alone. So a track at which no gradient exists is found, and left out, here.
         """
         poses = {n: Pose(*augmentation(self.seed, epoch, n)) for n in tracks} if self.augment else {}
         solved, failed = self.solver(tracks, poses)
