@@ -30,7 +30,7 @@ from ballfg.tracks import Track
 Array = NDArray[np.float64]
 T = TypeVar("T")
 
-OPTIMIZER: Final[dict[str, Any]] = {"learning_rate": 2e-3, "batch": 32, "epochs": 10, "clip": 5.0}
+OPTIMIZER: Final[dict[str, Any]] = {"learning_rate": 2e-3, "batch": 32, "epochs": 20, "clip": 5.0, "noise_step": 40.0}
 """Of all models in the factor graph."""
 SEQUENCE_OPTIMIZERS: Final[dict[str, dict[str, Any]]] = {
     "lstm": {"learning_rate": 3e-3, "batch": 16, "epochs": 150, "warm_start_epochs": 5},
