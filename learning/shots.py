@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,8 +60,7 @@ class Shot:
 
 def part(track: Track, count: int) -> Track:
     """The first samples of a track."""
-    sigmas = None if track.sigmas is None else track.sigmas[:count]
-    return replace(track, times=track.times[:count], positions=track.positions[:count], sigmas=sigmas)
+    return track.until(float(track.times[count - 1]))
 
 
 def shots_of(

@@ -9,6 +9,7 @@ the gradient of u . F is u + sum A_k^T c_k, and its derivative along v collects 
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -34,7 +35,6 @@ class _Work:
 
     Attributes:
         after: (n, 9) the state after the step.
-        jacobians: (4, n, 9, 9) of the rates at the stages.
         parameters: of the model, those that are learned.
     """
 
@@ -44,31 +44,31 @@ class _Work:
         with torch.no_grad():
             self.after, stages = stages_of(model.rates, state, h)
         self._stages = torch.stack(stages)
-        self._jacobians: Tensor | None = None
-        self._traced: tuple[Tensor, Tensor] | None = None
         self._bent: tuple[Tensor, Tensor] | None = None
-        self._curved: tuple[Tensor, Tensor, Tensor, Tensor] | None = None
+        self._curved: tuple[Tensor, tuple[Tensor, Tensor, Tensor, Tensor]] | None = None
         self._heavy = model.parameter_count * self._stages.shape[0] * self._stages.shape[1] > HEAVY
 
-    @property
+    @cached_property
     def jacobians(self) -> Tensor:
-        if self._jacobians is None:
-            self._jacobians = rate_jacobian(self.rates, self._stages, heavy=self._heavy)
-            self._transposed = self._jacobians.mT.contiguous()
-        return self._jacobians
+        """(4, n, 9, 9) of the rates at the stages."""
+        return rate_jacobian(self.rates, self._stages, heavy=self._heavy)
 
+    @cached_property
+    def transposed(self) -> Tensor:
+        """(4, n, 9, 9) `jacobians`, each transposed."""
+        return self.jacobians.mT.contiguous()
+
+    @cached_property
     def traced(self) -> tuple[Tensor, Tensor]:
         """The stages (4, n, 9) as a leaf and the derivatives there, with a graph."""
-        if self._traced is None:
-            leaf = self._stages.clone().requires_grad_(True)
-            with torch.enable_grad():
-                self._traced = leaf, derivative(self.rates, leaf)
-        return self._traced
+        leaf = self._stages.clone().requires_grad_(True)
+        with torch.enable_grad():
+            return leaf, derivative(self.rates, leaf)
 
     def bent(self, cotangents: Tensor, upstream: Tensor) -> Tensor:
         """(4, n, 9) sum_k A_k^T c_k stage by stage, with a graph; kept for the `upstream` that the c_k belong to."""
         if self._bent is None or self._bent[0] is not upstream:
-            leaf, rates = self.traced()
+            leaf, rates = self.traced
             with torch.enable_grad():
                 (gradient,) = torch.autograd.grad(rates, leaf, cotangents, create_graph=True)
             self._bent = upstream, gradient
@@ -89,8 +89,7 @@ class _Work:
 
         Args: u: (n, 9) that one; None for zero.  pulled: (4, n, 9) what acts on the stages besides; None for nothing.
         """
-        assert self.jacobians is not None
-        a, h, half = self._transposed, self.h, self.h / 2
+        a, h, half = self.transposed, self.h, self.h / 2
         zero = torch.zeros_like(self.after)
         sixth = zero if u is None else h / 6 * u
         third = sixth if u is None else 2.0 * sixth
@@ -109,17 +108,17 @@ class _Work:
         total = back(0, c1) + x2 + x3 + x4
         return torch.stack((c1, c2, c3, c4)), total if u is None else u + total
 
-    def curved(self, cotangents: Tensor, upstream: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Derivatives along v (n, 9): tangents of the stages, cotangents' change, that of the state's gradient.
+    def curved(self, cotangents: Tensor, upstream: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Along v (n, 9): tangents of the stages, of the state after; change of the cotangents, of the gradient.
 
         Kept for the last v: two nodes of the graph ask for the same.
         """
         kept = self._curved
         if kept is None or kept[0].data_ptr() != v.data_ptr() or self._bent is None or self._bent[0] is not upstream:
-            tangents, _ = self.tangents(v)
+            tangents, after = self.tangents(v)
             moved, gradient = self.cotangents(None, _bend(self, cotangents, upstream, tangents))
-            self._curved = kept = (v, tangents, moved, gradient)
-        return kept[1:]
+            self._curved = kept = (v, (tangents, after, moved, gradient))
+        return kept[1]
 
 
 def _times(matrix: Tensor, vector: Tensor) -> Tensor:
@@ -159,9 +158,8 @@ class _StepByParameters(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor | None, ...]:
         work: _Work = ctx.work
-        rates = work.traced()[1]
         cotangents, _ = work.cotangents(upstream[0])
-        return None, *_by_parameters(work, [rates], [cotangents])
+        return None, *_by_parameters(work, [work.traced[1]], [cotangents])
 
 
 class _Pull(torch.autograd.Function):
@@ -178,8 +176,8 @@ class _Pull(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *v: Tensor) -> tuple[Tensor | None, ...]:
         work: _Work = ctx.work
-        _, _, gradient = work.curved(ctx.cotangents, ctx.upstream, v[0])
-        return gradient, work.tangents(v[0])[1], None, None, None, None
+        _, after, _, gradient = work.curved(ctx.cotangents, ctx.upstream, v[0])
+        return gradient, after, None, None, None, None
 
 
 class _PullByParameters(torch.autograd.Function):
@@ -194,9 +192,8 @@ class _PullByParameters(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *v: Tensor) -> tuple[Tensor | None, ...]:
         work: _Work = ctx.work
-        cotangents = ctx.cotangents
-        tangents, moved, _ = work.curved(cotangents, ctx.upstream, v[0])
-        outputs = [work.traced()[1], work.bent(cotangents, ctx.upstream)]
+        tangents, _, moved, _ = work.curved(ctx.cotangents, ctx.upstream, v[0])
+        outputs = [work.traced[1], work.bent(ctx.cotangents, ctx.upstream)]
         return None, None, None, *_by_parameters(work, outputs, [moved, tangents])
 
 
@@ -205,7 +202,7 @@ def _bend(work: _Work, cotangents: Tensor, upstream: Tensor, tangents: Tensor) -
     gradient = work.bent(cotangents, upstream)
     if not gradient.requires_grad:  # rates that are linear in the state, with nothing to learn
         return torch.zeros_like(gradient)
-    leaf = work.traced()[0]
+    leaf, _ = work.traced
     (bent,) = torch.autograd.grad(gradient, leaf, tangents, retain_graph=True, allow_unused=True)
     return torch.zeros_like(gradient) if bent is None else bent
 
