@@ -96,15 +96,17 @@ class _Arc:
             nodes.gather(1, index + 1),
             slopes.gather(1, index + 1),
         )
-        return _hermite(theta, *ends)
+        return hermite(theta, MAX_STEP, *ends)
 
 
-def _hermite(theta: Tensor, x0: Tensor, d0: Tensor, x1: Tensor, d1: Tensor) -> Tensor:
+def hermite(theta: Tensor, h: Tensor | float, x0: Tensor, d0: Tensor, x1: Tensor, d1: Tensor) -> Tensor:
     """(..., 9) states within a step: position of degree five, velocity its derivative, everything else of degree three.
 
-    Args: theta: (..., 1) in [0, 1].  x0, d0: (..., 9) state and derivative at the step's start.  x1, d1: at its end.
+    Args:
+        theta: (..., 1) in [0, 1].  h: s, the step, scalar or (..., 1).
+        x0, d0: (..., 9) state and derivative at the step's start.  x1, d1: at its end.
     """
-    h, t2, t3 = MAX_STEP, theta * theta, theta * theta * theta
+    t2, t3 = theta * theta, theta * theta * theta
     t4, t5 = t3 * theta, t3 * t2
     p0, v0, a0 = x0[..., POSITION], d0[..., POSITION], d0[..., VELOCITY]
     p1, v1, a1 = x1[..., POSITION], d1[..., POSITION], d1[..., VELOCITY]

@@ -1,0 +1,260 @@
+"""What a diagnosis says: the verdict, the effects it added with their evidence, errors before and after, what is left."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.dynamics.model import BallModel
+
+Array = NDArray[np.float64]
+
+
+class Verdict(enum.Enum):
+    """The answer to: does the model lack anything?"""
+
+    FOUND = "effect found"
+    NOTHING = "nothing lacking"
+    UNEXPLAINED = "unexplained"
+
+
+@dataclass(frozen=True)
+class Value:
+    """A number with its standard deviation and unit. `declared`: what the model said before, where it said anything."""
+
+    value: float
+    sigma: float
+    unit: str
+    declared: float | None = None
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect that was added to the model.
+
+    Attributes:
+        name, kind, sentence, decide: of the effect: what it is; what to measure to tell it from others.
+        parameters: its coefficients as fitted on the finding half.
+        p_value: of its score test, corrected for the number of candidates tested.
+        delta_bic: BIC of the model with it minus BIC without; negative is better.
+        indistinguishable_from: candidates that would have explained as much.
+        held_out_gain: log likelihood per track that it adds on the judging half, natural units.
+        held_out_p: probability of such a gain there by chance.
+    """
+
+    name: str
+    kind: str
+    sentence: str
+    decide: str
+    parameters: Mapping[str, Value]
+    p_value: float
+    delta_bic: float
+    indistinguishable_from: tuple[str, ...]
+    held_out_gain: float
+    held_out_p: float
+
+
+class Standing(enum.Enum):
+    """What became of a candidate in a round."""
+
+    ADDED = "added"
+    ALIKE = "cannot be told from the one added"
+    WEAKER = "explains less"
+    NOT_HELPFUL = "did not help on the other half"
+    NOT_NEEDED = "not needed"
+    INVISIBLE = "cannot be seen in these data"
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One row of a round's ranking.
+
+    Attributes:
+        name, kind: of the effect.
+        estimate: its coefficients after one step from absent.
+        explained: squared whitened residual that it would explain.
+        p_value: of its score test, corrected for the number of candidates.
+        delta_bic: after a full refit; None where the score did not call for one.
+        standing: what became of it.
+    """
+
+    name: str
+    kind: str
+    estimate: Mapping[str, Value]
+    explained: float
+    p_value: float
+    delta_bic: float | None
+    standing: Standing
+
+
+@dataclass(frozen=True)
+class Errors:
+    """On the judging half: the first 40 % of each track observed, the rest predicted.
+
+    Attributes:
+        prediction_rmse_mm: root mean square distance of predicted from measured positions.
+        apex_rmse_mm: the same for the highest points of flights that begin after the observed part; NaN without any.
+        nis: mean squared whitened prediction error per coordinate; 1 for a calibrated prediction.
+        log_likelihood: mean log density of a measured coordinate under its prediction.
+        by_track: (t,) mm, root mean square distance of each track.
+    """
+
+    prediction_rmse_mm: float
+    apex_rmse_mm: float
+    nis: float
+    log_likelihood: float
+    by_track: Array
+
+
+@dataclass(frozen=True)
+class GenericTest:
+    """A test for a pattern that needs no name.
+
+    Attributes:
+        name: `flight`, `contact`, `measurement` or `time` (whiteness along the tracks).
+        where: in words, on what the pattern depends and how large it is.
+        p_value: probability of such a pattern by chance.
+        share: part of what was there at the start that this pattern would still explain.
+    """
+
+    name: str
+    where: str
+    p_value: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Fallback:
+    """What explains the rest without naming it.
+
+    Attributes:
+        kind: `sparse terms` or `learned residual`.
+        description: the terms, or the network.
+        after: errors on the judging half with it.
+        model: the model with it.
+    """
+
+    kind: str
+    description: str
+    after: Errors
+    model: BallModel
+
+
+@dataclass(frozen=True)
+class Unexplained:
+    """What is left at the end.
+
+    Attributes:
+        where: one sentence; empty where nothing is left.
+        share_of_residual: of the pattern that was there at the start, 0 to 1.
+        tests: all generic tests at the end.
+        fallback: None where none was needed or none helped.
+    """
+
+    where: str
+    share_of_residual: float
+    tests: tuple[GenericTest, ...]
+    fallback: Fallback | None
+
+
+@dataclass(frozen=True)
+class FlightResiduals:
+    """Accelerations that the fit would have to invent in flight, one a bin of time of each stretch.
+
+    Attributes:
+        stretch: (m,) number of the stretch.  times: (m,) s since its first sample.
+        states: (m, 9) there.  acceleration: (m, 3) m/s^2.  covariance: (m, 3, 3).
+    """
+
+    stretch: NDArray[np.int64]
+    times: Array
+    states: Array
+    acceleration: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class ContactResiduals:
+    """Outgoing minus predicted motion at each contact.
+
+    Attributes:
+        stretch: (m,).  number: (m,) of the contact in its stretch.  times: (m,) s.
+        incoming: (m, 9) state before it.
+        velocity: (m, 3) m/s.  spin: (m, 3) rad/s.  covariance: (m, 6, 6) of both.
+    """
+
+    stretch: NDArray[np.int64]
+    number: NDArray[np.int64]
+    times: Array
+    incoming: Array
+    velocity: Array
+    spin: Array
+    covariance: Array
+
+
+@dataclass(frozen=True)
+class MeasurementResiduals:
+    """Measured minus fitted positions.
+
+    Attributes:
+        stretch: (m,).  times: (m,) s since the stretch's first sample.
+        states: (m, 9) there.  since_contact: (m,) s since the last contact, NaN before the first one.
+        position: (m, 3) m.  sigma: (m, 3) m, noise.
+    """
+
+    stretch: NDArray[np.int64]
+    times: Array
+    states: Array
+    since_contact: Array
+    position: Array
+    sigma: Array
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """What a fit leaves, in three kinds; `names` (n,) of the track of each stretch."""
+
+    names: tuple[str, ...]
+    flight: FlightResiduals
+    contact: ContactResiduals
+    measurement: MeasurementResiduals
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """The whole answer.
+
+    Attributes:
+        verdict, sentence: the answer, and the same in one sentence with numbers.
+        findings: effects in the order added.
+        rounds: the ranking of all candidates in each round, best first.
+        before, after: errors on the judging half with the declared model as calibrated, and with the corrected one.
+        tracks_found_on, tracks_judged_on: sizes of the halves.
+        calibrated: declared coefficients as fitted with the corrected model.
+        noise: position noise along x, y, z as estimated (m), and as stated.
+        unexplained: what is left.
+        model: the corrected model.
+        residuals_before, residuals_after: on the finding half.
+        excluded: sentences on tracks that had no part and why.
+    """
+
+    dataset: str
+    verdict: Verdict
+    sentence: str
+    findings: tuple[Finding, ...]
+    rounds: tuple[tuple[Candidate, ...], ...]
+    before: Errors
+    after: Errors
+    tracks_found_on: int
+    tracks_judged_on: int
+    calibrated: Mapping[str, Value]
+    noise: Mapping[str, Value]
+    unexplained: Unexplained
+    model: BallModel
+    residuals_before: Residuals
+    residuals_after: Residuals
+    excluded: tuple[str, ...] = field(default=())

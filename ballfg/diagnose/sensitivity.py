@@ -1,0 +1,142 @@
+"""What a model says each sample should be, and how that changes with first states and coefficients.
+
+Derivatives are torch's forward mode: the batch is repeated once per direction, with a dual number in that direction.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import torch.autograd.forward_ad as forward
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ballfg.diagnose.shooting import Trajectories, shoot
+from ballfg.diagnose.stretches import Stretches
+from ballfg.dynamics.model import BallModel, substitute
+from ballfg.state import SPIN, STATE_DIM
+
+MOST_ROWS = 3000
+"""Rows of one forward pass: more are cut into several; memory is some 50 kB a row."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """What should have been measured, for n stretches of k samples.
+
+    Attributes:
+        positions: (n, k, 3) m.
+        labels: (n, 3) rad/s.
+        contacts: (n, c) s, when each contact happens; NaN where there is none.
+    """
+
+    positions: Array
+    labels: Array
+    contacts: Array
+
+
+@dataclass(frozen=True)
+class Sensitivity:
+    """Derivatives of `Predicted` by d directions: positions (n, k, 3, d), labels (n, 3, d)."""
+
+    positions: Array
+    labels: Array
+
+
+def predict(model: BallModel, stretches: Stretches, starts: Array, values: Mapping[str, float]) -> Predicted:
+    """What a model says, with some of its coefficients replaced.
+
+    Args:
+        model: the ball.  stretches: stamps and contacts.
+        starts: (n, 9) states at the first samples.
+        values: coefficients by name as in `model.named_parameters()`.
+    """
+    with torch.no_grad():
+        columns = {name: torch.full((len(stretches), 1), value, dtype=torch.float64) for name, value in values.items()}
+        positions, labels, motion = _measured(substitute(model, columns), stretches, torch.from_numpy(starts))
+    return Predicted(positions.numpy(), labels.numpy(), motion.contacts.numpy())
+
+
+def sensitivity(
+    model: BallModel,
+    stretches: Stretches,
+    starts: Array,
+    values: Mapping[str, float],
+    names: Sequence[str],
+    *,
+    by_start: bool = True,
+) -> Sensitivity:
+    """Derivatives by the nine components of the first state (unless not `by_start`), then by the named coefficients.
+
+    Args:
+        names: coefficients among `values`.
+        Others as for `predict`.
+    """
+    directions = (STATE_DIM if by_start else 0) + len(names)
+    size = max(1, MOST_ROWS // len(stretches))
+    parts = [
+        _directions(model, stretches, starts, values, names, by_start, range(first, min(first + size, directions)))
+        for first in range(0, directions, size)
+    ]
+    return Sensitivity(
+        np.concatenate([p.positions for p in parts], axis=-1), np.concatenate([p.labels for p in parts], axis=-1)
+    )
+
+
+def _directions(
+    model: BallModel,
+    stretches: Stretches,
+    starts: Array,
+    values: Mapping[str, float],
+    names: Sequence[str],
+    by_start: bool,
+    wanted: range,
+) -> Sensitivity:
+    n, d = len(stretches), len(wanted)
+    repeated = stretches.take(np.tile(np.arange(n), d))
+    offset = STATE_DIM if by_start else 0
+    state = torch.from_numpy(np.tile(starts, (d, 1)))
+    state_tangent = torch.zeros_like(state)
+    tangents = {name: torch.zeros(n * d, 1, dtype=torch.float64) for name in values}
+    for block, direction in enumerate(wanted):
+        rows = slice(block * n, (block + 1) * n)
+        if direction < offset:
+            state_tangent[rows, direction] = 1.0
+        else:
+            tangents[names[direction - offset]][rows] = 1.0
+    with forward.dual_level():
+        columns = {
+            name: forward.make_dual(torch.full((n * d, 1), value, dtype=torch.float64), tangents[name])
+            for name, value in values.items()
+        }
+        dual = forward.make_dual(state, state_tangent)
+        positions, labels, _ = _measured(substitute(model, columns), repeated, dual)
+        moved, relabelled = _tangent(positions), _tangent(labels)
+    k = positions.shape[1]
+    return Sensitivity(
+        np.moveaxis(moved.numpy().reshape(d, n, k, 3), 0, -1), np.moveaxis(relabelled.numpy().reshape(d, n, 3), 0, -1)
+    )
+
+
+def _tangent(dual: Tensor) -> Tensor:
+    tangent = forward.unpack_dual(dual).tangent
+    return torch.zeros_like(dual) if tangent is None else tangent
+
+
+def _measured(model: BallModel, stretches: Stretches, starts: Tensor) -> tuple[Tensor, Tensor, Trajectories]:
+    """Positions (r, k, 3) and labels (r, 3) as they are measured, and the motion behind them."""
+    # stamps run along the first axis: a coefficient of shape (r, 1) then goes with (k, r, 1)
+    times = model.true_stamps(stretches.times.T.unsqueeze(-1)).squeeze(-1)
+    motion = shoot(model, starts, stretches.heights, stretches.contacts, stretches.ends)
+
+    def later(delay: Tensor | float) -> Tensor:
+        shift = delay.squeeze(-1) if isinstance(delay, Tensor) and delay.dim() else delay
+        return motion.states(times + shift)
+
+    positions = model.measured(motion.states(times), later)
+    return positions.transpose(0, 1), model.labelled(starts[:, SPIN]), motion
