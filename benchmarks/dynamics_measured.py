@@ -8,12 +8,12 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.benchmarks.apex import measured_apexes
 from ballfg.benchmarks.dynamics_task import Shot, Task
 from ballfg.benchmarks.measured import HORIZON, OBSERVE
 from ballfg.cli.progress import progress
 from ballfg.dynamics import nominal_model
 from ballfg.estimate import Estimate, Smoother, dataset_settings, dataset_surfaces, estimate_tracks
+from ballfg.predict.apexes import measured_apexes
 from ballfg.tracks import Dataset, Track
 
 LEAST_OBSERVED: Final = 10

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.benchmarks.apex import FLIGHTS, flight_bounds, path_apex
 from ballfg.benchmarks.dynamics_task import Shot
 from ballfg.benchmarks.metrics import square_norms
+from ballfg.predict.apexes import FLIGHTS, flight_bounds, path_apex
 
 Array = NDArray[np.float64]
 

@@ -26,12 +26,12 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ballfg.benchmarks.apex import true_apexes
 from ballfg.benchmarks.dynamics_task import Shot, Task
 from ballfg.benchmarks.synthetic import gaussian_settings
 from ballfg.dynamics import BallModel, Surfaces, contact_time
 from ballfg.estimate import LauncherSpin
 from ballfg.factors.noise import ProcessNoise
+from ballfg.predict.apexes import true_apexes
 from ballfg.simulate import (
     MeasurementNoise,
     SimulatedTrack,

@@ -18,7 +18,8 @@ from ballfg.diagnose.stretches import Stretches
 from ballfg.diagnose.system import System
 from ballfg.dynamics.effect import Coefficient
 from ballfg.dynamics.model import BallModel
-from ballfg.state import SPIN, STATE_DIM
+from ballfg.dynamics.spin_embedding import SOFT_SPEED
+from ballfg.state import SPIN, STATE_DIM, VELOCITY
 
 Array = NDArray[np.float64]
 
@@ -26,8 +27,8 @@ HUBER = 3.0
 """Norm of a whitened position residual (three coordinates) beyond which a sample counts less."""
 LABEL_CAUCHY = 3.0
 """Scale of the robust weight of a spin label, in its standard deviations: labels were seen to contradict the flight."""
-GROUP_SPIN_SIGMA = 150.0
-"""rad/s, prior of the mean spin of a launcher group, per axis, about zero."""
+LAUNCHER_SPIN_SIGMA = 150.0
+"""rad/s, prior of the spin that a launcher setting of typical size means, per axis, about zero."""
 MOST_STEPS = 25
 """Gauss-Newton steps of one minimisation."""
 SCALE_ROUNDS = 3
@@ -35,8 +36,6 @@ SCALE_ROUNDS = 3
 TOLERANCE = 1e-5
 """A minimisation ends when the objective falls by less than this share and this number."""
 FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e6
-LEAST_GROUP = 3
-"""Tracks that a launcher group must have to get a mean spin of its own."""
 
 
 @dataclass(frozen=True)
@@ -46,12 +45,12 @@ class Unknowns:
     Attributes:
         starts: (n, 9) first states.
         values: coefficients by parameter name.
-        spins: (g, 3) rad/s, mean spin of each launcher group.
+        launcher: (s, 3) rad/s per unit of each launcher setting: spin about forward, across and up.
     """
 
     starts: Array
     values: dict[str, float]
-    spins: Array
+    launcher: Array
 
 
 @dataclass(frozen=True)
@@ -71,11 +70,14 @@ class Problem:
         model: with every effect that has a coefficient among `free`.
         stretches: the data.
         free: declared coefficients to estimate, by parameter name, with their priors.
+        shared: whether what all stretches share is estimated; else only first states are, as when a fit is judged on
+            other tracks.
     """
 
     model: BallModel
     stretches: Stretches
     free: Mapping[str, Coefficient]
+    shared: bool = True
 
     @property
     def centres(self) -> Array:
@@ -85,8 +87,14 @@ class Problem:
 
     @property
     def precisions(self) -> Array:
-        """(q,) of the priors."""
+        """(q,) of the priors of coefficients."""
         return np.array([c.sigma**-2 for c in self.free.values()])
+
+    @property
+    def launcher_precision(self) -> Array:
+        """(s,) of the priors of launcher settings, each for all three axes."""
+        typical = (self.stretches.settings**2).mean(axis=0)
+        return np.asarray(np.where(typical > 0.0, typical, 1.0) / LAUNCHER_SPIN_SIGMA**2)
 
 
 @dataclass(frozen=True)
@@ -117,55 +125,85 @@ class Fit:
     @property
     def whitened(self) -> Array:
         """(n, k, 3) position residuals over their noise; zero where there is no sample."""
-        return np.asarray((self.problem.stretches.positions.numpy() - self.predicted.positions) / self.sigmas)
+        return whitened_positions(self.problem, self.noise, self.predicted)
+
+    @property
+    def robust(self) -> Robust:
+        """Weights and losses at the minimum."""
+        return robust(self.problem, self.unknowns, self.noise, self.predicted)
 
 
-def whitened_spins(problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Predicted) -> tuple[Array, Array]:
-    """(n, 3) whitened residual of each spin against its label or its group's mean, and (n,) whether it has a label."""
-    labels = problem.stretches.labels.numpy()
-    labelled = ~np.isnan(labels[:, 0])
-    group = problem.stretches.group
-    mean = np.where(group[:, None] >= 0, unknowns.spins[group], 0.0) if len(unknowns.spins) else 0.0
+def launch_axes(starts: Array) -> Array:
+    """(n, 3, 3) columns forward (horizontally), across (z x forward) and up of launches (n, 9)."""
+    x, y = starts[:, VELOCITY.start], starts[:, VELOCITY.start + 1]
+    length = np.sqrt(x**2 + y**2 + SOFT_SPEED**2)
+    x, y, zero = x / length, y / length, np.zeros_like(x)
+    return np.stack(
+        (np.stack((x, y, zero), -1), np.stack((-y, x, zero), -1), np.stack((zero, zero, zero + 1.0), -1)), axis=-1
+    )
+
+
+def whitened_spins(problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Predicted) -> Array:
+    """(n, 3) whitened residual of each spin against its label, or where there is none against its launcher."""
+    labels, labelled = problem.stretches.labels.numpy(), problem.stretches.labelled
+    local = problem.stretches.settings @ unknowns.launcher
+    mean = (launch_axes(unknowns.starts) @ local[..., None])[..., 0]
     unlabelled = (mean - unknowns.starts[:, SPIN]) / noise.spin
     with np.errstate(invalid="ignore"):
         about = (labels - predicted.labels) / noise.label
-    return np.where(labelled[:, None], about, unlabelled), labelled
+    return np.where(labelled[:, None], about, unlabelled)
 
 
-def robust(whitened: Array, spins: Array, labelled: NDArray[np.bool_]) -> tuple[Array, Array, float]:
-    """Weights (n, k) of samples, (n,) of spins, and the sum of the losses."""
-    length = np.linalg.norm(whitened, axis=-1)
+@dataclass(frozen=True)
+class Robust:
+    """Robust weights of samples (n, k) and of spins (n,), and the losses (n,) of stretches."""
+
+    samples: Array
+    spins: Array
+    losses: Array
+
+
+def robust(problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Predicted) -> Robust:
+    """Huber's weights for positions, Cauchy's for labels, at some unknowns."""
+    length = np.linalg.norm(whitened_positions(problem, noise, predicted), axis=-1)
     weight = np.minimum(1.0, HUBER / np.maximum(length, HUBER))
     loss = np.where(length <= HUBER, 0.5 * length**2, HUBER * length - 0.5 * HUBER**2)
+    spins, labelled = whitened_spins(problem, unknowns, noise, predicted), problem.stretches.labelled
     square = (spins**2).sum(axis=-1)
     spin_weight = np.where(labelled, 1.0 / (1.0 + square / LABEL_CAUCHY**2), 1.0)
     spin_loss = np.where(labelled, 0.5 * LABEL_CAUCHY**2 * np.log1p(square / LABEL_CAUCHY**2), 0.5 * square)
-    return weight, spin_weight, float(loss.sum() + spin_loss.sum())
+    return Robust(weight, spin_weight, loss.sum(axis=-1) + spin_loss)
+
+
+def whitened_positions(problem: Problem, noise: Noise, predicted: Predicted) -> Array:
+    """(n, k, 3) measured minus predicted over the noise; zero where there is no sample."""
+    sigma = problem.stretches.sigmas.numpy() * noise.position
+    return np.asarray((problem.stretches.positions.numpy() - predicted.positions) / sigma)
 
 
 def assemble(
     problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Predicted, derivative: Sensitivity
 ) -> System:
-    """The whitened, robustly weighted rows; common columns are coefficients, then group spins."""
+    """The whitened, robustly weighted rows; common columns are coefficients, then launcher settings."""
     stretches = problem.stretches
     n, k = stretches.times.shape
     sigma = stretches.sigmas.numpy() * noise.position
-    whitened = (stretches.positions.numpy() - predicted.positions) / sigma
-    spins, labelled = whitened_spins(problem, unknowns, noise, predicted)
-    weight, spin_weight, _ = robust(whitened, spins, labelled)
-    root, spin_root = np.sqrt(weight)[..., None], np.sqrt(spin_weight)[:, None]
-    q, g = derivative.positions.shape[-1] - STATE_DIM, len(unknowns.spins)
+    whitened = whitened_positions(problem, noise, predicted)
+    spins, labelled = whitened_spins(problem, unknowns, noise, predicted), stretches.labelled
+    weights = robust(problem, unknowns, noise, predicted)
+    root, spin_root = np.sqrt(weights.samples)[..., None], np.sqrt(weights.spins)[:, None]
+    q = derivative.positions.shape[-1] - STATE_DIM
     rows = (derivative.positions * (root / sigma)[..., None]).reshape(n, 3 * k, -1)
     spin_rows = np.zeros((n, 3, STATE_DIM + q))
     spin_rows[:, range(3), range(SPIN.start, SPIN.stop)] = 1.0 / noise.spin
     by_label = derivative.labels / noise.label
     spin_rows = np.where(labelled[:, None, None], by_label, spin_rows) * spin_root[..., None]
-    by_group = np.zeros((n, 3 * k + 3, 3 * g))
-    for i in np.flatnonzero(~labelled & (stretches.group >= 0)) if g else ():
-        by_group[i, 3 * k + np.arange(3), 3 * stretches.group[i] + np.arange(3)] = -1.0 / noise.spin
+    by_launcher = np.zeros((n, 3 * k + 3, unknowns.launcher.size))
+    towards = -launch_axes(unknowns.starts)[:, :, None, :] * stretches.settings[:, None, :, None] / noise.spin
+    by_launcher[:, 3 * k :] = np.where(labelled[:, None, None], 0.0, towards.reshape(n, 3, -1))
     both = np.concatenate((rows, spin_rows), axis=1)
     residual = np.concatenate(((whitened * root).reshape(n, -1), spins * spin_root), axis=1)
-    return System(residual, both[..., :STATE_DIM], np.concatenate((both[..., STATE_DIM:], by_group), axis=-1))
+    return System(residual, both[..., :STATE_DIM], np.concatenate((both[..., STATE_DIM:], by_launcher), axis=-1))
 
 
 def linearise(problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Predicted) -> System:
@@ -178,9 +216,8 @@ def linearise(problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Pre
 
 def start_from(problem: Problem, label_noise: float, spin_prior: float) -> tuple[Unknowns, Noise]:
     """Where a fit starts that knows nothing better."""
-    groups = int(problem.stretches.group.max(initial=-1)) + 1
     values = dict(zip(problem.free, problem.centres.tolist(), strict=True))
-    unknowns = Unknowns(problem.stretches.starts.numpy().copy(), values, np.zeros((groups, 3)))
+    unknowns = Unknowns(problem.stretches.starts.numpy().copy(), values, np.zeros((problem.stretches.settings.shape[1], 3)))
     return unknowns, Noise(label=label_noise, spin=spin_prior)
 
 
@@ -199,14 +236,10 @@ def fit(problem: Problem, unknowns: Unknowns, noise: Noise, *, settle_noise: boo
 
 def objective(problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Predicted) -> float:
     """Half the robust sum of squares, priors included; infinite where a stretch misses a contact."""
-    whitened = (problem.stretches.positions.numpy() - predicted.positions) / (
-        problem.stretches.sigmas.numpy() * noise.position
-    )
-    spins, labelled = whitened_spins(problem, unknowns, noise, predicted)
-    cost = robust(whitened, spins, labelled)[2]
+    cost = float(robust(problem, unknowns, noise, predicted).losses.sum())
     values = np.array([unknowns.values[name] for name in problem.free])
     cost += 0.5 * float((problem.precisions * (values - problem.centres) ** 2).sum())
-    cost += 0.5 * float((unknowns.spins**2).sum()) / GROUP_SPIN_SIGMA**2
+    cost += 0.5 * float((problem.launcher_precision[:, None] * unknowns.launcher**2).sum())
     return cost if np.isfinite(cost) else np.inf
 
 
@@ -233,19 +266,24 @@ def _minimise(problem: Problem, unknowns: Unknowns, noise: Noise, steps: int) ->
     return Fit(problem, unknowns, noise, predicted, cost, steps)
 
 
+def common_precision(problem: Problem) -> Array:
+    """(q + 3 s,) precisions of the priors of all common columns."""
+    return np.concatenate((problem.precisions, np.repeat(problem.launcher_precision, 3)))
+
+
 def _moved(problem: Problem, unknowns: Unknowns, system: System, damping: float) -> Unknowns:
     """The unknowns after a damped Gauss-Newton step; coefficients stay within their bounds."""
-    q, g = len(problem.free), len(unknowns.spins)
+    q = len(problem.free)
     values = np.array([unknowns.values[name] for name in problem.free])
-    precision = np.concatenate((problem.precisions, np.full(3 * g, GROUP_SPIN_SIGMA**-2)))
-    pull = precision * np.concatenate((problem.centres - values, -unknowns.spins.ravel()))
+    precision = common_precision(problem)
+    pull = precision * np.concatenate((problem.centres - values, -unknowns.launcher.ravel()))
     eliminated = system.eliminated(damping)
-    step = eliminated.common_step(precision, pull, damping) if q + 3 * g else np.zeros(0)
+    step = eliminated.common_step(precision, pull, damping) if problem.shared else np.zeros_like(pull)
     low = np.array([c.low for c in problem.free.values()])
     high = np.array([c.high for c in problem.free.values()])
     moved = np.clip(values + step[:q], low, high)
     starts = unknowns.starts + eliminated.start_step(np.concatenate((moved - values, step[q:])))
-    return Unknowns(starts, dict(zip(problem.free, moved.tolist(), strict=True)), unknowns.spins + step[q:].reshape(g, 3))
+    return Unknowns(starts, dict(zip(problem.free, moved.tolist(), strict=True)), unknowns.launcher + step[q:].reshape(-1, 3))
 
 
 def _with_contacts(stretches: Stretches, predicted: Predicted) -> Stretches:

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 PRIOR_TRACKS = 10.0
 """Tracks that the pooled scatter is worth beside an effect's own: with few tracks an own covariance is too uncertain."""
-LEAST_SHARE = 1e-9
+LEAST_SHARE = 1e-8
 """Share of a column's length that must survive projection: less is rounding, and the effect cannot be seen at all."""
 
 
@@ -45,20 +45,14 @@ class Signatures:
 
     def efficient(self) -> Efficient:
         """Scores and information of the candidates with the common columns projected out too."""
-        q, total = self.common, self.gram.sum(axis=0)
-        share = np.zeros((q, total.shape[0] - q))
-        if q:
-            share = np.linalg.solve(total[:q, :q] + np.diag(self.precision), total[:q, q:-1])
-        else:
-            share = share[:, :-1]
-        share = share[:, : total.shape[0] - q - 1]
-        g = self.gram
-        score = g[:, q:-1, -1] - g[:, :q, -1] @ share
+        q, g = self.common, self.gram
+        total = g.sum(axis=0)
+        share = np.linalg.solve(total[:q, :q] + np.diag(self.precision), total[:q, q:-1])
         cross = g[:, q:-1, :q] @ share
-        own = g[:, q:-1, q:-1] - cross - cross.swapaxes(-1, -2) + share.T @ g[:, :q, :q] @ share
+        information = g[:, q:-1, q:-1] - cross - cross.swapaxes(-1, -2) + share.T @ g[:, :q, :q] @ share
         prior = share.T @ (self.precision[:, None] * share)
-        raw = np.diagonal(total)[q:-1]
-        return Efficient(score, np.asarray(own), prior, raw)
+        score = g[:, q:-1, -1] - g[:, :q, -1] @ share
+        return Efficient(score, np.asarray(information), np.asarray(prior), np.diagonal(total)[q:-1])
 
 
 @dataclass(frozen=True)
@@ -76,54 +70,68 @@ class Efficient:
     prior: Array
     raw: Array
 
-    def total(self) -> Array:
-        """(p, p) information over all tracks."""
-        return np.asarray(self.information.sum(axis=0) + self.prior)
-
-    def dispersion(self, columns: Sequence[Sequence[int]]) -> float:
+    def dispersion(self, candidates: Sequence[Sequence[int]]) -> float:
         """How much more the tracks' scores scatter than the noise says, pooled over candidates; at least 1."""
-        ratios = []
-        for chosen in columns:
-            result = self._wald(chosen)
-            if result is not None:
-                _, information, scatter = result
-                ratios.append(float(np.trace(np.linalg.solve(information, scatter))) / len(chosen))
+        seen = [visible for chosen in candidates if (visible := self._visible(chosen)) is not None]
+        ratios = [float(np.trace(np.linalg.solve(v.information, v.scatter))) / len(v.estimate) for v in seen]
         return max(1.0, float(np.median(ratios))) if ratios else 1.0
 
     def test(self, chosen: Sequence[int], dispersion: float) -> Score | None:
-        """The test of one candidate's columns; None where the data do not show it at all."""
-        result = self._wald(chosen)
-        if result is None:
+        """The test of one candidate's columns; None where the data do not show it at all.
+
+        Args: chosen: its columns.  dispersion: from `dispersion`, of all candidates.
+        """
+        visible = self._visible(chosen)
+        if visible is None:
             return None
-        estimate, information, scatter = result
-        tracks, p = len(self.score), len(chosen)
-        covariance = (tracks * scatter + PRIOR_TRACKS * dispersion * information) / (tracks + PRIOR_TRACKS)
-        pull = information @ estimate
+        tracks, p = len(self.score), len(visible.estimate)
+        covariance = tracks * visible.scatter + PRIOR_TRACKS * dispersion * visible.information
+        covariance /= tracks + PRIOR_TRACKS
+        pull = visible.information @ visible.estimate
         wald = float(pull @ np.linalg.solve(covariance, pull))
-        p_value = float(stats.f.sf(wald / p, p, tracks + PRIOR_TRACKS - p - 1))
-        inverse = np.linalg.inv(information)
+        inverse = np.linalg.inv(visible.information)
+        spread = visible.directions @ inverse @ covariance @ inverse @ visible.directions.T
         return Score(
-            estimate,
-            np.sqrt(np.diagonal(inverse @ covariance @ inverse)),
-            float(estimate @ information @ estimate),
-            p_value,
+            visible.directions @ visible.estimate,
+            np.sqrt(np.diagonal(spread)),
+            float(visible.estimate @ pull),
+            float(stats.f.sf(wald / p, p, tracks + PRIOR_TRACKS - p - 1)),
+            p,
         )
 
-    def _wald(self, chosen: Sequence[int]) -> tuple[Array, Array, Array] | None:
-        """One-step estimate (p,), its information (p, p), scatter (p, p) of the scores that the estimate leaves."""
+    def _visible(self, chosen: Sequence[int]) -> _Visible | None:
+        """What the data show of some columns, along the directions that projection leaves."""
         index = np.array(chosen)
-        information = self.total()[np.ix_(index, index)]
-        length = np.sqrt(self.raw[index])
-        if not (length > 0).all():
+        if not (self.raw[index] > 0.0).any():
             return None
-        scaled = information / np.outer(length, length)
-        if np.linalg.eigvalsh(scaled)[0] < LEAST_SHARE:
+        length = np.sqrt(np.maximum(self.raw[index], LEAST_SHARE * self.raw[index].max()))
+        total = self.information.sum(axis=0)[np.ix_(index, index)] + self.prior[np.ix_(index, index)]
+        value, vector = np.linalg.eigh(total / np.outer(length, length))
+        if not (kept := value > LEAST_SHARE).any():
             return None
-        estimate = np.linalg.solve(information, self.score[:, index].sum(axis=0))
-        left = self.score[:, index] - self.information[:, index[:, None], index] @ estimate
+        directions = vector[:, kept] / length[:, None]
+        information = directions.T @ total @ directions
+        score = self.score[:, index] @ directions
+        estimate = np.linalg.solve(information, score.sum(axis=0))
+        left = score - (directions.T @ self.information[:, index[:, None], index] @ directions) @ estimate
         left = left - left.mean(axis=0)
         scatter = left.T @ left * len(left) / max(1, len(left) - 1)
-        return estimate, information, np.asarray(scatter)
+        return _Visible(directions, estimate, information, scatter)
+
+
+@dataclass(frozen=True)
+class _Visible:
+    """A candidate in the r directions in which it can be seen.
+
+    Attributes:
+        directions: (p, r).  estimate: (r,) one step from absent.  information: (r, r).
+        scatter: (r, r) of the tracks' scores that the estimate leaves.
+    """
+
+    directions: Array
+    estimate: Array
+    information: Array
+    scatter: Array
 
 
 @dataclass(frozen=True)
@@ -135,9 +143,11 @@ class Score:
         sigma: (p,) their standard deviations.
         explained: squared whitened residual that the effect would explain: chi-square with p degrees under no effect.
         p_value: probability of so much by chance.
+        rank: number of directions in which the data show the coefficients.
     """
 
     estimate: Array
     sigma: Array
     explained: float
     p_value: float
+    rank: int

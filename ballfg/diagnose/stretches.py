@@ -7,7 +7,7 @@ model claims; what the samples hold beyond it is noise or something that the mod
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ballfg.estimate.batch import map_tracks
+from ballfg.estimate.launcher import Launcher
 from ballfg.estimate.problem import effective_sigmas
 from ballfg.estimate.segmentation import Contact
 from ballfg.estimate.smoother import Smoother
@@ -38,7 +39,7 @@ class Stretches:
     Attributes:
         names: of the tracks they come from.
         track: (n,) number of the track: stretches of one track count as one observation.
-        group: (n,) number of the launcher group, -1 without one.
+        settings: (n, s) launcher settings, zero where a stretch does not start at the launcher or tells none.
         times: (n, k) s since the stretch's first sample; the last one repeated.
         positions: (n, k, 3) m as measured.
         sigmas: (n, k, 3) m, stated noise; infinite where there is no sample.
@@ -50,7 +51,7 @@ class Stretches:
 
     names: tuple[str, ...]
     track: NDArray[np.int64]
-    group: NDArray[np.int64]
+    settings: Array
     times: Tensor
     positions: Tensor
     sigmas: Tensor
@@ -72,13 +73,18 @@ class Stretches:
         """(n, k) bool, there is a sample."""
         return self.sigmas[..., 0].isfinite()
 
+    @property
+    def labelled(self) -> NDArray[np.bool_]:
+        """(n,) whether each has a spin label."""
+        return np.asarray(~np.isnan(self.labels[:, 0].numpy()))
+
     def take(self, rows: Sequence[int] | NDArray[np.int64] | NDArray[np.bool_]) -> Stretches:
         """Some of the stretches."""
         index = np.arange(len(self))[np.asarray(rows)]
         where = torch.from_numpy(index)
         fields = ("times", "positions", "sigmas", "starts", "heights", "contacts", "labels")
         tensors = {name: getattr(self, name)[where] for name in fields}
-        return Stretches(tuple(self.names[i] for i in index), self.track[index], self.group[index], **tensors)
+        return Stretches(tuple(self.names[i] for i in index), self.track[index], self.settings[index], **tensors)
 
 
 @dataclass(frozen=True)
@@ -87,7 +93,7 @@ class _Stretch:
 
     name: str
     track: int
-    group: str | None
+    settings: Array
     times: Array
     positions: Array
     sigmas: Array
@@ -96,19 +102,20 @@ class _Stretch:
     label: Array | None
 
 
-def stretches_of(smoother: Smoother, tracks: Iterable[Track], jobs: int = 1) -> Stretches:
+def stretches_of(smoother: Smoother, tracks: Iterable[Track], launcher: Launcher, jobs: int = 1) -> Stretches:
     """The stretches of tracks.
 
     Args:
         smoother: finds contacts, hits and outliers, and the states from which the fit starts.
         tracks: as measured.
+        launcher: what the settings of a shot are; its weights do not matter.
         jobs: processes.
     Raises: ValueError: if no track has a stretch that is long enough.
     """
     tracks = list(tracks)
     found = [
         stretch
-        for number, stretches in enumerate(map_tracks(partial(_cut, smoother), tracks, len(tracks), jobs))
+        for number, stretches in enumerate(map_tracks(partial(_cut, smoother, launcher), tracks, len(tracks), jobs))
         for stretch in (replace(s, track=number) for s in stretches)
     ]
     if not found:
@@ -119,7 +126,9 @@ def stretches_of(smoother: Smoother, tracks: Iterable[Track], jobs: int = 1) -> 
     return _padded(found)
 
 
-def _cut(smoother: Smoother, track: Track) -> list[_Stretch]:
+def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[_Stretch]:
+    known = launcher.settings(track)
+    settings = np.zeros(len(launcher.embedding.names)) if known is None else known
     segmentation = smoother.segment(track)
     sigma = effective_sigmas(track, segmentation, smoother.settings)
     solution = smoother.solve(track, segmentation, sigma)
@@ -142,7 +151,7 @@ def _cut(smoother: Smoother, track: Track) -> list[_Stretch]:
             _Stretch(
                 name=track.name,
                 track=0,
-                group=str(track.labels["group"]) if "group" in track.labels and first == 0 else None,
+                settings=settings if usable[0] == 0 else np.zeros_like(settings),
                 times=track.times[usable] - begin,
                 positions=track.positions[usable],
                 sigmas=sigma[usable],
@@ -161,8 +170,6 @@ def _padded(found: Sequence[_Stretch]) -> Stretches:
     sigmas = np.full((n, k, 3), np.inf)
     heights, contacts, labels = np.full((n, c), np.nan), np.full((n, c), np.nan), np.full((n, 3), np.nan)
     starts = np.zeros((n, STATE_DIM))
-    names = sorted({s.group for s in found if s.group is not None})
-    number: Mapping[str | None, int] = {None: -1} | {name: i for i, name in enumerate(names)}
     for i, s in enumerate(found):
         m = len(s.times)
         times[i, :m], times[i, m:] = s.times, s.times[-1]
@@ -176,6 +183,6 @@ def _padded(found: Sequence[_Stretch]) -> Stretches:
     return Stretches(
         tuple(s.name for s in found),
         np.array([s.track for s in found]),
-        np.array([number[s.group] for s in found]),
+        np.stack([s.settings for s in found]),
         *(torch.from_numpy(a) for a in (times, positions, sigmas, starts, heights, contacts, labels)),
     )

@@ -5,9 +5,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.apex import flight_bounds, measured_apexes, path_apex, true_apexes
 from ballfg.benchmarks.dynamics_metrics import apex_errors, pooled_rmse, score_path
 from ballfg.benchmarks.dynamics_task import Shot
+from ballfg.predict.apexes import flight_bounds, measured_apexes, path_apex, true_apexes
 from ballfg.tracks import Track
 
 G = 9.81

@@ -1,0 +1,117 @@
+"""A hypothesis: one effect, in one shape, that the model may lack; and the models that hold it."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import cast
+
+from ballfg.diagnose.scene import Scene, shapes_of
+from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.dynamics.effect import Coefficient, Effect
+
+SECTION = {"flight": "flight", "bounce": "contact", "measurement": "measurement"}
+"""Attribute of the model that holds the effects of a kind."""
+LOOSE = 10.0
+"""By how much the prior of a hypothesis' coefficient is wider than the effect says: the data are to decide."""
+
+
+@dataclass(frozen=True)
+class Hypothesis:
+    """An effect that may be lacking.
+
+    Attributes:
+        effect: its class.
+        shape: coefficients that only give it a form (a centre, a reference), and values that are tried as a whole.
+        strengths: coefficients that a score test can look at: at their absent values nothing changes.
+    """
+
+    effect: type[Effect]
+    shape: Mapping[str, float] = field(default_factory=dict)
+    strengths: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Of the effect."""
+        return self.effect.name
+
+    def parameter(self, coefficient: str) -> str:
+        """Its name among the model's parameters."""
+        return f"{SECTION[self.effect.kind]}.{self.name}.{coefficient}"
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Parameter names of the strengths."""
+        return tuple(self.parameter(c) for c in self.strengths)
+
+    def free(self) -> dict[str, Coefficient]:
+        """What a refit estimates beside what was free before: strengths, and shapes that are uncertain."""
+        listed = {c.name: c for c in self.effect.coefficients}
+        loose = {self.parameter(n): replace(listed[n], sigma=LOOSE * listed[n].sigma) for n in self.strengths}
+        formed = {self.parameter(n): listed[n] for n in self.shape if listed[n].absent is None and listed[n].sigma > 0}
+        return loose | formed
+
+    def added_to(self, model: AnalyticModel) -> AnalyticModel:
+        """The model with the effect in it, its strengths absent; the model itself where it has the effect already."""
+        if has_effect(model, self.name):
+            return model
+        listed = {c.name: c for c in self.effect.coefficients}
+        absent = {n: cast(float, listed[n].absent) for n in self.strengths}
+        return with_effects(model, self.effect(**{**self.shape, **absent}))
+
+
+def effects_of(model: AnalyticModel) -> list[Effect]:
+    """All effects of a model, in order."""
+    groups = (model.flight, model.contact, model.measurement)
+    return [cast(Effect, effect) for group in groups for effect in group.values()]
+
+
+def has_effect(model: AnalyticModel, name: str) -> bool:
+    """Whether the model declares an effect."""
+    return any(effect.name == name for effect in effects_of(model))
+
+
+def with_effects(model: AnalyticModel, *effects: Effect) -> AnalyticModel:
+    """A copy of a model with further effects; its parameters do not learn (`requires_grad` is off)."""
+    every = [*(copy.deepcopy(effect) for effect in effects_of(model)), *effects]
+    return AnalyticModel(every, radius=model.radius, inertia_factor=model.inertia_factor).requires_grad_(False)
+
+
+def without_effect(model: AnalyticModel, name: str) -> AnalyticModel:
+    """A copy of a model without one of its effects, and without those that need it."""
+    kept = [copy.deepcopy(e) for e in effects_of(model) if e.name != name and name not in e.needs]
+    return AnalyticModel(kept, radius=model.radius, inertia_factor=model.inertia_factor).requires_grad_(False)
+
+
+def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effect]]) -> list[Hypothesis]:
+    """Everything that the model may lack and that could act in these data.
+
+    That is each effect of the catalogue that it does not have and whose needs it meets, in each shape that the scene
+    suggests; and each effect that it has with coefficients taken to be exact.
+
+    Args:
+        model: as declared so far.  scene: what the data span.  catalogue: effects by class.
+    """
+    listed: list[Hypothesis] = []
+    for effect in catalogue:
+        if has_effect(model, effect.name):
+            exact = tuple(c.name for c in effect.coefficients if c.sigma == 0.0 and c.absent is not None)
+            listed += [Hypothesis(effect, {}, exact)] if exact else []
+        elif all(has_effect(model, needed) for needed in effect.needs) and _applies(effect, scene):
+            strengths = tuple(c.name for c in effect.coefficients if c.absent is not None)
+            listed += [Hypothesis(effect, shape, strengths) for shape in shapes_of(effect, scene)]
+    return listed
+
+
+def _applies(effect: type[Effect], scene: Scene) -> bool:
+    if effect.kind == "bounce":
+        return scene.contacts > 0
+    return scene.labels > 0 or not effect.name.startswith("spin_label")
+
+
+def declared_free(model: AnalyticModel) -> dict[str, Coefficient]:
+    """Coefficients that a fit of the declared model estimates: those whose prior leaves room."""
+    return {n: c for n, c in model.declared_coefficients().items() if c.sigma > 0.0 and c.absent is not None}
+
+

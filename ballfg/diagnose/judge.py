@@ -1,0 +1,117 @@
+"""What a model is worth on tracks that it was not fitted to: predictions of their unseen parts, and held-out likelihood."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from ballfg.diagnose.fit import Fit, fit
+from ballfg.diagnose.result import Errors
+from ballfg.diagnose.stretches import Stretches
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimate.registry import make_estimator
+from ballfg.estimate.settings import Settings
+from ballfg.predict.apexes import measured_apexes, path_apex
+from ballfg.predict.tracks import TrackPrediction, predict_tracks
+from ballfg.tracks import Track
+
+Array = NDArray[np.float64]
+
+OBSERVED = 0.4
+"""Share of each judged track that is observed; the rest is predicted."""
+LEAST_PREDICTED = 3
+"""Samples that must be left to predict."""
+
+
+@dataclass(frozen=True)
+class JudgedTrack:
+    """The part of a track that a model is to explain: up to the first hit or rest, without outliers.
+
+    Attributes:
+        track: that part.
+        bounces: (b,) s, contacts in it.
+    """
+
+    track: Track
+    bounces: Array
+
+
+def prediction_errors(
+    model: BallModel, judged: Sequence[JudgedTrack], surfaces: Surfaces, settings: Settings, jobs: int
+) -> Errors:
+    """Errors of the predictions that `ballfg predict` would make with a model.
+
+    Args:
+        model: with what was found out about noise and launcher in `trained`.
+        judged: tracks that it was not fitted to.
+        surfaces, settings: of the dataset with this model.
+        jobs: processes.
+    """
+    estimator = make_estimator("smoother", model, surfaces, settings)
+    tracks = [j.track for j in judged]
+    predictions = predict_tracks(estimator, tracks, len(tracks), lambda t: OBSERVED * t.duration, jobs=jobs)
+    pairs = [(j, p) for j, p in zip(judged, predictions, strict=True) if len(p.times) >= LEAST_PREDICTED]
+    squares = [((p.positions - p.measured) ** 2).sum(axis=-1) for _, p in pairs]
+    scores = np.concatenate([((p.positions - p.measured) / p.sigmas).ravel() for _, p in pairs])
+    sigmas = np.concatenate([p.sigmas.ravel() for _, p in pairs])
+    apexes = np.concatenate([_apex_distances(j, p) for j, p in pairs])
+    return Errors(
+        1e3 * float(np.sqrt(np.concatenate(squares).mean())),
+        1e3 * float(np.sqrt((apexes**2).mean())) if len(apexes) else float("nan"),
+        float((scores**2).mean()),
+        float((-0.5 * scores**2 - np.log(sigmas)).mean() - 0.5 * np.log(2 * np.pi)),
+        1e3 * np.sqrt([s.mean() for s in squares]),
+    )
+
+
+def _apex_distances(judged: JudgedTrack, prediction: TrackPrediction) -> Array:
+    """(a,) m between measured and predicted apexes of flights whose apex was not observed."""
+    track, end = judged.track, float(prediction.times[0])
+    points, when = measured_apexes(track.times, track.positions, judged.bounces)
+    edges = [float(track.times[0]), *judged.bounces.tolist(), float(track.times[-1])]
+    found = []
+    for point, time in zip(points, when, strict=True):
+        if np.isfinite(time) and time > end:
+            start = max(e for e in edges if e <= time)
+            stop = min(e for e in edges if e >= time)
+            predicted, _ = path_apex(prediction.times, prediction.positions, start, stop)
+            found.append(float(np.linalg.norm(predicted - point)))
+    return np.array([d for d in found if np.isfinite(d)])
+
+
+@dataclass(frozen=True)
+class HeldOut:
+    """Gain of one fit over another on other tracks: log likelihood per track, and its probability by chance."""
+
+    gain: float
+    p_value: float
+
+
+def held_out(before: Fit, after: Fit, judged: Stretches) -> HeldOut:
+    """How much better a larger model explains tracks that neither was fitted to; only first states adapt to them.
+
+    Args: before, after: fits on other tracks.  judged: the tracks to compare on.
+    """
+    losses = [_losses(replace_data(f, judged, noise=after)) for f in (before, after)]
+    tracks, index = np.unique(judged.track, return_inverse=True)
+    gains = np.bincount(index, losses[0] - losses[1], minlength=len(tracks))
+    finite = gains[np.isfinite(gains)]
+    spread = float(finite.std(ddof=1)) / np.sqrt(len(finite)) if len(finite) > 1 else np.inf
+    p_value = float(stats.t.sf(finite.mean() / max(spread, 1e-300), max(1, len(finite) - 1))) if len(finite) else 1.0
+    return HeldOut(float(finite.mean()) if len(finite) else 0.0, p_value)
+
+
+def replace_data(fitted: Fit, judged: Stretches, noise: Fit) -> Fit:
+    """A fit's shared unknowns on other stretches, whose first states are fitted."""
+    problem = replace(fitted.problem, stretches=judged, shared=False)
+    unknowns = replace(fitted.unknowns, starts=judged.starts.numpy().copy())
+    return fit(problem, unknowns, noise.noise, settle_noise=False)
+
+
+def _losses(result: Fit) -> Array:
+    return result.robust.losses

@@ -1,0 +1,62 @@
+"""Numbers as a person reads them: as many digits as are known, with their unit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from ballfg.diagnose.result import Value
+
+NONE = "–"
+"""What stands for a number that there is not."""
+MOST_DECIMALS = 6
+"""A number that needs more is written with a power of ten."""
+LEAST_PROBABILITY = 1e-99
+"""Below it the distribution that a probability was read from is a mere convention."""
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number to some significant digits; a dash for NaN."""
+    return NONE if math.isnan(value) else f"{value:.{digits}g}"
+
+
+def fixed(value: float, decimals: int) -> str:
+    """A number to some decimals; a dash for NaN."""
+    return NONE if math.isnan(value) else f"{value:.{decimals}f}"
+
+
+def plus_minus(value: Value) -> str:
+    """For instance `0.203 ± 0.012 m/s`: two digits of the standard deviation and the value's to the same decimal."""
+    unit = "" if value.unit == "1" else f" {value.unit}"
+    if not (math.isfinite(value.sigma) and value.sigma > 0):
+        return f"{number(value.value, 4)}{unit}"
+    decimals = max(0, 1 - math.floor(math.log10(value.sigma)))
+    if decimals > MOST_DECIMALS:
+        return f"{value.value:.3g} ± {value.sigma:.2g}{unit}"
+    return f"{value.value:.{decimals}f} ± {value.sigma:.{decimals}f}{unit}"
+
+
+def listed(values: Mapping[str, Value]) -> str:
+    """For instance `x 0.203 ± 0.012 m/s, y 0.001 ± 0.010 m/s`."""
+    return ", ".join(f"{name} {plus_minus(value)}" for name, value in values.items())
+
+
+def probability(p: float) -> str:
+    """For instance `0.34`, `3e-12`, `less than 1e-99`; a dash for NaN."""
+    if math.isnan(p):
+        return NONE
+    if p < LEAST_PROBABILITY:
+        return f"less than {LEAST_PROBABILITY:.0e}"
+    return f"{p:.2g}" if p >= 0.01 else f"{p:.0e}".replace("e-0", "e-")
+
+
+def change(before: float, after: float) -> str:
+    """For instance `-34 %`; empty where there is nothing to compare with."""
+    if not (math.isfinite(before) and math.isfinite(after)) or before == 0.0:
+        return ""
+    return f"{100 * (after / before - 1):+.0f} %"
+
+
+def joined(names: tuple[str, ...]) -> str:
+    """For instance `wind, gust_region and drag_speed`."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}" if names else ""
