@@ -1,16 +1,18 @@
-"""The analytic model: a ball whose motion is a sum of named physical effects."""
+"""The analytic model: a ball whose motion and measurement are a sum of named physical effects."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import cast
 
 import torch
 from torch import Tensor, nn
 
-from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact
+from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact, per_row
 from ballfg.dynamics.impact import apply_impulse
+from ballfg.dynamics.measurement import Later, MeasurementEffect
 from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
+from ballfg.dynamics.tilted import from_plane, to_plane
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 _ONE, _ZERO = torch.tensor(1.0, dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64)
@@ -20,41 +22,53 @@ class AnalyticModel(BallModel):
     """Free flight as the sum of flight effects; a bounce as an impulse whose coefficients bounce effects set.
 
     Without a restitution effect a bounce loses no normal speed; without friction the surface is slippery.
-    Effects act on an impact in the order in which they are given.
+    Effects act on an impact in the order in which they are given, but none before those that it needs. Measurement
+    effects act in the order of their ranks.
 
     Attributes:
         flight: `nn.ModuleDict` of flight effects by name.  contact: `nn.ModuleDict` of bounce effects by name.
+        measurement: `nn.ModuleDict` of measurement effects by name.
     """
 
     def __init__(self, effects: Iterable[Effect], *, radius: float = 0.02, inertia_factor: float = THIN_SHELL) -> None:
         super().__init__(radius, inertia_factor)
         self.flight = nn.ModuleDict()
         self.contact = nn.ModuleDict()
-        for effect in effects:
-            group = self.flight if isinstance(effect, FlightEffect) else self.contact
-            if effect.name in group:
-                raise ValueError(f"effects must differ; '{effect.name}' was given twice. Remove one.")
-            group[effect.name] = effect
+        self.measurement = nn.ModuleDict()
+        groups = {"flight": self.flight, "bounce": self.contact, "measurement": self.measurement}
+        for effect in sorted(after_needs(effects), key=_rank):
+            groups[effect.kind][effect.name] = effect
+        # names, not effects: `substitute` puts others in their places
+        self._moving_air = _overriding(self.flight, FlightEffect, "air_velocity")
+        self._adjusting = _overriding(self.flight, FlightEffect, "adjust")
+        self._turning = _overriding(self.flight, FlightEffect, "spin_rate")
+        self._sloping = _overriding(self.contact, BounceEffect, "surface_slope")
 
     def declared_coefficients(self) -> dict[str, Coefficient]:
         """The coefficients of all effects, for instance under `flight.drag.k`."""
+        groups = {"flight": self.flight, "contact": self.contact, "measurement": self.measurement}
         return {
             f"{section}.{name}.{c.name}": c
-            for section, group in (("flight", self.flight), ("contact", self.contact))
+            for section, group in groups.items()
             for name, effect in group.items()
             for c in cast(Effect, effect).coefficients
         }
 
     def rates(self, state: Tensor) -> Rates:
         """Acceleration and angular acceleration in free flight."""
-        flight = Flight(state)
+        flight = Flight(state, self.radius)
+        if self._moving_air:
+            flight = self._against_air(flight)
+        for name in self._adjusting:
+            flight = cast(FlightEffect, self.flight[name]).adjust(flight)
         acceleration: Tensor | None = None
-        spin_rate: Tensor | None = None
-        for module in self.flight.values():
-            effect = cast(FlightEffect, module)
-            a, w = effect.acceleration(flight), effect.spin_rate(flight)
+        for effect in cast("Iterable[FlightEffect]", self.flight.values()):
+            a = effect.acceleration(flight)
             if a is not None:
                 acceleration = a if acceleration is None else acceleration + a
+        spin_rate: Tensor | None = None
+        for name in self._turning:
+            w = cast(FlightEffect, self.flight[name]).spin_rate(flight)
             if w is not None:
                 spin_rate = w if spin_rate is None else spin_rate + w
         if acceleration is None:
@@ -63,28 +77,126 @@ class AnalyticModel(BallModel):
             acceleration = acceleration.expand_as(flight.velocity)
         return acceleration, spin_rate
 
+    def _against_air(self, flight: Flight) -> Flight:
+        """The flight as the moving air sees it."""
+        winds = [cast(FlightEffect, self.flight[name]).air_velocity(flight) for name in self._moving_air]
+        total: Tensor | None = None
+        for wind in winds:
+            if wind is not None:
+                total = wind if total is None else total + wind
+        return flight if total is None else flight.against(total)
+
     def bounce(self, state: Tensor) -> Tensor:
-        """(..., 9) state just after an impact on a horizontal plane; the position does not change."""
-        impact = Impact(state[..., VELOCITY], state[..., SPIN], _ONE, _ZERO, _ZERO)
+        """(..., 9) state just after an impact on a surface; the position does not change."""
+        velocity, spin = state[..., VELOCITY], state[..., SPIN]
+        slope = self.surface_slope(state)
+        if slope is not None:
+            velocity, spin = to_plane(velocity, slope), to_plane(spin, slope)
+        impact = Impact(velocity, spin, _ONE, _ZERO, _ZERO)
         for module in self.contact.values():
             impact = cast(BounceEffect, module).adjust(impact)
         velocity, spin = apply_impulse(impact, self.radius, self.inertia_factor)
+        if slope is not None:
+            velocity, spin = from_plane(velocity, slope), from_plane(spin, slope)
         return torch.cat((state[..., POSITION], velocity, spin), dim=-1)
 
     def surface_offset(self, state: Tensor) -> Tensor | float:
-        """(...) m by which surfaces lie above the heights declared for them."""
+        """(...) m by which surfaces lie above the heights declared for them, where the ball would touch them.
+
+        A ball that touches a slope does so beside its lowest point: its centre is R sqrt(1 + slope^2) above the slope.
+        """
+        position = state[..., POSITION]
         total: Tensor | None = None
         for module in self.contact.values():
-            offset = cast(BounceEffect, module).surface_offset()
+            offset = cast(BounceEffect, module).surface_offset(position)
             if offset is not None:
                 total = offset if total is None else total + offset
         if total is None:
             return 0.0
-        return total.squeeze(-1) if total.dim() else total
+        slope = self.surface_slope(state)
+        if slope is None:
+            return per_row(total)
+        return per_row(total) + self.radius * ((1.0 + slope.square().sum(-1)).sqrt() - 1.0)
+
+    def surface_slope(self, state: Tensor) -> Tensor | None:
+        """(2,) or (..., 2) slope of the surfaces along x and y under the ball; None: they are horizontal."""
+        total: Tensor | None = None
+        for name in self._sloping:
+            slope = cast(BounceEffect, self.contact[name]).surface_slope(state[..., POSITION])
+            if slope is not None:
+                total = slope if total is None else total + slope
+        return total
+
+    @property
+    def measures_plainly(self) -> bool:
+        """Whether there is no measurement effect."""
+        return len(self.measurement) == 0
+
+    def measured(self, states: Tensor, later: Later) -> Tensor:
+        """(..., 3) m, the positions as they are measured, before noise: one effect after the other."""
+        for effect in self._measuring():
+            states = torch.cat((effect.positions(states, later), states[..., POSITION.stop :]), dim=-1)
+        return states[..., POSITION]
+
+    def true_stamps(self, stamps: Tensor) -> Tensor:
+        """(...) s of true time since the first stamp of a track, from the time written since then."""
+        for effect in reversed(tuple(self._measuring())):
+            stamps = effect.true_stamps(stamps)
+        return stamps
+
+    def stamps(self, times: Tensor) -> Tensor:
+        """(...) s as written since the first stamp of a track, from the true time since then; undoes `true_stamps`."""
+        for effect in self._measuring():
+            times = effect.stamps(times)
+        return times
+
+    def labelled(self, spin: Tensor) -> Tensor:
+        """(..., 3) rad/s as a label says, before noise, from the true spin; affine in it."""
+        for effect in self._measuring():
+            spin = effect.label(spin)
+        return spin
+
+    def _measuring(self) -> Iterator[MeasurementEffect]:
+        return (cast(MeasurementEffect, effect) for effect in self.measurement.values())
 
     def extra_repr(self) -> str:
         """Radius and inertia factor for `print(model)`."""
         return f"radius={self.radius:g} m, inertia_factor={self.inertia_factor:g}"
+
+
+def after_needs(effects: Iterable[Effect]) -> list[Effect]:
+    """The effects in their order, but each behind those that it needs.
+
+    Raises: ValueError: if one is given twice, or needs one that is not there.
+    """
+    waiting = list(effects)
+    names = [effect.name for effect in waiting]
+    for name in names:
+        if names.count(name) > 1:
+            raise ValueError(f"effects must differ; '{name}' was given twice. Remove one.")
+    placed: dict[str, Effect] = {}
+    while waiting:
+        ready = next((effect for effect in waiting if placed.keys() >= set(effect.needs)), None)
+        if ready is None:
+            lacking = [(e.name, need) for e in waiting for need in e.needs if need not in placed]
+            name, need = min(lacking, key=lambda pair: pair[1] in names)
+            raise ValueError(
+                f"effects must come with those that they change; got '{name}' without '{need}'. "
+                f"Add {need} to the model or leave {name} out."
+            )
+        waiting.remove(ready)
+        placed[ready.name] = ready
+    return list(placed.values())
+
+
+def _rank(effect: Effect) -> tuple[int, str]:
+    """What sorts measurement effects; the order of all others stays."""
+    return (effect.rank, effect.name) if isinstance(effect, MeasurementEffect) else (0, "")
+
+
+def _overriding(group: nn.ModuleDict, base: type[Effect], method: str) -> tuple[str, ...]:
+    """Names of the effects of a group that do something in a method of their base class."""
+    return tuple(name for name, effect in group.items() if getattr(type(effect), method) is not getattr(base, method))
 
 
 def coefficient_sigmas(model: BallModel) -> dict[str, float]:

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ballfg.dynamics.measurement import Later
 from ballfg.dynamics.model import BallModel, Rates, substitute
 from ballfg.state import STATE_DIM
 
@@ -34,6 +35,7 @@ class AugmentedModel(BallModel):
                 raise ValueError(f"'{name}' is not a scalar parameter of the model; there are: {scalars}")
         self.model = model
         self.names = tuple(names)
+        self._level = model.surface_slope(torch.zeros(STATE_DIM, dtype=torch.float64)) is None
 
     def bound(self, state: Tensor) -> BallModel:
         """The model with each state's own coefficients."""
@@ -52,6 +54,31 @@ class AugmentedModel(BallModel):
     def surface_offset(self, state: Tensor) -> Tensor | float:
         """(...) m by which surfaces lie above the heights declared for them."""
         return self.bound(state).surface_offset(state[..., :STATE_DIM])
+
+    def surface_slope(self, state: Tensor) -> Tensor | None:
+        """(2,) or (..., 2) slope of the surfaces; None: they are horizontal."""
+        return None if self._level else self.bound(state).surface_slope(state[..., :STATE_DIM])
+
+    @property
+    def measures_plainly(self) -> bool:
+        """As the model."""
+        return self.model.measures_plainly
+
+    def measured(self, states: Tensor, later: Later) -> Tensor:
+        """(..., 3) m, the positions as they are measured; `later` gives states without coefficients."""
+        return self.bound(states).measured(states[..., :STATE_DIM], later)
+
+    def true_stamps(self, stamps: Tensor) -> Tensor:
+        """(...) s, as the model; coefficients that act on stamps do not travel with the state."""
+        return self.model.true_stamps(stamps)
+
+    def stamps(self, times: Tensor) -> Tensor:
+        """(...) s, as the model; coefficients that act on stamps do not travel with the state."""
+        return self.model.stamps(times)
+
+    def labelled(self, spin: Tensor) -> Tensor:
+        """(..., 3) rad/s, as the model; coefficients that act on labels do not travel with the state."""
+        return self.model.labelled(spin)
 
     def roll(self, state: Tensor) -> Rates:
         """Rates of a ball that rests on a surface."""

@@ -1,4 +1,4 @@
-"""Contacts with a horizontal surface: when the ball touches it, and the flow through one or more contacts.
+"""Contacts with a surface: when the ball touches it, and the flow through one or more contacts.
 
 The contact time is a function of the state. A search finds it without a graph; two Newton steps then run with one. A
 Newton step from the solution has the solution's exact first derivative, two steps have its derivatives up
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ballfg.dynamics.integrate import MAX_STEP, batch_jacobian, derivative, fly, fly_jacobian, rk4_step
 from ballfg.dynamics.model import BallModel
-from ballfg.state import VZ, Z
+from ballfg.state import Z
 
 SEARCH_STEPS = 12
 """Upper bound on the search from a guess; one or two are enough for a contact within 20 ms."""
@@ -65,8 +65,8 @@ def _search(model: BallModel, state: Tensor, height: Tensor | float, start: Tens
     tau, lost = torch.nan_to_num(start), start.isnan()
     at = state if not bool(tau.any()) else fly(model, state, tau)
     for _ in range(SEARCH_STEPS):
-        h, vz = model.gap(at, height), at[..., VZ]
-        fall = -model.rates(at)[0][..., Z]
+        h, vz = model.gap(at, height), model.gap_rate(at)
+        fall = -model.gap_acceleration(at)
         used = fall.clamp_min(LEAST_FALL)
         square = vz.square() + 2 * used * h
         root = square.clamp_min(0.0).sqrt()
@@ -92,15 +92,15 @@ def _scan(model: BallModel, state: Tensor, height: Tensor | float, wanted: Tenso
     """
     found = torch.full_like(state[..., Z], torch.nan)
     h = model.gap(state, height)
-    step = torch.where((h < 0) & (state[..., VZ] < 0), -MAX_STEP, MAX_STEP).to(state.dtype)
+    step = torch.where((h < 0) & (model.gap_rate(state) < 0), -MAX_STEP, MAX_STEP).to(state.dtype)
     open_ = wanted.clone()
     furthest = float(longest.max()) if isinstance(longest, Tensor) else longest
     for i in range(math.ceil(furthest / MAX_STEP)):
         after = rk4_step(model.rates, state, step.unsqueeze(-1))
-        h_after = model.gap(after, height)
+        h_after, falling = model.gap(after, height), model.gap_rate(after) < 0
         forward = step > 0
         crossed = torch.where(forward, (h >= 0) & (h_after < 0), h_after >= 0)
-        missed = (h_after < 0) & torch.where(forward, after[..., VZ] < 0, after[..., VZ] >= 0) | ~h_after.isfinite()
+        missed = (h_after < 0) & torch.where(forward, falling, ~falling) | ~h_after.isfinite()
         found = torch.where(open_ & crossed, (i + ~forward) * step, found)
         open_ &= ~(crossed | missed)
         if not bool(open_.any()):
@@ -112,7 +112,7 @@ def _scan(model: BallModel, state: Tensor, height: Tensor | float, wanted: Tenso
 
 def _newton_step(model: BallModel, state: Tensor, height: Tensor | float, tau: Tensor) -> Tensor:
     at = fly(model, state, torch.nan_to_num(tau))
-    speed = at[..., VZ].clamp_max(-MIN_SPEED)
+    speed = model.gap_rate(at).clamp_max(-MIN_SPEED)
     return -model.gap(at, height) / speed + 0.0 * tau  # keeps NaN
 
 
@@ -168,10 +168,10 @@ def fly_through_jacobian(
         before, flight = fly_jacobian(model, state, tau)
         jacobian = flight @ jacobian
         with torch.no_grad():
-            rate = derivative(model.rates, before)
-        # at the contact the gap is zero: d gap + vz d tau = 0
+            rate, speed = derivative(model.rates, before), model.gap_rate(before).clamp_max(-MIN_SPEED)
+        # at the contact the gap is zero: d gap + gap_rate d tau = 0
         tau_by_state = -(_gap_gradient(model, before, height).unsqueeze(-2) @ jacobian)
-        tau_by_state = tau_by_state / rate[..., Z, None, None].clamp_max(-MIN_SPEED)
+        tau_by_state = tau_by_state / speed[..., None, None]
         jacobian = jacobian + rate.unsqueeze(-1) * tau_by_state
         state, impact = batch_jacobian(model.bounce, before, outputs=state.shape[-1])
         jacobian = impact @ jacobian

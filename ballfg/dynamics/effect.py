@@ -1,7 +1,9 @@
 """What one physical effect is: a small torch module with named, bounded coefficients and a prior for each.
 
-An effect of kind `flight` adds to the acceleration or the angular acceleration of the free ball; one of kind
-`bounce` changes the coefficients of an impact. A model is a set of effects; nothing else has to know them.
+An effect of kind `flight` adds to the acceleration or the angular acceleration of the free ball, or changes what other
+flight effects act on; one of kind `bounce` changes the coefficients of an impact or the place of the surfaces. The
+third kind, `measurement`, is in `ballfg.dynamics.measurement`. A model is a set of effects; nothing else has to know
+them.
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ class Coefficient:
     default: float
     """Nominal value for a table-tennis ball."""
     sigma: float
-    """Standard deviation of the prior: how far real balls and tables were seen to stray. 0: as good as known."""
+    """Standard deviation of the prior: how far real balls, tables and cameras stray. 0: as good as known."""
     unit: str
     """SI unit, `1` where the number has none."""
     low: float
@@ -33,6 +35,9 @@ class Coefficient:
     """Largest value accepted."""
     varies: bool = False
     """Differs from ball to ball or day to day by more than one track needs to tell: estimated with each track."""
+    absent: float | None = 0.0
+    """The value at which the effect is not there. None for a shape (a reference, a centre, a size): while all others of
+    its effect are absent it changes nothing."""
 
 
 TINY_LENGTH = 1e-12
@@ -40,31 +45,46 @@ TINY_LENGTH = 1e-12
 
 
 def length(vector: Tensor) -> Tensor:
-    """(..., 1) lengths of vectors (..., 3), twice differentiable at zero; the gradient there is zero."""
+    """(..., 1) lengths of vectors (..., k), twice differentiable at zero; the gradient there is zero."""
     if torch.is_grad_enabled():  # the norm's own second derivative is NaN at zero
         return vector.square().sum(-1, keepdim=True).clamp_min(TINY_LENGTH**2).sqrt()
     return torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
 
 
-def vector(x: Tensor, y: Tensor, z: Tensor) -> Tensor:
-    """(3,) or (..., 3) vectors from three coefficients, each of shape () or (..., 1)."""
-    return torch.cat(torch.broadcast_tensors(*(c if c.dim() else c.unsqueeze(-1) for c in (x, y, z))), dim=-1)
+def vector(*coefficients: Tensor) -> Tensor:
+    """(k,) or (..., k) vectors from k coefficients, each of shape () or (..., 1)."""
+    return torch.cat(torch.broadcast_tensors(*(c if c.dim() else c.unsqueeze(-1) for c in coefficients)), dim=-1)
+
+
+def per_row(value: Tensor) -> Tensor:
+    """() or (...) from a coefficient of shape () or (..., 1): what multiplies quantities without a last axis."""
+    return value.squeeze(-1) if value.dim() else value
+
+
+Kind = Literal["flight", "bounce", "measurement"]
 
 
 class Flight:
     """A batch of free-flight states, with the quantities that several effects share computed once.
 
     Attributes:
-        position: (..., 3) m.  velocity: (..., 3) m/s.  spin: (..., 3) rad/s.
-        speed: (..., 1) m/s, twice differentiable at rest (its gradient there is zero).
+        position: (..., 3) m.  spin: (..., 3) rad/s.
+        velocity: (..., 3) m/s against the air; over ground while effects are asked how the air moves.
+        speed: (..., 1) m/s, the length of `velocity`, twice differentiable at rest (its gradient there is zero).
+        radius: m, of the ball.
+        drag_gain: (..., 1) by which drag is multiplied; None for 1.
+        lift_gain: (..., 1) by which the Magnus force is multiplied; None for 1.
     """
 
-    __slots__ = ("_speed", "position", "spin", "velocity")
+    __slots__ = ("_speed", "drag_gain", "lift_gain", "position", "radius", "spin", "velocity")
 
-    def __init__(self, state: Tensor) -> None:
+    def __init__(self, state: Tensor, radius: float) -> None:
         self.position = state[..., POSITION]
         self.velocity = state[..., VELOCITY]
         self.spin = state[..., SPIN]
+        self.radius = radius
+        self.drag_gain: Tensor | None = None
+        self.lift_gain: Tensor | None = None
         self._speed: Tensor | None = None
 
     @property
@@ -74,10 +94,41 @@ class Flight:
             self._speed = length(self.velocity)
         return self._speed
 
+    @property
+    def spin_ratio(self) -> Tensor:
+        """(..., 1) R |w| / |v|, finite at rest: times the speed it is R |w| to autograd."""
+        return self.radius * length(self.spin) / self.speed.clamp_min(TINY_LENGTH)
+
+    def against(self, air: Tensor) -> Flight:
+        """This flight in air that moves at `air`, (3,) or (..., 3) m/s."""
+        moved = self._copy()
+        moved.velocity, moved._speed = self.velocity - air, None
+        return moved
+
+    def more_drag(self, share: Tensor) -> Flight:
+        """This flight with the drag larger by a share (..., 1) of the drag that `Drag` alone gives; shares add up."""
+        changed = self._copy()
+        changed.drag_gain = 1.0 + share if self.drag_gain is None else self.drag_gain + share
+        return changed
+
+    def more_lift(self, share: Tensor) -> Flight:
+        """This flight with the Magnus force larger by a share (..., 1) of what `Magnus` alone gives; shares add up."""
+        changed = self._copy()
+        changed.lift_gain = 1.0 + share if self.lift_gain is None else self.lift_gain + share
+        return changed
+
+    def _copy(self) -> Flight:
+        other = object.__new__(Flight)  # a third of the time that copy.copy takes
+        for name in Flight.__slots__:
+            setattr(other, name, getattr(self, name))
+        return other
+
 
 @dataclass(frozen=True)
 class Impact:
-    """A batch of impacts on a horizontal plane: the incoming motion and the coefficients that decide the outcome.
+    """A batch of impacts on a plane: the incoming motion and the coefficients that decide the outcome.
+
+    Motion is seen in the plane's own axes: the third is its normal. On a horizontal plane those are the world's.
 
     Attributes:
         velocity: (..., 3) m/s before the impact.  spin: (..., 3) rad/s before it.
@@ -103,16 +154,25 @@ class Impact:
 
 
 class Effect(nn.Module, ABC):
-    """Base of all effects. A subclass names itself, its coefficients and, in one sentence, what it is.
+    """Base of all effects. A subclass names itself, its coefficients and, in words, what it is.
 
     Each coefficient becomes a float64 `nn.Parameter` attribute of its name. Code must let it have shape () or any
     shape that broadcasts against (..., 1), so that one call can carry another value for each track.
+
+    Attributes:
+        name: as in a model file.  kind: the section of a model file that takes it.
+        sentence: what it is, and what looks exactly the same.
+        decide: what to measure to tell it from what it is mistaken for.
+        coefficients: its numbers.
+        needs: names of effects that must be in the same model, since this one changes them.
     """
 
     name: ClassVar[str]
-    kind: ClassVar[Literal["flight", "bounce"]]
+    kind: ClassVar[Kind]
     sentence: ClassVar[str]
+    decide: ClassVar[str]
     coefficients: ClassVar[tuple[Coefficient, ...]]
+    needs: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, /, **values: float) -> None:
         super().__init__()
@@ -132,9 +192,21 @@ class Effect(nn.Module, ABC):
 
 
 class FlightEffect(Effect):
-    """An effect on the free ball. It overrides one or both of the methods; what it leaves alone stays None."""
+    """An effect on the free ball. It overrides one or more of the methods; what it leaves alone does nothing.
 
-    kind: ClassVar[Literal["flight", "bounce"]] = "flight"
+    A model asks in three passes: how the air moves, then how large the air forces are, then for the forces. From the
+    second pass on every effect sees the velocity against the air.
+    """
+
+    kind: ClassVar[Kind] = "flight"
+
+    def air_velocity(self, flight: Flight) -> Tensor | None:
+        """(3,) or (..., 3) m/s by which the air moves at the ball's place, or None for still air."""
+        return None
+
+    def adjust(self, flight: Flight) -> Flight:
+        """The flight with other drag and lift gains."""
+        return flight
 
     def acceleration(self, flight: Flight) -> Tensor | None:
         """(..., 3) m/s^2 that this effect adds, or None."""
@@ -148,12 +220,19 @@ class FlightEffect(Effect):
 class BounceEffect(Effect):
     """An effect on the contact with a surface: on the coefficients of the impact, or on where the surface is."""
 
-    kind: ClassVar[Literal["flight", "bounce"]] = "bounce"
+    kind: ClassVar[Kind] = "bounce"
 
     def adjust(self, impact: Impact) -> Impact:
         """The impact with this effect in it."""
         return impact
 
-    def surface_offset(self) -> Tensor | None:
-        """(..., 1) or scalar m by which this effect lifts the surfaces, or None."""
+    def surface_offset(self, position: Tensor) -> Tensor | None:
+        """(..., 1) or scalar m by which this effect lifts the surfaces under a ball at (..., 3) m, or None."""
+        return None
+
+    def surface_slope(self, position: Tensor) -> Tensor | None:
+        """(2,) or (..., 2) derivative of `surface_offset` by x and y, or None where it is the same everywhere.
+
+        It tilts the plane of the impact.
+        """
         return None

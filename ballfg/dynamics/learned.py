@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.dynamics.architecture import Architecture
-from ballfg.dynamics.effect import Coefficient
+from ballfg.dynamics.effect import Coefficient, per_row
 from ballfg.dynamics.effects.table_height import TableHeight
 from ballfg.dynamics.learned_parts import (
     START_RESTITUTION,
@@ -17,6 +17,7 @@ from ballfg.dynamics.learned_parts import (
     RawContact,
     RawFlight,
 )
+from ballfg.dynamics.measurement import Later
 from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
 from ballfg.dynamics.networks import NetworkKind
 from ballfg.state import POSITION, SPIN, VELOCITY, VZ
@@ -107,7 +108,32 @@ class LearnedModel(BallModel):
         """(...) m by which surfaces lie above the heights declared for them."""
         if self.base is not None:
             return self.base.surface_offset(state)
-        return self.offset.squeeze(-1) if self.offset.dim() else self.offset
+        return per_row(self.offset)
+
+    def surface_slope(self, state: Tensor) -> Tensor | None:
+        """(2,) or (..., 2) slope of the surfaces: the base's."""
+        return None if self.base is None else self.base.surface_slope(state)
+
+    @property
+    def measures_plainly(self) -> bool:
+        """As the base; a model without one does."""
+        return self.base is None or self.base.measures_plainly
+
+    def measured(self, states: Tensor, later: Later) -> Tensor:
+        """(..., 3) m, the positions as the base measures them."""
+        return states[..., POSITION] if self.base is None else self.base.measured(states, later)
+
+    def true_stamps(self, stamps: Tensor) -> Tensor:
+        """(...) s, as the base."""
+        return stamps if self.base is None else self.base.true_stamps(stamps)
+
+    def stamps(self, times: Tensor) -> Tensor:
+        """(...) s, as the base."""
+        return times if self.base is None else self.base.stamps(times)
+
+    def labelled(self, spin: Tensor) -> Tensor:
+        """(..., 3) rad/s, as the base."""
+        return spin if self.base is None else self.base.labelled(spin)
 
     def extra_repr(self) -> str:
         """Kind, radius and inertia factor for `print(model)`."""

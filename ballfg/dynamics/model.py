@@ -12,7 +12,8 @@ from torch import Tensor, nn
 
 from ballfg.dynamics.effect import Coefficient
 from ballfg.dynamics.impact import slip_velocity
-from ballfg.state import SPIN, STANDARD_GRAVITY, VELOCITY, Z
+from ballfg.dynamics.measurement import Later
+from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, VELOCITY, VZ, Z
 
 if TYPE_CHECKING:
     from ballfg.dynamics.trained import Trained
@@ -36,7 +37,7 @@ _SUBSTITUTED = "_substituted"
 
 
 class BallModel(nn.Module, ABC):
-    """A ball of some radius that flies, hits horizontal surfaces and comes to rest on them.
+    """A ball of some radius that flies, hits surfaces and comes to rest on them, and how it is measured.
 
     States are (..., 9) float64 (see `ballfg.state`). Rates are a pair: acceleration (..., 3) m/s^2, and angular
     acceleration (..., 3) rad/s^2 or None where the spin is constant (a third of a Jacobian's cost is saved then).
@@ -78,15 +79,57 @@ class BallModel(nn.Module, ABC):
 
     @abstractmethod
     def bounce(self, state: Tensor) -> Tensor:
-        """(..., 9) state just after an impact on a horizontal plane; the position does not change."""
+        """(..., 9) state just after an impact on a surface; the position does not change."""
 
     def surface_offset(self, state: Tensor) -> Tensor | float:
         """(...) m by which surfaces lie above the heights declared for them; none, unless a model says so."""
         return 0.0
 
+    def surface_slope(self, state: Tensor) -> Tensor | None:
+        """(2,) or (..., 2) slope of the surfaces along x and y under the ball; None: they are horizontal."""
+        return None
+
     def gap(self, state: Tensor, height: Tensor | float) -> Tensor:
         """(...) m between the ball's lowest point and a surface declared at `height`; negative below it."""
         return state[..., Z] - height - self.surface_offset(state) - self.radius
+
+    def gap_rate(self, state: Tensor) -> Tensor:
+        """(...) m/s, the time derivative of the gap: vz, less what the surface rises under the moving ball."""
+        slope = self.surface_slope(state)
+        return state[..., VZ] if slope is None else state[..., VZ] - climb(slope, state[..., VELOCITY])
+
+    def gap_acceleration(self, state: Tensor) -> Tensor:
+        """(...) m/s^2, the second time derivative of the gap in free flight over a plane surface."""
+        acceleration = self.rates(state)[0]
+        slope = self.surface_slope(state)
+        return acceleration[..., Z] if slope is None else acceleration[..., Z] - climb(slope, acceleration)
+
+    @property
+    def measures_plainly(self) -> bool:
+        """Whether positions, stamps and spin labels are taken to be written down as they are."""
+        return True
+
+    def measured(self, states: Tensor, later: Later) -> Tensor:
+        """(..., 3) m, the positions as they are measured, before noise.
+
+        Args: states: (..., 9) true states.  later: a delay (s, not negative) to the true states that much later.
+        """
+        return states[..., POSITION]
+
+    def true_stamps(self, stamps: Tensor) -> Tensor:
+        """(...) s of true time since the first stamp of a track, from the time written since then.
+
+        Where each of n tracks has its own coefficients, of shape (n, 1), stamps have the shape (..., n, 1).
+        """
+        return stamps
+
+    def stamps(self, times: Tensor) -> Tensor:
+        """(...) s as written since the first stamp of a track, from the true time since then; undoes `true_stamps`."""
+        return times
+
+    def labelled(self, spin: Tensor) -> Tensor:
+        """(..., 3) rad/s as a label says, before noise, from the true spin; affine in it."""
+        return spin
 
     def roll(self, state: Tensor) -> Rates:
         """Rates of a ball that rests on a surface: air forces in the plane, friction until it rolls, resistance.
@@ -106,6 +149,11 @@ class BallModel(nn.Module, ABC):
         acceleration = torch.cat((air[..., :2] + friction + resistance, zero[..., None]), dim=-1)
         torque = torch.stack((torque_x, torque_y, zero), dim=-1)
         return acceleration, torque if air_torque is None else torque + air_torque
+
+
+def climb(slope: Tensor, motion: Tensor) -> Tensor:
+    """(...) by which a surface of some slope (..., 2) rises along a motion (..., 3), in the motion's unit."""
+    return (slope * motion[..., :2]).sum(-1)
 
 
 def _soft_direction(vector: Tensor) -> Tensor:

@@ -7,19 +7,20 @@ import os
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Final, cast
 
 import yaml
 
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.effect import Effect
+from ballfg.dynamics.analytic import AnalyticModel, after_needs
+from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import effect_class
 from ballfg.dynamics.learned import LearnedModel
 from ballfg.dynamics.learned_file import has_learned_part, read_learned, remove_others, write_learned
 from ballfg.dynamics.model import THIN_SHELL, BallModel
 from ballfg.dynamics.yaml_file import read_yaml
 
-SECTIONS = ("flight", "bounce", "measurement", "learned")
+KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
+SECTIONS = (*KINDS, "learned")
 
 
 def nominal_model(radius: float = 0.02) -> AnalyticModel:
@@ -68,20 +69,24 @@ def model_from_dict(
             raise ValueError(f"{where}: unknown section '{section}'{_nearest(section, SECTIONS)}")
     if content.get("learned") is not None:
         raise ValueError(f"{where}: section 'learned' must be null; only a file tells where a learned part lies")
-    if content.get("measurement"):
-        raise ValueError(f"{where}: section 'measurement' must be empty; this version has no measurement effects")
     effects: list[Effect] = []
-    for kind in ("flight", "bounce"):
+    for kind in KINDS:
         section = content.get(kind)
         if section is None:
+            if kind == "measurement":
+                continue
             raise ValueError(f"{where}: section '{kind}' is missing; write '{kind}: {{}}' for no effects")
         if not isinstance(section, Mapping):
             raise ValueError(f"{where}: section '{kind}' must map effects to coefficients; got {section!r}")
         effects += [_effect(name, kind, values, where) for name, values in section.items()]
+    try:
+        effects = after_needs(effects)
+    except ValueError as error:
+        raise ValueError(f"{where}: {error}") from error
     return AnalyticModel(effects, radius=radius, inertia_factor=inertia_factor)
 
 
-def _effect(name: str, kind: str, values: Any, where: str) -> Effect:
+def _effect(name: str, kind: Kind, values: Any, where: str) -> Effect:
     values = {} if values is None else values
     if not isinstance(values, Mapping):
         raise ValueError(f"{where}: {kind}.{name} must map coefficients to numbers; got {values!r}")
@@ -110,7 +115,7 @@ def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
     return {
         "flight": section(dict(model.flight.items())),
         "bounce": section(dict(model.contact.items())),
-        "measurement": {},
+        "measurement": section(dict(model.measurement.items())),
         "learned": None,
     }
 

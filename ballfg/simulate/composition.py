@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterable
 from typing import cast
 
@@ -10,35 +9,29 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.dynamics import AnalyticModel, BallModel, Effect, FlightEffect
+from ballfg.dynamics import AnalyticModel, BallModel, Effect
 from ballfg.dynamics.model import Rates
 from ballfg.dynamics.rollout import REST_SPEED
 from ballfg.simulate.config import ProcessNoise
-from ballfg.simulate.undeclared import AirEffect, MeasurementEffect
 from ballfg.state import SPIN, STATE_DIM, VELOCITY, VZ
 
 
 def true_model(declared: AnalyticModel, undeclared: Iterable[Effect]) -> AnalyticModel:
-    """The declared model with undeclared effects of flight and bounce in it; the arguments stay as they are.
+    """The declared model with undeclared effects in it; the arguments stay as they are.
 
     An undeclared effect that the model declares too takes the place of the declared one: the truth then has another
     value than the model.
 
     Raises: ValueError: if an effect is given twice, or changes one that the model does not have.
     """
-    listed = [cast(Effect, effect) for effect in (*declared.flight.values(), *declared.contact.values())]
-    effects = {effect.name: effect for effect in listed}
+    groups = (declared.flight, declared.contact, declared.measurement)
+    effects = {name: cast(Effect, effect) for group in groups for name, effect in group.items()}
     seen: set[str] = set()
     for effect in undeclared:
         if effect.name in seen:
             raise ValueError(f"undeclared effects must differ; '{effect.name}' was given twice. Remove one.")
         seen.add(effect.name)
-        if not isinstance(effect, MeasurementEffect):
-            effects[effect.name] = copy.deepcopy(effect)  # attaching must not change the caller's
-    changed = [effect for effect in effects.values() if isinstance(effect, AirEffect)]
-    basis = [effect for effect in effects.values() if isinstance(effect, FlightEffect) and effect not in changed]
-    for air_effect in changed:
-        air_effect.attach(basis, declared.radius)
+        effects[effect.name] = effect
     return AnalyticModel(effects.values(), radius=declared.radius, inertia_factor=declared.inertia_factor)
 
 
@@ -63,6 +56,10 @@ class KickedModel(BallModel):
     def surface_offset(self, state: Tensor) -> Tensor | float:
         """That of the undisturbed model."""
         return self.model.surface_offset(state)
+
+    def surface_slope(self, state: Tensor) -> Tensor | None:
+        """That of the undisturbed model."""
+        return self.model.surface_slope(state)
 
     def bounce(self, state: Tensor) -> Tensor:
         """(..., 9) after the impact and its kick. A bounce that ends in rest gets none: it would start again."""

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ballfg.dynamics import BallModel, Surfaces, advance
+from ballfg.dynamics import BallModel, advance
 from ballfg.simulate.config import MeasurementNoise, SimulationConfig
 from ballfg.simulate.motion import Motion
 from ballfg.simulate.settings import SETTING_LEVELS, Settings
 from ballfg.simulate.streams import Purpose, generator
-from ballfg.simulate.undeclared import MeasurementEffect
 from ballfg.state import POSITION, SPIN
 from ballfg.tracks import SPIN_LABELS, Track
 
@@ -47,8 +45,8 @@ def measure(
     """The tracks of a block of shots.
 
     Args:
-        config: noise, undeclared effects, rate, seed.
-        model: the true ball without random kicks.
+        config: noise, rate, seed.
+        model: the true ball without random kicks, and how it is measured.
         motion: (n, k) true frames.
         settings: (n, 3) of the launcher.
         block: number of the block, which picks the random streams.
@@ -59,7 +57,8 @@ def measure(
     exists = frames < motion.lengths[:, None]
     kept = exists & _kept_frames(noise, config.seed, block, motion.lengths, shape)
     true_times = frames / config.rate
-    stamps = true_times + noise.jitter * _cut_normal(generator(config.seed, Purpose.JITTER, block), shape)
+    jitter = noise.jitter * _cut_normal(generator(config.seed, Purpose.JITTER, block), shape)
+    stamps = _written(model, true_times) + jitter
     positions = _apparent_positions(config, model, motion.states, exists) + _position_noise(
         noise, config.seed, block, shape
     )
@@ -70,7 +69,7 @@ def measure(
         states = motion.states[i, keep]
         labels = dict(zip(SETTING_LEVELS, settings[i].astype(float).tolist(), strict=True))
         if config.spin_labels:
-            spin = states[0, SPIN] + label_noise[i]
+            spin = _labelled(model, states[0, SPIN]) + label_noise[i]
             labels = dict(zip(SPIN_LABELS, spin.tolist(), strict=True)) | labels
         track = Track(f"{first + i:0{width}d}", stamps[i, keep], positions[i, keep], labels=labels)
         tracks.append(SimulatedTrack(track, true_times[keep], states))
@@ -106,22 +105,28 @@ def _position_noise(noise: MeasurementNoise, seed: int, block: int, shape: tuple
 
 
 @torch.no_grad()
+def _written(model: BallModel, times: FloatArray) -> FloatArray:
+    """(k,) s, the stamps of frames taken at some times since the launch, before jitter."""
+    return times if model.measures_plainly else model.stamps(torch.from_numpy(times)).numpy()
+
+
+@torch.no_grad()
+def _labelled(model: BallModel, spin: FloatArray) -> FloatArray:
+    """(3,) rad/s, the label of a spin before noise."""
+    return spin if model.measures_plainly else model.labelled(torch.from_numpy(spin)).numpy()
+
+
+@torch.no_grad()
 def _apparent_positions(
     config: SimulationConfig, model: BallModel, states: FloatArray, exists: NDArray[np.bool_]
 ) -> FloatArray:
-    """(n, k, 3) m, where the ball seems to be before noise: undeclared measurement effects applied in their order."""
+    """(n, k, 3) m, where the ball seems to be before noise."""
     apparent = states[..., POSITION].copy()
-    effects = [effect for effect in config.undeclared if isinstance(effect, MeasurementEffect)]
-    if effects:
+    if not model.measures_plainly:
         flat = torch.from_numpy(states[exists])
-        later = partial(_later, model, config.ball.surfaces)
-        for effect in effects:
-            seen = effect.positions(flat, later)
-            flat = torch.cat((seen, flat[:, POSITION.stop :]), dim=-1)
-        apparent[exists] = flat[:, POSITION].numpy()
+
+        def later(delay: Tensor) -> Tensor:
+            return advance(model, flat, delay.expand(len(flat)), config.ball.surfaces)
+
+        apparent[exists] = model.measured(flat, later).numpy()
     return apparent
-
-
-def _later(model: BallModel, surfaces: Surfaces, states: Tensor, delay: Tensor) -> Tensor:
-    """(n, 9) the states `delay` (n,) s later."""
-    return advance(model, states, delay, surfaces)

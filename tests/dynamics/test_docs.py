@@ -24,14 +24,15 @@ def blocks(page, language):
 
 def coefficient_table():
     lines = [
-        "| effect | section | coefficient | default | sigma | unit | bounds | what |",
-        "|---|---|---|---|---|---|---|---|",
+        "| effect | section | coefficient | default | absent | sigma | unit | bounds | what |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for name, effect in EFFECTS.items():
         for c in effect.coefficients:
-            bounds = f"{c.low:g} to {c.high:g}"
-            cells = (name, effect.kind, c.name, f"{c.default:g}", f"{c.sigma:g}", c.unit, bounds, effect.sentence)
-            lines.append(f"| {' | '.join(cells)} |")
+            absent = "shape" if c.absent is None else f"{c.absent:g}"
+            what = effect.sentence if c is effect.coefficients[0] else ""
+            numbers = (f"{c.default:g}", absent, f"{c.sigma:g}", c.unit, f"{c.low:g} to {c.high:g}")
+            lines.append(f"| {' | '.join((name, effect.kind, c.name, *numbers, what))} |")
     return "\n".join(lines)
 
 

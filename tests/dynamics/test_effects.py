@@ -125,11 +125,15 @@ def test_a_model_without_effects_flies_straight(build, states):
 def test_every_effect_describes_itself(name):
     effect = EFFECTS[name]()
     assert effect.name == name
-    assert effect.kind in ("flight", "bounce")
+    assert effect.kind in ("flight", "bounce", "measurement")
     assert effect.sentence.endswith(".")
+    assert effect.decide.endswith(".")
+    assert set(effect.needs) <= set(EFFECTS)
+    assert any(c.absent is not None for c in effect.coefficients)
     for c in effect.coefficients:
         assert c.low <= c.default <= c.high
         assert c.sigma >= 0
+        assert c.absent is None or c.low <= c.absent <= c.high
         parameter = getattr(effect, c.name)
         assert parameter.dtype == torch.float64
         assert parameter.requires_grad
@@ -147,8 +151,8 @@ def test_unknown_coefficient():
 
 
 def test_unknown_effect_and_wrong_kind():
-    with pytest.raises(ValueError, match=r"^there is no flight effect 'wind'; known ones: gravity, drag, "):
-        effect_class("wind", "flight")
+    with pytest.raises(ValueError, match=r"^there is no flight effect 'gale'; known ones: gravity, drag, "):
+        effect_class("gale", "flight")
     with pytest.raises(ValueError, match=r"^there is no bounce effect 'drag'; known ones: restitution, friction"):
         effect_class("drag", "bounce")
 

@@ -54,6 +54,17 @@ def test_saving_replaces_a_file_whole(model, tmp_path):
     assert set(yaml.safe_load(path.read_text())) == {"flight", "bounce", "measurement", "learned"}
 
 
+def test_every_effect_in_a_file(tmp_path):
+    """Values away from the defaults come back; an effect without values changes nothing."""
+    content = {"flight": {}, "bounce": {}, "measurement": {}, "learned": None}
+    for name, effect in EFFECTS.items():
+        content[effect.kind][name] = {c.name: c.default + (c.high - c.default) / 7 for c in effect.coefficients}
+    path = tmp_path / "all.yaml"
+    save_model(model_from_dict(content), path)
+    assert model_to_dict(load_model(path)) == content
+    assert set(load_model(path).declared_coefficients()) == {n for n, _ in load_model(path).named_parameters()}
+
+
 def test_optional_sections():
     assert list(model_from_dict({"flight": {}, "bounce": {}}).flight) == []
 
@@ -102,14 +113,23 @@ def test_missing_file(tmp_path):
         (f"flight: {{drag: {{k: 1{'0' * 400}}}}}\nbounce: {{}}", r"too large"),
         ("flight: {drag: {k: 0.1, k: 0.2}}\nbounce: {}", r"not readable as YAML \('k' stands twice in .* line 1"),
         ("flight: {}\nbounce: {}\nflight: {drag: {}}", r"'flight' stands twice in .* line 1"),
-        ("flight: {wind: {}}\nbounce: {}", r"there is no flight effect 'wind'; known ones: gravity, drag"),
+        ("flight: {gale: {}}\nbounce: {}", r"there is no flight effect 'gale'; known ones: gravity, drag"),
         ("flight: {friction: {}}\nbounce: {}", r"there is no flight effect 'friction'"),
         (
             "flight: {}\nbounce: {}\nlearned: {x: 1}",
             r"section 'learned' must be null or the name of a folder; got \{'x': 1\}$",
         ),
         ("flight: {}\nbounce: {}\nlearned: ''", r"section 'learned' must be null or the name of a folder; got ''$"),
-        ("flight: {}\nbounce: {}\nmeasurement: {x: 1}", r"section 'measurement' must be empty; this version has no"),
+        (
+            "flight: {}\nbounce: {}\nmeasurement: {x: {}}",
+            r"there is no measurement effect 'x'; known ones: time_offset, velocity_lag, frame_tilt",
+        ),
+        ("flight: {}\nbounce: {}\nmeasurement: [scale]", r"section 'measurement' must map effects to coefficients"),
+        ("flight: {scale: {}}\nbounce: {}", r"there is no flight effect 'scale'; known ones: gravity"),
+        (
+            "flight: {drag_spin: {}}\nbounce: {}",
+            r"effects must come with those that they change; got 'drag_spin' without 'drag'\. Add drag to the model or",
+        ),
         ("flight: !!python/object/apply:os.getcwd []\nbounce: {}", r"not readable as YAML"),
     ],
 )

@@ -12,9 +12,11 @@ class Drag(FlightEffect):
 
     name = "drag"
     sentence = "Quadratic air drag with a constant coefficient."
+    decide = "Vary the speed of still-air shots: drag grows with its square and points backwards, whatever the spin."
     coefficients = (Coefficient("k", 0.12, 0.035, "1/m", 0.0, 2.0, varies=True),)
     k: Tensor
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2, opposite to the velocity; zero, with zero derivative, at rest."""
-        return -(self.k * flight.speed) * flight.velocity
+        k = self.k if flight.drag_gain is None else self.k * flight.drag_gain
+        return -(k * flight.speed) * flight.velocity

@@ -12,6 +12,9 @@ class Friction(BounceEffect):
 
     name = "friction"
     sentence = "Coulomb friction in the contact; the ball slides or rolls."
+    decide = (
+        "Shoot fast and flat, so that the ball slides through the bounce: only then does friction set what it loses."
+    )
     coefficients = (Coefficient("mu", 0.25, 0.05, "1", 0.0, 2.0),)
     mu: Tensor
 

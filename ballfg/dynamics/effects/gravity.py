@@ -12,10 +12,14 @@ _DOWN = torch.tensor((0.0, 0.0, -1.0), dtype=torch.float64)
 
 
 class Gravity(FlightEffect):
-    """a = (0, 0, -g). Buoyancy of the air and an error of the time scale look the same."""
+    """a = (0, 0, -g). Buoyancy of the air is the same as a smaller g."""
 
     name = "gravity"
-    sentence = "The weight of the ball: a constant downward acceleration."
+    sentence = (
+        "The weight of the ball: a constant downward acceleration; the same as buoyancy and, once drag and Magnus "
+        "force are free, as another time scale."
+    )
+    decide = "Look up the local g, known to four digits: a ball that falls otherwise shows a wrong clock or length."
     coefficients = (Coefficient("g", STANDARD_GRAVITY, 0.0, "m/s^2", 0.0, 30.0),)
     g: Tensor
 

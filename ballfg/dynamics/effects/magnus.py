@@ -13,9 +13,13 @@ class Magnus(FlightEffect):
 
     name = "magnus"
     sentence = "Lift of a spinning ball, proportional to spin x velocity."
+    decide = (
+        "Shoot with spins of opposite sign at one speed: the lift changes its sign with the spin, nothing else does."
+    )
     coefficients = (Coefficient("k", 0.0028, 0.0008, "1", -0.1, 0.1),)
     k: Tensor
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2, perpendicular to velocity and spin."""
-        return self.k * torch.linalg.cross(flight.spin, flight.velocity)
+        k = self.k if flight.lift_gain is None else self.k * flight.lift_gain
+        return k * torch.linalg.cross(flight.spin, flight.velocity)

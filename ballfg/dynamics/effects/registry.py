@@ -4,15 +4,36 @@ from __future__ import annotations
 
 from typing import Final
 
-from ballfg.dynamics.effect import BounceEffect, Effect, FlightEffect
+from ballfg.dynamics.effect import BounceEffect, Effect, FlightEffect, Kind
+from ballfg.dynamics.effects.buoyancy import Buoyancy
 from ballfg.dynamics.effects.drag import Drag
+from ballfg.dynamics.effects.drag_speed import DragSpeed
+from ballfg.dynamics.effects.drag_spin import DragSpin
+from ballfg.dynamics.effects.frame_tilt import FrameTilt
 from ballfg.dynamics.effects.friction import Friction
+from ballfg.dynamics.effects.generic_contact import GenericContact
+from ballfg.dynamics.effects.generic_flight import GenericFlight
+from ballfg.dynamics.effects.generic_measurement import GenericMeasurement
 from ballfg.dynamics.effects.gravity import Gravity
+from ballfg.dynamics.effects.gust_region import GustRegion
 from ballfg.dynamics.effects.magnus import Magnus
+from ballfg.dynamics.effects.magnus_saturation import MagnusSaturation
+from ballfg.dynamics.effects.radial_bias import RadialBias
 from ballfg.dynamics.effects.restitution import Restitution
+from ballfg.dynamics.effects.restitution_speed import RestitutionSpeed
+from ballfg.dynamics.effects.scale import Scale
 from ballfg.dynamics.effects.spin_decay import SpinDecay
+from ballfg.dynamics.effects.spin_label_frame import SpinLabelFrame
+from ballfg.dynamics.effects.spin_label_offset import SpinLabelOffset
+from ballfg.dynamics.effects.spin_label_scale import SpinLabelScale
 from ballfg.dynamics.effects.table_height import TableHeight
+from ballfg.dynamics.effects.table_tilt import TableTilt
 from ballfg.dynamics.effects.tangential_restitution import TangentialRestitution
+from ballfg.dynamics.effects.time_offset import TimeOffset
+from ballfg.dynamics.effects.time_scale import TimeScale
+from ballfg.dynamics.effects.velocity_lag import VelocityLag
+from ballfg.dynamics.effects.wind import Wind
+from ballfg.dynamics.effects.wind_shear import WindShear
 
 EFFECTS: Final[dict[str, type[Effect]]] = {
     effect.name: effect
@@ -21,24 +42,47 @@ EFFECTS: Final[dict[str, type[Effect]]] = {
         Drag,
         Magnus,
         SpinDecay,
+        Wind,
+        WindShear,
+        GustRegion,
+        DragSpeed,
+        DragSpin,
+        MagnusSaturation,
+        Buoyancy,
         Restitution,
         Friction,
         TangentialRestitution,
         TableHeight,
+        RestitutionSpeed,
+        TableTilt,
+        TimeOffset,
+        VelocityLag,
+        FrameTilt,
+        Scale,
+        RadialBias,
+        TimeScale,
+        SpinLabelFrame,
+        SpinLabelScale,
+        SpinLabelOffset,
     )
 }
 
+GENERIC: Final[dict[str, type[Effect]]] = {
+    effect.name: effect for effect in (GenericFlight, GenericContact, GenericMeasurement)
+}
+"""Sums of terms that a model file may name too. They describe without explaining, so no search for causes has them."""
 
-def effect_class(name: str, kind: str) -> type[Effect]:
-    """The class of the effect `name` of a kind, `flight` or `bounce`.
+
+def effect_class(name: str, kind: Kind) -> type[Effect]:
+    """The class of the effect `name` of a kind: `flight`, `bounce` or `measurement`.
 
     Raises: ValueError: if there is no such effect of that kind; the message lists those there are.
     """
-    effect = EFFECTS.get(name)
+    effect = (EFFECTS | GENERIC).get(name)
     if effect is None or effect.kind != kind:
         known = ", ".join(n for n, e in EFFECTS.items() if e.kind == kind) or "none"
         raise ValueError(f"there is no {kind} effect '{name}'; known ones: {known}")
     return effect
 
 
-__all__ = ["EFFECTS", "BounceEffect", "FlightEffect", "effect_class"]
+__all__ = ["EFFECTS", "GENERIC", "BounceEffect", "FlightEffect", "effect_class"]

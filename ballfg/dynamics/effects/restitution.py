@@ -12,7 +12,8 @@ class Restitution(BounceEffect):
 
     name = "restitution"
     sentence = "Constant coefficient of restitution along the normal."
-    coefficients = (Coefficient("e", 0.93, 0.02, "1", 0.0, 1.0, varies=True),)
+    decide = "Drop the ball without spin and compare the heights before and after several bounces."
+    coefficients = (Coefficient("e", 0.93, 0.02, "1", 0.0, 1.0, varies=True, absent=1.0),)
     e: Tensor
 
     def adjust(self, impact: Impact) -> Impact:

@@ -12,6 +12,7 @@ class SpinDecay(FlightEffect):
 
     name = "spin_decay"
     sentence = "Viscous torque of the air: the spin falls exponentially."
+    decide = "Film a mark on the ball at launch and at the end of a long flight, or label the spin at both ends."
     coefficients = (Coefficient("rate", 0.2, 0.2, "1/s", 0.0, 20.0),)
     rate: Tensor
 

@@ -16,9 +16,10 @@ class TableHeight(BounceEffect):
 
     name = "table_height"
     sentence = "Surfaces lie higher or lower than declared."
+    decide = "Lay the ball on the table and measure its position; vary the steepness of the impacts."
     coefficients = (Coefficient("offset", 0.0, 0.004, "m", -0.2, 0.2, varies=True),)
     offset: Tensor
 
-    def surface_offset(self) -> Tensor:
+    def surface_offset(self, position: Tensor) -> Tensor:
         """() or (..., 1) m."""
         return self.offset

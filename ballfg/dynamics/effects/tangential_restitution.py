@@ -15,6 +15,7 @@ class TangentialRestitution(BounceEffect):
 
     name = "tangential_restitution"
     sentence = "Tangential compliance of the contact: slip is partly reversed when the ball grips."
+    decide = "Shoot slowly with much spin, so that the ball grips in the bounce, and measure the spin after it."
     coefficients = (Coefficient("e_t", 0.15, 0.1, "1", -1.0, 1.0),)
     e_t: Tensor
 

@@ -1,6 +1,8 @@
-"""Effects that no model file declares, one file each: for tests of whether an analysis finds what a model lacks."""
+"""What may act although no model declares it: every effect of a model file, and some that no model file can name.
 
-from ballfg.simulate.undeclared.base import AirEffect, MeasurementEffect
+The latter test whether an analysis says "unexplained" where it lacks the explanation.
+"""
+
 from ballfg.simulate.undeclared.registry import UNDECLARED, parse_effects
 
-__all__ = ["UNDECLARED", "AirEffect", "MeasurementEffect", "parse_effects"]
+__all__ = ["UNDECLARED", "parse_effects"]

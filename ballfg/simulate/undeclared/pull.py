@@ -12,12 +12,13 @@ class Pull(FlightEffect):
 
     name = "pull"
     sentence = "A force toward one place in the room."
+    decide = "Nothing to decide: no catalogue holds it."
     coefficients = (
         Coefficient("strength", 0.0, 0.3, "m/s^2", -20.0, 20.0),
-        Coefficient("x", 1.4, 1.0, "m", -100.0, 100.0),
-        Coefficient("y", 0.5, 0.5, "m", -100.0, 100.0),
-        Coefficient("z", 1.5, 0.5, "m", -100.0, 100.0),
-        Coefficient("soft", 0.3, 0.1, "m", 0.01, 100.0),
+        Coefficient("x", 1.4, 1.0, "m", -100.0, 100.0, absent=None),
+        Coefficient("y", 0.5, 0.5, "m", -100.0, 100.0, absent=None),
+        Coefficient("z", 1.5, 0.5, "m", -100.0, 100.0, absent=None),
+        Coefficient("soft", 0.3, 0.1, "m", 0.01, 100.0, absent=None),
     )
     strength: Tensor
     x: Tensor

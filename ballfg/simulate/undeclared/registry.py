@@ -9,34 +9,13 @@ from typing import Final
 
 from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.registry import EFFECTS
-from ballfg.simulate.undeclared.drag_speed import DragSpeed
-from ballfg.simulate.undeclared.drag_spin import DragSpin
-from ballfg.simulate.undeclared.frame_tilt import FrameTilt
-from ballfg.simulate.undeclared.gust_region import GustRegion
-from ballfg.simulate.undeclared.magnus_saturation import MagnusSaturation
 from ballfg.simulate.undeclared.pull import Pull
-from ballfg.simulate.undeclared.restitution_speed import RestitutionSpeed
-from ballfg.simulate.undeclared.scale import Scale
-from ballfg.simulate.undeclared.time_offset import TimeOffset
-from ballfg.simulate.undeclared.wind import Wind
+from ballfg.simulate.undeclared.side_lean import SideLean
+from ballfg.simulate.undeclared.thick_air import ThickAir
 
-UNDECLARED: Final[dict[str, type[Effect]]] = {
-    effect.name: effect
-    for effect in (
-        Wind,
-        GustRegion,
-        DragSpeed,
-        DragSpin,
-        MagnusSaturation,
-        Pull,
-        RestitutionSpeed,
-        TimeOffset,  # first of the measurement effects: it needs the true states
-        FrameTilt,
-        Scale,
-    )
-} | EFFECTS
-"""Every effect by name, applied in this order. What a model file may declare can be left undeclared too: an effect that
-the model lacks (spin_decay), or another value of one that it has (restitution.e)."""
+UNDECLARED: Final[dict[str, type[Effect]]] = EFFECTS | {effect.name: effect for effect in (Pull, ThickAir, SideLean)}
+"""Every effect by name. What a model file may declare can be left undeclared: an effect that the model lacks (wind), or
+another value of one that it has (restitution.e). The last ones can be declared nowhere."""
 
 
 def parse_effects(texts: Iterable[str]) -> tuple[Effect, ...]:

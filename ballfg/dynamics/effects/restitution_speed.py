@@ -11,11 +11,16 @@ class RestitutionSpeed(BounceEffect):
     """e - slope (|v_n| - reference) in place of the declared e, kept within 0 and 1."""
 
     name = "restitution_speed"
-    sentence = "The coefficient of restitution falls with the normal speed of the impact."
+    sentence = (
+        "The coefficient of restitution falls with the normal speed of the impact; another reference is the same as "
+        "another restitution."
+    )
+    decide = "Drop the ball from very different heights and compare the ratios of the heights after and before."
     coefficients = (
         Coefficient("slope", 0.0, 0.02, "s/m", -0.2, 0.2),
-        Coefficient("reference", 3.0, 1.0, "m/s", 0.0, 20.0),
+        Coefficient("reference", 3.0, 1.0, "m/s", 0.0, 20.0, absent=None),
     )
+    needs = ("restitution",)
     slope: Tensor
     reference: Tensor
 

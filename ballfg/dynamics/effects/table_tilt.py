@@ -1,0 +1,35 @@
+"""Table tilt: the table is not level."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ballfg.dynamics.effect import TINY_LENGTH, BounceEffect, Coefficient, length, vector
+
+
+class TableTilt(BounceEffect):
+    """Surfaces turned by the rotation vector (x, y, 0) about the point at their declared height over the origin.
+
+    The plane through that point has the normal exp((x, y, 0)) z and the slope (-y, x) tan(angle) / angle. A ball
+    touches it where its centre is one radius away from it, and bounces along its normal.
+    """
+
+    name = "table_tilt"
+    sentence = (
+        "The table is not level: bounces lean to one side; over one place of impact its height is the same as that of "
+        "the table."
+    )
+    decide = "Put a level on the table, or bounce the ball in several places: a tilted frame bends flights too."
+    coefficients = tuple(Coefficient(axis, 0.0, 0.005, "rad", -0.3, 0.3) for axis in "xy")
+    x: Tensor
+    y: Tensor
+
+    def surface_offset(self, position: Tensor) -> Tensor:
+        """(..., 1) m, the plane's height below the ball less that over the origin."""
+        return (self.surface_slope(position) * position[..., :2]).sum(-1, keepdim=True)
+
+    def surface_slope(self, position: Tensor) -> Tensor:
+        """(2,) or (..., 2), the same everywhere."""
+        angle = length(vector(self.x, self.y)).clamp_min(TINY_LENGTH)
+        return (torch.tan(angle) / angle) * vector(-self.y, self.x)
