@@ -36,6 +36,8 @@ def estimate(
 ) -> None:
     """Position, velocity and spin with standard deviations, one row per stamp.
 
+    They are the true ones where the model file holds measurement effects; the stamps stay as they are written.
+
     Example: ballfg estimate data/aimy --method smoother --out states.csv
     """
     from ballfg.estimate import estimate_tracks

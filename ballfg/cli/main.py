@@ -10,6 +10,7 @@ from collections.abc import Sequence
 
 import typer
 
+from ballfg.cli.diagnose import diagnose
 from ballfg.cli.errors import guarded
 from ballfg.cli.estimate import estimate
 from ballfg.cli.predict import predict
@@ -25,6 +26,7 @@ app = typer.Typer(
 
 app.command()(estimate)
 app.command()(predict)
+app.command()(diagnose)
 app.command()(simulate)
 
 

@@ -28,6 +28,8 @@ def predict(
 ) -> None:
     """Positions at every stamp after the observed part, with the standard deviation of a measurement there.
 
+    They are those that will be measured, with all measurement effects that the model file holds.
+
     Example: ballfg predict data/ballgun --observe 0.25 --out predictions.csv
     """
     from ballfg.predict import check_observe, predict_tracks

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ballfg.diagnose.fit import Fit, common_precision, linearise
 from ballfg.diagnose.hypothesis import with_effects
+from ballfg.diagnose.problem import Fit, common_precision, linearise
 from ballfg.diagnose.result import Value
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.spin_embedding import SpinEmbedding

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.diagnose.fit import Fit, common_precision, linearise
 from ballfg.diagnose.hypothesis import Hypothesis
+from ballfg.diagnose.problem import Fit, common_precision, linearise
 from ballfg.diagnose.score import Signatures
 from ballfg.diagnose.sensitivity import Sensitivity, sensitivity
 from ballfg.diagnose.system import System, by_track

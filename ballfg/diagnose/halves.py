@@ -37,7 +37,7 @@ class Halves:
         surfaces: where its balls bounce.
         launcher: which labels of a shot tell its spin; its weights mean nothing.
         finding, judging: stretches of the two halves.
-        judged: tracks of the judging half up to their first hit.
+        found_on, judged: tracks of the two halves up to their first hit.
         excluded: sentences on what has no part.
     """
 
@@ -47,6 +47,7 @@ class Halves:
     launcher: Launcher
     finding: Stretches
     judging: Stretches
+    found_on: tuple[JudgedTrack, ...]
     judged: tuple[JudgedTrack, ...]
     excluded: tuple[str, ...]
 
@@ -54,7 +55,7 @@ class Halves:
 def halves_of(dataset: Dataset, model: AnalyticModel, jobs: int, watch: Callable[[str], None]) -> Halves:
     """Split a dataset and find the stretches of both halves.
 
-    Args: dataset: with at least `LEAST_TRACKS` tracks.  model: as declared.  jobs: processes.  watch: is told of progress.
+    Args: dataset: of at least `LEAST_TRACKS` tracks.  model: as declared.  jobs: processes.  watch: told of progress.
     Raises: ValueError: if there are too few tracks.
     """
     tracks, excluded = _chosen(dataset)
@@ -64,11 +65,12 @@ def halves_of(dataset: Dataset, model: AnalyticModel, jobs: int, watch: Callable
     watch(f"estimating {len(tracks)} tracks")
     finding = stretches_of(smoother, tracks[::2], launcher, jobs)
     judging = stretches_of(smoother, tracks[1::2], launcher, jobs)
-    judged = tuple(j for j in map_tracks(_JudgedPart(smoother), tracks[1::2], len(tracks) // 2, jobs) if j is not None)
+    parts = [list(map_tracks(_JudgedPart(smoother), half, len(half), jobs)) for half in (tracks[::2], tracks[1::2])]
+    found_on, judged = (tuple(part for part in half if part is not None) for half in parts)
     lost = len(tracks) - len(np.unique(finding.track)) - len(np.unique(judging.track))
     if lost:
         excluded.append(f"{lost} of {len(tracks)} tracks hold no free flight that is long enough")
-    return Halves(dataset, settings, surfaces, launcher, finding, judging, judged, tuple(excluded))
+    return Halves(dataset, settings, surfaces, launcher, finding, judging, found_on, judged, tuple(excluded))
 
 
 def _chosen(dataset: Dataset) -> tuple[list[Track], list[str]]:
@@ -84,7 +86,7 @@ def _chosen(dataset: Dataset) -> tuple[list[Track], list[str]]:
 
 
 def launcher_labels(dataset: Dataset, tracks: list[Track], settings: Settings) -> Launcher:
-    """What tells tracks without a spin label how they were launched: settings, else groups, else that they are one set."""
+    """What tells how tracks without a spin label were launched: settings, else groups, else that they are one set."""
     names = tuple(n for n in LAUNCHER_LABELS if all(isinstance(t.labels.get(n), float) for t in tracks))
     if names:
         return Launcher(SpinEmbedding(names, {}), settings.spin_prior)

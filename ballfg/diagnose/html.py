@@ -71,7 +71,7 @@ def _card(name: str, was: float, now: float, unit: str, changed: bool, note: str
     old = tag("span", f"{fixed(was, decimals)} → ", kind="was") if changed and math.isfinite(was) else Html()
     shown = f"{fixed(now, decimals)}{unit}" if math.isfinite(now) else NONE
     if not math.isfinite(now):
-        note = "no flight begins after the observed part"
+        note = "nothing to judge by"
     elif not note and changed:
         note = change(was, now)
     return tag("div", _quiet(name), tag("span", old, shown, kind="big"), _quiet(note), kind="card")

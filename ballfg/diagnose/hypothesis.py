@@ -7,9 +7,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import cast
 
-from ballfg.diagnose.scene import Scene, shapes_of
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.effect import Coefficient, Effect
+from ballfg.dynamics.scene import Scene
 
 SECTION = {"flight": "flight", "bounce": "contact", "measurement": "measurement"}
 """Attribute of the model that holds the effects of a kind."""
@@ -100,7 +100,7 @@ def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effe
             listed += [Hypothesis(effect, {}, exact)] if exact else []
         elif all(has_effect(model, needed) for needed in effect.needs) and _applies(effect, scene):
             strengths = tuple(c.name for c in effect.coefficients if c.absent is not None)
-            listed += [Hypothesis(effect, shape, strengths) for shape in shapes_of(effect, scene)]
+            listed += [Hypothesis(effect, shape, strengths) for shape in effect.shapes(scene)]
     return listed
 
 
@@ -113,5 +113,3 @@ def _applies(effect: type[Effect], scene: Scene) -> bool:
 def declared_free(model: AnalyticModel) -> dict[str, Coefficient]:
     """Coefficients that a fit of the declared model estimates: those whose prior leaves room."""
     return {n: c for n, c in model.declared_coefficients().items() if c.sigma > 0.0 and c.absent is not None}
-
-

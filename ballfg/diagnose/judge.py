@@ -1,4 +1,4 @@
-"""What a model is worth on tracks that it was not fitted to: predictions of their unseen parts, and held-out likelihood."""
+"""What a model is worth on tracks that it was not fitted to: predictions of unseen parts, and held-out likelihood."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from ballfg.diagnose.fit import Fit, fit
+from ballfg.diagnose.fit import fit, followed
+from ballfg.diagnose.problem import Fit, Noise
 from ballfg.diagnose.result import Errors
 from ballfg.diagnose.stretches import Stretches
 from ballfg.dynamics.model import BallModel
@@ -97,7 +98,8 @@ def held_out(before: Fit, after: Fit, judged: Stretches) -> HeldOut:
 
     Args: before, after: fits on other tracks.  judged: the tracks to compare on.
     """
-    losses = [_losses(replace_data(f, judged, noise=after)) for f in (before, after)]
+    judged = followed(before.problem.model, judged)
+    losses = [_on(f, judged, after.noise).robust.losses for f in (before, after)]
     tracks, index = np.unique(judged.track, return_inverse=True)
     gains = np.bincount(index, losses[0] - losses[1], minlength=len(tracks))
     finite = gains[np.isfinite(gains)]
@@ -106,12 +108,8 @@ def held_out(before: Fit, after: Fit, judged: Stretches) -> HeldOut:
     return HeldOut(float(finite.mean()) if len(finite) else 0.0, p_value)
 
 
-def replace_data(fitted: Fit, judged: Stretches, noise: Fit) -> Fit:
+def _on(fitted: Fit, judged: Stretches, noise: Noise) -> Fit:
     """A fit's shared unknowns on other stretches, whose first states are fitted."""
     problem = replace(fitted.problem, stretches=judged, shared=False)
     unknowns = replace(fitted.unknowns, starts=judged.starts.numpy().copy())
-    return fit(problem, unknowns, noise.noise, settle_noise=False)
-
-
-def _losses(result: Fit) -> Array:
-    return result.robust.losses
+    return fit(problem, unknowns, noise, settle_noise=False)

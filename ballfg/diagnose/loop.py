@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
-from ballfg.diagnose.calibrated import calibrated_model, values_of
-from ballfg.diagnose.fit import Fit, Problem, fit, start_from
-from ballfg.diagnose.halves import Halves, halves_of
+from ballfg.diagnose.calibrated import values_of
+from ballfg.diagnose.fit import fit, followed, start_from
+from ballfg.diagnose.frames import frame_hypotheses
+from ballfg.diagnose.halves import Halves
 from ballfg.diagnose.hypothesis import declared_free, hypotheses, with_effects
-from ballfg.diagnose.judge import HeldOut, held_out, prediction_errors
-from ballfg.diagnose.result import Candidate, Diagnosis, Errors, Finding, Standing, Value
+from ballfg.diagnose.judge import HeldOut, held_out
+from ballfg.diagnose.problem import Fit, Problem
+from ballfg.diagnose.result import Candidate, Finding, Standing, Value
 from ballfg.diagnose.scene import scene_of
-from ballfg.diagnose.trace import Refit, Scored, refit, score_all, shortlist
+from ballfg.diagnose.trace import ALARM, Refit, Scored, explained, refit, refit_driven, score_all, shortlist
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.effect import Effect
-from ballfg.dynamics.effects.registry import EFFECTS
-from ballfg.tracks import Dataset
+from ballfg.dynamics.effects.spin_label_frame import SpinLabelFrame
 
 MOST_EFFECTS = 4
 """Effects that are added before the search ends; further ones would be found in what earlier wrong ones left."""
@@ -48,7 +49,7 @@ def search_effects(
     Returns: the fit of the declared model, and the search at its end.
     """
     declared = with_effects(model)
-    problem = Problem(declared, halves.finding, declared_free(declared))
+    problem = Problem(declared, followed(declared, halves.finding), declared_free(declared))
     watch(f"fitting the declared model to {len(halves.finding)} flights")
     first = fit(problem, *start_from(problem, halves.settings.spin_label_noise, halves.settings.spin_prior))
     search = Search(first)
@@ -57,19 +58,24 @@ def search_effects(
     return first, search
 
 
-def _round(
-    search: Search, halves: Halves, catalogue: Sequence[type[Effect]], watch: Callable[[str], None]
-) -> bool:
+def _round(search: Search, halves: Halves, catalogue: Sequence[type[Effect]], watch: Callable[[str], None]) -> bool:
     """One round; whether an effect was added."""
     model = search.fit.problem.model
     assert isinstance(model, AnalyticModel)
     candidates = hypotheses(model, scene_of(search.fit), catalogue)
     watch(f"round {len(search.rounds) + 1}: testing {len(candidates)} hypotheses")
-    scored = score_all(search.fit, candidates)
+    driven = [h for h in candidates if h.effect.multiplies_spin and not search.fit.problem.stretches.labelled.all()]
+    scored = score_all(search.fit, [h for h in candidates if h not in driven])
     refits = []
     for candidate in shortlist(scored):
         watch(f"round {len(search.rounds) + 1}: fitting with {candidate.hypothesis.name}")
-        refits.append(refit(search.fit, candidate))
+        refits += [refit(search.fit, shaped) for shaped in _shaped(search.fit, candidate)]
+    for hypothesis in driven:
+        watch(f"round {len(search.rounds) + 1}: fitting with {hypothesis.name} and spins that nobody labelled")
+        fitted = refit_driven(search.fit, hypothesis)
+        scored.append(fitted.scored)
+        refits += [fitted] if fitted.scored.p_value < ALARM else []
+    scored.sort(key=explained, reverse=True)
     refits.sort(key=lambda r: r.delta_bic)
     standing: dict[str, Standing] = {}
     winner, evidence = _confirmed(search.fit, refits, halves, standing)
@@ -77,7 +83,8 @@ def _round(
         alike = tuple(
             r.scored.hypothesis.name
             for r in refits
-            if r is not winner and r.delta_bic - winner.delta_bic < ALIKE and r.scored.hypothesis.name not in standing
+            if r.scored.hypothesis.name not in (winner.scored.hypothesis.name, *standing)
+            and r.delta_bic - winner.delta_bic < ALIKE
         )
         standing |= dict.fromkeys(alike, Standing.ALIKE) | {winner.scored.hypothesis.name: Standing.ADDED}
         settled = fit(winner.fit.problem, winner.fit.unknowns, winner.fit.noise)
@@ -85,6 +92,14 @@ def _round(
         search.fit = settled
     search.rounds.append(_ranking(scored, refits, standing))
     return winner is not None
+
+
+def _shaped(before: Fit, scored: Scored) -> list[Scored]:
+    """What to refit for a hypothesis: itself, or the frames that come into question."""
+    if scored.hypothesis.effect is not SpinLabelFrame:
+        return [scored]
+    frames = frame_hypotheses(before, scored.hypothesis)
+    return [Scored(frame, None, scored.p_value) for frame in frames]
 
 
 def _confirmed(
@@ -105,12 +120,15 @@ def _finding(winner: Refit, settled: Fit, alike: tuple[str, ...], evidence: Held
     hypothesis = winner.scored.hypothesis
     names = {hypothesis.parameter(c.name): c.name for c in hypothesis.effect.coefficients}
     fitted = values_of(settled, [n for n in names if n in settled.problem.free], {})
+    units = {c.name: c.unit for c in hypothesis.effect.coefficients}
+    shaped = {n: c for n, c in names.items() if c in hypothesis.shape and n not in fitted}
+    exact = {n: Value(hypothesis.shape[c], 0.0, units[c]) for n, c in shaped.items()}
     return Finding(
         name=hypothesis.name,
         kind=hypothesis.effect.kind,
         sentence=hypothesis.effect.sentence,
         decide=hypothesis.effect.decide,
-        parameters={names[n]: value for n, value in fitted.items()},
+        parameters={names[n]: value for n, value in (fitted | exact).items()},
         p_value=winner.scored.p_value,
         delta_bic=winner.delta_bic,
         indistinguishable_from=alike,
@@ -149,5 +167,3 @@ def _row(scored: Scored, delta_bic: float | None, standing: Standing | None) -> 
     return Candidate(
         hypothesis.name, hypothesis.effect.kind, estimate, score.explained, scored.p_value, delta_bic, standing
     )
-
-

@@ -104,7 +104,8 @@ def contacts(series: Series, radius: float) -> Figure:
             _means(column, against, values, sigmas, contact.stretch, label)
             column[0].set_title(label, size=11)
             column[-1].set_xlabel(name)
-            column[0].sharex(panels[0, j * count])
+            if i:
+                column[0].sharex(panels[0, j * count])
     reach = 1.15 * float(np.quantile(np.abs(np.concatenate(points)), SHOWN_SHARE))
     if reach > 0.0:
         panels[0, 0].set_ylim(-reach, reach)
@@ -239,9 +240,16 @@ def _means(
     colour = BEFORE if label == "before" else AFTER
     for axes, component, sigma in zip(column, values.T, sigmas.T, strict=True):
         bins = binned(against, component, sigma, stretch)
-        style = {"fmt": "o-", "color": colour, "markersize": 4, "linewidth": 1.2, "capsize": 2}
         axes.axhline(0.0, color="black", linewidth=0.8, zorder=0)
-        axes.errorbar(bins.centres, bins.means, bins.errors, label=label, **style)
+        axes.errorbar(
+            *(bins.centres, bins.means, bins.errors),
+            fmt="o-",
+            color=colour,
+            markersize=4,
+            linewidth=1.2,
+            capsize=2,
+            label=label,
+        )
 
 
 def _name_rows(panels: NDArray[np.object_], names: Sequence[str], unit: str) -> None:

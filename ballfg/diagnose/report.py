@@ -13,8 +13,7 @@ from typing import Any, Final
 
 from ballfg.diagnose.html import page
 from ballfg.diagnose.result import Candidate, Diagnosis, Errors, Fallback, Finding, GenericTest, Value
-from ballfg.dynamics import save_model
-from ballfg.dynamics.learned_file import has_learned_part
+from ballfg.dynamics import LearnedModel, save_model
 
 REPORT: Final = "report.json"
 """Written last: where it is, the others are whole."""
@@ -64,7 +63,7 @@ def check_report_folder(folder: Path) -> None:
 def _write_all(diagnosis: Diagnosis, folder: Path) -> None:
     save_model(diagnosis.model, folder / MODEL)
     fallback = diagnosis.unexplained.fallback
-    if fallback is not None and has_learned_part(fallback.model):
+    if fallback is not None and isinstance(fallback.model, LearnedModel):
         save_model(fallback.model, folder / FALLBACK)
     (folder / PAGE).write_text(page(diagnosis), encoding="utf-8")
     text = json.dumps(content(diagnosis), indent=2, allow_nan=False, ensure_ascii=False)

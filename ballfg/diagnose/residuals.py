@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.diagnose.fit import Fit, linearise
+from ballfg.diagnose.problem import Fit, linearise
 from ballfg.diagnose.response import Along, ArcResponse, along, responses, weighted
 from ballfg.diagnose.result import ContactResiduals, FlightResiduals, MeasurementResiduals, Residuals
-from ballfg.state import SPIN, STATE_DIM, VELOCITY
+from ballfg.state import STATE_DIM
 
 BIN = 0.04
 """s, about how long an acceleration stays the same: a bin never reaches across a contact."""

@@ -17,7 +17,7 @@ import torch.autograd.forward_ad as forward
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ballfg.diagnose.fit import Fit
+from ballfg.diagnose.problem import Fit
 from ballfg.diagnose.shooting import LEAST_ARC, Arc, Trajectories, shoot
 from ballfg.dynamics.model import BallModel, substitute
 from ballfg.state import STATE_DIM, VELOCITY

@@ -1,4 +1,4 @@
-"""What a diagnosis says: the verdict, the effects it added with their evidence, errors before and after, what is left."""
+"""What a diagnosis says: the verdict, effects added with their evidence, errors before and after, what is left."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
 """Score tests: would an effect that is absent make the samples more probable, everything else being free to adapt?
 
 At the minimum of the declared model the derivative of the objective by an absent effect's coefficients is its score.
-First states are eliminated stretch by stretch, declared coefficients over all tracks; what information is left tells how
-large the score may be by chance. Tracks are the independent units: the scatter of their scores says how far the
+First states are eliminated stretch by stretch, declared coefficients over all tracks; what information is left tells
+how large the score may be by chance. Tracks are the independent units: the scatter of their scores says how far the
 stated noise can be trusted, so that a false alarm stays as rare as stated when noise is misjudged or has a memory.
 docs/derivations/diagnosis.md derives all of it.
 """
@@ -19,7 +19,7 @@ from scipy import stats
 Array = NDArray[np.float64]
 
 PRIOR_TRACKS = 10.0
-"""Tracks that the pooled scatter is worth beside an effect's own: with few tracks an own covariance is too uncertain."""
+"""Tracks that the pooled scatter is worth beside an effect's own: of few tracks an own covariance is too uncertain."""
 LEAST_SHARE = 1e-8
 """Share of a column's length that must survive projection: less is rounding, and the effect cannot be seen at all."""
 

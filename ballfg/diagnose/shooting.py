@@ -88,7 +88,9 @@ def shoot(model: BallModel, start: Tensor, heights: Tensor, guesses: Tensor, end
     arcs: list[Arc] = []
     contacts = torch.full_like(heights, torch.nan)
     for number in range(heights.shape[1] + 1):
-        meets = ~heights[rows, number].isnan() if number < heights.shape[1] else torch.zeros_like(rows, dtype=torch.bool)
+        meets = (
+            ~heights[rows, number].isnan() if number < heights.shape[1] else torch.zeros_like(rows, dtype=torch.bool)
+        )
         until = torch.where(meets, guesses[rows, number], ends[rows]) if number < heights.shape[1] else ends[rows]
         arc = _fly_arc(own, rows, start, begun, until - begun.detach())
         arcs.append(arc)

@@ -4,20 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from scipy import stats
 
 from ballfg.diagnose.columns import signatures
-from ballfg.diagnose.fit import Fit, fit
-from ballfg.diagnose.hypothesis import Hypothesis
+from ballfg.diagnose.fit import fit
+from ballfg.diagnose.hypothesis import Hypothesis, with_effects, without_effect
+from ballfg.diagnose.problem import Fit, Problem
 from ballfg.diagnose.score import Score
 from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.state import SPIN
 
 Array = NDArray[np.float64]
 
-ALARM = 0.01
-"""Probability of naming an effect where there is none, for one round on the finding half alone."""
+ALARM = 0.05
+"""Probability that a hypothesis passes the score tests of one round by chance. It must then also help on the judging
+half (`loop.CONFIRMED`), so that both together happen by chance in one round of 400."""
 MOST_REFITS = 6
 """Hypotheses that are refitted in a round."""
 LEADING = 0.5
@@ -61,7 +67,12 @@ def score_all(before: Fit, candidates: Sequence[Hypothesis]) -> list[Scored]:
         score = efficient.test(columns, dispersion)
         p_value = 1.0 if score is None else min(1.0, score.p_value * len(testable))
         scored.append(Scored(hypothesis, score, p_value))
-    return sorted(scored, key=lambda s: -1.0 if s.score is None else -s.score.explained)
+    return sorted(scored, key=explained, reverse=True)
+
+
+def explained(scored: Scored) -> float:
+    """Squared whitened residual that a hypothesis would explain; below zero where it cannot be seen."""
+    return -1.0 if scored.score is None else scored.score.explained
 
 
 def shortlist(scored: Sequence[Scored]) -> list[Scored]:
@@ -77,24 +88,59 @@ def shortlist(scored: Sequence[Scored]) -> list[Scored]:
 
 def refit(before: Fit, scored: Scored) -> Refit:
     """The joint fit with a hypothesis in the model, from where its score points."""
-    hypothesis = scored.hypothesis
-    assert isinstance(before.problem.model, AnalyticModel) and scored.score is not None
-    model = hypothesis.added_to(before.problem.model)
-    problem = replace(before.problem, model=model, free={**before.problem.free, **hypothesis.free()})
-    parameters = dict(model.named_parameters())
+    hypothesis, problem = scored.hypothesis, with_hypothesis(before.problem, scored.hypothesis)
+    parameters = dict(problem.model.named_parameters())
     values = {name: float(parameters[name]) for name in hypothesis.free()}
-    for name, step in zip(hypothesis.columns, scored.score.estimate, strict=True):
+    steps = () if scored.score is None else zip(hypothesis.columns, scored.score.estimate, strict=True)
+    for name, step in steps:
         coefficient = problem.free[name]
         values[name] = float(np.clip(values[name] + step, coefficient.low, coefficient.high))
     unknowns = replace(before.unknowns, values={**before.unknowns.values, **values})
+    if hypothesis.shape and not hypothesis.strengths:
+        unknowns = replace(unknowns, starts=_starts_with_labels(problem, unknowns.starts))
     after = fit(problem, unknowns, before.noise, settle_noise=False)
     return Refit(scored, after, delta_bic(before, after))
 
 
+def with_hypothesis(problem: Problem, hypothesis: Hypothesis) -> Problem:
+    """The problem with an effect in its model and the effect's coefficients free."""
+    assert isinstance(problem.model, AnalyticModel)
+    return replace(problem, model=hypothesis.added_to(problem.model), free={**problem.free, **hypothesis.free()})
+
+
+def _starts_with_labels(problem: Problem, starts: Array) -> Array:
+    """First states whose spins are what the labels mean to a model that reads them in another frame."""
+    with torch.no_grad():
+        read = problem.model.labelled(torch.eye(3, dtype=torch.float64)).numpy()  # affine without offset: rows M e_i
+    labelled, moved = problem.stretches.labelled, starts.copy()
+    moved[labelled, SPIN] = problem.stretches.labels.numpy()[labelled] @ np.linalg.inv(read)
+    return moved
+
+
+def refit_driven(before: Fit, hypothesis: Hypothesis) -> Refit:
+    """The fit with an effect that multiplies spins nobody labelled.
+
+    A coefficient times a spin of mean zero has no slope at zero. With the coefficient at its usual value the spins
+    have one: launcher settings and single shots find theirs, and the likelihood ratio is the test.
+    """
+    problem = with_hypothesis(before.problem, hypothesis)
+    listed = {hypothesis.parameter(c.name): c for c in hypothesis.effect.coefficients}
+    free = {**before.problem.free, **{name: listed[name] for name in hypothesis.columns}}
+    usual = hypothesis.effect()
+    model = with_effects(without_effect(cast(AnalyticModel, problem.model), hypothesis.name), usual)
+    values = {hypothesis.parameter(c.name): c.default for c in hypothesis.effect.coefficients}
+    unknowns = replace(before.unknowns, values={**before.unknowns.values, **values})
+    after = fit(replace(problem, model=model, free=free), unknowns, before.noise, settle_noise=False)
+    gain = 2.0 * (before.cost - after.cost)
+    freedom = 3 * problem.stretches.settings.shape[1] + len(hypothesis.columns)
+    estimate = np.array([after.unknowns.values[name] for name in hypothesis.columns])
+    p_value = float(stats.chi2.sf(max(gain, 0.0), freedom))
+    score = Score(estimate, np.full(len(estimate), np.nan), gain, p_value, freedom)
+    return Refit(Scored(hypothesis, score, score.p_value), after, delta_bic(before, after))
+
+
 def delta_bic(before: Fit, after: Fit) -> float:
-    """BIC of one fit minus that of another at the same noise; the samples are coordinates."""
+    """BIC of one fit minus that of another at the same noise; what is counted are tracks, the independent units."""
     more = len(after.problem.free) - len(before.problem.free)
-    samples = 3 * int(before.problem.stretches.used.sum())
-    return 2.0 * (after.cost - before.cost) + more * float(np.log(samples))
-
-
+    tracks = len(np.unique(before.problem.stretches.track))
+    return 2.0 * (after.cost - before.cost) + more * float(np.log(tracks))

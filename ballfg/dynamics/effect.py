@@ -9,12 +9,14 @@ them.
 from __future__ import annotations
 
 from abc import ABC
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
+from ballfg.dynamics.scene import Scene
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 
@@ -165,6 +167,7 @@ class Effect(nn.Module, ABC):
         decide: what to measure to tell it from what it is mistaken for.
         coefficients: its numbers.
         needs: names of effects that must be in the same model, since this one changes them.
+        multiplies_spin: its strength multiplies a spin that nobody may know: without labels it has no slope at absence.
     """
 
     name: ClassVar[str]
@@ -173,6 +176,7 @@ class Effect(nn.Module, ABC):
     decide: ClassVar[str]
     coefficients: ClassVar[tuple[Coefficient, ...]]
     needs: ClassVar[tuple[str, ...]] = ()
+    multiplies_spin: ClassVar[bool] = False
 
     def __init__(self, /, **values: float) -> None:
         super().__init__()
@@ -189,6 +193,15 @@ class Effect(nn.Module, ABC):
                     f"{self.name}.{c.name} must lie in [{c.low:g}, {c.high:g}] {c.unit}; got {value:g}. Check its unit."
                 )
             self.register_parameter(c.name, nn.Parameter(torch.tensor(value, dtype=torch.float64)))
+
+    @classmethod
+    def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
+        """Values of the shape coefficients with which the effect is looked for in data that span `scene`.
+
+        By default the shapes are as declared. A reference is best put in the middle of the data, a region over all of
+        their extent. None: it cannot act there.
+        """
+        return ({},)
 
 
 class FlightEffect(Effect):

@@ -12,6 +12,7 @@ from ballfg.estimate.online import Online
 from ballfg.estimate.settings import Settings
 from ballfg.estimate.sliding_window import SlidingWindow
 from ballfg.estimate.smoother import Smoother
+from ballfg.estimate.through_measurement import ThroughMeasurement
 
 ESTIMATORS: Final[dict[str, type[Estimator]]] = {
     estimator.name: estimator for estimator in (Smoother, Online, ExtendedKalmanFilter, SlidingWindow)
@@ -19,7 +20,12 @@ ESTIMATORS: Final[dict[str, type[Estimator]]] = {
 
 
 def make_estimator(name: str, model: BallModel, surfaces: Surfaces, settings: Settings) -> Estimator:
-    """The estimator of a name. Raises: ValueError: if there is none; the message lists those there are."""
+    """The estimator of a name; one that undoes the model's measurement effects, where there are any.
+
+    Raises: ValueError: if there is none of that name; the message lists those there are.
+    """
     if name not in ESTIMATORS:
         raise ValueError(f"method must be one of {', '.join(ESTIMATORS)}; got '{name}'")
+    if not model.measures_plainly:
+        return ThroughMeasurement(ESTIMATORS[name], model, surfaces, settings)
     return ESTIMATORS[name](model, surfaces, settings)

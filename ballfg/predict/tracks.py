@@ -1,16 +1,17 @@
-"""Prediction of whole tracks: observe the first part, predict the position at every later stamp."""
+"""Prediction of whole tracks: observe the first part, predict what will be measured at every later stamp."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ballfg.estimate.as_measured import measured_positions, true_times
 from ballfg.estimate.batch import estimate_tracks
 from ballfg.estimate.estimator import Estimator
 from ballfg.estimate.result import Estimate, Status
@@ -30,13 +31,14 @@ STAMP_TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class TrackPrediction:
-    """Where the ball of one track will be.
+    """Where the ball of one track will be measured: as the model measures it, at written stamps.
 
     Attributes:
         name: of the track.
         times: (k,) s, the stamps after the observed part; none if the track ends before.
         positions: (k, 3) m.
-        sigmas: (k, 3) m, of a measured position: state and measurement noise.
+        sigmas: (k, 3) m, of a measured position: state and measurement noise. Measurement effects do not change them:
+            they are right to the share by which those stretch lengths and to a lag times the velocity's sigma.
         measured: (k, 3) m, what the track has at those stamps.
         estimate: from the observed part.
     """
@@ -55,7 +57,13 @@ class TrackPrediction:
 
 
 def predict_tracks(
-    estimator: Estimator, tracks: Iterable[Track], count: int, observe: float, *, horizon: float = np.inf, jobs: int = 1
+    estimator: Estimator,
+    tracks: Iterable[Track],
+    count: int,
+    observe: float | Callable[[Track], float],
+    *,
+    horizon: float = np.inf,
+    jobs: int = 1,
 ) -> Iterator[TrackPrediction]:
     """Predictions in the order of the tracks.
 
@@ -63,16 +71,18 @@ def predict_tracks(
         estimator: from what it sees of a track comes the belief that is propagated.
         tracks: a stream; some tens at a time are in memory.
         count: how many there are, about.
-        observe: s from the track's first stamp; a stamp at its end is observed.
+        observe: s from the track's first stamp; a stamp at its end is observed. A function gives each track its own.
         horizon: s after the last observed stamp; later stamps are left out.
         jobs: processes for the estimation.
 
     Raises: ValueError: if observe or horizon is not positive.
     """
-    check_observe(observe)
+    if not callable(observe):
+        check_observe(observe)
     if not horizon > 0.0:
         raise ValueError(f"horizon must be a positive number of seconds; got {horizon:g}. Leave it out for all stamps.")
-    return _predictions(estimator, tracks, count, observe, horizon, jobs)
+    seconds = observe if callable(observe) else lambda track: observe
+    return _predictions(estimator, tracks, count, seconds, horizon, jobs)
 
 
 def check_observe(observe: float) -> None:
@@ -84,7 +94,12 @@ def check_observe(observe: float) -> None:
 
 
 def _predictions(
-    estimator: Estimator, tracks: Iterable[Track], count: int, observe: float, horizon: float, jobs: int
+    estimator: Estimator,
+    tracks: Iterable[Track],
+    count: int,
+    observe: Callable[[Track], float],
+    horizon: float,
+    jobs: int,
 ) -> Iterator[TrackPrediction]:
     propagator = Propagator(estimator.surfaces, estimator.settings.process)
     waiting: deque[Track] = deque()
@@ -92,7 +107,7 @@ def _predictions(
     def observed() -> Iterator[Track]:
         for track in tracks:
             waiting.append(track)
-            yield track.until(float(track.times[0]) + observe + _tolerance(track))
+            yield track.until(float(track.times[0]) + observe(track) + _tolerance(track))
 
     estimates = estimate_tracks(estimator, observed(), count, jobs)
     while block := list(islice(estimates, BLOCK)):
@@ -107,19 +122,26 @@ def _tolerance(track: Track) -> float:
 def _predict_block(
     estimator: Estimator, propagator: Propagator, estimates: list[Estimate], tracks: list[Track], horizon: float
 ) -> Iterator[TrackPrediction]:
-    ends = [float(e.times[-1]) for e in estimates]
-    later = [(t.times > end) & (t.times <= end + horizon + _tolerance(t)) for t, end in zip(tracks, ends, strict=True)]
-    times = _padded([t.times[mask] for t, mask in zip(tracks, later, strict=True)], ends)
+    later = [_later(t, float(e.times[-1]), horizon) for t, e in zip(tracks, estimates, strict=True)]
+    clocks = [true_times(estimator.model, t.times) for t in tracks]
+    ends = [float(clock[len(e.times) - 1]) for clock, e in zip(clocks, estimates, strict=True)]
+    times = _padded([clock[mask] for clock, mask in zip(clocks, later, strict=True)], ends)
     belief = Belief.last(estimator.model, estimates, estimator.settings.coefficients)
+    belief = replace(belief, time=torch.tensor(ends, dtype=torch.float64))
     positions, variances = np.zeros((*times.shape, 3)), np.zeros((*times.shape, 3))
     for k, predicted in enumerate(propagator.walk(belief, torch.from_numpy(times)) if times.size else ()):
-        positions[:, k] = predicted.mean[:, POSITION].numpy()
+        positions[:, k] = measured_positions(predicted.model, predicted.mean, estimator.surfaces).numpy()
         variances[:, k] = torch.diagonal(predicted.covariance, dim1=-2, dim2=-1)[:, POSITION].numpy()
     for i, (track, result, mask) in enumerate(zip(tracks, estimates, later, strict=True)):
         k = int(mask.sum())
         noise = sample_sigmas(estimator.settings, len(track), track.sigmas)[mask]
         sigmas = np.sqrt(variances[i, :k] + noise**2)
         yield TrackPrediction(track.name, track.times[mask], positions[i, :k], sigmas, track.positions[mask], result)
+
+
+def _later(track: Track, end: float, horizon: float) -> NDArray[np.bool_]:
+    """(n,) bool: the stamps that are predicted."""
+    return (track.times > end) & (track.times <= end + horizon + _tolerance(track))
 
 
 def _padded(times: list[Array], ends: list[float]) -> Array:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 from torch import Tensor
 
 from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect
+from ballfg.dynamics.scene import Scene
 
 
 class DragSpeed(FlightEffect):
@@ -23,6 +26,11 @@ class DragSpeed(FlightEffect):
     needs = ("drag",)
     slope: Tensor
     reference: Tensor
+
+    @classmethod
+    def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
+        """The reference in the middle of the data."""
+        return ({"reference": scene.speed},)
 
     def adjust(self, flight: Flight) -> Flight:
         """The flight with more drag where it is fast."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Final
 
 import torch
-from torch import Tensor
 
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Impact, vector
 

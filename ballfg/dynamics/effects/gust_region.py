@@ -2,10 +2,22 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Final
+
 import torch
 from torch import Tensor
 
 from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect, vector
+from ballfg.dynamics.scene import Scene
+
+PLACES: Final = (4, 2, 2)
+"""Centres that are tried along x, y and z."""
+REGION_SHARE: Final = 0.25
+"""Size of a region that is tried, as a share of the longest extent of the data."""
+LARGEST_REGION: Final = 50.0
+"""m. Of a region that is tried."""
 
 
 class GustRegion(FlightEffect):
@@ -30,6 +42,17 @@ class GustRegion(FlightEffect):
     center_y: Tensor
     center_z: Tensor
     size: Tensor
+
+    @classmethod
+    def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
+        """Regions of one size at places over the extent of the data."""
+        extent = [high - low for low, high in zip(scene.low, scene.high, strict=True)]
+        axes = [
+            [low + length * (i + 0.5) / count for i in range(count)]
+            for low, length, count in zip(scene.low, extent, PLACES, strict=True)
+        ]
+        size = min(REGION_SHARE * max(extent), LARGEST_REGION)
+        return [{"center_x": x, "center_y": y, "center_z": z, "size": size} for x, y, z in itertools.product(*axes)]
 
     def air_velocity(self, flight: Flight) -> Tensor:
         """(..., 3) m/s at the ball's place."""

@@ -12,6 +12,7 @@ class Magnus(FlightEffect):
     """a = k (spin x v), k dimensionless: sources differ by 3.6 times (0.0010 to 0.0036)."""
 
     name = "magnus"
+    multiplies_spin = True
     sentence = "Lift of a spinning ball, proportional to spin x velocity."
     decide = (
         "Shoot with spins of opposite sign at one speed: the lift changes its sign with the spin, nothing else does."

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 from torch import Tensor
 
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Impact
+from ballfg.dynamics.scene import Scene
 
 
 class RestitutionSpeed(BounceEffect):
@@ -23,6 +26,11 @@ class RestitutionSpeed(BounceEffect):
     needs = ("restitution",)
     slope: Tensor
     reference: Tensor
+
+    @classmethod
+    def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
+        """The reference in the middle of the data."""
+        return ({"reference": scene.impact_speed},) if scene.contacts else ()
 
     def adjust(self, impact: Impact) -> Impact:
         """The impact with a restitution that depends on its normal speed."""

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import torch
 from torch import Tensor
 
 from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect, vector
+from ballfg.dynamics.scene import Scene
 from ballfg.state import Z
 
 
@@ -25,6 +28,11 @@ class WindShear(FlightEffect):
     x: Tensor
     y: Tensor
     reference: Tensor
+
+    @classmethod
+    def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
+        """The reference in the middle of the data."""
+        return ({"reference": scene.middle[2]},)
 
     def air_velocity(self, flight: Flight) -> Tensor:
         """(..., 3) m/s at the height of the ball."""

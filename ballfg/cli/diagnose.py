@@ -1,0 +1,97 @@
+"""`ballfg diagnose`: what the model of a dataset's tracks lacks."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ballfg.cli.inputs import default_jobs, open_inputs
+
+if TYPE_CHECKING:
+    from ballfg.diagnose.result import Diagnosis
+
+
+def diagnose(
+    dataset: Annotated[Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.")],
+    out: Annotated[Path, typer.Option(help="Folder of the report: new, empty or with an earlier report.")],
+    model: Annotated[Path | None, typer.Option(help="Model file; the nominal table-tennis model without it.")] = None,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.", show_default="one per core")] = default_jobs(),
+) -> None:
+    """Is anything lacking in the model? What, how sure, what else could it be, and what does it bring?
+
+    Example: ballfg diagnose data/aimy --model model.yaml --out diagnosis
+
+    Half of the tracks serve to find, the others to judge. The folder then holds
+    report.html to read, report.json for programs, and model.yaml, the corrected
+    model, for the --model of other commands.
+    """
+    from ballfg.diagnose import diagnose as find
+    from ballfg.diagnose.report import FALLBACK, MODEL, PAGE, REPORT, check_report_folder, write_report
+    from ballfg.dynamics import AnalyticModel
+
+    if out.resolve() == dataset.resolve():
+        raise ValueError(f"out must not be the dataset itself; got {out}. Choose another folder.")
+    check_report_folder(out)
+    if model is not None and model.resolve() == out.resolve() / MODEL:
+        raise ValueError(f"out must not hold the model itself; {model} would be replaced. Choose another folder.")
+    inputs = open_inputs(dataset, model)
+    if not isinstance(inputs.model, AnalyticModel):
+        raise ValueError(
+            f"--model must be analytic: a diagnosis adds physical effects to it; {model} is a learned one. "
+            "Give the analytic model that you believe in."
+        )
+    diagnosis = find(
+        inputs.dataset, inputs.model, jobs=jobs, watch=lambda line: print(line, file=sys.stderr, flush=True)
+    )
+    write_report(diagnosis, out)
+    for line in _summary(diagnosis):
+        print(line)
+    written = ", ".join(name for name in (PAGE, REPORT, MODEL, FALLBACK) if (out / name).is_file())
+    print(f"\nwrote {written} to {out}")
+
+
+def _summary(diagnosis: Diagnosis) -> Iterator[str]:
+    """The diagnosis in lines: the sentence, effects, errors on the judging half, what is left."""
+    from ballfg.diagnose.wording import listed, probability
+
+    yield f"{diagnosis.verdict.value}: {diagnosis.sentence}"
+    rows = [("effect", "kind", "by chance", "BIC", "cannot be told from", "coefficients")]
+    for f in diagnosis.findings:
+        others = ", ".join(f.indistinguishable_from) or "-"
+        rows.append((f.name, f.kind, probability(f.p_value), f"{f.delta_bic:+.0f}", others, listed(f.parameters)))
+    if diagnosis.findings:
+        yield from ("", *_aligned(rows))
+    yield from ("", *_aligned(_errors(diagnosis)))
+    left = diagnosis.unexplained
+    if left.where:
+        yield from ("", f"left unexplained: {left.where}")
+    if left.fallback is not None:
+        error = left.fallback.after.prediction_rmse_mm
+        yield f"  {left.fallback.kind}: {left.fallback.description}; prediction RMSE {error:.1f} mm with it"
+    if diagnosis.excluded:
+        yield from ("", *(f"left out: {line}" for line in diagnosis.excluded))
+
+
+def _errors(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
+    from ballfg.diagnose.wording import fixed
+
+    before, after = diagnosis.before, diagnosis.after
+    rows: list[tuple[str, ...]] = [(f"on {diagnosis.tracks_judged_on} judging tracks", "before", "after")]
+    for name, was, now, decimals in (
+        ("prediction RMSE, mm", before.prediction_rmse_mm, after.prediction_rmse_mm, 1),
+        ("apex RMSE, mm", before.apex_rmse_mm, after.apex_rmse_mm, 1),
+        ("NIS (1 is right)", before.nis, after.nis, 2),
+        ("log likelihood", before.log_likelihood, after.log_likelihood, 2),
+    ):
+        rows.append((name, fixed(was, decimals), fixed(now, decimals)))
+    return rows
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    for row in rows:
+        yield "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip()

@@ -1,0 +1,125 @@
+"""When no named effect explains what is left: a description that predicts better, without a name.
+
+First a few generic terms, which a person can read; only if those do not help, a network that corrects the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from ballfg.diagnose.calibrated import calibrated_model
+from ballfg.diagnose.problem import Fit
+from ballfg.diagnose.result import Errors, Fallback
+from ballfg.diagnose.sparse import SparseTerms, fit_with_terms, sparse_terms
+from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.dynamics.architecture import Architecture
+from ballfg.dynamics.learned import LearnedModel, build
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.spin_embedding import SpinEmbedding
+from ballfg.estimate.configure import dataset_settings, dataset_surfaces
+from ballfg.learning.distributed import Ranks
+from ballfg.learning.end_to_end import EndToEnd
+from ballfg.learning.learnables import Learnables, NoiseScales
+from ballfg.learning.loop import Task, Training, TrainingStoppedError
+from ballfg.learning.shots import Shot, shots_of
+from ballfg.learning.train_config import LossConfig, OptimizerConfig, TrainConfig
+from ballfg.tracks import Dataset, Track
+
+HELPS = 0.9
+"""A fallback must reduce the prediction error on the judging half to this share of what it is without."""
+OBSERVED = 0.4
+"""Share of a typical track that the network's estimates see; it learns to predict the rest."""
+VALIDATES = 5
+"""One track of so many decides at which epoch the network is best."""
+LEAST_LEARNED = 10
+"""Fewer shots than this make no network that predicts others."""
+EPOCHS = 30
+"""About a minute for 25 tracks."""
+POSITION_SCALE = 0.03
+"""m, prediction error beyond which a track's part in the loss grows only linearly: a few must not rule the network."""
+
+Judge = Callable[[BallModel], Errors]
+"""Errors of a model's predictions on the judging half."""
+
+
+def fallback(
+    before: Fit, embedding: SpinEmbedding, dataset: Dataset, tracks: Sequence[Track], now: Errors, judge: Judge
+) -> Fallback | None:
+    """What explains the rest without naming it; None if nothing predicts better.
+
+    Args:
+        before: of an `AnalyticModel`, on the finding half.
+        embedding: names its launcher settings.
+        dataset: where the tracks come from.  tracks: of the finding half.
+        now: errors of the model as it is, on the judging half.
+    """
+    most = HELPS * now.prediction_rmse_mm
+    terms = sparse_terms(before)
+    if terms is not None:
+        after = fit_with_terms(before, terms)
+        model: BallModel = calibrated_model(after, embedding)
+        errors = judge(model)
+        if errors.prediction_rmse_mm < most:
+            return Fallback("sparse terms", describe(terms, after), errors, model)
+    network = learned_residual(calibrated_model(before, embedding), dataset, tracks)
+    if network is None:
+        return None
+    errors = judge(network)
+    if errors.prediction_rmse_mm >= most:
+        return None
+    return Fallback("learned residual", f"{network.architecture.kind}, {_size(network)} parameters", errors, network)
+
+
+def describe(terms: SparseTerms, after: Fit) -> str:
+    """The terms with their fitted coefficients, those that explain most first."""
+    units = after.problem.model.declared_coefficients()
+    values = {name: after.unknowns.values[name] for name in terms.estimates}
+    return ", ".join(f"{name.split('.', 1)[1]} = {value:.3g} {units[name].unit}" for name, value in values.items())
+
+
+def learned_residual(base: AnalyticModel, dataset: Dataset, tracks: Sequence[Track]) -> LearnedModel | None:
+    """A network that corrects a model, trained end to end on tracks; None if they are too few or the training fails.
+
+    Args: base: calibrated; its noise and launcher stay.
+    """
+    settings = dataset_settings(dataset, base)
+    seconds = OBSERVED * float(np.median([track.duration for track in tracks]))
+    made = shots_of(tracks, base, dataset_surfaces(dataset), settings, samples=None, seconds=seconds)
+    shots = [shot for _, shot in made if isinstance(shot, Shot)]
+    if len(shots) < LEAST_LEARNED:
+        return None
+    model = build(Architecture.of("mnn+gs", residual=True), radius=base.radius, base=base, seed=0)
+    launcher = None if settings.launcher is None else settings.launcher.embedding
+    noise = NoiseScales(settings.process, position=settings.position_scale, learned=False)
+    loss = LossConfig(position_scale=POSITION_SCALE)
+    trainee = EndToEnd(shots, Learnables(model, launcher, noise), loss)
+    if not _trained(trainee, len(shots), TrainConfig(optimizer=OptimizerConfig(epochs=EPOCHS), loss=loss)):
+        return None
+    model.trained = base.trained
+    return model.requires_grad_(False)
+
+
+def _trained(trainee: EndToEnd, count: int, config: TrainConfig) -> bool:
+    """Whether the training came to its end."""
+    numbers = range(count)
+    validation = tuple(numbers[VALIDATES - 1 :: VALIDATES])
+    train = tuple(n for n in numbers if n not in validation)
+    training = Training(Task(trainee, train, validation, config, Ranks(), _unwatched))
+    try:
+        for _ in training.epochs():
+            pass
+    except TrainingStoppedError:
+        return False
+    training.take_best()
+    return True
+
+
+def _unwatched(items: Iterator[list[int]], count: int, what: str) -> Iterator[list[int]]:
+    return iter(items)
+
+
+def _size(model: LearnedModel) -> int:
+    own = (*model.flight.parameters(), *model.contact.parameters())
+    return sum(p.numel() for p in own)

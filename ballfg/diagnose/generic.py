@@ -1,0 +1,139 @@
+"""Is anything left that has a pattern, and where does it live? Tests that need no name for it.
+
+Each block of patterns (`ballfg.diagnose.patterns`) is tested as a candidate effect is: scores of its columns with states
+and declared coefficients projected out, tracks as independent units. Of a large block only the directions that the data
+show best are tested, chosen before anything is known of the residuals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.diagnose.clustered import Pattern, judge_patterns
+from ballfg.diagnose.patterns import EVERYWHERE, PLAUSIBLE, UNIT, Block, blocks_of
+from ballfg.diagnose.problem import Fit, common_precision, linearise
+from ballfg.diagnose.result import GenericTest
+from ballfg.diagnose.score import Signatures
+from ballfg.diagnose.system import System, by_track
+from ballfg.diagnose.whiteness import Whiteness, whiteness
+
+ALARM = 0.005
+"""Probability that any of the tests of a fit that lacks nothing raises an alarm: p-values below it are alarms."""
+TRACKS_PER_DIRECTION = 4
+"""Tracks for each direction of a block that is tested: their scatter must tell the directions' covariance."""
+LEAST_INFORMATION = 1.0
+"""Of a direction that is tested: the data tell its strength to the size of a pattern that is large in practice."""
+MOST_SEEN = 95.0
+"""Percentile over the data that "up to" means."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Tested:
+    """The outcome for one block: the likely strengths (3, f) of its columns, and the test in its leading directions."""
+
+    block: Block
+    strengths: Array
+    pattern: Pattern
+
+
+def generic_tests(fit: Fit, reference: Fit | None = None) -> tuple[GenericTest, ...]:
+    """All tests of a fit, p-values corrected for their number, the least probable first.
+
+    Args: reference: the fit at the start, to which shares refer; None: this one.
+    """
+    found, drift = _examine(fit)
+    start = (found, drift) if reference is None else _examine(reference)
+    count = len(found) + 1
+    tests = [_generic(tested, _of_block(start[0], tested.block), count) for tested in found]
+    return tuple(sorted([*tests, _time(drift, start[1], count)], key=lambda t: t.p_value))
+
+
+def _examine(fit: Fit) -> tuple[list[_Tested], Whiteness]:
+    system = linearise(fit.problem, fit.unknowns, fit.noise, fit.predicted)
+    blocks = blocks_of(fit)
+    columns = np.concatenate((system.by_common, *(block.columns for block in blocks)), axis=-1)
+    whole = System(system.residual, system.by_start, columns)
+    gram = by_track(whole.eliminated().gram, fit.problem.stretches.track)
+    signatures = Signatures(gram, common_precision(fit.problem), system.by_common.shape[-1])
+    return _tested(signatures, blocks), whiteness(fit, system)
+
+
+def _tested(signatures: Signatures, blocks: list[Block]) -> list[_Tested]:
+    """Every block that the data show at all."""
+    efficient = signatures.efficient()
+    information = efficient.information.sum(axis=0) + efficient.prior
+    score, at = efficient.score.sum(axis=0), 0
+    seen: list[tuple[Block, Array]] = []
+    directions: list[Array] = []
+    for block in blocks:
+        own = slice(at, at + block.columns.shape[-1])
+        at = own.stop
+        turn = _leading(information[own, own], signatures.tracks, own, len(score))
+        if turn.shape[1]:
+            strengths = np.linalg.solve(information[own, own] + np.eye(own.stop - own.start), score[own])
+            seen.append((block, strengths.reshape(3, -1)))
+            directions.append(turn)
+    patterns = judge_patterns(signatures, directions)
+    return [_Tested(*of, pattern) for of, pattern in zip(seen, patterns, strict=True)]
+
+
+def _leading(information: Array, tracks: int, own: slice, count: int) -> Array:
+    """(count, r) the directions of a block's columns that the data show best, among all `count` columns."""
+    values, vectors = np.linalg.eigh(information)
+    most = max(1, tracks // TRACKS_PER_DIRECTION)
+    shown = np.flatnonzero(values >= LEAST_INFORMATION)[::-1][:most]
+    turn = np.zeros((count, len(shown)))
+    turn[own] = vectors[:, shown]
+    return turn
+
+
+def _of_block(found: list[_Tested], block: Block) -> _Tested | None:
+    same = [t for t in found if (t.block.kind, t.block.quantities) == (block.kind, block.quantities)]
+    return same[0] if same else None
+
+
+def _generic(tested: _Tested, start: _Tested | None, count: int) -> GenericTest:
+    left = max(0.0, tested.pattern.explained - tested.pattern.rank)
+    first = max(left, 0.0 if start is None else start.pattern.explained - start.pattern.rank)
+    return GenericTest(
+        name=tested.block.kind,
+        where=where(tested.block, tested.strengths),
+        p_value=min(1.0, count * tested.pattern.p_value),
+        share=left / first if first > 0.0 else 0.0,
+    )
+
+
+def where(block: Block, strengths: Array) -> str:
+    """In words, where a block's pattern lives.
+
+    Args: strengths: (3, f) of its columns, in units of what is plausible.
+    """
+    pattern = PLAUSIBLE[block.kind] * strengths @ block.values.T  # (3, m)
+    axis = int(np.argmax((pattern**2).mean(axis=1)))
+    share = strengths[axis] ** 2 * (block.values**2).mean(axis=0)
+    name = block.quantities[int(np.argmax(share))]
+    size = float(np.percentile(np.abs(pattern[axis]), MOST_SEEN))
+    what = {"flight": "acceleration", "contact": "velocity after a contact", "measurement": "error of position"}
+    depends = f"is off {EVERYWHERE}" if name == EVERYWHERE else f"depends on {name}"
+    return f"{block.kind}: {what[block.kind]} {block.axes[axis]} {depends}, up to {_amount(block.kind, size)}"
+
+
+def _amount(kind: str, size: float) -> str:
+    return f"{1e3 * size:.2g} mm" if kind == "measurement" else f"{size:.2g} {UNIT[kind]}"
+
+
+def _time(drift: Whiteness, start: Whiteness, count: int) -> GenericTest:
+    place = drift.reach
+    left = max(0.0, float(drift.explained.max()))
+    first = max(left, float(start.explained.max()))
+    return GenericTest(
+        name="time",
+        where=f"time: samples within {1e3 * place:.0f} ms err alike, by {1e3 * drift.drift:.2g} mm",
+        p_value=min(1.0, count * drift.p_value),
+        share=left / first if first > 0.0 else 0.0,
+    )

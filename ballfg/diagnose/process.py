@@ -1,0 +1,50 @@
+"""How far real balls stray from a model from one moment to the next: the process noise that predictions call for.
+
+The fit is deterministic: what balls do beside their model goes to the residual. A prediction needs it as process noise,
+else it is too sure of itself, or gives away what the observed part tells. The usual process noise of measured tracks is
+scaled as a whole, to the scale at which the finding half is predicted with the largest likelihood.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+
+from ballfg.diagnose.judge import JudgedTrack, prediction_errors
+from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.dynamics.trained import Trained
+from ballfg.estimate.configure import dataset_settings, dataset_surfaces
+from ballfg.estimate.settings import MEASURED
+from ballfg.tracks import Dataset
+
+SCALES = (1.0, 0.3, 0.1, 0.03)
+"""Of the usual process noise; the likelihood is flat between neighbours."""
+SCALED = ("acceleration", "spin", "contact_velocity", "contact_tangential", "contact_spin")
+"""What is scaled; a hit remains a hit."""
+
+
+def with_process_noise(
+    model: AnalyticModel, tracks: Sequence[JudgedTrack], dataset: Dataset, jobs: int
+) -> AnalyticModel:
+    """The model with the process noise that predicts tracks best.
+
+    Args: model: with `trained`; changed in place and returned.  tracks: those that it was fitted to.
+    """
+    likelihoods = []
+    trained = cast(Trained, model.trained)
+    for scale in SCALES:
+        model.trained = _scaled(trained, scale)
+        settings = dataset_settings(dataset, model)
+        errors = prediction_errors(model, tracks, dataset_surfaces(dataset), settings, jobs)
+        likelihoods.append(errors.log_likelihood)
+        if len(likelihoods) > 1 and likelihoods[-1] < likelihoods[-2]:
+            break  # it has one maximum
+    model.trained = _scaled(trained, SCALES[int(np.argmax(likelihoods))])
+    return model
+
+
+def _scaled(trained: Trained, scale: float) -> Trained:
+    return replace(trained, process_noise={name: scale * getattr(MEASURED, name) for name in SCALED})

@@ -1,0 +1,171 @@
+"""`ballfg diagnose` as a user meets it: what it prints and writes, what it refuses, and a whole run."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "diagnose"))
+
+from made_diagnosis import found, silent, unexplained
+
+import ballfg.diagnose
+from ballfg.cli.main import run
+from ballfg.diagnose.result import Diagnosis
+from ballfg.dynamics import AnalyticModel, Architecture, build, load_model, nominal_model, save_model
+from ballfg.simulate import SimulationConfig, write_simulation
+from ballfg.tracks import Dataset
+
+Asked = list[tuple[str, tuple[str, ...], int]]
+"""Dataset, flight effects of the model and jobs."""
+Answer = Callable[[Diagnosis], Asked]
+NAMES = ["model.yaml", "report.html", "report.json"]
+needs_the_loop = pytest.mark.skipif(
+    not callable(getattr(ballfg.diagnose, "diagnose", None)), reason="ballfg.diagnose.diagnose is not there yet"
+)
+
+
+def status(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as exit_:
+        run([str(argument) for argument in arguments])
+    assert isinstance(exit_.value.code, int)
+    return exit_.value.code
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("cli") / "shots"
+    write_simulation(folder, SimulationConfig(tracks=12, rate=100.0, seed=2))
+    return folder
+
+
+@pytest.fixture
+def answer(monkeypatch: pytest.MonkeyPatch) -> Answer:
+    """answer(diagnosis): the search finds that; returns what the search was asked."""
+    asked: Asked = []
+
+    def answer(diagnosis: Diagnosis) -> Asked:
+        def diagnose(
+            dataset: Dataset, model: AnalyticModel, *, jobs: int = 1, watch: Callable[[str], None] | None = None
+        ) -> Diagnosis:
+            assert watch is not None
+            watch("fitting the declared model to 25 tracks")
+            asked.append((dataset.info.name, tuple(model.flight), jobs))
+            return diagnosis
+
+        monkeypatch.setattr(ballfg.diagnose, "diagnose", diagnose, raising=False)
+        monkeypatch.setattr("ballfg.diagnose.report.page", lambda diagnosis: "<html></html>")
+        return asked
+
+    return answer
+
+
+def test_what_is_printed_and_written(
+    dataset: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    answer: Answer,
+) -> None:
+    asked = answer(found())
+    out = tmp_path / "diagnosis"
+    assert status("diagnose", dataset, "--model", dataset / "model.yaml", "--out", out, "--jobs", 2) == 0
+    ((_, effects, jobs),) = asked
+    assert (effects[:2], jobs) == (("gravity", "drag"), 2)
+    said = capsys.readouterr()
+    assert said.err == "fitting the declared model to 25 tracks\n"
+    lines = said.out.splitlines()
+    assert lines[0] == f"effect found: {found().sentence}"
+    assert lines[2].split()[:4] == ["effect", "kind", "by", "chance"]
+    assert lines[3].startswith("wind    flight  less than 1e-99  -598  gust_region          x 0.200 ± 0.012 m/s, ")
+    assert lines[5:8] == [
+        "on 25 judging tracks  before  after",
+        "prediction RMSE, mm   20.1    10.2",
+        "apex RMSE, mm         12.1    –",
+    ]
+    assert "left out: shot 7 has no free flight of 10 samples." in lines
+    assert lines[-1] == f"wrote report.html, report.json, model.yaml to {out}"
+    assert sorted(path.name for path in out.iterdir()) == NAMES
+
+
+def test_other_verdicts(
+    dataset: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    answer: Answer,
+) -> None:
+    answer(silent())
+    assert status("diagnose", dataset, "--out", tmp_path / "a") == 0
+    said = capsys.readouterr().out
+    assert said.startswith("nothing lacking: Nothing is lacking")
+    assert "effect " not in said
+    answer(unexplained())
+    assert status("diagnose", dataset, "--out", tmp_path / "a") == 0
+    said = capsys.readouterr().out
+    assert "left unexplained: In flight, along the motion" in said
+    assert "  sparse terms: 0.31 t |v| v; prediction RMSE 11.8 mm with it" in said
+    assert json.loads((tmp_path / "a" / "report.json").read_text(encoding="utf-8"))["verdict"] == "unexplained"
+
+
+def test_a_learned_model_is_refused(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], answer: Answer
+) -> None:
+    asked = answer(found())
+    model = build(Architecture(kind="mnn+gs", width_flight=4, width_contact=4, depth=1), radius=0.02)
+    save_model(model, tmp_path / "learned.yaml")
+    out = tmp_path / "diagnosis"
+    assert status("diagnose", dataset, "--model", tmp_path / "learned.yaml", "--out", out) == 2
+    refused(capsys, "--model must be analytic: a diagnosis adds physical effects to it; ")
+    assert not out.exists()
+    assert asked == []
+
+
+def test_places_that_are_refused(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], answer: Answer
+) -> None:
+    asked = answer(found())
+    before = sorted(dataset.iterdir())
+    assert status("diagnose", dataset, "--out", dataset) == 2
+    refused(capsys, "out must not be the dataset itself; got ")
+    (tmp_path / "notes.txt").write_text("mine")
+    assert status("diagnose", dataset, "--out", tmp_path) == 2
+    refused(capsys, "out must be new, empty or hold an earlier report; ")
+    out = tmp_path / "earlier"
+    out.mkdir()
+    save_model(nominal_model(), out / "model.yaml")
+    (out / "report.json").write_text("{}")
+    assert status("diagnose", dataset, "--model", out / "model.yaml", "--out", out) == 2
+    refused(capsys, "out must not hold the model itself; ")
+    assert status("diagnose", tmp_path / "nowhere", "--out", tmp_path / "new") == 2
+    assert sorted(dataset.iterdir()) == before
+    assert not (tmp_path / "new").exists()
+    assert asked == []
+
+
+def refused(capsys: pytest.CaptureFixture[str], message: str) -> None:
+    said = capsys.readouterr()
+    assert (said.out, said.err.count("\n")) == ("", 1)
+    assert said.err.startswith(f"ballfg: error: {message}")
+
+
+def test_help_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
+    assert status("diagnose", "--help") == 0
+    assert "ballfg diagnose data/aimy --model model.yaml --out diagnosis" in " ".join(capsys.readouterr().out.split())
+
+
+@needs_the_loop
+@pytest.mark.slow
+def test_a_whole_run(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """On tracks of the declared model: a report whose error is about the noise, and a model that can be read."""
+    out = tmp_path / "diagnosis"
+    assert status("diagnose", dataset, "--model", dataset / "model.yaml", "--out", out, "--jobs", 1) == 0
+    assert sorted(path.name for path in out.iterdir()) == NAMES
+    report = json.loads((out / "report.json").read_text(encoding="utf-8"))
+    assert report["verdict"] == "nothing lacking"
+    assert report["effects"] == []
+    assert 3.0 < report["error"]["before"]["prediction_rmse_mm"] < 60.0
+    assert isinstance(load_model(out / "model.yaml"), AnalyticModel)
+    assert capsys.readouterr().out.startswith("nothing lacking: ")
