@@ -30,7 +30,7 @@ def diagnose(
     model, for the --model of other commands.
     """
     from ballfg.diagnose import diagnose as find
-    from ballfg.diagnose.report import FALLBACK, MODEL, PAGE, REPORT, check_report_folder, write_report
+    from ballfg.diagnose.report import MODEL, PAGE, REPORT, check_report_folder, write_report
     from ballfg.dynamics import AnalyticModel
 
     if out.resolve() == dataset.resolve():
@@ -50,7 +50,7 @@ def diagnose(
     write_report(diagnosis, out)
     for line in _summary(diagnosis):
         print(line)
-    written = ", ".join(name for name in (PAGE, REPORT, MODEL, FALLBACK) if (out / name).is_file())
+    written = ", ".join(name for name in (PAGE, REPORT, MODEL) if (out / name).is_file())
     print(f"\nwrote {written} to {out}")
 
 

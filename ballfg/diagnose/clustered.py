@@ -15,8 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
-from ballfg.diagnose.score import PRIOR_TRACKS, Signatures
+from ballfg.diagnose.signatures import Signatures
 
+PRIOR_TRACKS = 10.0
+"""Tracks that the scatter pooled over all patterns is worth beside a pattern's own: of few tracks an own covariance is too
+uncertain."""
 LEAST_OWN = 1e-9
 """Share of a track's information that every direction is taken to have, so that a track that tells nothing of one counts."""
 LEAST_KEPT = 0.05

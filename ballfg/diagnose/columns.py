@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from ballfg.diagnose.hypothesis import Hypothesis
 from ballfg.diagnose.problem import Fit, common_precision, linearise
-from ballfg.diagnose.score import Signatures
 from ballfg.diagnose.sensitivity import Sensitivity, sensitivity
+from ballfg.diagnose.signatures import Signatures
 from ballfg.diagnose.system import System, by_track
 from ballfg.dynamics.analytic import AnalyticModel
 

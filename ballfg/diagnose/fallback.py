@@ -62,14 +62,14 @@ def fallback(
         model: BallModel = calibrated_model(after, embedding)
         errors = judge(model)
         if errors.prediction_rmse_mm < most:
-            return Fallback("sparse terms", describe(terms, after), errors, model)
+            return Fallback("sparse terms", describe(terms, after), now, errors, model)
     network = learned_residual(calibrated_model(before, embedding), dataset, tracks)
     if network is None:
         return None
     errors = judge(network)
     if errors.prediction_rmse_mm >= most:
         return None
-    return Fallback("learned residual", f"{network.architecture.kind}, {_size(network)} parameters", errors, network)
+    return Fallback("learned residual", f"{network.architecture.kind}, {_size(network)} parameters", now, errors, network)
 
 
 def describe(terms: SparseTerms, after: Fit) -> str:

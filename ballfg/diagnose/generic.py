@@ -16,7 +16,7 @@ from ballfg.diagnose.clustered import Pattern, judge_patterns
 from ballfg.diagnose.patterns import EVERYWHERE, PLAUSIBLE, UNIT, Block, blocks_of
 from ballfg.diagnose.problem import Fit, common_precision, linearise
 from ballfg.diagnose.result import GenericTest
-from ballfg.diagnose.score import Signatures
+from ballfg.diagnose.signatures import Signatures
 from ballfg.diagnose.system import System, by_track
 from ballfg.diagnose.whiteness import Whiteness, whiteness
 

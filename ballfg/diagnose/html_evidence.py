@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from ballfg.diagnose import pictures
 from ballfg.diagnose.html_parts import Html, bar, items, picture, section, table, tag
-from ballfg.diagnose.result import Candidate, Diagnosis, Errors, Fallback, Standing, Value
+from ballfg.diagnose.result import Candidate, Diagnosis, Fallback, Standing, Value
 from ballfg.diagnose.wording import NONE, fixed, joined, listed, number, plus_minus, probability
 from ballfg.dynamics import EFFECTS
 
@@ -45,7 +45,7 @@ def left_over(diagnosis: Diagnosis) -> Html:
         ("test", "by chance", "share of the first pattern", "what it sees"),
         ((t.name, probability(t.p_value), _percent(t.share), t.where) for t in left.tests),
     )
-    rest = _fallback(left.fallback, diagnosis.after) if left.fallback else Html()
+    rest = _fallback(left.fallback) if left.fallback else Html()
     return section("What is left unexplained", tag("p", words), tag("p", share) if share else "", tests, rest)
 
 
@@ -53,10 +53,11 @@ def _percent(share: float) -> str:
     return f"{100 * share:.0f} %" if math.isfinite(share) else NONE
 
 
-def _fallback(fallback: Fallback, without: Errors) -> Html:
+def _fallback(fallback: Fallback) -> Html:
+    without, within = (fixed(errors.prediction_rmse_mm, 1) for errors in (fallback.before, fallback.after))
     words = (
-        f"It explains the rest without naming it. Prediction error on the judging tracks: "
-        f"{fixed(without.prediction_rmse_mm, 1)} mm without, {fixed(fallback.after.prediction_rmse_mm, 1)} mm with it."
+        "It explains the rest without naming it. Prediction error on the judging tracks: "
+        f"{without} mm without, {within} mm with it."
     )
     head = tag("h3", "A stopgap: ", fallback.kind)
     return tag("article", head, tag("p", tag("code", fallback.description)), tag("p", words), kind="card")

@@ -13,14 +13,12 @@ from typing import Any, Final
 
 from ballfg.diagnose.html import page
 from ballfg.diagnose.result import Candidate, Diagnosis, Errors, Fallback, Finding, GenericTest, Value
-from ballfg.dynamics import LearnedModel, save_model
+from ballfg.dynamics import save_model
 
 REPORT: Final = "report.json"
 """Written last: where it is, the others are whole."""
 PAGE: Final = "report.html"
 MODEL: Final = "model.yaml"
-FALLBACK: Final = "fallback.yaml"
-"""The model with a learned residual, where what is left has no name and the residual helps."""
 
 
 def write_report(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> None:
@@ -62,9 +60,6 @@ def check_report_folder(folder: Path) -> None:
 
 def _write_all(diagnosis: Diagnosis, folder: Path) -> None:
     save_model(diagnosis.model, folder / MODEL)
-    fallback = diagnosis.unexplained.fallback
-    if fallback is not None and isinstance(fallback.model, LearnedModel):
-        save_model(fallback.model, folder / FALLBACK)
     (folder / PAGE).write_text(page(diagnosis), encoding="utf-8")
     text = json.dumps(content(diagnosis), indent=2, allow_nan=False, ensure_ascii=False)
     (folder / REPORT).write_text(text + "\n", encoding="utf-8")
@@ -79,12 +74,9 @@ def _move(made: Path, folder: Path) -> None:
     for name in sorted(new, key=lambda name: (name == REPORT, new[name].is_file())):
         if not (folder / name).is_dir():  # a folder's name holds a digest of its content: the same one may stay
             os.replace(new[name], folder / name)
-    if FALLBACK not in new:
-        (folder / FALLBACK).unlink(missing_ok=True)
-    for model in (MODEL, FALLBACK):
-        for path in folder.glob(f"{Path(model).stem}.learned-*"):
-            if path.name not in new:
-                shutil.rmtree(path)
+    for path in folder.glob(f"{Path(MODEL).stem}.learned-*"):
+        if path.name not in new:
+            shutil.rmtree(path)
 
 
 def content(diagnosis: Diagnosis) -> dict[str, Any]:
@@ -162,7 +154,11 @@ def _test(test: GenericTest) -> dict[str, Any]:
 
 
 def _fallback(fallback: Fallback) -> dict[str, Any]:
-    return {"kind": fallback.kind, "description": fallback.description, "error": _errors(fallback.after)}
+    return {
+        "kind": fallback.kind,
+        "description": fallback.description,
+        "error": {"before": _errors(fallback.before), "after": _errors(fallback.after)},
+    }
 
 
 def _values(values: Mapping[str, Value]) -> dict[str, Any]:

@@ -62,9 +62,7 @@ def residuals_of(fit: Fit) -> Residuals:
             bins = len(piece.times)
             for b in range(bins):
                 own = slice(at + 3 * b, at + 3 * b + 3)
-                flights.append(
-                    (np.array(row), piece.times[b], piece.states[b], value[own], covariance[own, own])
-                )
+                flights.append((np.array(row), piece.times[b], piece.states[b], value[own], covariance[own, own]))
             at += 3 * bins
             if piece.contact is not None:
                 number, time, incoming = piece.contact
@@ -97,7 +95,9 @@ def _pieces(fit: Fit, arc: ArcResponse) -> list[_Piece]:
             own = np.concatenate((own, kicks[i]), axis=1)
             sigma = np.concatenate((sigma, np.repeat((CONTACT_VELOCITY, CONTACT_SPIN), 3)))
             contact = (arc.number - 1, float(arc.begun[i]), arc.incoming[i])
-        pieces.append(_Piece(own, sigma, arc.begun[i] + (np.arange(count) + 0.5) * length, arc.nodes[i, middle], contact))
+        pieces.append(
+            _Piece(own, sigma, arc.begun[i] + (np.arange(count) + 0.5) * length, arc.nodes[i, middle], contact)
+        )
     return pieces
 
 

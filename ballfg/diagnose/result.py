@@ -134,12 +134,13 @@ class Fallback:
     Attributes:
         kind: `sparse terms` or `learned residual`.
         description: the terms, or the network.
-        after: errors on the judging half with it.
+        before, after: errors on the judging half without and with it, named effects in both.
         model: the model with it.
     """
 
     kind: str
     description: str
+    before: Errors
     after: Errors
     model: BallModel
 
@@ -232,7 +233,8 @@ class Diagnosis:
         verdict, sentence: the answer, and the same in one sentence with numbers.
         findings: effects in the order added.
         rounds: the ranking of all candidates in each round, best first.
-        before, after: errors on the judging half with the declared model as calibrated, and with the corrected one.
+        before, after: errors on the judging half with the declared model as calibrated, and with the corrected one:
+            named effects, and the fallback where there is one.
         tracks_found_on, tracks_judged_on: sizes of the halves.
         calibrated: declared coefficients as fitted with the corrected model.
         noise: position noise along x, y, z as estimated (m), and as stated.

@@ -14,124 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+
+from ballfg.diagnose.clustered import Pattern, judge_patterns
+from ballfg.diagnose.signatures import Efficient, Signatures
 
 Array = NDArray[np.float64]
 
-PRIOR_TRACKS = 10.0
-"""Tracks that the pooled scatter is worth beside an effect's own: of few tracks an own covariance is too uncertain."""
 LEAST_SHARE = 1e-8
 """Share of a column's length that must survive projection: less is rounding, and the effect cannot be seen at all."""
-
-
-@dataclass(frozen=True)
-class Signatures:
-    """Inner products of projected columns, summed over each of t tracks.
-
-    Attributes:
-        gram: (t, q + p + 1, q + p + 1): q common columns, p columns of candidates, the residual.
-        precision: (q,) priors of the common ones.
-        common: q.
-    """
-
-    gram: Array
-    precision: Array
-    common: int
-
-    @property
-    def tracks(self) -> int:
-        """Number of tracks."""
-        return len(self.gram)
-
-    def efficient(self) -> Efficient:
-        """Scores and information of the candidates with the common columns projected out too."""
-        q, g = self.common, self.gram
-        total = g.sum(axis=0)
-        share = np.linalg.solve(total[:q, :q] + np.diag(self.precision), total[:q, q:-1])
-        cross = g[:, q:-1, :q] @ share
-        information = g[:, q:-1, q:-1] - cross - cross.swapaxes(-1, -2) + share.T @ g[:, :q, :q] @ share
-        prior = share.T @ (self.precision[:, None] * share)
-        score = g[:, q:-1, -1] - g[:, :q, -1] @ share
-        return Efficient(score, np.asarray(information), np.asarray(prior), np.diagonal(total)[q:-1])
-
-
-@dataclass(frozen=True)
-class Efficient:
-    """Scores of p columns on t tracks.
-
-    Attributes:
-        score: (t, p).  information: (t, p, p).
-        prior: (p, p) information that the priors of common columns leave.
-        raw: (p,) squared length of each column before common columns were projected out.
-    """
-
-    score: Array
-    information: Array
-    prior: Array
-    raw: Array
-
-    def dispersion(self, candidates: Sequence[Sequence[int]]) -> float:
-        """How much more the tracks' scores scatter than the noise says, pooled over candidates; at least 1."""
-        seen = [visible for chosen in candidates if (visible := self._visible(chosen)) is not None]
-        ratios = [float(np.trace(np.linalg.solve(v.information, v.scatter))) / len(v.estimate) for v in seen]
-        return max(1.0, float(np.median(ratios))) if ratios else 1.0
-
-    def test(self, chosen: Sequence[int], dispersion: float) -> Score | None:
-        """The test of one candidate's columns; None where the data do not show it at all.
-
-        Args: chosen: its columns.  dispersion: from `dispersion`, of all candidates.
-        """
-        visible = self._visible(chosen)
-        if visible is None:
-            return None
-        tracks, p = len(self.score), len(visible.estimate)
-        covariance = tracks * visible.scatter + PRIOR_TRACKS * dispersion * visible.information
-        covariance /= tracks + PRIOR_TRACKS
-        pull = visible.information @ visible.estimate
-        wald = float(pull @ np.linalg.solve(covariance, pull))
-        inverse = np.linalg.inv(visible.information)
-        spread = visible.directions @ inverse @ covariance @ inverse @ visible.directions.T
-        return Score(
-            visible.directions @ visible.estimate,
-            np.sqrt(np.diagonal(spread)),
-            float(visible.estimate @ pull),
-            float(stats.f.sf(wald / p, p, tracks + PRIOR_TRACKS - p - 1)),
-            p,
-        )
-
-    def _visible(self, chosen: Sequence[int]) -> _Visible | None:
-        """What the data show of some columns, along the directions that projection leaves."""
-        index = np.array(chosen)
-        if not (self.raw[index] > 0.0).any():
-            return None
-        length = np.sqrt(np.maximum(self.raw[index], LEAST_SHARE * self.raw[index].max()))
-        total = self.information.sum(axis=0)[np.ix_(index, index)] + self.prior[np.ix_(index, index)]
-        value, vector = np.linalg.eigh(total / np.outer(length, length))
-        if not (kept := value > LEAST_SHARE).any():
-            return None
-        directions = vector[:, kept] / length[:, None]
-        information = directions.T @ total @ directions
-        score = self.score[:, index] @ directions
-        estimate = np.linalg.solve(information, score.sum(axis=0))
-        left = score - (directions.T @ self.information[:, index[:, None], index] @ directions) @ estimate
-        left = left - left.mean(axis=0)
-        scatter = left.T @ left * len(left) / max(1, len(left) - 1)
-        return _Visible(directions, estimate, information, scatter)
-
-
-@dataclass(frozen=True)
-class _Visible:
-    """A candidate in the r directions in which it can be seen.
-
-    Attributes:
-        directions: (p, r).  estimate: (r,) one step from absent.  information: (r, r).
-        scatter: (r, r) of the tracks' scores that the estimate leaves.
-    """
-
-    directions: Array
-    estimate: Array
-    information: Array
-    scatter: Array
 
 
 @dataclass(frozen=True)
@@ -141,7 +31,7 @@ class Score:
     Attributes:
         estimate: (p,) coefficients after one step from absent.
         sigma: (p,) their standard deviations.
-        explained: squared whitened residual that the effect would explain: chi-square with p degrees under no effect.
+        explained: squared whitened residual that the effect would explain: chi-square of `rank` degrees by chance.
         p_value: probability of so much by chance.
         rank: number of directions in which the data show the coefficients.
     """
@@ -151,3 +41,42 @@ class Score:
     explained: float
     p_value: float
     rank: int
+
+
+def score_tests(signatures: Signatures, candidates: Sequence[Sequence[int]]) -> list[Score | None]:
+    """One test for each candidate; None where the data do not show it at all.
+
+    Args: candidates: for each the columns that are its coefficients, counted after the common ones.
+    """
+    efficient = signatures.efficient()
+    turns = [_visible(efficient, np.array(chosen)) for chosen in candidates]
+    seen = [turn for turn in turns if turn is not None]
+    outcomes = iter(judge_patterns(signatures, seen))
+    return [
+        None if turn is None else _score(next(outcomes), turn[np.array(chosen)])
+        for turn, chosen in zip(turns, candidates, strict=True)
+    ]
+
+
+def _score(pattern: Pattern, turn: Array) -> Score:
+    """Args: turn: (p, r) the coefficients of a candidate in the directions that were tested."""
+    inverse = np.linalg.inv(pattern.information)
+    spread = turn @ inverse @ pattern.scatter @ inverse @ turn.T
+    return Score(
+        turn @ pattern.estimate, np.sqrt(np.diagonal(spread)), pattern.explained, pattern.p_value, pattern.rank
+    )
+
+
+def _visible(efficient: Efficient, chosen: NDArray[np.int64]) -> Array | None:
+    """(p, r) the directions of some of all p columns that projection leaves; None: it leaves none."""
+    raw = efficient.raw[chosen]
+    if not (raw > 0.0).any():
+        return None
+    length = np.sqrt(np.maximum(raw, LEAST_SHARE * raw.max()))
+    total = efficient.information.sum(axis=0) + efficient.prior
+    value, vector = np.linalg.eigh(total[np.ix_(chosen, chosen)] / np.outer(length, length))
+    if not (kept := value > LEAST_SHARE).any():
+        return None
+    turn = np.zeros((len(efficient.raw), int(kept.sum())))
+    turn[chosen] = vector[:, kept] / length[:, None]
+    return turn

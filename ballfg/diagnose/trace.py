@@ -15,7 +15,7 @@ from ballfg.diagnose.columns import signatures
 from ballfg.diagnose.fit import fit
 from ballfg.diagnose.hypothesis import Hypothesis, with_effects, without_effect
 from ballfg.diagnose.problem import Fit, Problem
-from ballfg.diagnose.score import Score
+from ballfg.diagnose.score import Score, score_tests
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.state import SPIN
 
@@ -60,11 +60,8 @@ def score_all(before: Fit, candidates: Sequence[Hypothesis]) -> list[Scored]:
     if not testable:
         return []
     found, chosen = signatures(before, testable)
-    efficient = found.efficient()
-    dispersion = efficient.dispersion(chosen)
     scored = []
-    for hypothesis, columns in zip(testable, chosen, strict=True):
-        score = efficient.test(columns, dispersion)
+    for hypothesis, score in zip(testable, score_tests(found, chosen), strict=True):
         p_value = 1.0 if score is None else min(1.0, score.p_value * len(testable))
         scored.append(Scored(hypothesis, score, p_value))
     return sorted(scored, key=explained, reverse=True)

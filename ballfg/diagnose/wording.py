@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
-from ballfg.diagnose.result import Value
+from ballfg.diagnose.result import Finding, Unexplained, Value, Verdict
 
 NONE = "–"
 """What stands for a number that there is not."""
@@ -60,3 +60,21 @@ def change(before: float, after: float) -> str:
 def joined(names: tuple[str, ...]) -> str:
     """For instance `wind, gust_region and drag_speed`."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}" if names else ""
+
+
+def sentence(verdict: Verdict, findings: Sequence[Finding], left: Unexplained) -> str:
+    """The answer of a diagnosis in one sentence."""
+    if verdict is Verdict.NOTHING:
+        return "Nothing is lacking that these tracks could show: what the model leaves is noise."
+    named = joined(tuple(f"{_or_others(f)} ({listed(f.parameters)})" for f in findings))
+    if verdict is Verdict.FOUND:
+        return f"The model lacks {named}; with {'it' if len(findings) == 1 else 'them'} what is left is noise."
+    if not findings:
+        return f"Something is lacking that no effect of the catalogue explains: {left.where}."
+    share = f"{100 * left.share_of_residual:.0f} %"
+    return f"Something is lacking: {named} would explain a part; {share} of a pattern stays unexplained: {left.where}."
+
+
+def _or_others(finding: Finding) -> str:
+    """The finding's name, with those that could stand in its place."""
+    return " or ".join((finding.name, *finding.indistinguishable_from))

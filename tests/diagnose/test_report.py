@@ -24,6 +24,7 @@ from ballfg.diagnose.report import content, write_report
 from ballfg.diagnose.result import Diagnosis, Errors, Fallback
 from ballfg.dynamics import Architecture, build, load_model, model_to_dict, nominal_model
 from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.dynamics.learned import LearnedModel
 
 VOID = {"meta", "img"}
 
@@ -118,7 +119,8 @@ def test_json_of_a_fallback() -> None:
     assert read["verdict"] == "unexplained"
     fallback = read["unexplained"]["fallback"]
     assert fallback["kind"] == "sparse terms"
-    assert fallback["error"]["prediction_rmse_mm"] == unexplained().unexplained.fallback.after.prediction_rmse_mm
+    made = unexplained().unexplained.fallback
+    assert fallback["error"]["after"]["prediction_rmse_mm"] == made.after.prediction_rmse_mm
 
 
 def test_the_page_stands_alone_and_is_whole(found_page: Page) -> None:
@@ -179,12 +181,12 @@ def test_the_three_files_appear_and_the_model_can_be_read(tmp_path: Path) -> Non
 def test_an_earlier_report_is_replaced_and_other_files_stay(tmp_path: Path) -> None:
     out = tmp_path / "diagnosis"
     write_report(with_learned_fallback(), out)
-    learned = [path.name for path in out.glob("fallback.learned-*")]
+    learned = [path.name for path in out.glob("model.learned-*")]
     assert len(learned) == 1
-    load_model(out / "fallback.yaml")
+    assert isinstance(load_model(out / "model.yaml"), LearnedModel)
     (out / "notes.txt").write_text("mine")
     write_report(with_learned_fallback(), out)
-    assert [path.name for path in out.glob("fallback.learned-*")] == learned
+    assert [path.name for path in out.glob("model.learned-*")] == learned
     write_report(silent(), out)
     assert sorted(p.name for p in out.iterdir()) == ["model.yaml", "notes.txt", "report.html", "report.json"]
     assert silent().sentence in (out / "report.html").read_text(encoding="utf-8")
@@ -197,7 +199,7 @@ def with_learned_fallback() -> Diagnosis:
     left = unexplained().unexplained
     assert isinstance(left.fallback, Fallback)
     fallback = replace(left.fallback, kind="learned residual", model=learned)
-    return replace(unexplained(), unexplained=replace(left, fallback=fallback))
+    return replace(unexplained(), model=learned, unexplained=replace(left, fallback=fallback))
 
 
 @pytest.mark.parametrize("there", [False, True])

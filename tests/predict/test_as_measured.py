@@ -44,7 +44,7 @@ def errors(found: list[TrackPrediction]) -> np.ndarray:
 @pytest.mark.parametrize(
     ("texts", "method", "settings"),
     [
-        (["velocity_lag.lag=0.005", "frame_tilt.x=0.02"], "smoother", EXACT),
+        (["velocity_lag.lag=0.005", "frame_tilt.x=0.05"], "smoother", EXACT),
         (["time_offset.z=0.004", "time_scale.s=0.02"], "smoother", UNSURE),
         (["velocity_lag.lag=0.005", "time_scale.s=0.02"], "ekf", UNSURE),
     ],
