@@ -12,8 +12,9 @@ import torch
 from numpy.typing import NDArray
 
 from ballfg.benchmarks.dynamics_task import Task
-from ballfg.dynamics import BallModel, Surfaces, nominal_model, rollout
+from ballfg.dynamics import BallModel, Surfaces, nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.paths import paths
 from ballfg.estimate import Estimate, Settings, Smoother, Status
 from ballfg.factors.noise import ProcessNoise
 from ballfg.predict import Belief, Propagator
@@ -93,26 +94,26 @@ class GraphContender:
     def _onward(self, estimates: Sequence[Estimate], times: Sequence[Array]) -> list[Array]:
         """Smoothed positions where a track was observed, then those that follow from its last state."""
         propagator = Propagator(self.surfaces, self.settings.process)
-        paths: list[Array] = []
+        found: list[Array] = []
         for first in range(0, len(estimates), BLOCK):
             block = estimates[first : first + BLOCK]
             rests = [t[len(e.times) :] for e, t in zip(block, times[first : first + BLOCK], strict=True)]
             belief = Belief.last(self.model, block, self.settings.coefficients)
             states = propagator.rollout(belief, _padded(rests)).states
             for estimate, path, rest in zip(block, states, rests, strict=True):
-                paths.append(np.concatenate((estimate.states[:, POSITION], path[: len(rest), POSITION])))
-        return paths
+                found.append(np.concatenate((estimate.states[:, POSITION], path[: len(rest), POSITION])))
+        return found
 
     @torch.no_grad()
     def roll(self, starts: Array, times: Sequence[Array]) -> list[Array]:
         """Positions (n, 3) m of each ball at its times (n,) s since its start, from first states (m, 9)."""
-        paths: list[Array] = []
+        found: list[Array] = []
         for first in range(0, len(starts), BLOCK):
             block = times[first : first + BLOCK]
             start = torch.from_numpy(starts[first : first + BLOCK])
-            states = rollout(self.model, start, torch.from_numpy(_padded(block)), self.surfaces).numpy()
-            paths += [path[: len(t), POSITION].copy() for path, t in zip(states, block, strict=True)]
-        return paths
+            states = paths(self.model, start, torch.from_numpy(_padded(block)), self.surfaces).numpy()
+            found += [path[: len(t), POSITION].copy() for path, t in zip(states, block, strict=True)]
+        return found
 
 
 def _padded(times: Sequence[Array]) -> Array:
@@ -123,7 +124,7 @@ def _padded(times: Sequence[Array]) -> Array:
 
 def label_of(task: Task) -> Callable[[Track], Track]:
     """What turns launcher settings into spin labels for a method that does not learn it."""
-    return _as_it_is if task.launcher is None else task.launcher.label
+    return _as_it_is if task.launcher is None else task.launcher.labelled
 
 
 def _as_it_is(track: Track) -> Track:

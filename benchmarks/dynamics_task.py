@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.dynamics import BallModel, Surfaces
-from ballfg.estimate import LauncherSpin, Settings
+from ballfg.estimate import Launcher, Settings
 from ballfg.tracks import DatasetInfo, Track, write_dataset
 
 Array = NDArray[np.float64]
@@ -73,7 +73,7 @@ class Task:
     info: DatasetInfo
     surfaces: Surfaces
     settings: Settings
-    launcher: LauncherSpin | None
+    launcher: Launcher | None
     launcher_labels: tuple[str, ...]
     observe: Mapping[str, float]
     truth: BallModel | None

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from ballfg.benchmarks.dynamics_task import Shot, Task
 from ballfg.benchmarks.synthetic import gaussian_settings
 from ballfg.dynamics import BallModel, Surfaces, contact_time
-from ballfg.estimate import LauncherSpin
+from ballfg.estimate import Launcher
 from ballfg.factors.noise import ProcessNoise
 from ballfg.predict.apexes import true_apexes
 from ballfg.simulate import (
@@ -62,7 +62,7 @@ MOST_BOUNCES: Final = 3
 OBSERVED: Final = 80
 """Samples that a model is given; as in the paper."""
 LABEL_NOISE: Final = 4.0
-"""rad/s per axis, of the spin that `LauncherSpin` reads off the settings: the spins of the launches spread by 3, and
+"""rad/s per axis, of the spin that `Launcher` reads off the settings: the spins of the launches spread by 3, and
 the direction of flight, taken from noisy samples, adds to that. The root mean square of the labels' errors is 3.9."""
 EFFECTS: Final = (
     "magnus.k=0.0056",
@@ -110,7 +110,7 @@ def synthetic_task(seed: int, tracks: int = TRACKS) -> Task:
     train, validation = split(len(shots), seed)
     # the tracks end where a ball goes beside the table, so that its edges need not be told
     surfaces = Surfaces.table_tennis(kind.surfaces.table_height)
-    launcher = LauncherSpin(kind.launcher.topspin_scale, kind.launcher.sidespin_scale)
+    launcher = Launcher.of_levels(kind.launcher.topspin_scale, kind.launcher.sidespin_scale, LABEL_NOISE)
     return Task(
         case=CASE,
         info=replace(dataset_info(config), name=CASE),

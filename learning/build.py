@@ -130,7 +130,10 @@ def _analytic(config: TrainConfig, datasets: Sequence[Dataset]) -> AnalyticModel
     radii = {dataset.info.ball.radius for dataset in datasets}
     if len(radii) > 1:
         raise ValueError(f"data must be of one kind of ball; got radii {sorted(radii)} m. Train a model for each.")
-    return analytic_model(config.model, radii.pop())
+    model = analytic_model(config.model, radii.pop())
+    if not model.measures_plainly:
+        raise ValueError("model must have no measurement effects to be trained; got some. Empty its section measurement.")
+    return model
 
 
 def _model(config: TrainConfig, analytic: AnalyticModel) -> BallModel:
@@ -180,7 +183,7 @@ def _settings(
     process: ProcessNoise = replace(settings.process, **given)
     launcher = None
     if embedding is not None:
-        launcher = Launcher(embedding, spin or FIRST_SPIN_NOISE, {"group": dataset.info.name})
+        launcher = Launcher(embedding, spin or FIRST_SPIN_NOISE)
     return replace(
         settings,
         process=process,

@@ -1,9 +1,9 @@
-"""The test of a pattern among few and unequal tracks: their scatter, corrected for each track's own pull on the estimate.
+"""The test of a pattern among few, unequal tracks: their scatter, corrected for each track's own pull on the estimate.
 
 A track that says much about a pattern pulls the estimate towards itself, so that the score which the estimate leaves
-scatters less than the score of a track that had no part. Uncorrected, false alarms are twice to four times as frequent as
-stated for 12 tracks. Source: R. Bell and D. McCaffrey 2002, "Bias reduction in standard errors for linear regression
-with multi-stage samples", Survey Methodology 28, the estimator known as CR2.
+scatters less than the score of a track that had no part. Uncorrected, false alarms are twice to four times as
+frequent as stated for 12 tracks. Source: R. Bell and D. McCaffrey 2002, "Bias reduction in standard errors for linear
+regression with multi-stage samples", Survey Methodology 28, the estimator known as CR2.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ from scipy import stats
 from ballfg.diagnose.signatures import Signatures
 
 PRIOR_TRACKS = 10.0
-"""Tracks that the scatter pooled over all patterns is worth beside a pattern's own: of few tracks an own covariance is too
-uncertain."""
+"""Tracks that the scatter pooled over all patterns is worth beside a pattern's own: of few tracks an own covariance is
+too uncertain."""
 LEAST_OWN = 1e-9
-"""Share of a track's information that every direction is taken to have, so that a track that tells nothing of one counts."""
+"""Share of all information that every track is taken to have in every direction: it may tell nothing of one."""
 LEAST_KEPT = 0.05
 """Share of a track's score that is left of it at least: one that rules a direction alone cannot tell its scatter."""
 
@@ -79,6 +79,7 @@ def _corrected(signatures: Signatures, turn: Array) -> Pattern:
     left = (score - own @ (efficient @ estimate)) @ efficient
     full = efficient.T @ own @ efficient
     kept = full - efficient.T @ own @ np.linalg.inv(whole) @ own @ efficient
+    full = full + LEAST_OWN * information
     left = np.stack([_as_if_apart(*of) for of in zip(left, full, kept, strict=True)])
     return Pattern(rank, estimate, information, left.T @ left, 1.0)
 
@@ -88,7 +89,7 @@ def _as_if_apart(left: Array, full: Array, kept: Array) -> Array:
 
     Args: full, kept: (r, r) its covariance without and with the track's part, for noise as stated.
     """
-    root = np.linalg.cholesky(full + LEAST_OWN * np.trace(full) * np.eye(len(full)))
+    root = np.linalg.cholesky(full)
     inverse = np.linalg.inv(root)
     values, vectors = np.linalg.eigh(inverse @ kept @ inverse.T)
     grown = vectors / np.sqrt(np.maximum(values, LEAST_KEPT)) @ vectors.T

@@ -10,7 +10,9 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from ballfg.diagnose.calibrated import calibrated_model
+from ballfg.diagnose.judge import JudgedTrack
 from ballfg.diagnose.problem import Fit
+from ballfg.diagnose.process import with_process_noise
 from ballfg.diagnose.result import Errors, Fallback
 from ballfg.diagnose.sparse import SparseTerms, fit_with_terms, sparse_terms
 from ballfg.dynamics.analytic import AnalyticModel
@@ -56,20 +58,22 @@ def fallback(
         now: errors of the model as it is, on the judging half.
     """
     most = HELPS * now.prediction_rmse_mm
+    parts = [JudgedTrack(track, np.zeros(0)) for track in tracks]
     terms = sparse_terms(before)
     if terms is not None:
         after = fit_with_terms(before, terms)
-        model: BallModel = calibrated_model(after, embedding)
+        model = with_process_noise(calibrated_model(after, embedding), parts, dataset, 1)
         errors = judge(model)
         if errors.prediction_rmse_mm < most:
-            return Fallback("sparse terms", describe(terms, after), now, errors, model)
-    network = learned_residual(calibrated_model(before, embedding), dataset, tracks)
+            return Fallback("sparse terms", describe(terms, after), errors, model)
+    base = with_process_noise(calibrated_model(before, embedding), parts, dataset, 1)
+    network = learned_residual(base, dataset, tracks)
     if network is None:
         return None
     errors = judge(network)
     if errors.prediction_rmse_mm >= most:
         return None
-    return Fallback("learned residual", f"{network.architecture.kind}, {_size(network)} parameters", now, errors, network)
+    return Fallback("learned residual", f"{network.architecture.kind}, {_size(network)} parameters", errors, network)
 
 
 def describe(terms: SparseTerms, after: Fit) -> str:

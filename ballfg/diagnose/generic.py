@@ -1,8 +1,8 @@
 """Is anything left that has a pattern, and where does it live? Tests that need no name for it.
 
-Each block of patterns (`ballfg.diagnose.patterns`) is tested as a candidate effect is: scores of its columns with states
-and declared coefficients projected out, tracks as independent units. Of a large block only the directions that the data
-show best are tested, chosen before anything is known of the residuals.
+Each block of patterns (`ballfg.diagnose.patterns`) is tested as a candidate effect is: scores of its columns with
+states and declared coefficients projected out, tracks as independent units. Of a large block only the directions that
+the data show best are tested, chosen before anything is known of the residuals.
 """
 
 from __future__ import annotations

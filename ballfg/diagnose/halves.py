@@ -12,6 +12,7 @@ from ballfg.diagnose.stretches import LEAST_SAMPLES, Stretches, stretches_of
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.spin_embedding import SpinEmbedding
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimate.as_measured import plainly_measured
 from ballfg.estimate.batch import map_tracks
 from ballfg.estimate.configure import dataset_settings, dataset_surfaces
 from ballfg.estimate.launcher import Launcher
@@ -61,7 +62,7 @@ def halves_of(dataset: Dataset, model: AnalyticModel, jobs: int, watch: Callable
     tracks, excluded = _chosen(dataset)
     settings, surfaces = dataset_settings(dataset, model), dataset_surfaces(dataset)
     launcher = launcher_labels(dataset, tracks, settings)
-    smoother = Smoother(model, surfaces, settings)
+    smoother = Smoother(plainly_measured(model), surfaces, settings)
     watch(f"estimating {len(tracks)} tracks")
     finding = stretches_of(smoother, tracks[::2], launcher, jobs)
     judging = stretches_of(smoother, tracks[1::2], launcher, jobs)

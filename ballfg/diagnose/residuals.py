@@ -7,7 +7,9 @@ at once with the first state of their stretch, under the priors of a white proce
 from __future__ import annotations
 
 from collections import defaultdict
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,16 +28,17 @@ CONTACT_VELOCITY, CONTACT_SPIN = 0.2, 20.0
 """m/s and rad/s, priors of the kicks after a contact, per axis."""
 
 Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+_Row = tuple[Any, ...]
+"""A row of residuals: the stretch's number and what its kind has beside it."""
 
 
 @dataclass(frozen=True)
 class _Piece:
-    """Free kicks of one arc of one stretch, padded to d columns where several stretches are worked out together.
+    """Free kicks of one arc of one stretch: three columns for each of b bins, then six for a contact before the arc.
 
     Attributes:
         columns: (m, d) whitened answers.  sigma: (d,) priors.
-        bins: (b, 3) columns of each bin.  times: (b,) s.  states: (b, 9).
+        times: (b,) s.  states: (b, 9).
         contact: None for a first arc; else number of the contact, its time, the state before it.
     """
 
@@ -45,6 +48,17 @@ class _Piece:
     states: Array
     contact: tuple[int, float, Array] | None
 
+    def flights(self, row: int, value: Array, covariance: Array) -> Iterator[_Row]:
+        """Rows of `FlightResiduals` from the piece's part (d,) and (d, d) of what was invented."""
+        for b, (time, state) in enumerate(zip(self.times, self.states, strict=True)):
+            own = slice(3 * b, 3 * b + 3)
+            yield row, time, state, value[own], covariance[own, own]
+
+    def contacts(self, row: int, value: Array, covariance: Array) -> Iterator[_Row]:
+        """Rows of `ContactResiduals`, one or none."""
+        if self.contact is not None:
+            yield row, *self.contact, value[-6:], covariance[-6:, -6:]
+
 
 def residuals_of(fit: Fit) -> Residuals:
     """The residuals of a fit."""
@@ -53,24 +67,15 @@ def residuals_of(fit: Fit) -> Residuals:
     for arc in responses(fit, path):
         for row, piece in zip(arc.rows.tolist(), _pieces(fit, arc), strict=True):
             pieces[row].append(piece)
-    flights: list[tuple[Array, ...]] = []
-    contacts: list[tuple[Array, ...]] = []
-    for row in range(len(fit.problem.stretches)):
-        value, covariance = _invented(system.residual[row], system.by_start[row], pieces[row])
-        at = 0
-        for piece in pieces[row]:
-            bins = len(piece.times)
-            for b in range(bins):
-                own = slice(at + 3 * b, at + 3 * b + 3)
-                flights.append((np.array(row), piece.times[b], piece.states[b], value[own], covariance[own, own]))
-            at += 3 * bins
-            if piece.contact is not None:
-                number, time, incoming = piece.contact
-                own = slice(at, at + 6)
-                contacts.append(
-                    (np.array(row), np.array(number), np.array(time), incoming, value[own], covariance[own, own])
-                )
-                at += 6
+    flights: list[_Row] = []
+    contacts: list[_Row] = []
+    for row, own in pieces.items():
+        value, covariance = _invented(system.residual[row], system.by_start[row], own)
+        end = 0
+        for piece in own:
+            part = slice(end, end := end + len(piece.sigma))
+            flights += piece.flights(row, value[part], covariance[part, part])
+            contacts += piece.contacts(row, value[part], covariance[part, part])
     return Residuals(fit.problem.stretches.names, _flight(flights), _contact(contacts), _measurement(fit, path))
 
 
@@ -110,12 +115,12 @@ def _invented(residual: Array, by_start: Array, pieces: list[_Piece]) -> tuple[A
     return (covariance @ (columns.T @ residual))[STATE_DIM:], covariance[STATE_DIM:, STATE_DIM:]
 
 
-def _flight(found: list[tuple[Array, ...]]) -> FlightResiduals:
+def _flight(found: list[_Row]) -> FlightResiduals:
     stretch, times, states, acceleration, covariance = (np.array(c) for c in zip(*found, strict=True))
     return FlightResiduals(stretch, times, states, acceleration, covariance)
 
 
-def _contact(found: list[tuple[Array, ...]]) -> ContactResiduals:
+def _contact(found: list[_Row]) -> ContactResiduals:
     if not found:
         none = np.zeros(0, dtype=np.int64)
         empty = np.zeros((0, 3))

@@ -143,7 +143,7 @@ def _arc_response(fit: Fit, path: Along, number: int, part: Tensor) -> ArcRespon
         incoming=_at(path.motion.arcs[number - 1], rows, begun) if number else arc.nodes[0][part].numpy(),
         nodes=states,
         times=(begun + nodes).T.numpy(),
-        inverse=np.linalg.inv(by_first)[..., VELOCITY],
+        inverse=np.asarray(np.linalg.inv(by_first)[..., VELOCITY], dtype=np.float64),
         positions=positions,
         passed=passed,
     )

@@ -1,7 +1,7 @@
 """A sparse regression over generic terms: few of them, chosen one by one, that explain what no named effect does.
 
-Forward selection on projected Gram matrices: each step takes the term that explains most beside those chosen, until none is
-worth its penalty; then terms that later ones made superfluous are dropped. Source: J. Chen and Z. Chen 2008,
+Forward selection on projected Gram matrices: each step takes the term that explains most beside those chosen, until
+none is worth its penalty; then terms that later ones made superfluous are dropped. Source: J. Chen and Z. Chen 2008,
 "Extended Bayesian information criteria for model selection with large model spaces", with gamma = 1.
 """
 

@@ -18,7 +18,7 @@ from ballfg.diagnose.problem import Fit, common_precision
 from ballfg.diagnose.system import System
 
 REACHES = (0.02, 0.06, 0.18)
-"""s. Widths of the Gaussian kernels in the time between two samples: from a contact's trace to a force on a whole arc."""
+"""s. Widths of the Gaussian kernels in the time between two samples: from a contact's trace to a force on an arc."""
 LEAST_WEIGHT = 0.5
 """Samples of a smaller robust weight are outliers: their products say nothing of drift."""
 
@@ -80,7 +80,7 @@ def _summed(residual: Array, taken: Array, kept: NDArray[np.bool_], kernel: Arra
     """Sum of U over stretches, its variance and third cumulant without drift.
 
     Args:
-        residual: (n, k, 3).  taken: (n, 3 directions rows) as (n, k, 3 d), directions that the fit takes up.
+        residual: (n, k, 3).  taken: (n, k, 3 d) directions that the fit takes up.
         kernel: (n, k, k).
     """
     n, k, _ = residual.shape

@@ -4,7 +4,7 @@ from ballfg.estimate.batch import estimate_tracks
 from ballfg.estimate.configure import dataset_settings, dataset_surfaces
 from ballfg.estimate.ekf import ExtendedKalmanFilter
 from ballfg.estimate.estimator import Estimator
-from ballfg.estimate.launcher_spin import LauncherSpin
+from ballfg.estimate.launcher import Launcher
 from ballfg.estimate.online import Online
 from ballfg.estimate.registry import ESTIMATORS, make_estimator
 from ballfg.estimate.result import Estimate, Status
@@ -17,7 +17,7 @@ __all__ = [
     "Estimate",
     "Estimator",
     "ExtendedKalmanFilter",
-    "LauncherSpin",
+    "Launcher",
     "Online",
     "Settings",
     "SlidingWindow",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ballfg.dynamics.spin_embedding import SpinEmbedding
 from ballfg.estimate.settings import SpinLabel
 from ballfg.estimate.sliding_window import window_velocities
-from ballfg.tracks import Track
+from ballfg.tracks import SPIN_LABELS, Track
 
 FIRST_SAMPLES = 10
 """The launch direction is the mean direction of flight over so many samples."""
@@ -36,6 +36,18 @@ class Launcher:
         if not (np.isfinite(self.sigma) and self.sigma > 0.0):
             raise ValueError(f"sigma must be positive and finite; got {self.sigma}. Leave the launcher out instead.")
 
+    @classmethod
+    def of_levels(cls, topspin: float, sidespin: float, sigma: float) -> Launcher:
+        """A launcher whose spin per level is known, of the labels `topspin` and `sidespin`.
+
+        Topspin turns about the horizontal axis across the flight (the top of the ball moves forward), sidespin about
+        the vertical.
+
+        Args: topspin, sidespin: rad/s per level.  sigma: as in the class.
+        """
+        rows = torch.tensor([[0.0, topspin, 0.0], [0.0, 0.0, sidespin]], dtype=torch.float64)
+        return cls(SpinEmbedding(("topspin", "sidespin"), {}, rows), sigma)
+
     def settings(self, track: Track) -> NDArray[np.float64] | None:
         """(k,) the settings of a shot; None where the track does not tell them, or has a spin label of its own."""
         if track.spin_label is not None:
@@ -56,3 +68,10 @@ class Launcher:
         with torch.no_grad():
             spin = self.embedding.spin(torch.from_numpy(settings), torch.from_numpy(velocity))
         return SpinLabel(spin.numpy(), self.sigma)
+
+    def labelled(self, track: Track) -> Track:
+        """The track with spin labels made from its settings, for methods that know labels only; else as it is."""
+        label = self.label(track)
+        if label is None:
+            return track
+        return replace(track, labels={**track.labels, **dict(zip(SPIN_LABELS, label.spin.tolist(), strict=True))})

@@ -113,7 +113,7 @@ def test_air_forces_have_the_declared_coefficients(task: Task) -> None:
 
 def test_label_noise_is_that_of_the_labels() -> None:
     made = synthetic_task(0, 256)
-    errors = [made.launcher.label(s.seen).spin_label - s.states[0, 6:] for s in made.train]  # type: ignore
+    errors = [made.launcher.labelled(s.seen).spin_label - s.states[0, 6:] for s in made.train]  # type: ignore
     assert float(np.sqrt(np.square(errors).mean())) == pytest.approx(LABEL_NOISE, rel=0.1)
 
 

@@ -10,7 +10,6 @@ import torch
 
 from ballfg.dynamics import SpinEmbedding
 from ballfg.dynamics.spin_embedding import SOFT_SPEED
-from ballfg.estimate.launcher_spin import LauncherSpin
 
 
 def local_spins(*rows):
@@ -27,7 +26,8 @@ def test_axes_are_those_of_the_launcher(levels):
     velocity = np.array([3.0, -4.0, 1.5])
     settings = levels.settings({"topspin": 2.0, "sidespin": -3.0, "group": "a"})
     spin = levels.spin(settings, torch.from_numpy(velocity)).detach().numpy()
-    expected = LauncherSpin(40.0, -25.0).spin(2.0, -3.0, velocity)
+    across = np.array([4.0, 3.0, 0.0]) / 5.0  # z x forward
+    expected = 2.0 * 40.0 * across + np.array([0.0, 0.0, 75.0])
     softness = (SOFT_SPEED / 5.0) ** 2
     np.testing.assert_allclose(spin, expected, rtol=softness, atol=1e-12)
     forward = SpinEmbedding(("x",), {}, local_spins((1.0, 0.0, 0.0))).spin(

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from ballfg import simulate as simulate_module
 from ballfg.dynamics import Surfaces, nominal_model, rollout
 from ballfg.dynamics.spin_embedding import SpinEmbedding
 from ballfg.dynamics.trained import Trained
@@ -195,3 +196,32 @@ def test_settings_of_a_trained_model(tmp_path, embedding) -> None:
         model.trained = half
         assert dataset_settings(data, model).launcher is None
     assert dataset_settings(data, model).spin_label_noise == 22.0
+
+
+def test_topspin_turns_the_top_of_the_ball_forward() -> None:
+    levels = Launcher.of_levels(50.0, 40.0, 4.0)
+    for direction in ((1.0, 0.0), (0.0, -1.0), (0.6, 0.8)):
+        velocity = torch.tensor([5.0 * direction[0], 5.0 * direction[1], 1.0], dtype=torch.float64)
+        settings = torch.tensor([2.0, 0.0], dtype=torch.float64)
+        spin = levels.embedding.spin(settings, velocity).detach().numpy()
+        top = np.cross(spin, [0.0, 0.0, 0.02])  # velocity of the ball's top relative to its centre
+        np.testing.assert_allclose(top, 0.02 * 100.0 * np.array([*direction, 0.0]), atol=1e-3)
+
+
+def test_levels_give_the_spin_of_the_simulated_launcher() -> None:
+    simulated = simulate_module.Launcher()
+    levels = Launcher.of_levels(simulated.topspin_scale, simulated.sidespin_scale, 4.0)
+    for made in simulate_module.simulate(simulate_module.SimulationConfig(tracks=12, seed=2, spin_labels=False)):
+        labelled = levels.labelled(made.track)
+        assert labelled.spin_label is not None
+        # what is left is the launcher's shot-to-shot spread of spin and direction
+        np.testing.assert_allclose(labelled.spin_label, made.true_states[0, 6:], atol=40.0)
+
+
+def test_measured_labels_win_and_missing_settings_change_nothing() -> None:
+    levels = Launcher.of_levels(50.0, 40.0, 4.0)
+    track = Track("a", np.arange(5) * 0.01, np.arange(15.0).reshape(5, 3) * 0.05)
+    assert levels.labelled(track) is track
+    labels = {"spin_x": 1.0, "spin_y": 2.0, "spin_z": 3.0, "topspin": 1.0, "sidespin": 0.0}
+    measured = Track("a", track.times, track.positions, labels=labels)
+    assert levels.labelled(measured) is measured

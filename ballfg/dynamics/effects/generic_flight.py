@@ -38,8 +38,8 @@ MOTION_TERMS: Final = {
     "vsl": (0.001, "1"),
     "vs": (0.001, "1"),
 }
-"""Terms along the flight, across it to the left, and along the lift: speed less its reference (v), its square (vv), that
-times x, y, z from the centre, vertical velocity, speed times the spin about each of the three axes and times all of it."""
+"""Terms along the flight, across it to the left, and along the lift: speed less its reference (v), its square (vv),
+that times x, y, z from the centre, vertical velocity, speed times the spin about each of these axes, and times all."""
 SOFT_SPEED: Final = 0.1
 """m/s. Below it the directions of flight fade, so that a ball at rest has none."""
 SOFT_SPIN: Final = 1.0
@@ -55,8 +55,8 @@ def _coefficient(axis: str, term: str, sigma: float, unit: str) -> Coefficient:
 class GenericFlight(FlightEffect):
     """sum of c_{axis,term} term(state) axis, over the world's axes and those of the flight.
 
-    The flight's axes are a = v / |v|, c = z x v / |z x v|, l = a x c. Every coefficient is a number by itself: x_xz is the
-    acceleration along x for a unit of x z; along_vvx is a drag that grows with x.
+    The flight's axes are a = v / |v|, c = z x v / |z x v|, l = a x c. Every coefficient is a number by itself: x_xz is
+    the acceleration along x for a unit of x z; along_vvx is a drag that grows with x.
     """
 
     name = "generic_flight"

@@ -1,4 +1,4 @@
-"""Generic measurement: an error of the measured positions that is smooth in place and velocity, for what nobody can name."""
+"""Generic measurement: an error of the measured positions, smooth in place and velocity, for what nobody can name."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TERMS: Final = {
     "vy": (0.001, "s"),
     "vz": (0.001, "s"),
 }
-"""Terms in the place from the centre and the velocity: standard deviation of the prior and unit; each worth about 5 mm."""
+"""Terms in the place from the centre and the velocity: standard deviation of the prior and unit; each is worth 5 mm."""
 BOUND: Final = 100.0
 """Of each coefficient, in units of its prior's standard deviation."""
 
