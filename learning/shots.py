@@ -11,11 +11,8 @@ from numpy.typing import NDArray
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate import Settings, Smoother
-from ballfg.estimate.problem import effective_sigmas
 from ballfg.estimate.segmentation import Segmentation
 from ballfg.tracks import Track
-
-Array = NDArray[np.float64]
 
 LEAST_OBSERVED = 5
 """Samples that an estimate needs."""
@@ -52,10 +49,6 @@ class Shot:
     def seen(self) -> Track:
         """The observed part."""
         return part(self.track, self.observed)
-
-    def sigmas(self) -> Array:
-        """(observed, 3) m, of the observed positions."""
-        return effective_sigmas(self.seen, self.segmentation, self.settings)
 
 
 def part(track: Track, count: int) -> Track:

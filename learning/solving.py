@@ -13,6 +13,7 @@ from torch import Tensor
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate import Smoother
+from ballfg.estimate.problem import effective_sigmas
 from ballfg.estimate.segmentation import Contact
 from ballfg.estimate.smoother import Earlier, Solution
 from ballfg.factors.graph import Convergence, LevenbergMarquardt
@@ -159,8 +160,8 @@ class BatchSolver:
         smoother = smoothers.get(key)
         if smoother is None:
             smoother = smoothers[key] = self._smoother(shot)
-        sigma = shot.sigmas() * self.learnables.noise.position_scale()
         track, segmentation = shot.seen, shot.segmentation
+        sigma = effective_sigmas(track, segmentation, smoother.settings)
         if pose is not None:
             track = pose.track(track)
             sigma[:, :2] = np.sqrt(np.square(sigma[:, :2]).mean(axis=1, keepdims=True))  # a turn mixes x and y

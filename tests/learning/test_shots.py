@@ -10,7 +10,7 @@ import torch
 
 from ballfg.dynamics import Surfaces, nominal_model, rollout
 from ballfg.estimate import Settings, Smoother
-from ballfg.estimate.problem import QUALITY_SIGMA
+from ballfg.estimate.problem import QUALITY_SIGMA, effective_sigmas
 from ballfg.estimate.segmentation import Quality
 from ballfg.learning.shots import Shot, part, shots_of
 from ballfg.tracks import Track
@@ -90,7 +90,7 @@ def test_outliers_do_not_count_and_hardly_weigh() -> None:
     positions[[8, 45]] += 0.4
     shot = shot_of(replace(track, positions=positions), samples=25)
     assert np.flatnonzero(~shot.usable).tolist() == [8, 45]
-    sigma = shot.sigmas()
+    sigma = effective_sigmas(shot.seen, shot.segmentation, shot.settings)
     assert sigma.shape == (25, 3)
     np.testing.assert_allclose(np.delete(sigma, 8, axis=0), 0.002)
     np.testing.assert_allclose(sigma[8], 0.002 * QUALITY_SIGMA[Quality.OUTLIER])
@@ -99,7 +99,7 @@ def test_outliers_do_not_count_and_hardly_weigh() -> None:
 def test_sigmas_of_the_track_itself() -> None:
     own = np.linspace(0.001, 0.003, 180).reshape(60, 3)
     shot = shot_of(flown(sigmas=own), samples=25)
-    np.testing.assert_array_equal(shot.sigmas(), own[:25])
+    np.testing.assert_array_equal(effective_sigmas(shot.seen, shot.segmentation, shot.settings), own[:25])
     assert part(flown(), 7).sigmas is None
     assert len(part(flown(sigmas=own), 7).sigmas) == 7
 
