@@ -132,7 +132,7 @@ def _analytic(config: TrainConfig, datasets: Sequence[Dataset]) -> AnalyticModel
         raise ValueError(f"data must be of one kind of ball; got radii {sorted(radii)} m. Train a model for each.")
     model = analytic_model(config.model, radii.pop())
     if not model.measures_plainly:
-        raise ValueError("model must have no measurement effects to be trained; got some. Empty its section measurement.")
+        raise ValueError("model must have no measurement effects; got some, which training does not know. Remove them.")
     return model
 
 

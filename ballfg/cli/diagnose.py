@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import default_jobs, open_inputs
+from ballfg.cli.inputs import OwnEffects, default_jobs, open_inputs
 
 if TYPE_CHECKING:
     from ballfg.diagnose.result import Diagnosis
@@ -19,6 +19,7 @@ def diagnose(
     dataset: Annotated[Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.")],
     out: Annotated[Path, typer.Option(help="Folder of the report: new, empty or with an earlier report.")],
     model: Annotated[Path | None, typer.Option(help="Model file; the nominal table-tennis model without it.")] = None,
+    effects: OwnEffects = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.", show_default="one per core")] = default_jobs(),
 ) -> None:
     """Is anything lacking in the model? What, how sure, what else could it be, and what does it bring?
@@ -38,7 +39,7 @@ def diagnose(
     check_report_folder(out)
     if model is not None and model.resolve() == out.resolve() / MODEL:
         raise ValueError(f"out must not hold the model itself; {model} would be replaced. Choose another folder.")
-    inputs = open_inputs(dataset, model)
+    inputs = open_inputs(dataset, model, effects)
     if not isinstance(inputs.model, AnalyticModel):
         raise ValueError(
             f"--model must be analytic: a diagnosis adds physical effects to it; {model} is a learned one. "

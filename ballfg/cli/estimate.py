@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import check_out, default_jobs, open_inputs, status_lines
+from ballfg.cli.inputs import OwnEffects, check_out, default_jobs, open_inputs, status_lines
 from ballfg.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ def estimate(
     out: Annotated[Path, typer.Option(help="Table to write; .csv or .parquet.")],
     method: Annotated[Method, typer.Option(help="The estimator.")] = Method.SMOOTHER,
     model: Annotated[Path | None, typer.Option(help="Model file; the nominal table-tennis model without it.")] = None,
+    effects: OwnEffects = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.", show_default="one per core")] = default_jobs(),
 ) -> None:
     """Position, velocity and spin with standard deviations, one row per stamp.
@@ -47,7 +48,7 @@ def estimate(
     rows = hits = 0
     with TableWriter(out) as table:
         check_out(out, dataset)
-        inputs = open_inputs(dataset, model)
+        inputs = open_inputs(dataset, model, effects)
         count = len(inputs.dataset)
         estimates = estimate_tracks(inputs.estimator(method.value), inputs.dataset, count, jobs)
         for result in progress(estimates, count, "tracks estimated"):

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel
@@ -16,6 +18,11 @@ if TYPE_CHECKING:
     from ballfg.estimate import Estimator, Settings
     from ballfg.tracks import Dataset
 
+OwnEffects = Annotated[
+    list[Path] | None,
+    typer.Option("--effects", help="Python file with effects of your own, to run and know; may be repeated."),
+]
+"""The option of every command that reads or names effects."""
 DATASET_TABLES = ("tracks", "labels", "detections", "truth")
 """Names, without their endings, of the tables that a dataset's folder holds."""
 
@@ -36,7 +43,15 @@ class Inputs:
         return make_estimator(method, self.model, self.surfaces, self.settings)
 
 
-def open_inputs(dataset: Path, model: Path | None) -> Inputs:
+def know_effects(files: Iterable[Path] | None) -> None:
+    """Registers the effects that files define, so that model files and options can name them."""
+    from ballfg.dynamics import load_effects
+
+    for file in files or ():
+        load_effects(file)
+
+
+def open_inputs(dataset: Path, model: Path | None, effects: Iterable[Path] | None = None) -> Inputs:
     """Open and check everything before any work starts; what was repaired is said on stderr."""
     import torch
 
@@ -45,6 +60,7 @@ def open_inputs(dataset: Path, model: Path | None) -> Inputs:
     from ballfg.tracks import read_dataset
 
     torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
+    know_effects(effects)
     data = read_dataset(dataset)
     for note in data.notes:
         print(f"note: {note}", file=sys.stderr)

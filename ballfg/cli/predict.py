@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ballfg.cli.estimate import Method
-from ballfg.cli.inputs import check_out, default_jobs, open_inputs, status_lines
+from ballfg.cli.inputs import OwnEffects, check_out, default_jobs, open_inputs, status_lines
 from ballfg.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -24,6 +24,7 @@ def predict(
     out: Annotated[Path, typer.Option(help="Table to write; .csv or .parquet.")],
     method: Annotated[Method, typer.Option(help="The estimator.")] = Method.SMOOTHER,
     model: Annotated[Path | None, typer.Option(help="Model file; the nominal table-tennis model without it.")] = None,
+    effects: OwnEffects = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.", show_default="one per core")] = default_jobs(),
 ) -> None:
     """Positions at every stamp after the observed part, with the standard deviation of a measurement there.
@@ -40,7 +41,7 @@ def predict(
     with TableWriter(out) as table:
         check_out(out, dataset)
         check_observe(observe)
-        inputs = open_inputs(dataset, model)
+        inputs = open_inputs(dataset, model, effects)
         count = len(inputs.dataset)
         predictions = predict_tracks(inputs.estimator(method.value), inputs.dataset, count, observe, jobs=jobs)
         for result in progress(predictions, count, "tracks predicted"):

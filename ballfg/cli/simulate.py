@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ballfg.cli.inputs import OwnEffects, know_effects
 from ballfg.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -41,6 +42,7 @@ def simulate(
         list[str] | None,
         _ball_option(help="An effect that nobody declares, as wind.x=0.3; may be repeated."),
     ] = None,
+    effects: OwnEffects = None,
     format: Annotated[str, _files(help="csv or parquet.")] = "csv",
     force: Annotated[bool, _files("--force", help="Replace a simulated dataset.")] = False,
 ) -> None:
@@ -62,6 +64,7 @@ def simulate(
     from ballfg.simulate.writing import check_format
 
     file_format = check_format(format)
+    know_effects(effects)
     config = SimulationConfig(
         tracks=tracks,
         rate=rate,

@@ -20,8 +20,9 @@ from ballfg.diagnose.signatures import Signatures
 PRIOR_TRACKS = 10.0
 """Tracks that the scatter pooled over all patterns is worth beside a pattern's own: of few tracks an own covariance is
 too uncertain."""
-LEAST_OWN = 1e-9
-"""Share of all information that every track is taken to have in every direction: it may tell nothing of one."""
+LEAST_OWN = 1e-6
+"""Share of all information that a track is taken to have in every direction: one that tells nothing of it counts, and
+rounding in columns that were nearly projected out does not."""
 LEAST_KEPT = 0.05
 """Share of a track's score that is left of it at least: one that rules a direction alone cannot tell its scatter."""
 
@@ -79,8 +80,11 @@ def _corrected(signatures: Signatures, turn: Array) -> Pattern:
     left = (score - own @ (efficient @ estimate)) @ efficient
     full = efficient.T @ own @ efficient
     kept = full - efficient.T @ own @ np.linalg.inv(whole) @ own @ efficient
-    full = full + LEAST_OWN * information
-    left = np.stack([_as_if_apart(*of) for of in zip(left, full, kept, strict=True)])
+    unit = np.linalg.inv(np.linalg.cholesky(information))  # all tracks together have the information one
+    apart = [
+        _as_if_apart(unit @ s, unit @ f @ unit.T, unit @ k @ unit.T) for s, f, k in zip(left, full, kept, strict=True)
+    ]
+    left = np.stack(apart) @ np.linalg.inv(unit).T
     return Pattern(rank, estimate, information, left.T @ left, 1.0)
 
 
@@ -89,8 +93,9 @@ def _as_if_apart(left: Array, full: Array, kept: Array) -> Array:
 
     Args: full, kept: (r, r) its covariance without and with the track's part, for noise as stated.
     """
-    root = np.linalg.cholesky(full)
-    inverse = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(full)
+    lengths = np.sqrt(np.maximum(values, LEAST_OWN))
+    root, inverse = vectors * lengths, (vectors / lengths).T
     values, vectors = np.linalg.eigh(inverse @ kept @ inverse.T)
     grown = vectors / np.sqrt(np.maximum(values, LEAST_KEPT)) @ vectors.T
     return np.asarray(root @ grown @ inverse @ left)

@@ -65,7 +65,7 @@ def fallback(
         model = with_process_noise(calibrated_model(after, embedding), parts, dataset, 1)
         errors = judge(model)
         if errors.prediction_rmse_mm < most:
-            return Fallback("sparse terms", describe(terms, after), errors, model)
+            return Fallback("sparse terms", describe(terms, after), now, errors, model)
     base = with_process_noise(calibrated_model(before, embedding), parts, dataset, 1)
     network = learned_residual(base, dataset, tracks)
     if network is None:
@@ -73,7 +73,8 @@ def fallback(
     errors = judge(network)
     if errors.prediction_rmse_mm >= most:
         return None
-    return Fallback("learned residual", f"{network.architecture.kind}, {_size(network)} parameters", errors, network)
+    words = f"{network.architecture.kind}, {_size(network)} parameters"
+    return Fallback("learned residual", words, now, errors, network)
 
 
 def describe(terms: SparseTerms, after: Fit) -> str:

@@ -128,12 +128,11 @@ def _amount(kind: str, size: float) -> str:
 
 
 def _time(drift: Whiteness, start: Whiteness, count: int) -> GenericTest:
-    place = drift.reach
     left = max(0.0, float(drift.explained.max()))
     first = max(left, float(start.explained.max()))
     return GenericTest(
         name="time",
-        where=f"time: samples within {1e3 * place:.0f} ms err alike, by {1e3 * drift.drift:.2g} mm",
+        where=f"time: samples within {1e3 * drift.reach:.0f} ms err alike, by {1e3 * drift.drift:.2g} mm",
         p_value=min(1.0, count * drift.p_value),
         share=left / first if first > 0.0 else 0.0,
     )

@@ -21,7 +21,7 @@ from ballfg.state import POSITION, SPIN, VELOCITY
 PLAUSIBLE = {"flight": 1.0, "contact": 0.2, "measurement": 0.01}
 """m/s^2, m/s and m: scatter of a pattern that is large in practice. Columns are answers to patterns of this size."""
 UNIT = {"flight": "m/s^2", "contact": "m/s", "measurement": "m"}
-WORLD = ("along x", "along y", "vertical")
+WORLD = ("along x", "along y", "vertically")
 OWN = ("along the flight", "across the flight", "along the lift")
 EVERYWHERE = "everywhere"
 """The quantity that is one for all."""

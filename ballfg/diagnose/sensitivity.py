@@ -14,6 +14,7 @@ import torch.autograd.forward_ad as forward
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ballfg.diagnose.dual import make_dual
 from ballfg.diagnose.shooting import Trajectories, shoot
 from ballfg.diagnose.stretches import Stretches
 from ballfg.dynamics.model import BallModel, substitute
@@ -111,10 +112,10 @@ def _directions(
             tangents[names[direction - offset]][rows] = 1.0
     with forward.dual_level():
         columns = {
-            name: forward.make_dual(torch.full((n * d, 1), value, dtype=torch.float64), tangents[name])
+            name: make_dual(torch.full((n * d, 1), value, dtype=torch.float64), tangents[name])
             for name, value in values.items()
         }
-        dual = forward.make_dual(state, state_tangent)
+        dual = make_dual(state, state_tangent)
         positions, labels, _ = _measured(substitute(model, columns), repeated, dual)
         moved, relabelled = _tangent(positions), _tangent(labels)
     k = positions.shape[1]

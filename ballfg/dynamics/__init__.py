@@ -4,6 +4,7 @@ from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.architecture import Architecture
 from ballfg.dynamics.contact import contact_time, fly_through, fly_through_jacobian
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact
+from ballfg.dynamics.effects.registration import load_effects, register
 from ballfg.dynamics.effects.registry import EFFECTS
 from ballfg.dynamics.integrate import fly, fly_jacobian
 from ballfg.dynamics.learned import LearnedModel, build
@@ -36,10 +37,12 @@ __all__ = [
     "fly_jacobian",
     "fly_through",
     "fly_through_jacobian",
+    "load_effects",
     "load_model",
     "model_from_dict",
     "model_to_dict",
     "nominal_model",
+    "register",
     "rollout",
     "save_model",
     "substitute",

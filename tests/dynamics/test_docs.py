@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
 from pathlib import Path
 
@@ -10,8 +9,9 @@ import pytest
 import torch
 import yaml
 
-from ballfg.dynamics import EFFECTS, advance, model_from_dict, model_to_dict, nominal_model
+from ballfg.dynamics import EFFECTS, AnalyticModel, advance, model_from_dict, model_to_dict, nominal_model
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.simulate import parse_effects
 
 DOCS = Path(__file__).parents[2] / "docs"
 
@@ -59,36 +59,40 @@ def test_model_code_runs(tmp_path, monkeypatch):
 
 @pytest.fixture
 def example(tmp_path, monkeypatch):
-    """The example effect of the guide, imported from a file and registered."""
-    (code,) = blocks("add_an_effect.md", "python")
-    path = tmp_path / "restitution_slope.py"
-    path.write_text(code, encoding="utf-8")
-    spec = importlib.util.spec_from_file_location("restitution_slope", path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    effect = module.RestitutionSlope
-    monkeypatch.setitem(EFFECTS, effect.name, effect)
+    """The example effect of the guide, from a file as a user has it; the guide's model with it."""
+    monkeypatch.chdir(tmp_path)
+    code, use = blocks("add_an_effect.md", "python")
+    Path("static_charge.py").write_text(code, encoding="utf-8")
+    names = {}
+    exec(compile(use, "add_an_effect.md", "exec"), names)
+    assert model_to_dict(names["model"])["flight"]["static_charge"] == {"strength": 1.0, "reach": 0.1, "surface": 0.76}
     (text,) = blocks("add_an_effect.md", "yaml")
-    return model_from_dict(yaml.safe_load(text))
+    yield model_from_dict(yaml.safe_load(text))
+    del EFFECTS["static_charge"]
 
 
 def test_example_effect_does_what_it_says(example):
-    state = torch.tensor([[0, 0, 0.02, 0, 0, -4.0, 0, 0, 0], [0, 0, 0.02, 0, 0, -60.0, 0, 0, 0]], dtype=torch.float64)
-    assert example.bounce(state)[:, 5].tolist() == pytest.approx([4 * (0.95 - 0.02 * 4), 0.0])
+    state = torch.tensor([[0, 0, 0.76, 1, 0, 0, 0, 0, 0], [0, 0, 0.96, 1, 0, 0, 0, 0, 0]], dtype=torch.float64)
+    without = AnalyticModel([e for n, e in example.flight.items() if n != "static_charge"])
+    added = example.rates(state)[0] - without.rates(state)[0]
+    assert added[:, :2].abs().max() == 0.0
+    assert added[:, 2].tolist() == pytest.approx([-1.0, -0.2])
 
 
 def test_example_effect_is_found_everywhere(example):
-    assert model_to_dict(example)["bounce"]["restitution_slope"] == {"slope": 0.02}
-    state = torch.tensor([[0, 0, 0.2, 4, 0, -1.0, 0, 50, 0]], dtype=torch.float64)
-    after = advance(example, state, torch.tensor([0.3], dtype=torch.float64), Surfaces(0.0))
-    slope = dict(example.named_parameters())["contact.restitution_slope.slope"]
-    (gradient,) = torch.autograd.grad(after[0, 2], slope)
-    assert gradient.item() < 0
+    assert model_to_dict(example)["flight"]["static_charge"]["strength"] == 1.0
+    state = torch.tensor([[0, 0, 1.0, 4, 0, -1.0, 0, 50, 0]], dtype=torch.float64)
+    after = advance(example, state, torch.tensor([0.3], dtype=torch.float64), Surfaces(0.76))
+    strength = dict(example.named_parameters())["flight.static_charge.strength"]
+    (gradient,) = torch.autograd.grad(after[0, 0], strength)
+    assert gradient.item() != 0.0
+    (undeclared,) = parse_effects(["static_charge.strength=2"])
+    assert undeclared.strength.item() == 2.0
 
 
 def test_example_effect_has_right_derivatives(example):
-    state = torch.tensor([[0, 0, 0.02, 4, 0, -3.0, 0, 50, 0]], dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda s, *_: example.bounce(s), (state, *example.contact.parameters()))
+    state = torch.tensor([[0, 0, 0.9, 4, 0, -3.0, 0, 50, 0]], dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda s, *_: example.rates(s)[0], (state, *example.flight.parameters()))
 
 
 def test_nominal_values_in_the_physics_page():

@@ -1,5 +1,6 @@
-"""One physical effect a file, and the registry that names them."""
+"""One physical effect a file, the registry that names them, and effects of one's own."""
 
+from ballfg.dynamics.effects.registration import load_effects, register
 from ballfg.dynamics.effects.registry import EFFECTS, effect_class
 
-__all__ = ["EFFECTS", "effect_class"]
+__all__ = ["EFFECTS", "effect_class", "load_effects", "register"]

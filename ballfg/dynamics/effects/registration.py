@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -17,6 +16,7 @@ from ballfg.dynamics.measurement import MeasurementEffect
 E = TypeVar("E", bound=type[Effect])
 
 REMEDY = "docs/add_an_effect.md has an example."
+BASES = (FlightEffect, BounceEffect, MeasurementEffect)
 
 
 def register(effect: E) -> E:
@@ -30,7 +30,7 @@ def register(effect: E) -> E:
         TypeError: if it is no such class.
         ValueError: if its name is taken or something that it must say is missing or contradicts itself.
     """
-    if not (isinstance(effect, type) and issubclass(effect, FlightEffect | BounceEffect | MeasurementEffect)):
+    if not (isinstance(effect, type) and issubclass(effect, BASES)):
         raise TypeError(
             f"effect must be a subclass of FlightEffect, BounceEffect or MeasurementEffect; got {effect!r}. {REMEDY}"
         )
@@ -39,8 +39,7 @@ def register(effect: E) -> E:
     taken = (EFFECTS | GENERIC).get(effect.name)
     if taken is not None and _origin(taken) != _origin(effect):
         raise ValueError(
-            f"name of an effect must be its own; got '{effect.name}', which {taken.__module__}.{taken.__qualname__} has. "
-            "Rename one."
+            f"name of an effect must be its own; got '{effect.name}', that of {'.'.join(_origin(taken))}. Rename one."
         )
     unknown = sorted(set(effect.needs) - set(EFFECTS))
     if unknown:
@@ -80,18 +79,14 @@ def load_effects(path: str | Path) -> tuple[type[Effect], ...]:
 
 def _run(path: Path) -> ModuleType:
     """The module of a file, under a name that no import finds: worker processes then get its classes as a whole."""
-    name = f"ballfg effects {path}"
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
-        raise ValueError(f"effects file must end with .py; got {path}. Rename it.")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their module up
+    module = ModuleType(f"ballfg effects {path}")
+    sys.modules[module.__name__] = module  # dataclasses look their module up
     try:
-        spec.loader.exec_module(module)
+        exec(compile(path.read_bytes(), path, "exec"), module.__dict__)
     except Exception as error:  # whatever the user's code raises is the user's to mend
         raise ValueError(f"{path} must run as Python; {_where(error, path)}. Mend it there.") from error
     finally:
-        del sys.modules[name]
+        del sys.modules[module.__name__]
     return module
 
 
@@ -118,6 +113,9 @@ def _check_words(effect: type[Effect]) -> None:
             raise ValueError(f"{said}.{word} must be a text; it is missing. {REMEDY}")
     if not effect.name.isidentifier():
         raise ValueError(f"{said}.name must be letters, digits and _; got '{effect.name}'. Rename it.")
+    kind = next(base.kind for base in BASES if issubclass(effect, base))
+    if effect.kind != kind:
+        raise ValueError(f"{said}.kind must be that of its base, '{kind}'; got '{effect.kind}'. Leave it out.")
 
 
 def _check_coefficients(effect: type[Effect]) -> None:
@@ -127,7 +125,8 @@ def _check_coefficients(effect: type[Effect]) -> None:
     names = [c.name for c in listed]
     for c in listed:
         where = f"{effect.name}.{c.name}"
-        if names.count(c.name) > 1 or not c.name.isidentifier() or hasattr(nn.Module, c.name) or c.name in _RESERVED:
+        taken = names.count(c.name) > 1 or hasattr(effect, c.name) or hasattr(nn.Module(), c.name)
+        if taken or not c.name.isidentifier():
             raise ValueError(f"{where} must be a name of its own; it is taken or no name. Rename the coefficient.")
         if not (c.low <= c.default <= c.high and c.sigma >= 0.0):
             raise ValueError(f"{where} must have low <= default <= high and sigma >= 0; got {c}. Mend it.")
@@ -140,7 +139,3 @@ def _check_coefficients(effect: type[Effect]) -> None:
             f"{effect.name} must have a coefficient that can be absent; all are shapes (absent=None). Give one a value "
             "at which the effect is not there."
         )
-
-
-_RESERVED = frozenset({*vars(Effect), *Effect.__annotations__})
-"""Names that an effect has already."""

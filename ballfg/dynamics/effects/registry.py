@@ -1,4 +1,4 @@
-"""The effects a model file may name: one line for each. docs/add_an_effect.md shows how to add one."""
+"""The effects a model file may name: one line for each. docs/add_an_effect.md shows how to add one, here or outside."""
 
 from __future__ import annotations
 
@@ -81,7 +81,8 @@ def effect_class(name: str, kind: Kind) -> type[Effect]:
     effect = (EFFECTS | GENERIC).get(name)
     if effect is None or effect.kind != kind:
         known = ", ".join(n for n, e in EFFECTS.items() if e.kind == kind) or "none"
-        raise ValueError(f"there is no {kind} effect '{name}'; known ones: {known}")
+        own = "One of your own must be registered first: --effects FILE.py, or ballfg.dynamics.register"
+        raise ValueError(f"there is no {kind} effect '{name}'; known ones: {known}. {own}.")
     return effect
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Iterable
+from collections import ChainMap
+from collections.abc import Iterable, Mapping
 from typing import Final
 
 from ballfg.dynamics.effect import Effect
@@ -13,9 +14,11 @@ from ballfg.simulate.undeclared.pull import Pull
 from ballfg.simulate.undeclared.side_lean import SideLean
 from ballfg.simulate.undeclared.thick_air import ThickAir
 
-UNDECLARED: Final[dict[str, type[Effect]]] = EFFECTS | {effect.name: effect for effect in (Pull, ThickAir, SideLean)}
-"""Every effect by name. What a model file may declare can be left undeclared: an effect that the model lacks (wind), or
-another value of one that it has (restitution.e). The last ones can be declared nowhere."""
+NOWHERE: Final[dict[str, type[Effect]]] = {effect.name: effect for effect in (Pull, ThickAir, SideLean)}
+"""Effects that no model file can declare."""
+UNDECLARED: Final[Mapping[str, type[Effect]]] = ChainMap(EFFECTS, NOWHERE)
+"""Every effect by name, also those registered later. What a model file may declare can be left undeclared: an effect
+that the model lacks (wind), or another value of one that it has (restitution.e)."""
 
 
 def parse_effects(texts: Iterable[str]) -> tuple[Effect, ...]:
@@ -31,7 +34,8 @@ def parse_effects(texts: Iterable[str]) -> tuple[Effect, ...]:
         if coefficient in given:
             raise ValueError(f"effect must name each coefficient once; got {effect}.{coefficient} twice. Remove one.")
         given[coefficient] = value
-    return tuple(UNDECLARED[name](**values[name]) for name in UNDECLARED if name in values)
+    order = (*EFFECTS, *NOWHERE)
+    return tuple(UNDECLARED[name](**values[name]) for name in sorted(values, key=order.index))
 
 
 def _parse(text: str) -> tuple[str, str, float]:
