@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     name="ballfg-bench",
-    help="Estimators and dynamics models against each other, the diagnosis against what was planted, and what they cost.",
+    help="Estimators, dynamics models and the diagnosis, measured: a table, results.json, pictures.",
     add_completion=False,
     pretty_exceptions_enable=False,
 )
@@ -30,6 +30,9 @@ Data = Annotated[Path | None, typer.Option("--data", help="Dataset of measured t
 Datasets = Annotated[
     list[Path] | None,
     typer.Option("--data", help="Dataset of measured tracks, several times for several; synthetic ones without it."),
+]
+MeasuredBeside = Annotated[
+    list[Path] | None, typer.Option("--data", help="Dataset of measured tracks beside the simulated ones; repeatable.")
 ]
 Transfer = Annotated[Path | None, typer.Option(help="Dataset that the models are judged on without learning from it.")]
 TransferTracks = Annotated[int | None, typer.Option(min=1, help="Only so many of its first tracks.")]
@@ -41,7 +44,7 @@ Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes; one 
 
 @app.callback(invoke_without_command=True)
 def _root(context: typer.Context) -> None:
-    """Estimators and dynamics models against each other, the diagnosis against what was planted, and what they cost."""
+    """Estimators, dynamics models and the diagnosis, measured: a table, results.json, pictures."""
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
 
@@ -104,7 +107,7 @@ def dynamics(
 
 @app.command()
 def loop(
-    data: Datasets = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = None
+    data: MeasuredBeside = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = None
 ) -> None:
     """The diagnosis: does it name what was planted, stay silent where nothing was, and mend the model?
 
@@ -119,7 +122,7 @@ def loop(
 
     results = _start("loop", data or [], quick, seed)
     for folder in data or []:
-        _open(folder)  # what is wrong with it is better known now than hours later
+        _open(folder)  # a bad one is better known now than hours later
     pictures = run_loop(results, data or [], _folder(out), QUICK if quick else FULL, jobs or default_jobs())
     _finish(results, out, pictures)
 

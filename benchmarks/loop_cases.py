@@ -205,9 +205,14 @@ def unknown_cases(plan: Plan, seed: int) -> Iterator[Case]:
 
 
 def measured_cases(folders: Sequence[Path]) -> Iterator[Case]:
-    """Each measured dataset with the nominal model and with gravity, drag and the bounce only."""
-    for folder in folders:
-        name = folder.resolve().name
+    """Each measured dataset with the nominal model and with gravity, drag and the bounce only.
+
+    Raises: ValueError: if two folders have the same name.
+    """
+    names = [folder.resolve().name for folder in folders]
+    for folder, name in zip(folders, names, strict=True):
+        if names.count(name) > 1:
+            raise ValueError(f"datasets must differ in the names of their folders; got '{name}' twice. Rename one.")
         yield Case("measured", name, 1.0, 0, data=folder)
         yield Case("measured", f"{name}-bare", 1.0, 0, planted=BARE, left_out=BARE, data=folder)
 

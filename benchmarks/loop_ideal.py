@@ -30,6 +30,7 @@ from ballfg.diagnose.halves import launcher_labels
 from ballfg.diagnose.hypothesis import declared_free
 from ballfg.diagnose.loop import CONFIRMED
 from ballfg.diagnose.problem import Problem
+from ballfg.diagnose.score import LEAST_SHARE
 from ballfg.diagnose.stretches import stretches_of
 from ballfg.diagnose.trace import ALARM
 from ballfg.estimate import Smoother, dataset_settings, dataset_surfaces
@@ -97,12 +98,23 @@ def ideal_of(name: str, seed: int) -> Ideal:
     problem = Problem(model, followed(model, stretches), declared_free(model))
     unknowns, noise = start_from(problem, settings.spin_label_noise, settings.spin_prior)
     at_truth = fit(problem, unknowns, noise, settle_noise=False)
-    found, (columns,) = signatures(at_truth, [plant.hypothesis()])
+    found, _ = signatures(at_truth, [plant.hypothesis()])
     efficient, direction = found.efficient(), plant.direction()
-    score = efficient.test(columns, 1.0)
     information = efficient.information.sum(axis=0) + efficient.prior
-    rank = 0 if score is None else score.rank
-    return Ideal(case_digest(case), rank, float(direction @ information @ direction))
+    return Ideal(case_digest(case), visible(information, efficient.raw), float(direction @ information @ direction))
+
+
+def visible(information: Array, raw: Array) -> int:
+    """In how many directions p coefficients can be seen at all.
+
+    Args:
+        information: (p, p), everything else projected out.
+        raw: (p,) information of each coefficient if all else were known.
+    """
+    if not (raw > 0.0).any():
+        return 0
+    length = np.sqrt(np.maximum(raw, LEAST_SHARE * raw.max()))
+    return int((np.linalg.eigvalsh(information / np.outer(length, length)) > LEAST_SHARE).sum())
 
 
 def save_ideal(ideal: Ideal, path: Path) -> None:

@@ -50,8 +50,8 @@ class Record:
         verdict: as in the report.
         found: findings in order.
         rounds: leading candidates of each round, best first, and those planted.
-        errors: mm, prediction error on the judging half: `before`, `after`, with the fallback `fallback` where there is
-            one (it is then the one after), and of the true model `true`.
+        errors: mm, prediction error on the judging half: `before`, `after`, of the true model `true`, and where there
+            is a fallback, with it (`fallback`, the one after) and with named effects only (`named`).
         patterns: p-values of the tests for what is left, by the place that they name.
         tracks, judged: numbers of tracks in the dataset and on the judging half.
         seconds: of the diagnosis, wall clock.
@@ -82,7 +82,7 @@ def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None
     errors = {"before": diagnosis.before, "after": diagnosis.after}
     left = diagnosis.unexplained
     if left.fallback is not None:
-        errors["fallback"] = left.fallback.after
+        errors |= {"named": left.fallback.before, "fallback": left.fallback.after}
     if true is not None:
         errors["true"] = true
     return Record(

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
-
 from ballfg.benchmarks.loop_cases import BARE, STATED_NOISE, Case
 from ballfg.benchmarks.loop_effects import PLANTS
 from ballfg.benchmarks.loop_ideal import Ideal
@@ -52,8 +50,7 @@ def add_naming(results: Results, cases: Sequence[Case], records: Records, part: 
 def add_pairs(results: Results, cases: Sequence[Case], records: Records) -> None:
     """For two effects at once: is the first finding one of them, are both found and nothing else?"""
     listed = of_part(cases, "pairs")
-    for line in [*dict.fromkeys(case.subject for case in listed), ALL]:
-        chosen = [case for case in listed if line in (ALL, case.subject)]
+    for line, chosen in _lines(listed).items():
         first = [_right(case, records) for case in chosen]
         both = [case.name in records and complete(records[case.name], case.planted) for case in chosen]
         results.add("pairs", "first", line, "1", share(first), len(chosen))
@@ -142,17 +139,16 @@ def add_unknown(results: Results, cases: Sequence[Case], records: Records) -> No
     """Physics of no catalogue: called unexplained, error reduced by the fallback, both, and by how much."""
     listed = of_part(cases, "unknown")
     title = "unknown physics"
-    for line in [*dict.fromkeys(case.subject for case in listed), ALL]:
-        own = [case for case in listed if line in (ALL, case.subject)]
+    for line, own in _lines(listed).items():
         done = [records.get(case.name) for case in own]
         called = [r is not None and r.verdict == Verdict.UNEXPLAINED.value for r in done]
-        reduced = [r is not None and r.errors.get("fallback", np.inf) < r.errors["before"] for r in done]
+        reduced = [r is not None and "fallback" in r.errors and r.errors["fallback"] < r.errors["named"] for r in done]
         both = [c and r for c, r in zip(called, reduced, strict=True)]
         for column, outcomes in (("unexplained", called), ("reduced", reduced), ("both", both)):
             results.add(title, column, line, "1", share(outcomes), len(own))
-        ratios = [r.errors["after"] / r.errors["before"] for r in done if r is not None]
+        ratios = [r.errors["fallback"] / r.errors["named"] for r in done if r is not None and "fallback" in r.errors]
         if ratios:
-            results.add(title, "error after / before", line, "1", median(ratios), len(ratios))
+            results.add(title, "error with / without fallback", line, "1", median(ratios), len(ratios))
     _add_failed(results, listed, records, title)
 
 
@@ -184,6 +180,12 @@ def add_time(results: Results, cases: Sequence[Case], records: Records) -> None:
     if seconds:
         results.add("time", "two processes", "one diagnosis, 50 tracks", "s", median(seconds), len(seconds))
     _add_failed(results, of_part(cases, "time"), records, "time")
+
+
+def _lines(cases: Sequence[Case]) -> dict[str, list[Case]]:
+    """The cases of each subject, then all; empty where there is none."""
+    lines = {subject: [c for c in cases if c.subject == subject] for subject in dict.fromkeys(c.subject for c in cases)}
+    return lines | {ALL: list(cases)} if cases else {}
 
 
 def _right(case: Case, records: Records) -> bool:

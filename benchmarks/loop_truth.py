@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 from ballfg.benchmarks.loop_cases import Case
 from ballfg.benchmarks.loop_data import actual_model, declared_model
 from ballfg.benchmarks.loop_effects import PLANTS
 from ballfg.diagnose.calibrated import calibrated_model
 from ballfg.diagnose.fit import fit, followed, start_from
 from ballfg.diagnose.halves import halves_of
-from ballfg.diagnose.hypothesis import LOOSE, declared_free
+from ballfg.diagnose.hypothesis import declared_free
 from ballfg.diagnose.judge import prediction_errors
 from ballfg.diagnose.problem import Problem
 from ballfg.diagnose.process import with_process_noise
 from ballfg.diagnose.result import Errors
+from ballfg.diagnose.stretches import stretches_of
 from ballfg.dynamics.effect import Coefficient
-from ballfg.estimate import dataset_settings
+from ballfg.estimate import Smoother, dataset_settings
 from ballfg.tracks import Dataset
 
 
@@ -27,8 +26,9 @@ def true_errors(case: Case, dataset: Dataset) -> Errors:
     """
     truth, declared = actual_model(case), declared_model(case, dataset.info.ball.radius)
     halves = halves_of(dataset, declared, 1, _unwatched)  # as the diagnosis has them: both are judged by the same
-    free = {**declared_free(declared), **planted_free(case)}
-    problem = Problem(truth, followed(truth, halves.finding), free)
+    smoother = Smoother(truth, halves.surfaces, dataset_settings(dataset, truth))
+    finding = stretches_of(smoother, [part.track for part in halves.found_on], halves.launcher)
+    problem = Problem(truth, followed(truth, finding), {**declared_free(declared), **planted_free(case)})
     start = start_from(problem, halves.settings.spin_label_noise, halves.settings.spin_prior)
     fitted = calibrated_model(fit(problem, *start), halves.launcher.embedding)
     model = with_process_noise(fitted, halves.found_on, dataset, 1)
@@ -36,17 +36,10 @@ def true_errors(case: Case, dataset: Dataset) -> Errors:
 
 
 def planted_free(case: Case) -> dict[str, Coefficient]:
-    """What a fit with the planted effects estimates beside what is declared.
-
-    A coefficient that its effect takes to be exact is as uncertain as what was planted is large.
-    """
+    """What a fit with the planted effects estimates beside what is declared, by parameter name."""
     free: dict[str, Coefficient] = {}
     for name in case.planted:
-        plant = PLANTS[name]
-        amounts = {plant.hypothesis().parameter(c): abs(amount) for c, amount in plant.amounts}
-        for parameter, coefficient in plant.hypothesis().free().items():
-            sigma = coefficient.sigma or LOOSE * amounts[parameter]
-            free[parameter] = replace(coefficient, sigma=sigma)
+        free |= PLANTS[name].hypothesis().free()
     return free
 
 

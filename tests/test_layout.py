@@ -16,6 +16,7 @@ LEVELS = (
     ("estimate",),
     ("predict",),
     ("learning",),
+    ("diagnose",),
     ("benchmarks", "cli"),
 )
 """Rooms from the first to the last; a module imports from its own room and from earlier levels only."""

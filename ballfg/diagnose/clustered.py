@@ -105,5 +105,7 @@ def _judged(pattern: Pattern, tracks: int, dispersion: float) -> Pattern:
     covariance = tracks * pattern.scatter + PRIOR_TRACKS * dispersion * pattern.information
     pull = pattern.information @ pattern.estimate
     wald = (tracks + PRIOR_TRACKS) * float(pull @ np.linalg.solve(covariance, pull))
-    p_value = float(stats.f.sf(wald / pattern.rank, pattern.rank, tracks + PRIOR_TRACKS - pattern.rank - 1))
+    freedom = tracks + PRIOR_TRACKS - 1.0
+    left = freedom - pattern.rank + 1.0  # Hotelling's: the covariance of several directions is estimated too
+    p_value = float(stats.f.sf(wald * left / (freedom * pattern.rank), pattern.rank, left))
     return Pattern(pattern.rank, pattern.estimate, pattern.information, pattern.scatter, p_value)

@@ -7,6 +7,7 @@ so that what the data cannot tell stays put.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -48,7 +49,9 @@ def fit(problem: Problem, unknowns: Unknowns, noise: Noise, *, settle_noise: boo
     """Minimise over all unknowns, and settle the scale of the noise.
 
     Args:
-        unknowns: where to start.  noise: scales to start from; kept as they are unless `settle_noise`.
+        unknowns: where to start: every stretch must reach its contacts from there, as those of `followed` do, or the
+            result is the start itself, its cost infinite.
+        noise: scales to start from; kept as they are unless `settle_noise`.
     """
     result = _minimise(problem, unknowns, noise, 0)
     for _ in range(SCALE_ROUNDS if settle_noise else 0):
@@ -69,6 +72,8 @@ def objective(problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Pre
 def _minimise(problem: Problem, unknowns: Unknowns, noise: Noise, steps: int) -> Fit:
     predicted = predict(problem.model, problem.stretches, unknowns.starts, unknowns.values)
     cost, damping = objective(problem, unknowns, noise, predicted), FIRST_DAMPING
+    if not np.isfinite(cost):
+        return Fit(problem, unknowns, noise, predicted, cost, steps)
     for _ in range(MOST_STEPS):
         problem = replace(problem, stretches=_with_contacts(problem.stretches, predicted))
         system = linearise(problem, unknowns, noise, predicted)
@@ -107,13 +112,17 @@ def _moved(problem: Problem, unknowns: Unknowns, system: System, damping: float)
 
 
 def _with_contacts(stretches: Stretches, predicted: Predicted) -> Stretches:
-    """The same with the contact times of a prediction as guesses."""
-    return replace(stretches, contacts=torch.from_numpy(predicted.contacts))
+    """The same with the contact times of a prediction as guesses; the old one stays for a contact it has not."""
+    found = torch.from_numpy(predicted.contacts)
+    return replace(stretches, contacts=torch.where(found.isnan(), stretches.contacts, found))
 
 
-def followed(model: BallModel, stretches: Stretches) -> Stretches:
-    """Those stretches whose contacts a model reaches from the first guess of their states."""
-    predicted = predict(model, stretches, stretches.starts.numpy(), {})
+def followed(model: BallModel, stretches: Stretches, values: Mapping[str, float] | None = None) -> Stretches:
+    """Those stretches whose contacts a model reaches from the first guess of their states.
+
+    Args: values: coefficients by parameter name that differ from the model's own, as fitted.
+    """
+    predicted = predict(model, stretches, stretches.starts.numpy(), values or {})
     return stretches.take(np.isfinite(predicted.positions).all(axis=(1, 2)))
 
 

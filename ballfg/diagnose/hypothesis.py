@@ -16,6 +16,9 @@ SECTION = {"flight": "flight", "bounce": "contact", "measurement": "measurement"
 LOOSE = 10.0
 """By how much the prior of a hypothesis' coefficient is wider than the effect says: the data are to decide."""
 
+INEXACT = 0.02
+"""Spread of a coefficient that is taken to be exact, as a share of its value: a wrong clock or length shows so in g."""
+
 
 @dataclass(frozen=True)
 class Hypothesis:
@@ -48,7 +51,7 @@ class Hypothesis:
     def free(self) -> dict[str, Coefficient]:
         """What a refit estimates beside what was free before: strengths, and shapes that are uncertain."""
         listed = {c.name: c for c in self.effect.coefficients}
-        loose = {self.parameter(n): replace(listed[n], sigma=LOOSE * listed[n].sigma) for n in self.strengths}
+        loose = {self.parameter(n): replace(listed[n], sigma=LOOSE * _spread(listed[n])) for n in self.strengths}
         formed = {self.parameter(n): listed[n] for n in self.shape if listed[n].absent is None and listed[n].sigma > 0}
         return loose | formed
 
@@ -59,6 +62,10 @@ class Hypothesis:
         listed = {c.name: c for c in self.effect.coefficients}
         absent = {n: cast(float, listed[n].absent) for n in self.strengths}
         return with_effects(model, self.effect(**{**self.shape, **absent}))
+
+
+def _spread(coefficient: Coefficient) -> float:
+    return coefficient.sigma if coefficient.sigma > 0.0 else INEXACT * abs(coefficient.default)
 
 
 def effects_of(model: AnalyticModel) -> list[Effect]:

@@ -98,7 +98,8 @@ def held_out(before: Fit, after: Fit, judged: Stretches) -> HeldOut:
 
     Args: before, after: fits on other tracks.  judged: the tracks to compare on.
     """
-    judged = followed(before.problem.model, judged)
+    for fitted in (before, after):
+        judged = followed(fitted.problem.model, judged, fitted.unknowns.values)
     losses = [_on(f, judged, after.noise).robust.losses for f in (before, after)]
     tracks, index = np.unique(judged.track, return_inverse=True)
     gains = np.bincount(index, losses[0] - losses[1], minlength=len(tracks))

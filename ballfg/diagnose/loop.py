@@ -91,6 +91,7 @@ def _round(search: Search, halves: Halves, catalogue: Sequence[type[Effect]], wa
         search.findings.append(_finding(winner, settled, alike, evidence))
         search.fit = settled
     search.rounds.append(_ranking(scored, refits, standing))
+    watch(f"round {len(search.rounds)}: {'nothing helps' if winner is None else f'{winner.scored.hypothesis.name} added'}")
     return winner is not None
 
 

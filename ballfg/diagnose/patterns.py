@@ -28,7 +28,21 @@ EVERYWHERE = "everywhere"
 PLACE = ("place along x", "place along y", "height")
 SPINS = ("spin about the flight", "topspin", "sidespin")
 
+FLIGHT = (
+    ((EVERYWHERE, *PLACE), WORLD),
+    (("speed", "rate of climb"), OWN),
+    (SPINS, OWN),
+    (("time since launch", "time since the last contact"), OWN),
+)
+CONTACT = (((EVERYWHERE, "vertical speed", "horizontal speed"), OWN), (PLACE[:2], WORLD), (SPINS, OWN))
+MEASUREMENT = (PLACE, ("velocity along x", "velocity along y", "vertical velocity"))
+"""Groups of quantities that are tested together; those of forces and kicks with the axes of the pattern."""
+LEAST_SCATTER = 1e-6
+"""In the unit of a quantity. Less is rounding: all tracks have the same of it."""
+
 Array = NDArray[np.float64]
+Quantities = Mapping[str, Array]
+"""(...,) values by name in words."""
 
 
 @dataclass(frozen=True)
@@ -58,19 +72,6 @@ def blocks_of(fit: Fit) -> list[Block]:
     if after:
         blocks += [_contact(fit, after, group, axes) for group, axes in CONTACT]
     return blocks + [_measurement(fit, path, group) for group in MEASUREMENT]
-
-
-Quantities = Mapping[str, Array]
-"""(...,) values by name in words."""
-
-FLIGHT = (
-    ((EVERYWHERE, *PLACE), WORLD),
-    (("speed", "rate of climb"), OWN),
-    (SPINS, OWN),
-    (("time since launch", "time since the last contact"), OWN),
-)
-CONTACT = (((EVERYWHERE, "vertical speed", "horizontal speed"), OWN), (PLACE[:2], WORLD), (SPINS, OWN))
-MEASUREMENT = (PLACE, ("velocity along x", "velocity along y", "vertical velocity"))
 
 
 def _quantities(states: Array, times: Array, since: Array) -> dict[str, Array]:
@@ -109,7 +110,7 @@ class _Scale:
         flat = values.reshape(-1, values.shape[-1])
         same = np.array([name == EVERYWHERE for name in group])
         scatter = np.where(same, 1.0, flat.std(axis=0))
-        return _Scale(np.where(same, 0.0, flat.mean(axis=0)), np.where(scatter > 0.0, scatter, np.inf))
+        return _Scale(np.where(same, 0.0, flat.mean(axis=0)), np.where(scatter > LEAST_SCATTER, scatter, np.inf))
 
     def __call__(self, values: Array) -> Array:
         return np.asarray((values - self.centre) / self.scatter)

@@ -150,6 +150,10 @@ COEFFICIENT = Coefficient("a", 0.0, 0.1, "m/s^2", -5.0, 5.0)
         ({"coefficients": (dataclasses.replace(COEFFICIENT, name="name"),)}, r"^own_push\.name must be a name of its"),
         ({"coefficients": (dataclasses.replace(COEFFICIENT, low=1.0),)}, r"^own_push\.a must have low <= default <="),
         ({"coefficients": (dataclasses.replace(COEFFICIENT, sigma=-1.0),)}, r"^own_push\.a must have low <= default"),
+        (
+            {"coefficients": (dataclasses.replace(COEFFICIENT, sigma=0.0),)},
+            r"^own_push\.a\.sigma must be above 0, a pl",
+        ),
         ({"coefficients": (dataclasses.replace(COEFFICIENT, absent=9.0),)}, r"^own_push\.a\.absent must lie within "),
         ({"coefficients": (dataclasses.replace(COEFFICIENT, absent=None),)}, r"^own_push must have a coefficient that"),
         (

@@ -130,6 +130,10 @@ def _check_coefficients(effect: type[Effect]) -> None:
             raise ValueError(f"{where} must be a name of its own; it is taken or no name. Rename the coefficient.")
         if not (c.low <= c.default <= c.high and c.sigma >= 0.0):
             raise ValueError(f"{where} must have low <= default <= high and sigma >= 0; got {c}. Mend it.")
+        if c.absent is not None and c.sigma == 0.0:
+            raise ValueError(
+                f"{where}.sigma must be above 0, a plausible size; got 0. Guess it, or make it a shape (absent=None)."
+            )
         if c.absent is not None and not c.low <= c.absent <= c.high:
             raise ValueError(
                 f"{where}.absent must lie within [{c.low:g}, {c.high:g}]; got {c.absent:g}. Widen the bounds."

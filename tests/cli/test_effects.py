@@ -1,0 +1,96 @@
+"""`--effects FILE.py` as a user meets it: an effect of one's own in simulations, model files and searches."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import yaml
+
+import ballfg.diagnose
+from ballfg.cli.main import run
+from ballfg.dynamics import EFFECTS
+
+GUIDE = Path(__file__).parents[2] / "docs" / "add_an_effect.md"
+
+
+def status(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as exit_:
+        run([str(argument) for argument in arguments])
+    assert isinstance(exit_.value.code, int)
+    return exit_.value.code
+
+
+@pytest.fixture(autouse=True)
+def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """A folder with the guide's effect; what a command registers is forgotten."""
+    monkeypatch.chdir(tmp_path)
+    code = re.findall(r"```python\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)[0]
+    Path("static_charge.py").write_text(code, encoding="utf-8")
+    known = dict(EFFECTS)
+    yield tmp_path
+    EFFECTS.clear()
+    EFFECTS.update(known)
+
+
+def test_the_guides_commands(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """As they stand there, with fewer tracks; the search itself is tested elsewhere."""
+    asked = []
+
+    def diagnose(dataset: object, model: object, **options: object) -> None:
+        asked.append(list(EFFECTS))
+        raise ValueError("enough")
+
+    monkeypatch.setattr(ballfg.diagnose, "diagnose", diagnose)
+    commands = re.findall(r"^ballfg (.*--effects.*)$", GUIDE.read_text(encoding="utf-8"), re.MULTILINE)
+    simulate, search, predict = (command.replace("--tracks 50", "--tracks 2").split() for command in commands)
+    assert status(*simulate) == 0
+    assert "undeclared effects: static_charge" in capsys.readouterr().out
+    assert yaml.safe_load(Path("charged/truth.yaml").read_text(encoding="utf-8"))
+    EFFECTS.pop("static_charge")
+    assert status(*search) == 2
+    assert asked[0][-1] == "static_charge"
+    EFFECTS.pop("static_charge")
+    model = yaml.safe_load(Path("charged/model.yaml").read_text(encoding="utf-8"))
+    model["flight"]["static_charge"] = {"strength": 2.0}
+    Path("diagnosis").mkdir()
+    Path("diagnosis/model.yaml").write_text(yaml.safe_dump(model), encoding="utf-8")
+    assert status(*predict) == 0
+    assert Path("predictions.csv").is_file()
+
+
+def test_a_model_file_that_names_an_unknown_effect_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert status("simulate", "--out", "plain", "--tracks", 2) == 0
+    Path("model.yaml").write_text("flight: {gravity: {}, static_charge: {strength: 1.0}}\nbounce: {}\n")
+    capsys.readouterr()
+    arguments = ("estimate", "plain", "--model", "model.yaml", "--out", "states.csv")
+    assert status(*arguments) == 2
+    said = capsys.readouterr()
+    assert said.out == ""
+    assert said.err.startswith("ballfg: error: model.yaml: there is no flight effect 'static_charge'; known ones: ")
+    assert said.err.endswith("must be registered first: --effects FILE.py, or ballfg.dynamics.register.\n")
+    assert not Path("states.csv").exists()
+    assert status(*arguments, "--effects", "static_charge.py", "--effects", "static_charge.py") == 0
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "broken.py does not exist; effects of one's own are one Python file."),
+        ("import nowhere_at_all", "line 1: ModuleNotFoundError: No module named 'nowhere_at_all'. Mend it there."),
+        ("x = 1", "must define an effect, a class; it defines none. docs/add_an_effect.md has an example."),
+    ],
+)
+def test_bad_files_are_one_line_and_status_2(
+    capsys: pytest.CaptureFixture[str], text: str | None, message: str
+) -> None:
+    if text is not None:
+        Path("broken.py").write_text(text, encoding="utf-8")
+    assert status("simulate", "--out", "d", "--effects", "broken.py") == 2
+    said = capsys.readouterr()
+    assert (said.out, said.err.count("\n")) == ("", 1)
+    assert said.err.startswith("ballfg: error: ")
+    assert said.err.endswith(f"{message}\n")
+    assert not Path("d").exists()
