@@ -9,6 +9,7 @@ from typing import Final
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ballfg.benchmarks.loop_cases import Case
 from ballfg.benchmarks.loop_ideal import Ideal
@@ -68,7 +69,15 @@ def _draw_power(axes: Axes, sizes: Sequence[float], outcomes: Sequence[bool], cu
     axes.plot(grid, curve.at(grid), color=LOOP_COLOUR, linewidth=1.0, alpha=0.6, label="curve through the loop's")
     axes.axhline(NAMED, color="black", linewidth=0.5, linestyle=":")
     axes.set(xscale="log", ylim=(-0.05, 1.05))
+    _plain_sizes(axes)
     axes.grid(visible=True, alpha=0.25)
+
+
+def _plain_sizes(axes: Axes) -> None:
+    """Numbers as 0.05, not as powers of ten, at 1, 2 and 5 of each decade of the horizontal axis."""
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def confusion_picture(cases: Sequence[Case], records: Mapping[str, Record], path: Path) -> Path:
@@ -117,8 +126,9 @@ def repair_picture(rows: Sequence[Row], path: Path) -> Path:
     axes.set_yticks(range(len(names)), names, fontsize="small")
     axes.invert_yaxis()
     axes.set(xscale="log", xlabel="prediction RMSE on the judging half / that of the true model")
+    _plain_sizes(axes)
     axes.set_title("What the diagnosis mends; dot: median over seeds, line: lowest to highest", size=11)
     axes.grid(visible=True, axis="x", which="both", alpha=0.25)
     if found:
-        axes.legend(loc="best", fontsize="small")
+        figure.legend(loc="outside lower center", ncols=2, fontsize="small")
     return save(figure, path)

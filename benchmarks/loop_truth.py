@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import torch
+
 from ballfg.benchmarks.loop_cases import Case
 from ballfg.benchmarks.loop_data import actual_model, declared_model
 from ballfg.benchmarks.loop_effects import PLANTS
@@ -13,9 +17,12 @@ from ballfg.diagnose.judge import prediction_errors
 from ballfg.diagnose.problem import Problem
 from ballfg.diagnose.process import with_process_noise
 from ballfg.diagnose.result import Errors
-from ballfg.diagnose.stretches import stretches_of
+from ballfg.diagnose.stretches import Stretches, stretches_of
+from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effect import Coefficient
 from ballfg.estimate import Smoother, dataset_settings
+from ballfg.estimate.as_measured import plainly_measured
+from ballfg.state import SPIN
 from ballfg.tracks import Dataset
 
 
@@ -26,9 +33,11 @@ def true_errors(case: Case, dataset: Dataset) -> Errors:
     """
     truth, declared = actual_model(case), declared_model(case, dataset.info.ball.radius)
     halves = halves_of(dataset, declared, 1, _unwatched)  # as the diagnosis has them: both are judged by the same
-    smoother = Smoother(truth, halves.surfaces, dataset_settings(dataset, truth))
+    moving = plainly_measured(truth)
+    smoother = Smoother(moving, halves.surfaces, dataset_settings(dataset, moving))
     finding = stretches_of(smoother, [part.track for part in halves.found_on], halves.launcher)
-    problem = Problem(truth, followed(truth, finding), {**declared_free(declared), **planted_free(case)})
+    finding = followed(truth, _with_labelled_spins(truth, finding))
+    problem = Problem(truth, finding, {**declared_free(declared), **planted_free(case)})
     start = start_from(problem, halves.settings.spin_label_noise, halves.settings.spin_prior)
     fitted = calibrated_model(fit(problem, *start), halves.launcher.embedding)
     model = with_process_noise(fitted, halves.found_on, dataset, 1)
@@ -41,6 +50,18 @@ def planted_free(case: Case) -> dict[str, Coefficient]:
     for name in case.planted:
         free |= PLANTS[name].hypothesis().free()
     return free
+
+
+def _with_labelled_spins(model: AnalyticModel, stretches: Stretches) -> Stretches:
+    """Stretches whose first guess of a labelled spin is what the label means to a model."""
+    with torch.no_grad():
+        offset = model.labelled(torch.zeros(3, dtype=torch.float64))
+        turn = model.labelled(torch.eye(3, dtype=torch.float64)) - offset  # labels are affine: rows M e_i
+        spins = torch.linalg.solve(turn.T, (stretches.labels - offset).T).T
+    starts = stretches.starts.clone()
+    labelled = torch.from_numpy(stretches.labelled)
+    starts[labelled, SPIN] = spins[labelled]
+    return replace(stretches, starts=starts)
 
 
 def _unwatched(line: str) -> None:

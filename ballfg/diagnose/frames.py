@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 
 UNLABELLED_SPIN = 200.0
 """rad/s, prior of a spin about zero while labels are set aside."""
+FRAMES = 48
+"""Ways in which axes can be exchanged and reversed, the identity among them."""
 FRAMES_FITTED = 2
 """Frames that are fitted in full."""
 

@@ -23,6 +23,8 @@ MOST_EFFECTS = 4
 """Effects that are added before the search ends; further ones would be found in what earlier wrong ones left."""
 CONFIRMED = 0.05
 """An effect stays only if its gain on the judging half would arise by chance less often than this."""
+LABELLED = 0.5
+"""Share of flights whose spin must be labelled for an effect that multiplies spins to show in a score test."""
 ALIKE = 6.0
 """BIC difference below which two effects cannot be told apart: odds of 20 to 1."""
 
@@ -64,7 +66,8 @@ def _round(search: Search, halves: Halves, catalogue: Sequence[type[Effect]], wa
     assert isinstance(model, AnalyticModel)
     candidates = hypotheses(model, scene_of(search.fit), catalogue)
     watch(f"round {len(search.rounds) + 1}: testing {len(candidates)} hypotheses")
-    driven = [h for h in candidates if h.effect.multiplies_spin and not search.fit.problem.stretches.labelled.all()]
+    unknown = search.fit.problem.stretches.labelled.mean() < LABELLED
+    driven = [h for h in candidates if h.effect.multiplies_spin and unknown]
     scored = score_all(search.fit, [h for h in candidates if h not in driven])
     refits = []
     for candidate in shortlist(scored):
@@ -91,7 +94,8 @@ def _round(search: Search, halves: Halves, catalogue: Sequence[type[Effect]], wa
         search.findings.append(_finding(winner, settled, alike, evidence))
         search.fit = settled
     search.rounds.append(_ranking(scored, refits, standing))
-    watch(f"round {len(search.rounds)}: {'nothing helps' if winner is None else f'{winner.scored.hypothesis.name} added'}")
+    added = "nothing helps" if winner is None else f"{winner.scored.hypothesis.name} added"
+    watch(f"round {len(search.rounds)}: {added}")
     return winner is not None
 
 

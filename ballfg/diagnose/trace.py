@@ -13,8 +13,9 @@ from scipy import stats
 
 from ballfg.diagnose.columns import signatures
 from ballfg.diagnose.fit import fit
+from ballfg.diagnose.frames import FRAMES
 from ballfg.diagnose.hypothesis import Hypothesis, with_effects, without_effect
-from ballfg.diagnose.problem import Fit, Problem
+from ballfg.diagnose.problem import Fit, Problem, linearise
 from ballfg.diagnose.score import Score, score_tests
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.state import SPIN
@@ -26,6 +27,8 @@ ALARM = 0.05
 half (`loop.CONFIRMED`), so that both together happen by chance in one round of 400."""
 MOST_REFITS = 6
 """Hypotheses that are refitted in a round."""
+SEARCHED = 2.0 * float(np.log(FRAMES - 1))
+"""What a label frame costs in BIC: it was chosen among so many others."""
 LEADING = 0.5
 """A hypothesis that explains less than this share of the best one's is not refitted."""
 
@@ -96,7 +99,8 @@ def refit(before: Fit, scored: Scored) -> Refit:
     if hypothesis.shape and not hypothesis.strengths:
         unknowns = replace(unknowns, starts=_starts_with_labels(problem, unknowns.starts))
     after = fit(problem, unknowns, before.noise, settle_noise=False)
-    return Refit(scored, after, delta_bic(before, after))
+    chosen = 0.0 if hypothesis.strengths else SEARCHED
+    return Refit(scored, after, delta_bic(before, after) + chosen)
 
 
 def with_hypothesis(problem: Problem, hypothesis: Hypothesis) -> Problem:
@@ -118,7 +122,7 @@ def refit_driven(before: Fit, hypothesis: Hypothesis) -> Refit:
     """The fit with an effect that multiplies spins nobody labelled.
 
     A coefficient times a spin of mean zero has no slope at zero. With the coefficient at its usual value the spins
-    have one: launcher settings and single shots find theirs, and the likelihood ratio is the test.
+    have one: launcher settings and single shots find theirs, and the ratio of marginal likelihoods is the test.
     """
     problem = with_hypothesis(before.problem, hypothesis)
     listed = {hypothesis.parameter(c.name): c for c in hypothesis.effect.coefficients}
@@ -128,12 +132,22 @@ def refit_driven(before: Fit, hypothesis: Hypothesis) -> Refit:
     values = {hypothesis.parameter(c.name): c.default for c in hypothesis.effect.coefficients}
     unknowns = replace(before.unknowns, values={**before.unknowns.values, **values})
     after = fit(replace(problem, model=model, free=free), unknowns, before.noise, settle_noise=False)
-    gain = 2.0 * (before.cost - after.cost)
+    taken = 2.0 * (_narrowness(after) - _narrowness(before))
+    gain = 2.0 * (before.cost - after.cost) - taken
     freedom = 3 * problem.stretches.settings.shape[1] + len(hypothesis.columns)
     estimate = np.array([after.unknowns.values[name] for name in hypothesis.columns])
     p_value = float(stats.chi2.sf(max(gain, 0.0), freedom))
     score = Score(estimate, np.full(len(estimate), np.nan), gain, p_value, freedom)
-    return Refit(Scored(hypothesis, score, score.p_value), after, delta_bic(before, after))
+    return Refit(Scored(hypothesis, score, score.p_value), after, delta_bic(before, after) + taken)
+
+
+def _narrowness(fitted: Fit) -> float:
+    """Half the log determinant of what is known of first states: with the cost their Laplace marginal likelihood.
+
+    With a lift every spin is a degree of freedom of its flight, which fits noise too; this is what that costs.
+    """
+    by_start = linearise(fitted.problem, fitted.unknowns, fitted.noise, fitted.predicted).by_start
+    return 0.5 * float(np.linalg.slogdet(by_start.swapaxes(-1, -2) @ by_start)[1].sum())
 
 
 def delta_bic(before: Fit, after: Fit) -> float:

@@ -53,8 +53,10 @@ def whiteness(fit: Fit, system: System) -> Whiteness:
     stretches = fit.problem.stretches
     n, k = stretches.times.shape
     kept = stretches.used.numpy() & (fit.robust.samples >= LEAST_WEIGHT)
-    residual = np.where(kept[..., None], system.residual[:, : 3 * k].reshape(n, k, 3), 0.0)
-    taken = np.where(kept[..., None, None], _absorbed(fit, system).reshape(n, k, 3, -1), 0.0)
+    system = _without(system, ~kept)
+    projected = system.projected()
+    residual = projected[:, : 3 * k, -1].reshape(n, k, 3)
+    taken = _absorbed(fit, system, projected[..., :-1]).reshape(n, k, 3, -1)
     sums, spreads, p_values, products = [], [], [], []
     for reach in REACHES:
         kernel = _kernel(stretches.times.numpy(), kept, reach)
@@ -120,13 +122,21 @@ def _gamma_tail(value: float, variance: float, third: float) -> float:
     return float(stats.pearson3.sf(value / np.sqrt(variance), third / variance**1.5))
 
 
-def _absorbed(fit: Fit, system: System) -> Array:
+def _without(system: System, samples: NDArray[np.bool_]) -> System:
+    """The system less some samples (n, k): outliers that pulled at the fit, though weakly, would look like drift."""
+    rows = np.ones(system.residual.shape)
+    rows[:, : 3 * samples.shape[1]] -= np.repeat(samples, 3, axis=1)
+    return System(system.residual * rows, system.by_start * rows[..., None], system.by_common * rows[..., None])
+
+
+def _absorbed(fit: Fit, system: System, shared: Array) -> Array:
     """(n, 3 k, 9 + q) directions of the samples' noise that the fit takes up, of unit length over all rows.
 
     First states take theirs in each stretch; what all stretches share takes a part of unit length over all of them.
+
+    Args: shared: (n, m, q) columns of what all share, first states projected out.
     """
     own, _ = np.linalg.qr(system.by_start)
-    shared = system.projected()[..., :-1]
     precision = (shared.swapaxes(-1, -2) @ shared).sum(axis=0) + np.diag(common_precision(fit.problem))
     root = np.linalg.inv(np.linalg.cholesky(precision)).T
     rows = system.residual.shape[1] - 3

@@ -71,7 +71,7 @@ def test_the_model_goes_through_a_file(unlabelled, tmp_path):
     save_model(model, tmp_path / "model.yaml")
     again = load_model(tmp_path / "model.yaml", radius=model.radius)
     for name, value in model.named_parameters():
-        assert float(dict(again.named_parameters())[name]) == pytest.approx(float(value), rel=1e-9)
+        assert dict(again.named_parameters())[name].item() == pytest.approx(value.item(), rel=1e-9)
     assert again.trained.position_scale == pytest.approx(model.trained.position_scale, rel=1e-9)
     np.testing.assert_allclose(
         again.trained.launcher.weight.detach(), model.trained.launcher.weight.detach(), rtol=1e-9

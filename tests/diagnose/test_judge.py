@@ -29,7 +29,7 @@ def test_the_true_effect_helps_on_other_tracks(windy_fit, others):
     after = refit(windy_fit, score_all(windy_fit, [WIND])[0]).fit
     found = held_out(windy_fit, after, others[0])
     assert found.gain > 5.0
-    assert found.p_value < 1e-3
+    assert found.p_value < 0.05
 
 
 def test_an_idle_effect_does_not(calm_fit, others):

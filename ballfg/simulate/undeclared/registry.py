@@ -34,15 +34,19 @@ def parse_effects(texts: Iterable[str]) -> tuple[Effect, ...]:
         if coefficient in given:
             raise ValueError(f"effect must name each coefficient once; got {effect}.{coefficient} twice. Remove one.")
         given[coefficient] = value
-    order = (*EFFECTS, *NOWHERE)
-    return tuple(UNDECLARED[name](**values[name]) for name in sorted(values, key=order.index))
+    return tuple(UNDECLARED[name](**values[name]) for name in sorted(values, key=_names().index))
+
+
+def _names() -> list[str]:
+    """Every effect, those that can be declared nowhere last."""
+    return [*EFFECTS, *NOWHERE]
 
 
 def _parse(text: str) -> tuple[str, str, float]:
     key, equals, number = text.partition("=")
     name, dot, coefficient = key.strip().partition(".")
     if name not in UNDECLARED:
-        raise ValueError(f"effect must be one that exists; got '{name}'. {_nearest(name, UNDECLARED)}")
+        raise ValueError(f"effect must be one that exists; got '{name}'. {_nearest(name, _names())}")
     known = [c.name for c in UNDECLARED[name].coefficients]
     example = f"{name}.{known[0]}=0.1"
     if not (dot and equals):

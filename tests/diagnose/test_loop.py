@@ -1,0 +1,79 @@
+"""The search: the effect that is there, silence where nothing is, and what it says of each candidate."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ballfg.diagnose.hypothesis import declared_free, has_effect
+from ballfg.diagnose.loop import search_effects
+from ballfg.diagnose.result import Standing
+from ballfg.dynamics import EFFECTS
+from ballfg.estimate.settings import Settings
+
+CATALOGUE = [EFFECTS[name] for name in ("gravity", "wind", "table_tilt", "spin_decay")]
+
+
+def halves(finding, judging):
+    """What of a dataset's halves the search asks for."""
+    return SimpleNamespace(finding=finding, judging=judging, settings=Settings(spin_label_noise=4.0))
+
+
+def shots(make_ball, make_launches, make_shots, seed, **truth):
+    return make_shots(make_ball(**truth), make_launches(14, seed), seed, duration=0.6, rate=50.0).stretches
+
+
+@pytest.fixture(scope="module")
+def tilted(make_ball, make_launches, make_shots):
+    """A search on shots over a table that leans by 1.1 degrees."""
+    truth = {"table_tilt": {"x": 0.02, "y": 0.0}}
+    data = (shots(make_ball, make_launches, make_shots, seed, **truth) for seed in (71, 72))
+    said = []
+    return *search_effects(halves(*data), make_ball(), CATALOGUE, said.append), said
+
+
+def test_the_effect_that_is_there_comes_first(tilted):
+    _, search, _ = tilted
+    (finding,) = search.findings
+    assert finding.name == "table_tilt"
+    for axis, truth in (("x", 0.02), ("y", 0.0)):
+        value = finding.parameters[axis]
+        assert abs(value.value - truth) < 4 * value.sigma
+        assert value.unit == "rad"
+    assert finding.delta_bic < -20.0
+    assert finding.p_value < 1e-3
+    assert finding.held_out_gain > 0.0
+    assert finding.held_out_p < 0.05
+    assert finding.indistinguishable_from == ()
+
+
+def test_the_model_holds_what_was_found(tilted):
+    first, search, _ = tilted
+    assert has_effect(search.fit.problem.model, "table_tilt")
+    assert not has_effect(first.problem.model, "table_tilt")
+    assert set(first.problem.free) == set(declared_free(first.problem.model))
+    assert set(search.fit.problem.free) - set(first.problem.free) == {"contact.table_tilt.x", "contact.table_tilt.y"}
+    assert float(np.prod(search.fit.noise.position)) < float(np.prod(first.noise.position))
+
+
+def test_every_round_ranks_every_candidate(tilted):
+    _, search, said = tilted
+    assert len(search.rounds) == 2
+    first, second = ({c.name: c for c in rows} for rows in search.rounds)
+    assert set(first) == {"gravity", "wind", "table_tilt", "spin_decay"}
+    assert first["table_tilt"].standing is Standing.ADDED
+    assert Standing.ADDED not in {c.standing for c in second.values()}
+    assert "table_tilt" not in second
+    explained = [c.explained for c in search.rounds[0]]
+    assert explained == sorted(explained, reverse=True)
+    assert any(line.startswith("round 1: fitting with table_tilt") for line in said)
+
+
+def test_nothing_is_added_where_nothing_is(make_ball, make_launches, make_shots):
+    data = (shots(make_ball, make_launches, make_shots, seed) for seed in (73, 74))
+    first, search = search_effects(halves(*data), make_ball(), CATALOGUE, lambda line: None)
+    assert search.findings == []
+    assert search.fit is first
+    assert len(search.rounds) == 1
