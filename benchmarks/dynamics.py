@@ -26,6 +26,7 @@ from ballfg.benchmarks.dynamics_task import Task
 from ballfg.benchmarks.dynamics_truth import TRACKS, synthetic_task
 from ballfg.benchmarks.results import Results
 from ballfg.cli.progress import progress
+from ballfg.learning.loop import TrainingStoppedError
 from ballfg.tracks import Dataset
 
 RUNS_FOLDER: Final = "runs"
@@ -168,11 +169,19 @@ def read(job: Job) -> dict[int, Record] | None:
 
 
 def finish(job: Job) -> tuple[tuple[str, int], dict[int, Record]]:
-    """Make a method's contenders, judge them, keep the records; with the method and its seed."""
+    """Make a method's contenders, judge them, keep the records; with the method and its seed.
+
+    Without any record where its training does not get through: the others are compared all the same.
+    """
     torch.set_num_threads(1)  # the processes share the cores already
     records = {}
     for k in judged(job):
-        records[k] = judge(METHODS[job.method].make(job, job.tasks[k]), job, k)
+        try:
+            contender = METHODS[job.method].make(job, job.tasks[k])
+        except TrainingStoppedError as error:
+            print(f"note: {job.method}, seed {job.seed}, is left out: {error}", file=sys.stderr)
+            break
+        records[k] = judge(contender, job, k)
         records[k].save(record_path(job, k))
     return (job.method, job.seed), records
 

@@ -28,7 +28,7 @@ class Tracks:
     def signatures(self, residual: np.ndarray) -> Signatures:
         """What a fit of everything common leaves of a residual (t, m)."""
         t, m = residual.shape
-        residual = residual - (self.starts @ np.linalg.lstsq(self.starts, residual.T, rcond=None)[0]).T
+        residual = residual - residual @ np.linalg.pinv(self.starts).T @ self.starts.T
         common = self.columns[..., :COMMON].reshape(t * m, COMMON)
         shared = np.linalg.solve(common.T @ common + np.diag(PRECISION), common.T @ residual.ravel())
         left = residual - (common @ shared).reshape(t, m)
@@ -42,7 +42,7 @@ def tracks_of(count, rng):
     mixed = rng.normal(size=(8, COMMON + COLUMNS)) + rng.normal(size=(count, 8, COMMON + COLUMNS))
     columns = waves @ (mixed * rng.lognormal(0.0, 0.5, (count, 1, 1)))
     starts = waves[:, :3]
-    return Tracks(columns - starts @ np.linalg.lstsq(starts, columns, rcond=None)[0], starts)
+    return Tracks(columns - starts @ (np.linalg.pinv(starts) @ columns), starts)
 
 
 def with_memory(white):

@@ -15,8 +15,9 @@ PROBE_SPEEDS = (2.0, 4.0, 8.0)
 """m/s, at which drag is read off."""
 PROBE_FALLS = (1.0, 2.0, 4.0)
 """m/s, at which restitution and friction are read off."""
-PROBE_SLIDE = 40.0
-"""m/s, tangential: fast enough to slide through a bounce, so that the change of velocity shows the friction."""
+PROBE_SLIDE = 12.0
+"""m/s, tangential: fast enough to slide through a bounce, so that the change of velocity shows the friction, and no
+faster than strong spin makes a ball slip: a learned contact knows nothing beyond what it has seen."""
 BOUNDS = {
     "gravity": (0.1, 100.0),
     "drag": (0.0, 5.0),
@@ -65,8 +66,8 @@ def physics_of(model: BallModel) -> SegmentationPhysics:
     """The physics of a model, analytic or learned, from its answers at a few states without spin.
 
     Gravity, and the offset of the surfaces, come from a ball that hangs still; drag is the least-squares k over
-    horizontal flight in four directions; restitution and friction are means over bounces. Values outside `BOUNDS`,
-    which an untrained model may give, are clipped into them.
+    horizontal flight in four directions; restitution and friction are means over bounces. A value outside `BOUNDS`,
+    which a learned model may give where it was never asked, says nothing: a table-tennis ball's takes its place.
 
     Args: model: any `BallModel`; it is neither changed nor differentiated.
     """
@@ -82,9 +83,7 @@ def physics_of(model: BallModel) -> SegmentationPhysics:
             "radius": model.radius,
             "surface_offset": float(torch.as_tensor(model.surface_offset(still)).reshape(-1)[0]),
         }
-    return SegmentationPhysics(
-        **{name: min(max(value, BOUNDS[name][0]), BOUNDS[name][1]) for name, value in values.items()}
-    )
+    return SegmentationPhysics(**{n: v for n, v in values.items() if BOUNDS[n][0] <= v <= BOUNDS[n][1]})
 
 
 def _drag_coefficient(model: BallModel, still: Tensor) -> float:
