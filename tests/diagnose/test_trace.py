@@ -27,7 +27,7 @@ CANDIDATES = [
     hypothesis("table_tilt"),
     hypothesis("spin_decay"),
     hypothesis("spin_label_scale"),
-    hypothesis("velocity_lag"),
+    hypothesis("buoyancy"),
 ]
 
 
