@@ -47,10 +47,16 @@ def generic_tests(fit: Fit, reference: Fit | None = None) -> tuple[GenericTest, 
     Args: reference: the fit at the start, to which shares refer; None: this one.
     """
     found, drift = _examine(fit)
-    start = (found, drift) if reference is None else _examine(reference)
+    start, first = (found, drift) if reference is None else _examine(reference)
+    quieter = 1.0 if reference is None else _noise_square(fit) / _noise_square(reference)
     count = len(found) + 1
-    tests = [_generic(tested, _of_block(start[0], tested.block), count) for tested in found]
-    return tuple(sorted([*tests, _time(drift, start[1], count)], key=lambda t: t.p_value))
+    tests = [_generic(tested, _of_block(start, tested.block), quieter, count) for tested in found]
+    return tuple(sorted([*tests, _time(drift, first, count)], key=lambda t: t.p_value))
+
+
+def _noise_square(fit: Fit) -> float:
+    """Mean square of the noise's scale, by which residuals are whitened: shares are of residuals that are not."""
+    return float((fit.noise.position**2).mean())
 
 
 def _examine(fit: Fit) -> tuple[list[_Tested], Whiteness]:
@@ -97,8 +103,8 @@ def _of_block(found: list[_Tested], block: Block) -> _Tested | None:
     return same[0] if same else None
 
 
-def _generic(tested: _Tested, start: _Tested | None, count: int) -> GenericTest:
-    left = max(0.0, tested.pattern.explained - tested.pattern.rank)
+def _generic(tested: _Tested, start: _Tested | None, quieter: float, count: int) -> GenericTest:
+    left = quieter * max(0.0, tested.pattern.explained - tested.pattern.rank)
     first = max(left, 0.0 if start is None else start.pattern.explained - start.pattern.rank)
     return GenericTest(
         name=tested.block.kind,
@@ -128,11 +134,10 @@ def _amount(kind: str, size: float) -> str:
 
 
 def _time(drift: Whiteness, start: Whiteness, count: int) -> GenericTest:
-    left = max(0.0, float(drift.explained.max()))
-    first = max(left, float(start.explained.max()))
+    whole = max(drift.drift, start.drift)
     return GenericTest(
         name="time",
         where=f"time: samples within {1e3 * drift.reach:.0f} ms err alike, by {1e3 * drift.drift:.2g} mm",
         p_value=min(1.0, count * drift.p_value),
-        share=left / first if first > 0.0 else 0.0,
+        share=(drift.drift / whole) ** 2 if whole > 0.0 else 0.0,
     )
