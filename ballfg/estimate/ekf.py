@@ -24,7 +24,8 @@ from ballfg.estimate.result import Array, Estimate, Status, leave_one_out
 from ballfg.estimate.rts import FilterRecord, fly_back, rts_smooth
 from ballfg.estimate.segmentation import Contact, Quality
 from ballfg.estimate.settings import Settings, sample_sigmas, spin_start
-from ballfg.estimate.sliding_window import WINDOW, SlidingWindow, first_pair
+from ballfg.estimate.sliding_window import SlidingWindow, first_pair
+from ballfg.estimate.window import WINDOW
 from ballfg.state import POSITION, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
 from ballfg.tracks import Track
 

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from ballfg.dynamics.contact import fly_through
 from ballfg.dynamics.model import BallModel
+from ballfg.estimate.launcher import SpinLabel
 from ballfg.estimate.segmentation import Contact, Quality, Segmentation
-from ballfg.estimate.settings import SpinLabel
-from ballfg.estimate.sliding_window import window_velocities
+from ballfg.estimate.window import window_velocities
 from ballfg.factors.kind import Values
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
 from ballfg.tracks import Track

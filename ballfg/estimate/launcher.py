@@ -10,12 +10,19 @@ import torch
 from numpy.typing import NDArray
 
 from ballfg.dynamics.spin_embedding import SpinEmbedding
-from ballfg.estimate.settings import SpinLabel
-from ballfg.estimate.sliding_window import window_velocities
+from ballfg.estimate.window import window_velocities
 from ballfg.tracks import SPIN_LABELS, Track
 
 FIRST_SAMPLES = 10
 """The launch direction is the mean direction of flight over so many samples."""
+
+
+@dataclass(frozen=True)
+class SpinLabel:
+    """A spin that is known before the flight is looked at: (3,) rad/s, and its standard deviation per axis, rad/s."""
+
+    spin: NDArray[np.float64]
+    sigma: float
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
+from ballfg.estimate.launcher import SpinLabel
 from ballfg.estimate.motion import FLIGHT, Motion, motions_of
 from ballfg.estimate.online_events import SIGMA_FACTOR, EventTracker, contact_step, first_difference
 from ballfg.estimate.online_final import Frozen, final_estimate, freeze, unknown
@@ -18,7 +19,7 @@ from ballfg.estimate.online_window import Window
 from ballfg.estimate.problem import trackwise_model
 from ballfg.estimate.result import Estimate, Status
 from ballfg.estimate.segmentation import physics_of
-from ballfg.estimate.settings import Settings, SpinLabel, sample_sigmas
+from ballfg.estimate.settings import Settings, sample_sigmas
 from ballfg.estimate.smoother import Smoother
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Track

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.dynamics.model import BallModel
+from ballfg.estimate.launcher import SpinLabel
 from ballfg.estimate.motion import FLIGHT, Motion
 from ballfg.estimate.online_interval import Interval, IntervalMaker, coefficient_count, evaluate, store
 from ballfg.estimate.problem import coefficient_means, start_priors
-from ballfg.estimate.settings import Settings, SpinLabel
+from ballfg.estimate.settings import Settings
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
 from ballfg.factors.kind import FactorKind
 from ballfg.factors.position import PositionFactors

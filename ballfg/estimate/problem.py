@@ -16,9 +16,10 @@ from numpy.typing import NDArray
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.integrate import steps_over
 from ballfg.dynamics.model import BallModel
+from ballfg.estimate.launcher import SpinLabel
 from ballfg.estimate.motion import motions_of
 from ballfg.estimate.segmentation import Contact, Quality, Segmentation
-from ballfg.estimate.settings import Settings, SpinLabel, sample_sigmas, spin_start
+from ballfg.estimate.settings import Settings, sample_sigmas, spin_start
 from ballfg.factors.dynamics import ContactFactors, FlightFactors, RestFactors
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.kind import FactorKind, Values

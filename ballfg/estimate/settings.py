@@ -4,27 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.model import BallModel
+from ballfg.estimate.launcher import Launcher, SpinLabel
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
-
-if TYPE_CHECKING:
-    from ballfg.estimate.launcher import Launcher
-    from ballfg.tracks import Track
-
-
-@dataclass(frozen=True)
-class SpinLabel:
-    """A spin that is known before the flight is looked at: (3,) rad/s, and its standard deviation per axis, rad/s."""
-
-    spin: NDArray[np.float64]
-    sigma: float
+from ballfg.tracks import Track
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from itertools import combinations
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ballfg.dynamics.integrate import rate_jacobian
 from ballfg.dynamics.model import BallModel
@@ -18,11 +18,10 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
 from ballfg.estimate.result import Array, Estimate, Status
 from ballfg.estimate.settings import sample_sigmas, spin_start
+from ballfg.estimate.window import WINDOW
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
 from ballfg.tracks import Track
 
-WINDOW = 5
-"""Samples in a window."""
 START_SEARCH = 12
 """How many samples are looked at for the first good ones of a flight."""
 START_GATE = 30.7
@@ -135,59 +134,6 @@ def _bounce_covariance(track: Track, first: NDArray[np.int64], bounced: NDArray[
     jump = 2.0 * fall[window].max(axis=-1) * held
     shares = np.array([FRICTION_SHARE, FRICTION_SHARE, 1.0])
     return np.asarray((jump[:, None, None] * np.diag(shares)) ** 2 / 3.0)
-
-
-def window_velocities(times: Array, positions: Array, breaks: ArrayLike = ()) -> Array:
-    """Velocities at all samples, by line fits over five samples that end at the breaks of the motion.
-
-    Least squares over p(t) = p_0 + v t - g t^2/2 e_z, with t counted from the sample, so that v is the velocity there.
-    A window is centred on its sample, shifted where a break or an end of the track is near, shorter where there are
-    fewer than five samples between two breaks. A sample alone between breaks gets the mean slope to its neighbours.
-
-    Args:
-        times: (n,) s, increasing.
-        positions: (n, 3) m.
-        breaks: intervals (between samples i and i+1) in which a contact or a hit broke the motion.
-    Returns: (n, 3) m/s, always finite; zero for a track of one sample.
-    """
-    n = len(times)
-    if n == 1:
-        return np.zeros((1, 3))
-    begin, end = _segment_bounds(n, np.asarray(breaks, dtype=np.int64))
-    at = np.arange(n)
-    low = np.maximum(np.minimum(at - WINDOW // 2, end - WINDOW), begin)
-    window = low[:, None] + np.arange(WINDOW)
-    weight = (window < end[:, None]).astype(np.float64)  # (n, 5)
-    window = np.minimum(window, n - 1)
-    t = times[window] - times[:, None]
-    p = positions[window]  # (n, 5, 3)
-    p[:, :, Z] += 0.5 * STANDARD_GRAVITY * t**2
-    count = weight.sum(axis=-1, keepdims=True)
-    centred = weight * (t - (weight * t).sum(axis=-1, keepdims=True) / count)
-    scatter = (centred * t).sum(axis=-1)
-    alone = count[:, 0] == 1
-    velocities = np.einsum("nk,nkd->nd", centred, p) / np.where(alone, 1.0, scatter)[:, None]
-    if alone.any():
-        velocities[alone] = _neighbour_slopes(times, positions)[alone]
-    return np.asarray(velocities)
-
-
-def _segment_bounds(n: int, breaks: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """(n,) first sample of each sample's segment, and (n,) the one after its last."""
-    edges = np.zeros(n + 1, dtype=np.int64)
-    edges[breaks + 1] = breaks + 1
-    begin = np.maximum.accumulate(edges[:-1])
-    edges = np.full(n + 1, n)
-    edges[breaks + 1] = breaks + 1
-    end = np.minimum.accumulate(edges[:0:-1])[::-1]
-    return begin, end
-
-
-def _neighbour_slopes(times: Array, positions: Array) -> Array:
-    """(n, 3) mean of the slopes to the samples before and after; at the ends the one there is."""
-    slopes = np.diff(positions, axis=0) / np.diff(times)[:, None]
-    padded = np.concatenate((slopes[:1], slopes, slopes[-1:]))
-    return np.asarray((padded[1:] + padded[:-1]) / 2)
 
 
 def first_pair(

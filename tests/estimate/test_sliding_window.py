@@ -13,7 +13,8 @@ from ballfg.dynamics.rollout import rollout
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.result import Status
 from ballfg.estimate.settings import Settings
-from ballfg.estimate.sliding_window import SlidingWindow, may_touch, window_velocities
+from ballfg.estimate.sliding_window import SlidingWindow, may_touch
+from ballfg.estimate.window import window_velocities
 from ballfg.state import POSITION, SPIN, VELOCITY
 from ballfg.tracks import Track
 

@@ -1,0 +1,66 @@
+"""Velocities from line fits in windows of a few samples: where estimates start, and what a launch looks like."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ballfg.state import STANDARD_GRAVITY, Z
+
+Array = NDArray[np.float64]
+
+WINDOW = 5
+"""Samples in a window."""
+
+
+def window_velocities(times: Array, positions: Array, breaks: ArrayLike = ()) -> Array:
+    """Velocities at all samples, by line fits over five samples that end at the breaks of the motion.
+
+    Least squares over p(t) = p_0 + v t - g t^2/2 e_z, with t counted from the sample, so that v is the velocity there.
+    A window is centred on its sample, shifted where a break or an end of the track is near, shorter where there are
+    fewer than five samples between two breaks. A sample alone between breaks gets the mean slope to its neighbours.
+
+    Args:
+        times: (n,) s, increasing.
+        positions: (n, 3) m.
+        breaks: intervals (between samples i and i+1) in which a contact or a hit broke the motion.
+    Returns: (n, 3) m/s, always finite; zero for a track of one sample.
+    """
+    n = len(times)
+    if n == 1:
+        return np.zeros((1, 3))
+    begin, end = _segment_bounds(n, np.asarray(breaks, dtype=np.int64))
+    at = np.arange(n)
+    low = np.maximum(np.minimum(at - WINDOW // 2, end - WINDOW), begin)
+    window = low[:, None] + np.arange(WINDOW)
+    weight = (window < end[:, None]).astype(np.float64)  # (n, 5)
+    window = np.minimum(window, n - 1)
+    t = times[window] - times[:, None]
+    p = positions[window]  # (n, 5, 3)
+    p[:, :, Z] += 0.5 * STANDARD_GRAVITY * t**2
+    count = weight.sum(axis=-1, keepdims=True)
+    centred = weight * (t - (weight * t).sum(axis=-1, keepdims=True) / count)
+    scatter = (centred * t).sum(axis=-1)
+    alone = count[:, 0] == 1
+    velocities = np.einsum("nk,nkd->nd", centred, p) / np.where(alone, 1.0, scatter)[:, None]
+    if alone.any():
+        velocities[alone] = _neighbour_slopes(times, positions)[alone]
+    return np.asarray(velocities)
+
+
+def _segment_bounds(n: int, breaks: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(n,) first sample of each sample's segment, and (n,) the one after its last."""
+    edges = np.zeros(n + 1, dtype=np.int64)
+    edges[breaks + 1] = breaks + 1
+    begin = np.maximum.accumulate(edges[:-1])
+    edges = np.full(n + 1, n)
+    edges[breaks + 1] = breaks + 1
+    end = np.minimum.accumulate(edges[:0:-1])[::-1]
+    return begin, end
+
+
+def _neighbour_slopes(times: Array, positions: Array) -> Array:
+    """(n, 3) mean of the slopes to the samples before and after; at the ends the one there is."""
+    slopes = np.diff(positions, axis=0) / np.diff(times)[:, None]
+    padded = np.concatenate((slopes[:1], slopes, slopes[-1:]))
+    return np.asarray((padded[1:] + padded[:-1]) / 2)
