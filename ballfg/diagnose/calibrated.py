@@ -28,6 +28,7 @@ def calibrated_model(fit: Fit, embedding: SpinEmbedding) -> AnalyticModel:
         fit: of an `AnalyticModel`.
         embedding: names the launcher settings of the fit.
     """
+    assert isinstance(fit.problem.model, AnalyticModel)
     model = with_effects(fit.problem.model)  # a copy
     parameters = dict(model.named_parameters())
     with torch.no_grad():

@@ -5,7 +5,7 @@ First a few generic terms, which a person can read; only if those do not help, a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -121,7 +121,7 @@ def _trained(trainee: EndToEnd, count: int, config: TrainConfig) -> bool:
     return True
 
 
-def _unwatched(items: Iterator[list[int]], count: int, what: str) -> Iterator[list[int]]:
+def _unwatched(items: Iterable[list[int]], count: int, what: str) -> Iterator[list[int]]:
     return iter(items)
 
 

@@ -123,7 +123,8 @@ def followed(model: BallModel, stretches: Stretches, values: Mapping[str, float]
     Args: values: coefficients by parameter name that differ from the model's own, as fitted.
     """
     predicted = predict(model, stretches, stretches.starts.numpy(), values or {})
-    return stretches.take(np.isfinite(predicted.positions).all(axis=(1, 2)))
+    reached: NDArray[np.bool_] = np.asarray(np.isfinite(predicted.positions).all(axis=(1, 2)))
+    return stretches.take(reached)
 
 
 def _settled(result: Fit) -> Noise:

@@ -52,7 +52,7 @@ def _spins_without_labels(before: Fit) -> tuple[Array, Array, Array]:
     result = fit(alone, unknowns, replace(before.noise, spin=UNLABELLED_SPIN), settle_noise=False)
     by_start = linearise(result.problem, result.unknowns, result.noise, result.predicted).by_start
     covariances = np.linalg.inv(by_start.swapaxes(-1, -2) @ by_start)[:, SPIN, SPIN]
-    return result.unknowns.starts[:, SPIN], covariances, labelled.labels.numpy()
+    return result.unknowns.starts[:, SPIN], np.asarray(covariances), labelled.labels.numpy()
 
 
 def _disagreement(labels: Array, spins: Array, covariances: Array, frame: Array, noise: float) -> float:

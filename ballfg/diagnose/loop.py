@@ -64,7 +64,8 @@ def _round(search: Search, halves: Halves, catalogue: Sequence[type[Effect]], wa
     """One round; whether an effect was added."""
     model = search.fit.problem.model
     assert isinstance(model, AnalyticModel)
-    candidates = hypotheses(model, scene_of(search.fit), catalogue)
+    listed = hypotheses(model, scene_of(search.fit), catalogue)
+    candidates = [h for h in listed if not set(h.columns) & set(search.fit.problem.free)]
     watch(f"round {len(search.rounds) + 1}: testing {len(candidates)} hypotheses")
     unknown = search.fit.problem.stretches.labelled.mean() < LABELLED
     driven = [h for h in candidates if h.effect.multiplies_spin and unknown]

@@ -19,9 +19,7 @@ def scene_of(fit: Fit) -> Scene:
     gaps = np.maximum(np.gradient(times, axis=1), LEAST_GAP)[..., None]
     velocities = np.gradient(fit.predicted.positions, axis=1) / gaps
     impacts = [
-        -velocities[
-            i, max(0, int(np.searchsorted(times[i], time)) - 2), 2
-        ]  # no difference spans the contact there
+        -velocities[i, max(0, int(np.searchsorted(times[i], time)) - 2), 2]  # no difference spans the contact there
         for i, row in enumerate(fit.predicted.contacts)
         for time in row[np.isfinite(row)]
     ]

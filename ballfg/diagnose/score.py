@@ -62,6 +62,7 @@ def _score(pattern: Pattern, turn: Array) -> Score:
     """Args: turn: (p, r) the coefficients of a candidate in the directions that were tested."""
     inverse = np.linalg.inv(pattern.information)
     spread = turn @ inverse @ pattern.scatter @ inverse @ turn.T
+    spread[np.diag_indices_from(spread)] += np.where((turn**2).sum(axis=1) > 0.0, 0.0, np.inf)  # nothing tells it
     return Score(
         turn @ pattern.estimate, np.sqrt(np.diagonal(spread)), pattern.explained, pattern.p_value, pattern.rank
     )

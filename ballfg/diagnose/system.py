@@ -41,7 +41,7 @@ class System:
         pulled = transposed @ columns
         solved = np.linalg.solve(hessian, pulled)
         gram = columns.swapaxes(-1, -2) @ columns - pulled.swapaxes(-1, -2) @ solved
-        return Eliminated(solved, np.asarray(gram))
+        return Eliminated(np.asarray(solved), np.asarray(gram))
 
     def projected(self) -> Array:
         """(n, m, q + 1) what first states leave of each column, the residual last."""

@@ -112,9 +112,10 @@ def with_hypothesis(problem: Problem, hypothesis: Hypothesis) -> Problem:
 def _starts_with_labels(problem: Problem, starts: Array) -> Array:
     """First states whose spins are what the labels mean to a model that reads them in another frame."""
     with torch.no_grad():
-        read = problem.model.labelled(torch.eye(3, dtype=torch.float64)).numpy()  # affine without offset: rows M e_i
+        offset = problem.model.labelled(torch.zeros(3, dtype=torch.float64)).numpy()
+        read = problem.model.labelled(torch.eye(3, dtype=torch.float64)).numpy() - offset  # rows M e_i
     labelled, moved = problem.stretches.labelled, starts.copy()
-    moved[labelled, SPIN] = problem.stretches.labels.numpy()[labelled] @ np.linalg.inv(read)
+    moved[labelled, SPIN] = (problem.stretches.labels.numpy()[labelled] - offset) @ np.linalg.inv(read)
     return moved
 
 

@@ -46,7 +46,7 @@ def test_an_idle_effect_does_not(calm_fit, others):
 def test_a_fit_gains_nothing_over_itself(calm_fit, others):
     found = held_out(calm_fit, calm_fit, others[1])
     assert found.gain == 0.0
-    assert found.p_value == 0.5
+    assert found.p_value == 1.0
 
 
 def test_stretches_of_one_track_are_one_observation(windy_fit, with_wind, others):
@@ -55,7 +55,8 @@ def test_stretches_of_one_track_are_one_observation(windy_fit, with_wind, others
     once = held_out(windy_fit, with_wind, some)
     twice = held_out(windy_fit, with_wind, some.take(np.tile(np.arange(6), 2)))
     assert twice.gain == pytest.approx(2 * once.gain, rel=1e-3)
-    assert np.log(twice.p_value) == pytest.approx(np.log(once.p_value), rel=1e-2)
+    # as two tracks each the logarithm would double
+    assert np.log(twice.p_value) == pytest.approx(np.log(once.p_value), rel=0.2)
 
 
 def test_errors_of_predictions(make_ball, make_launches, make_shots, surfaces):
