@@ -4,7 +4,6 @@ import json
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 
 import pytest
 
@@ -20,7 +19,7 @@ from ballfg.benchmarks.results import Results
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "diagnose"))
 
-from made_diagnosis import found, silent, unexplained
+from made_diagnosis import found, unexplained
 
 SMALL = Plan(
     effects=("wind", "scale", "velocity_lag"),
@@ -239,23 +238,6 @@ def test_a_run_makes_rows_and_pictures_and_goes_on_where_it_was(
     run_loop(again, [], tmp_path, SMALL, 1)
     assert made == ["silence-nothing-1-1"]  # what failed is tried again, nothing else
     assert again.rows == results.rows
-
-
-@pytest.mark.parametrize("name", ["magnus", "spin_label_frame"])
-def test_a_case_is_simulated_diagnosed_and_compared_with_the_truth(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = SimpleNamespace()
-
-    def diagnose(dataset: object, model: object, *, jobs: int) -> object:
-        asked.tracks, asked.model, asked.jobs = len(dataset), model, jobs  # type: ignore[arg-type]
-        return silent()
-
-    monkeypatch.setattr(loop_run, "diagnose", diagnose)
-    case = replace(planted_case("naming", name, 1.0, 0), recording=Recording(tracks=6, rate=60.0), repair=True)
-    kept = loop_run.run(case)
-    assert (asked.tracks, asked.jobs) == (6, 1)
-    assert ("magnus" in asked.model.flight) == (name != "magnus")
-    assert 1.0 < kept.errors["true"] < 60.0  # mm: the true model predicts to centimetres
-    assert not kept.found
 
 
 @pytest.mark.slow
