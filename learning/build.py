@@ -183,7 +183,7 @@ def _settings(
     process: ProcessNoise = replace(settings.process, **given)
     launcher = None
     if embedding is not None:
-        launcher = Launcher(embedding, spin or FIRST_SPIN_NOISE)
+        launcher = Launcher(embedding, spin or FIRST_SPIN_NOISE, {"group": dataset.info.name})
     return replace(
         settings,
         process=process,

@@ -197,7 +197,7 @@ def unexplained() -> Diagnosis:
 
     tests = (GenericTest("flight", "along the flight, grows with time since launch, 0.3 m/s²", 2e-40, 0.8),)
     where = "In flight, along the motion: an acceleration of 0.3 m/s² that grows with the time since launch."
-    fallback = Fallback("sparse terms", "0.31 t |v| v", errors(20.3, 4), errors(12.0, 5), nominal_model())
+    fallback = Fallback("sparse terms", "0.31 t |v| v", errors(20.0, 1), errors(12.0, 5), nominal_model())
     return replace(
         found(),
         verdict=Verdict.UNEXPLAINED,
