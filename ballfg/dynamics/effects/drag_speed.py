@@ -21,7 +21,7 @@ class DragSpeed(FlightEffect):
     decide = "Shoot without spin at very different speeds, in both directions so that a wind cancels."
     coefficients = (
         Coefficient("slope", 0.0, 0.02, "s/m", -0.2, 0.2),
-        Coefficient("reference", 5.0, 2.0, "m/s", 0.0, 20.0, absent=None),
+        Coefficient("reference", 5.0, 0.0, "m/s", 0.0, 20.0, absent=None),
     )
     needs = ("drag",)
     slope: Tensor

@@ -21,7 +21,7 @@ class RestitutionSpeed(BounceEffect):
     decide = "Drop the ball from very different heights and compare the ratios of the heights after and before."
     coefficients = (
         Coefficient("slope", 0.0, 0.02, "s/m", -0.2, 0.2),
-        Coefficient("reference", 3.0, 1.0, "m/s", 0.0, 20.0, absent=None),
+        Coefficient("reference", 3.0, 0.0, "m/s", 0.0, 20.0, absent=None),
     )
     needs = ("restitution",)
     slope: Tensor
