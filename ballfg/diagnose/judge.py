@@ -54,11 +54,17 @@ def prediction_errors(
         judged: tracks that it was not fitted to.
         surfaces, settings: of the dataset with this model.
         jobs: processes.
+    Raises: ValueError: if no track leaves enough to predict.
     """
     estimator = make_estimator("smoother", model, surfaces, settings)
     tracks = [j.track for j in judged]
     predictions = predict_tracks(estimator, tracks, len(tracks), lambda t: OBSERVED * t.duration, jobs=jobs)
     pairs = [(j, p) for j, p in zip(judged, predictions, strict=True) if len(p.times) >= LEAST_PREDICTED]
+    if not pairs:
+        raise ValueError(
+            f"tracks must leave {LEAST_PREDICTED} samples after the first {OBSERVED:.0%} of them, to judge predictions "
+            "by; none does. Record longer tracks."
+        )
     squares = [((p.positions - p.measured) ** 2).sum(axis=-1) for _, p in pairs]
     scores = np.concatenate([((p.positions - p.measured) / p.sigmas).ravel() for _, p in pairs])
     sigmas = np.concatenate([p.sigmas.ravel() for _, p in pairs])

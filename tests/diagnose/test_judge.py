@@ -59,6 +59,11 @@ def test_stretches_of_one_track_are_one_observation(windy_fit, with_wind, others
     assert np.log(twice.p_value) == pytest.approx(np.log(once.p_value), rel=0.2)
 
 
+def test_nothing_to_predict(make_ball, surfaces):
+    with pytest.raises(ValueError, match="must leave 3 samples after the first 40% of them"):
+        prediction_errors(make_ball(), [], surfaces, Settings(), 1)
+
+
 def test_errors_of_predictions(make_ball, make_launches, make_shots, surfaces):
     data = make_shots(make_ball(), make_launches(4, 53), 53, duration=0.5).stretches
     judged = [
