@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
@@ -17,6 +15,7 @@ from numpy.typing import NDArray
 from ballfg.benchmarks.dynamics_fan import Fan
 from ballfg.benchmarks.dynamics_metrics import PathScore
 from ballfg.benchmarks.dynamics_task import Task
+from ballfg.benchmarks.record_file import read_record_file, write_record
 
 Array = NDArray[np.float64]
 
@@ -49,9 +48,7 @@ class Record:
         """Write the file; its name appears once it is whole."""
         content = vars(self) | {"scores": [_score_to_json(s) for s in self.scores]}
         content["fan"] = None if self.fan is None else self.fan.to_json()
-        part = path.with_name(f".{path.name}.part")
-        part.write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(part, path)
+        write_record(path, content)
 
 
 def read_record(path: Path, digest: str) -> Record | None:
@@ -59,17 +56,13 @@ def read_record(path: Path, digest: str) -> Record | None:
 
     Raises: ValueError: if the file is no record.
     """
-    if not path.is_file():
-        return None
-    try:
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        if content["digest"] != digest:
-            return None
-        content["scores"] = tuple(_score_from_json(s) for s in content["scores"])
-        content["fan"] = None if content["fan"] is None else Fan.from_json(content["fan"])
-        return Record(**content)
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path}: must be a finished run ({error!r}). Delete it, and it is run again.") from error
+    return read_record_file(path, digest, _record_from, "a finished run")
+
+
+def _record_from(content: dict[str, Any]) -> Record:
+    content["scores"] = tuple(_score_from_json(s) for s in content["scores"])
+    content["fan"] = None if content["fan"] is None else Fan.from_json(content["fan"])
+    return Record(**content)
 
 
 def task_digest(task: Task, recipe: str) -> str:

@@ -10,8 +10,6 @@ Source: D. R. Cox and D. V. Hinkley, Theoretical Statistics, 1974, section 9.3.
 
 from __future__ import annotations
 
-import json
-import os
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -24,13 +22,14 @@ from ballfg.benchmarks.loop_cases import Case, Recording, planted_case
 from ballfg.benchmarks.loop_data import declared_model, make_dataset
 from ballfg.benchmarks.loop_effects import PLANTS
 from ballfg.benchmarks.loop_record import case_digest
+from ballfg.benchmarks.record_file import read_record_file, write_record
 from ballfg.diagnose.columns import signatures
 from ballfg.diagnose.fit import fit, followed, start_from
 from ballfg.diagnose.halves import launcher_labels
 from ballfg.diagnose.hypothesis import declared_free
 from ballfg.diagnose.loop import CONFIRMED
 from ballfg.diagnose.problem import Problem
-from ballfg.diagnose.score import LEAST_SHARE
+from ballfg.diagnose.signatures import visible_directions
 from ballfg.diagnose.stretches import stretches_of
 from ballfg.diagnose.trace import ALARM
 from ballfg.estimate import Smoother, dataset_settings, dataset_surfaces
@@ -100,28 +99,13 @@ def ideal_of(name: str, seed: int) -> Ideal:
     at_truth = fit(problem, unknowns, noise, settle_noise=False)
     found, _ = signatures(at_truth, [plant.hypothesis()])
     efficient, direction = found.efficient(), plant.direction()
-    information = efficient.information.sum(axis=0) + efficient.prior
-    return Ideal(case_digest(case), visible(information, efficient.raw), float(direction @ information @ direction))
-
-
-def visible(information: Array, raw: Array) -> int:
-    """In how many directions p coefficients can be seen at all.
-
-    Args:
-        information: (p, p), everything else projected out.
-        raw: (p,) information of each coefficient if all else were known.
-    """
-    if not (raw > 0.0).any():
-        return 0
-    length = np.sqrt(np.maximum(raw, LEAST_SHARE * raw.max()))
-    return int((np.linalg.eigvalsh(information / np.outer(length, length)) > LEAST_SHARE).sum())
+    rank = visible_directions(efficient.total, efficient.raw).shape[1]
+    return Ideal(case_digest(case), rank, float(direction @ efficient.total @ direction))
 
 
 def save_ideal(ideal: Ideal, path: Path) -> None:
     """Write the file; its name appears once it is whole."""
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(json.dumps(asdict(ideal), allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(part, path)
+    write_record(path, asdict(ideal))
 
 
 def read_ideal(path: Path, digest: str) -> Ideal | None:
@@ -129,10 +113,4 @@ def read_ideal(path: Path, digest: str) -> Ideal | None:
 
     Raises: ValueError: if the file holds something else.
     """
-    if not path.is_file():
-        return None
-    try:
-        ideal = Ideal(**json.loads(path.read_text(encoding="utf-8")))
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{path}: must be an ideal test ({error!r}). Delete it, and it is made again.") from error
-    return ideal if ideal.digest == digest else None
+    return read_record_file(path, digest, lambda content: Ideal(**content), "an ideal test")

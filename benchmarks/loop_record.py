@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
-import os
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
@@ -13,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ballfg.benchmarks.loop_cases import Case
+from ballfg.benchmarks.record_file import read_record_file, write_record
 from ballfg.diagnose.result import Candidate, Diagnosis, Errors, Finding
 
 RANKED = 8
@@ -69,9 +68,7 @@ class Record:
 
     def save(self, path: Path) -> None:
         """Write the file; its name appears once it is whole."""
-        part = path.with_name(f".{path.name}.part")
-        part.write_text(json.dumps(asdict(self), allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(part, path)
+        write_record(path, asdict(self))
 
 
 def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None, seconds: float) -> Record:
@@ -127,17 +124,13 @@ def read_record(path: Path, digest: str) -> Record | None:
 
     Raises: ValueError: if the file is no record.
     """
-    if not path.is_file():
-        return None
-    try:
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        if content["digest"] != digest:
-            return None
-        content["found"] = tuple(_found_from(one) for one in content["found"])
-        content["rounds"] = tuple(tuple(Ranked(**one) for one in listed) for listed in content["rounds"])
-        return Record(**content)
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: must be a finished case ({error!r}). Delete it, and it is run again.") from error
+    return read_record_file(path, digest, _record_from, "a finished case")
+
+
+def _record_from(content: dict[str, Any]) -> Record:
+    content["found"] = tuple(_found_from(one) for one in content["found"])
+    content["rounds"] = tuple(tuple(Ranked(**one) for one in listed) for listed in content["rounds"])
+    return Record(**content)
 
 
 def _found_from(content: Mapping[str, Any]) -> Found:

@@ -72,7 +72,7 @@ def _examine(fit: Fit) -> tuple[list[_Tested], Whiteness]:
 def _tested(signatures: Signatures, blocks: list[Block]) -> list[_Tested]:
     """Every block that the data show at all."""
     efficient = signatures.efficient()
-    information = efficient.information.sum(axis=0) + efficient.prior
+    information = efficient.total
     score, at = efficient.score.sum(axis=0), 0
     seen: list[tuple[Block, Array]] = []
     directions: list[Array] = []

@@ -16,12 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.diagnose.clustered import Pattern, judge_patterns
-from ballfg.diagnose.signatures import Efficient, Signatures
+from ballfg.diagnose.signatures import Efficient, Signatures, visible_directions
 
 Array = NDArray[np.float64]
-
-LEAST_SHARE = 1e-8
-"""Share of a column's length that must survive projection: less is rounding, and the effect cannot be seen at all."""
 
 
 @dataclass(frozen=True)
@@ -70,14 +67,9 @@ def _score(pattern: Pattern, turn: Array) -> Score:
 
 def _visible(efficient: Efficient, chosen: NDArray[np.int64]) -> Array | None:
     """(p, r) the directions of some of all p columns that projection leaves; None: it leaves none."""
-    raw = efficient.raw[chosen]
-    if not (raw > 0.0).any():
+    directions = visible_directions(efficient.total[np.ix_(chosen, chosen)], efficient.raw[chosen])
+    if not directions.shape[1]:
         return None
-    length = np.sqrt(np.maximum(raw, LEAST_SHARE * raw.max()))
-    total = efficient.information.sum(axis=0) + efficient.prior
-    value, vector = np.linalg.eigh(total[np.ix_(chosen, chosen)] / np.outer(length, length))
-    if not (kept := value > LEAST_SHARE).any():
-        return None
-    turn = np.zeros((len(efficient.raw), int(kept.sum())))
-    turn[chosen] = vector[:, kept] / length[:, None]
+    turn = np.zeros((len(efficient.raw), directions.shape[1]))
+    turn[chosen] = directions
     return turn

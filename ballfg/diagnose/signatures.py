@@ -9,6 +9,9 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+LEAST_SHARE = 1e-8
+"""Share of a column's length that must survive projection: less is rounding, and the effect cannot be seen at all."""
+
 
 @dataclass(frozen=True)
 class Signatures:
@@ -55,3 +58,22 @@ class Efficient:
     information: Array
     prior: Array
     raw: Array
+
+    @property
+    def total(self) -> Array:
+        """(p, p) information over all tracks."""
+        return np.asarray(self.information.sum(axis=0) + self.prior)
+
+
+def visible_directions(information: Array, raw: Array) -> Array:
+    """(p, r) the directions of p coefficients that projection leaves; r is zero where it leaves none.
+
+    Args:
+        information: (p, p), everything else projected out.
+        raw: (p,) information of each coefficient if all else were known.
+    """
+    if not (raw > 0.0).any():
+        return np.zeros((len(raw), 0))
+    length = np.sqrt(np.maximum(raw, LEAST_SHARE * raw.max()))
+    value, vector = np.linalg.eigh(information / np.outer(length, length))
+    return np.asarray(vector[:, value > LEAST_SHARE] / length[:, None])

@@ -54,7 +54,7 @@ def sparse_terms(before: Fit) -> SparseTerms | None:
     found, _ = signatures(before, library)
     efficient = found.efficient()
     loose = np.concatenate([[c.sigma for c in h.free().values()] for h in library])
-    information = efficient.information.sum(axis=0) + efficient.prior + np.diag(loose**-2.0)
+    information = efficient.total + np.diag(loose**-2.0)
     score = efficient.score.sum(axis=0)
     samples = 3 * int(before.problem.stretches.used.sum())
     chosen = select(information, score, np.log(samples) + 2.0 * np.log(len(score)))

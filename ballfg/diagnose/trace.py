@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 import torch
@@ -14,7 +13,7 @@ from scipy import stats
 from ballfg.diagnose.columns import signatures
 from ballfg.diagnose.fit import fit
 from ballfg.diagnose.frames import FRAMES
-from ballfg.diagnose.hypothesis import Hypothesis, with_effects, without_effect
+from ballfg.diagnose.hypothesis import Hypothesis, with_effects
 from ballfg.diagnose.problem import Fit, Problem, linearise
 from ballfg.diagnose.score import Score, score_tests
 from ballfg.dynamics.analytic import AnalyticModel
@@ -125,14 +124,14 @@ def refit_driven(before: Fit, hypothesis: Hypothesis) -> Refit:
     A coefficient times a spin of mean zero has no slope at zero. With the coefficient at its usual value the spins
     have one: launcher settings and single shots find theirs, and the ratio of marginal likelihoods is the test.
     """
-    problem = with_hypothesis(before.problem, hypothesis)
+    assert isinstance(before.problem.model, AnalyticModel)
     listed = {hypothesis.parameter(c.name): c for c in hypothesis.effect.coefficients}
     free = {**before.problem.free, **{name: listed[name] for name in hypothesis.columns}}
-    usual = hypothesis.effect()
-    model = with_effects(without_effect(cast(AnalyticModel, problem.model), hypothesis.name), usual)
-    values = {hypothesis.parameter(c.name): c.default for c in hypothesis.effect.coefficients}
+    model = with_effects(before.problem.model, hypothesis.effect())
+    problem = replace(before.problem, model=model, free=free)
+    values = {name: c.default for name, c in listed.items()}
     unknowns = replace(before.unknowns, values={**before.unknowns.values, **values})
-    after = fit(replace(problem, model=model, free=free), unknowns, before.noise, settle_noise=False)
+    after = fit(problem, unknowns, before.noise, settle_noise=False)
     taken = 2.0 * (_narrowness(after) - _narrowness(before))
     gain = 2.0 * (before.cost - after.cost) - taken
     freedom = 3 * problem.stretches.settings.shape[1] + len(hypothesis.columns)

@@ -18,13 +18,13 @@ from ballfg.benchmarks.loop_ideal import (
     power,
     read_ideal,
     save_ideal,
-    visible,
 )
 from ballfg.benchmarks.loop_limit import median, power_curve, share
 from ballfg.diagnose.fit import fit, followed, start_from
 from ballfg.diagnose.halves import launcher_labels
 from ballfg.diagnose.hypothesis import declared_free
 from ballfg.diagnose.problem import Problem
+from ballfg.diagnose.signatures import visible_directions
 from ballfg.diagnose.stretches import stretches_of
 from ballfg.estimate import Smoother, dataset_settings, dataset_surfaces
 
@@ -92,9 +92,9 @@ def test_ideal_size_and_power_belong_together() -> None:
 
 def test_visible_counts_directions() -> None:
     information = np.diag([4.0, 1.0, 0.0])
-    assert visible(information, np.array([4.0, 100.0, 5.0])) == 2
-    assert visible(np.ones((2, 2)), np.ones(2)) == 1
-    assert visible(np.zeros((2, 2)), np.zeros(2)) == 0
+    assert visible_directions(information, np.array([4.0, 100.0, 5.0])).shape == (3, 2)
+    assert visible_directions(np.ones((2, 2)), np.ones(2)).shape == (2, 1)
+    assert visible_directions(np.zeros((2, 2)), np.zeros(2)).shape == (2, 0)
 
 
 @pytest.mark.parametrize(("name", "size"), [("wind", 0.1), ("restitution_speed", 0.2)])

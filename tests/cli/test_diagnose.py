@@ -24,9 +24,6 @@ Asked = list[tuple[str, tuple[str, ...], int]]
 """Dataset, flight effects of the model and jobs."""
 Answer = Callable[[Diagnosis], Asked]
 NAMES = ["model.yaml", "report.html", "report.json"]
-needs_the_loop = pytest.mark.skipif(
-    not callable(getattr(ballfg.diagnose, "diagnose", None)), reason="ballfg.diagnose.diagnose is not there yet"
-)
 
 
 def status(*arguments: object) -> int:
@@ -57,7 +54,7 @@ def answer(monkeypatch: pytest.MonkeyPatch) -> Answer:
             asked.append((dataset.info.name, tuple(model.flight), jobs))
             return diagnosis
 
-        monkeypatch.setattr(ballfg.diagnose, "diagnose", diagnose, raising=False)
+        monkeypatch.setattr(ballfg.diagnose, "diagnose", diagnose)
         monkeypatch.setattr("ballfg.diagnose.report.page", lambda diagnosis: "<html></html>")
         return asked
 
@@ -156,7 +153,6 @@ def test_help_has_an_example(capsys: pytest.CaptureFixture[str]) -> None:
     assert "ballfg diagnose data/aimy --model model.yaml --out diagnosis" in " ".join(capsys.readouterr().out.split())
 
 
-@needs_the_loop
 @pytest.mark.slow
 def test_a_whole_run(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """On tracks of the declared model: a report whose error is about the noise, and a model that can be read."""
