@@ -25,37 +25,57 @@ def signatures(fit: Fit, candidates: Sequence[Hypothesis]) -> tuple[Signatures, 
         candidates: hypotheses that it may lack.
     """
     base = linearise(fit.problem, fit.unknowns, fit.noise, fit.predicted)
-    parts, chosen, count = [], [], 0
+    chosen, count = [], 0
     for hypothesis in candidates:
-        parts.append(hypothesis_columns(fit, hypothesis))
         chosen.append(list(range(count, count + len(hypothesis.strengths))))
         count += len(hypothesis.strengths)
     common = base.by_common.shape[-1]
-    system = System(base.residual, base.by_start, np.concatenate((base.by_common, *parts), axis=-1))
+    columns = np.concatenate((base.by_common, _columns(fit, candidates)), axis=-1)
+    system = System(base.residual, base.by_start, columns)
     gram = by_track(system.eliminated().gram, fit.problem.stretches.track)
     return Signatures(gram, common_precision(fit.problem), common), chosen
 
 
 def hypothesis_columns(fit: Fit, hypothesis: Hypothesis) -> Array:
     """(n, m, p) whitened, weighted derivative of what is measured by the strengths of a hypothesis."""
+    return _together(fit, [hypothesis])
+
+
+def _columns(fit: Fit, candidates: Sequence[Hypothesis]) -> Array:
+    """Columns of all candidates, in their order.
+
+    Those that act on the ball are taken together, and so are those that act on its measurement: the latter call for
+    states at further moments, which is dear where rows are many.
+    """
+    groups = [[i for i, h in enumerate(candidates) if (h.effect.kind == "measurement") is late] for late in (False, True)]
+    parts: dict[int, Array] = {}
+    for group in groups:
+        ends = np.cumsum([len(candidates[i].strengths) for i in group])[:-1]
+        own = np.split(_together(fit, [candidates[i] for i in group]), ends, axis=-1) if group else []
+        parts |= dict(zip(group, own, strict=True))
+    return np.concatenate([parts[i] for i in range(len(candidates))], axis=-1)
+
+
+def _together(fit: Fit, group: Sequence[Hypothesis]) -> Array:
+    """Columns of hypotheses from one model that holds all of them: each is absent, so that none sees another."""
     model = fit.problem.model
     assert isinstance(model, AnalyticModel)
-    names = hypothesis.columns
-    absent = dict(zip(names, _absent(hypothesis, model), strict=True))
+    for hypothesis in group:
+        model = hypothesis.added_to(model)
+    own = [{h.parameter(n): v for n, v in h.shape.items()} for h in group]
+    names = [name for h in group for name in h.columns]
+    parameters = dict(model.named_parameters())
+    shared = {name: float(parameters[name]) for name in [*names, *(n for shape in own for n in shape)]}
     derivative = sensitivity(
-        hypothesis.added_to(model),
+        model,
         fit.problem.stretches,
         fit.unknowns.starts,
-        {**fit.unknowns.values, **absent},
+        {**shared, **fit.unknowns.values},
         names,
         by_start=False,
+        shapes=[shape for h, shape in zip(group, own, strict=True) for _ in h.strengths],
     )
     return _weighted(fit, derivative)
-
-
-def _absent(hypothesis: Hypothesis, model: AnalyticModel) -> list[float]:
-    parameters = dict(hypothesis.added_to(model).named_parameters())
-    return [float(parameters[name]) for name in hypothesis.columns]
 
 
 def _weighted(fit: Fit, derivative: Sensitivity) -> Array:

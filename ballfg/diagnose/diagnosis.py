@@ -59,8 +59,11 @@ def diagnose(
     first, search = search_effects(halves, model, tuple(catalogue or EFFECTS.values()), tell)
     tell("predicting the judging half")
     judge = partial(_errors, halves, jobs)
-    before_model, corrected = (_predicting(fit, halves, jobs) for fit in (first, search.fit))
-    before, named = judge(before_model), judge(corrected)
+    corrected = _predicting(first, halves, jobs)
+    named = before = judge(corrected)
+    if search.findings:
+        corrected = _predicting(search.fit, halves, jobs)
+        named = judge(corrected)
     tell("looking at what is left")
     tests = generic_tests(search.fit, first)
     verdict = _verdict(search, tests)

@@ -47,7 +47,7 @@ def generic_tests(fit: Fit, reference: Fit | None = None) -> tuple[GenericTest, 
     Args: reference: the fit at the start, to which shares refer; None: this one.
     """
     found, drift = _examine(fit)
-    start, first = (found, drift) if reference is None else _examine(reference)
+    start, first = (found, drift) if reference is None or reference is fit else _examine(reference)
     quieter = 1.0 if reference is None else _noise_square(fit) / _noise_square(reference)
     count = len(found) + 1
     tests = [_generic(tested, _of_block(start, tested.block), quieter, count) for tested in found]

@@ -17,7 +17,7 @@ import torch.autograd.forward_ad as forward
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ballfg.diagnose.dual import make_dual
+from ballfg.diagnose.dual import dual_level, make_dual
 from ballfg.diagnose.problem import Fit
 from ballfg.diagnose.shooting import LEAST_ARC, Arc, Trajectories, shoot
 from ballfg.dynamics.model import BallModel, substitute
@@ -169,7 +169,7 @@ def _shot(fit: Fit, path: Along, number: int, part: Tensor, nodes: Tensor) -> tu
     start = arc.nodes[0][part].repeat(STATE_DIM, 1)
     times = path.times[:, rows] - begun
     model = _valued(fit, len(rows))
-    with forward.dual_level():
+    with dual_level():
         first = make_dual(start, torch.eye(STATE_DIM, dtype=torch.float64).repeat_interleave(m, dim=0))
         guesses = path.motion.contacts[rows, number:] - begun.unsqueeze(-1)
         motion = shoot(model, first, stretches.heights[rows, number:], guesses, stretches.ends[rows] - begun)

@@ -14,7 +14,7 @@ import torch.autograd.forward_ad as forward
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ballfg.diagnose.dual import make_dual
+from ballfg.diagnose.dual import dual_level, make_dual
 from ballfg.diagnose.shooting import Trajectories, shoot
 from ballfg.diagnose.stretches import Stretches
 from ballfg.dynamics.model import BallModel, substitute
@@ -71,22 +71,34 @@ def sensitivity(
     names: Sequence[str],
     *,
     by_start: bool = True,
+    shapes: Sequence[Mapping[str, float]] = (),
 ) -> Sensitivity:
     """Derivatives by the nine components of the first state (unless not `by_start`), then by the named coefficients.
 
     Args:
-        names: coefficients among `values`.
+        names: coefficients among `values`; one that is named again has one derivative for each of its shapes.
+        shapes: for each name, values of other coefficients with which that derivative is taken; empty: none.
         Others as for `predict`.
     """
-    directions = (STATE_DIM if by_start else 0) + len(names)
+    wanted = [_Direction(number, None, {}) for number in range(STATE_DIM if by_start else 0)]
+    wanted += [_Direction(None, name, shape) for name, shape in zip(names, shapes or [{}] * len(names), strict=True)]
     size = max(1, MOST_ROWS // len(stretches))
     parts = [
-        _directions(model, stretches, starts, values, names, by_start, range(first, min(first + size, directions)))
-        for first in range(0, directions, size)
+        _directions(model, stretches, starts, values, wanted[first : first + size])
+        for first in range(0, len(wanted), size)
     ]
     return Sensitivity(
         np.concatenate([p.positions for p in parts], axis=-1), np.concatenate([p.labels for p in parts], axis=-1)
     )
+
+
+@dataclass(frozen=True)
+class _Direction:
+    """What a derivative is taken by: a component of the first state, or a coefficient, with others at some values."""
+
+    component: int | None
+    name: str | None
+    values: Mapping[str, float]
 
 
 def _directions(
@@ -94,27 +106,24 @@ def _directions(
     stretches: Stretches,
     starts: Array,
     values: Mapping[str, float],
-    names: Sequence[str],
-    by_start: bool,
-    wanted: range,
+    wanted: Sequence[_Direction],
 ) -> Sensitivity:
     n, d = len(stretches), len(wanted)
     repeated = stretches.take(np.tile(np.arange(n), d))
-    offset = STATE_DIM if by_start else 0
     state = torch.from_numpy(np.tile(starts, (d, 1)))
     state_tangent = torch.zeros_like(state)
+    primals = {name: torch.full((n * d, 1), value, dtype=torch.float64) for name, value in values.items()}
     tangents = {name: torch.zeros(n * d, 1, dtype=torch.float64) for name in values}
     for block, direction in enumerate(wanted):
         rows = slice(block * n, (block + 1) * n)
-        if direction < offset:
-            state_tangent[rows, direction] = 1.0
-        else:
-            tangents[names[direction - offset]][rows] = 1.0
-    with forward.dual_level():
-        columns = {
-            name: make_dual(torch.full((n * d, 1), value, dtype=torch.float64), tangents[name])
-            for name, value in values.items()
-        }
+        if direction.component is not None:
+            state_tangent[rows, direction.component] = 1.0
+        if direction.name is not None:
+            tangents[direction.name][rows] = 1.0
+        for name, value in direction.values.items():
+            primals[name][rows] = value
+    with dual_level():
+        columns = {name: make_dual(primals[name], tangents[name]) for name in values}
         dual = make_dual(state, state_tangent)
         positions, labels, _ = _measured(substitute(model, columns), repeated, dual)
         moved, relabelled = _tangent(positions), _tangent(labels)

@@ -12,8 +12,8 @@ from ballfg.dynamics.paths import paths
 
 pytestmark = pytest.mark.usefixtures("no_graph")
 END = 1.08
-INTEGRATION = 4e-8
-"""m. Arcs are cut into steps of another length: errors of 2e-9 m a step differ, and grow through three contacts."""
+INTEGRATION = 1e-6
+"""m. Arcs are cut into longer steps: errors of 6e-8 m a step, that grow through three contacts."""
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ def test_states_are_those_of_paths(model, states, stretches, surfaces, late):
     moved = motion.states(times.unsqueeze(1).expand(-1, len(states))).transpose(0, 1)
     exact = paths(model, states, times, surfaces)
     torch.testing.assert_close(moved[..., :3], exact[..., :3], rtol=0, atol=INTEGRATION)
-    torch.testing.assert_close(moved, exact, rtol=0, atol=3e-6)
+    torch.testing.assert_close(moved, exact, rtol=0, atol=3e-5)
 
 
 def test_states_are_those_of_the_rollout(model, states, stretches, surfaces):
