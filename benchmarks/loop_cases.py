@@ -93,7 +93,8 @@ class Plan:
         effects: names of those planted one by one.
         unlabelled: names of those planted where no spin is labelled.
         pairs: names of two planted together.
-        sizes, seeds: of the naming.
+        sizes: of those planted with labels.
+        seeds: of each at its typical size.  side_seeds: at other sizes, of pairs, and without labels.
         ratios, detection_seeds: sizes over the ideal test's, and seeds at each, where the detection limit is sought.
         nulls: datasets that lack nothing.
         unknown, unknown_seeds: physics outside the catalogue.
@@ -105,6 +106,7 @@ class Plan:
     pairs: tuple[tuple[str, str], ...]
     sizes: tuple[float, ...]
     seeds: int
+    side_seeds: int
     ratios: tuple[float, ...]
     detection_seeds: int
     nulls: int
@@ -123,11 +125,12 @@ FULL: Final = Plan(
     pairs=PAIRS,
     sizes=(0.5, 1.0, 2.0),
     seeds=5,
+    side_seeds=2,
     ratios=(1.0, 1.5, 2.0, 3.0),
-    detection_seeds=5,
+    detection_seeds=3,
     nulls=100,
     unknown=tuple(UNKNOWN),
-    unknown_seeds=5,
+    unknown_seeds=3,
     timed=3,
 )
 QUICK: Final = Plan(
@@ -136,6 +139,7 @@ QUICK: Final = Plan(
     pairs=PAIRS[:1],
     sizes=(1.0,),
     seeds=1,
+    side_seeds=1,
     ratios=(),
     detection_seeds=0,
     nulls=5,
@@ -155,13 +159,13 @@ def planted_case(part: str, name: str, size: float, seed: int) -> Case:
 def naming_cases(plan: Plan, seed: int) -> Iterator[Case]:
     """Every effect in every size, pairs, and effects where no spin is labelled."""
     for number, name, size in product(range(seed, seed + plan.seeds), plan.effects, plan.sizes):
-        if size == 1.0 or PLANTS[name].sized:
+        if size == 1.0 or (PLANTS[name].sized and number < seed + plan.side_seeds):
             yield replace(planted_case("naming", name, size, number), repair=size == 1.0)
-    for number, (one, other) in product(range(seed, seed + plan.seeds), plan.pairs):
+    for number, (one, other) in product(range(seed, seed + plan.side_seeds), plan.pairs):
         texts = (*PLANTS[one].texts(1.0), *PLANTS[other].texts(1.0))
         left_out = tuple(name for name in (one, other) if PLANTS[name].left_out)
         yield Case("pairs", f"{one}+{other}", 1.0, number, (one, other), left_out, (texts,))
-    for number, name in product(range(seed, seed + plan.seeds), plan.unlabelled):
+    for number, name in product(range(seed, seed + plan.side_seeds), plan.unlabelled):
         yield replace(planted_case("no_labels", name, 1.0, number), recording=Recording(labels=False))
 
 

@@ -14,7 +14,18 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ballfg.diagnose.problem import Fit, Noise, Problem, Unknowns, common_precision, linearise, robust, whitened_spins
+from ballfg.diagnose.problem import (
+    Fit,
+    Noise,
+    Problem,
+    Robust,
+    Unknowns,
+    common_precision,
+    linearise,
+    robust,
+    weighted_residual,
+    whitened_spins,
+)
 from ballfg.diagnose.sensitivity import Predicted, predict
 from ballfg.diagnose.stretches import Stretches
 from ballfg.diagnose.system import System
@@ -23,10 +34,12 @@ from ballfg.state import SPIN, STATE_DIM
 
 Array = NDArray[np.float64]
 
-MOST_STEPS = 25
+MOST_STEPS = 15
 """Gauss-Newton steps of one minimisation."""
 SCALE_ROUNDS = 3
 """Noise and weights are settled after so many minimisations."""
+FOLLOW_UPS = 1
+"""Corrections of first states after each step; further ones gain nothing that the next step does not."""
 TOLERANCE = 1e-5
 """A minimisation ends when the objective falls by less than this share."""
 FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e6
@@ -77,14 +90,15 @@ def _minimise(problem: Problem, unknowns: Unknowns, noise: Noise, steps: int) ->
     for _ in range(MOST_STEPS):
         problem = replace(problem, stretches=_with_contacts(problem.stretches, predicted))
         system = linearise(problem, unknowns, noise, predicted)
+        weights = robust(problem, unknowns, noise, predicted)
         steps += 1
-        improved = False
+        improved, tries = False, 0
         while not improved and damping < LARGEST_DAMPING:
             moved = _moved(problem, unknowns, system, damping)
-            moved_predicted = predict(problem.model, problem.stretches, moved.starts, moved.values)
+            moved, moved_predicted = _followed_up(problem, moved, noise, system, weights)
             moved_cost = objective(problem, moved, noise, moved_predicted)
-            improved = moved_cost < cost
-            damping = damping / 10.0 if improved else damping * 10.0
+            improved, tries = moved_cost < cost, tries + 1
+            damping *= 10.0 if not improved else 0.1 if tries == 1 else 1.0
         if not improved:
             break
         gain, cost = cost - moved_cost, moved_cost
@@ -108,6 +122,35 @@ def _moved(problem: Problem, unknowns: Unknowns, system: System, damping: float)
     starts = unknowns.starts + eliminated.start_step(np.concatenate((moved - values, step[q:])))
     return Unknowns(
         starts, dict(zip(problem.free, moved.tolist(), strict=True)), unknowns.launcher + step[q:].reshape(-1, 3)
+    )
+
+
+def _followed_up(
+    problem: Problem, moved: Unknowns, noise: Noise, system: System, weights: Robust
+) -> tuple[Unknowns, Predicted]:
+    """First states brought after a step of all unknowns, and the prediction there.
+
+    A step of coefficients times a step of states is what a linearised problem leaves out, and with many samples it is
+    much: states take most of it up. No derivative is taken again; a stretch that does not gain stays where it was.
+    """
+    predicted = predict(problem.model, problem.stretches, moved.starts, moved.values)
+    for _ in range(FOLLOW_UPS):
+        losses = robust(problem, moved, noise, predicted).losses
+        correction = system.start_correction(weighted_residual(problem, moved, noise, predicted, weights))
+        closer = replace(moved, starts=moved.starts + correction)
+        closer_predicted = predict(problem.model, problem.stretches, closer.starts, closer.values)
+        gains = robust(problem, closer, noise, closer_predicted).losses < losses
+        moved = replace(moved, starts=np.where(gains[:, None], closer.starts, moved.starts))
+        predicted = _chosen(gains, closer_predicted, predicted)
+    return moved, predicted
+
+
+def _chosen(first: NDArray[np.bool_], one: Predicted, other: Predicted) -> Predicted:
+    """Of each stretch (n,) either what `one` says or what `other` does."""
+    return Predicted(
+        np.where(first[:, None, None], one.positions, other.positions),
+        np.where(first[:, None], one.labels, other.labels),
+        np.where(first[:, None], one.contacts, other.contacts),
     )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.diagnose.fit import fit, followed
-from ballfg.diagnose.problem import Fit, Noise, Robust, whitened_spins
+from ballfg.diagnose.problem import Fit, Noise, Robust, weighted_residual
 from ballfg.diagnose.result import Errors
 from ballfg.diagnose.score import score_tests
 from ballfg.diagnose.signatures import Signatures
@@ -125,10 +125,7 @@ def held_out(before: Fit, after: Fit, judged: Stretches) -> HeldOut:
 
 
 def _rows(fitted: Fit, weights: Robust) -> Array:
-    """(n, m) whitened residuals of positions and spins, weighted."""
-    spins = whitened_spins(fitted.problem, fitted.unknowns, fitted.noise, fitted.predicted)
-    positions = fitted.whitened * np.sqrt(weights.samples)[..., None]
-    return np.concatenate((positions.reshape(len(spins), -1), spins * np.sqrt(weights.spins)[:, None]), axis=1)
+    return weighted_residual(fitted.problem, fitted.unknowns, fitted.noise, fitted.predicted, weights)
 
 
 def _on(fitted: Fit, judged: Stretches, noise: Noise) -> Fit:

@@ -169,6 +169,15 @@ def whitened_positions(problem: Problem, noise: Noise, predicted: Predicted) -> 
     return np.asarray((problem.stretches.positions.numpy() - predicted.positions) / sigma)
 
 
+def weighted_residual(
+    problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Predicted, weights: Robust
+) -> Array:
+    """(n, m) whitened residuals of positions and spins, with the roots of some weights."""
+    positions = whitened_positions(problem, noise, predicted) * np.sqrt(weights.samples)[..., None]
+    spins = whitened_spins(problem, unknowns, noise, predicted) * np.sqrt(weights.spins)[:, None]
+    return np.concatenate((positions.reshape(len(spins), -1), spins), axis=1)
+
+
 def assemble(
     problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Predicted, derivative: Sensitivity
 ) -> System:
@@ -176,8 +185,7 @@ def assemble(
     stretches = problem.stretches
     n, k = stretches.times.shape
     sigma = stretches.sigmas.numpy() * noise.position
-    whitened = whitened_positions(problem, noise, predicted)
-    spins, labelled = whitened_spins(problem, unknowns, noise, predicted), stretches.labelled
+    labelled = stretches.labelled
     weights = robust(problem, unknowns, noise, predicted)
     root, spin_root = np.sqrt(weights.samples)[..., None], np.sqrt(weights.spins)[:, None]
     q = derivative.positions.shape[-1] - STATE_DIM
@@ -190,7 +198,7 @@ def assemble(
     towards = -launch_axes(unknowns.starts)[:, :, None, :] * stretches.settings[:, None, :, None] / noise.spin
     by_launcher[:, 3 * k :] = np.where(labelled[:, None, None], 0.0, towards.reshape(n, 3, -1))
     both = np.concatenate((rows, spin_rows), axis=1)
-    residual = np.concatenate(((whitened * root).reshape(n, -1), spins * spin_root), axis=1)
+    residual = weighted_residual(problem, unknowns, noise, predicted, weights)
     return System(residual, both[..., :STATE_DIM], np.concatenate((both[..., STATE_DIM:], by_launcher), axis=-1))
 
 

@@ -7,6 +7,7 @@ scaled as a whole, to the scale at which the finding half is predicted with the 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import cast
@@ -22,6 +23,8 @@ from ballfg.tracks import Dataset
 
 SCALES = (1.0, 0.3, 0.1, 0.03)
 """Of the usual process noise; the likelihood is flat between neighbours."""
+MOST_PREDICTED = 15
+"""Tracks that are predicted for it, evenly over those given."""
 SCALED = ("acceleration", "spin", "contact_velocity", "contact_tangential", "contact_spin")
 """What is scaled; a hit remains a hit."""
 
@@ -34,11 +37,12 @@ def with_process_noise(
     Args: model: with `trained`; changed in place and returned.  tracks: those that it was fitted to.
     """
     likelihoods = []
+    some = tracks[:: math.ceil(len(tracks) / MOST_PREDICTED)]
     trained = cast(Trained, model.trained)
     for scale in SCALES:
         model.trained = _scaled(trained, scale)
         settings = dataset_settings(dataset, model)
-        errors = prediction_errors(model, tracks, dataset_surfaces(dataset), settings, jobs)
+        errors = prediction_errors(model, some, dataset_surfaces(dataset), settings, jobs)
         likelihoods.append(errors.log_likelihood)
         if len(likelihoods) > 1 and likelihoods[-1] < likelihoods[-2]:
             break  # it has one maximum

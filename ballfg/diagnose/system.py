@@ -43,6 +43,12 @@ class System:
         gram = columns.swapaxes(-1, -2) @ columns - pulled.swapaxes(-1, -2) @ solved
         return Eliminated(np.asarray(solved), np.asarray(gram))
 
+    def start_correction(self, residual: Array) -> Array:
+        """(n, 9) step of the first states alone against another residual (n, m): derivatives stay as they are."""
+        transposed = self.by_start.swapaxes(-1, -2)
+        step = np.linalg.solve(transposed @ self.by_start, transposed @ residual[..., None])
+        return np.asarray(step[..., 0])
+
     def projected(self) -> Array:
         """(n, m, q + 1) what first states leave of each column, the residual last."""
         transposed = self.by_start.swapaxes(-1, -2)

@@ -86,14 +86,10 @@ def shortlist(scored: Sequence[Scored]) -> list[Scored]:
 
 
 def refit(before: Fit, scored: Scored) -> Refit:
-    """The joint fit with a hypothesis in the model, from where its score points."""
+    """The joint fit with a hypothesis in the model, from where it is absent: the first step goes where its score points."""
     hypothesis, problem = scored.hypothesis, with_hypothesis(before.problem, scored.hypothesis)
     parameters = dict(problem.model.named_parameters())
     values = {name: float(parameters[name]) for name in hypothesis.free()}
-    steps = () if scored.score is None else zip(hypothesis.columns, scored.score.estimate, strict=True)
-    for name, step in steps:
-        coefficient = problem.free[name]
-        values[name] = float(np.clip(values[name] + step, coefficient.low, coefficient.high))
     unknowns = replace(before.unknowns, values={**before.unknowns.values, **values})
     if hypothesis.shape and not hypothesis.strengths:
         unknowns = replace(unknowns, starts=_starts_with_labels(problem, unknowns.starts))

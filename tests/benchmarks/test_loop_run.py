@@ -27,6 +27,7 @@ SMALL = Plan(
     pairs=(("wind", "scale"),),
     sizes=(0.5, 1.0),
     seeds=2,
+    side_seeds=2,
     ratios=(1.0, 2.0),
     detection_seeds=2,
     nulls=3,
