@@ -75,15 +75,16 @@ def run_loop(results: Results, data: Sequence[Path], out: Path, plan: Plan, jobs
 
 
 def all_cases(plan: Plan, seed: int, ideals: dict[str, Ideal], data: Sequence[Path]) -> list[Case]:
-    """Everything that may run side by side, the first seed of each part first: an early look sees something of all."""
-    cases = [
-        *measured_cases(data),
-        *naming_cases(plan, seed),
-        *null_cases(plan, seed),
-        *unknown_cases(plan, seed),
-        *detection_cases(plan, seed, detectable(ideals)),
+    """Everything that may run side by side, parts evenly mixed: an early look sees something of all."""
+    parts = [
+        list(measured_cases(data)),
+        list(naming_cases(plan, seed)),
+        list(null_cases(plan, seed)),
+        list(unknown_cases(plan, seed)),
+        list(detection_cases(plan, seed, detectable(ideals))),
     ]
-    return sorted(cases, key=lambda case: case.seed)
+    placed = [(number / len(part), case) for part in parts for number, case in enumerate(part)]
+    return [case for _, case in sorted(placed, key=lambda pair: pair[0])]
 
 
 def add_all(results: Results, cases: Sequence[Case], records: dict[str, Record], ideals: dict[str, Ideal]) -> None:

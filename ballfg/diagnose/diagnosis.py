@@ -28,6 +28,9 @@ from ballfg.tracks import Dataset
 MOSTLY = 0.1
 """Of the pattern that was there at the start: where effects leave less than this share, they are the explanation."""
 
+DESCRIBABLE = ("flight", "contact", "measurement")
+"""Tests whose patterns a model could follow that is the same for every track."""
+
 
 def diagnose(
     dataset: Dataset,
@@ -68,7 +71,7 @@ def diagnose(
     tests = generic_tests(search.fit, first)
     verdict = _verdict(search, tests)
     helped = None
-    if verdict is Verdict.UNEXPLAINED and any(t.name != "time" for t in _alarms(tests)):
+    if verdict is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in _alarms(tests)):
         tell("describing what is left without a name")
         tracks = [part.track for part in halves.found_on]
         helped = fallback(search.fit, halves.launcher.embedding, dataset, tracks, named, judge)

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ballfg.diagnose.clustered import Pattern, judge_patterns
 from ballfg.diagnose.patterns import EVERYWHERE, PLAUSIBLE, UNIT, Block, blocks_of
 from ballfg.diagnose.problem import Fit, common_precision, linearise
+from ballfg.diagnose.recording import RECORDING, drift, recording_block
 from ballfg.diagnose.result import GenericTest
 from ballfg.diagnose.signatures import Signatures
 from ballfg.diagnose.system import System, by_track
@@ -34,10 +35,10 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _Tested:
-    """The outcome for one block: the likely strengths (3, f) of its columns, and the test in its leading directions."""
+    """The outcome for one block: where it lives, and the test in its leading directions."""
 
     block: Block
-    strengths: Array
+    where: str
     pattern: Pattern
 
 
@@ -61,20 +62,21 @@ def _noise_square(fit: Fit) -> float:
 
 def _examine(fit: Fit) -> tuple[list[_Tested], Whiteness]:
     system = linearise(fit.problem, fit.unknowns, fit.noise, fit.predicted)
-    blocks = blocks_of(fit)
+    drifting = recording_block(fit, system)
+    blocks = [*blocks_of(fit), *([] if drifting is None else [drifting])]
     columns = np.concatenate((system.by_common, *(block.columns for block in blocks)), axis=-1)
     whole = System(system.residual, system.by_start, columns)
     gram = by_track(whole.eliminated().gram, fit.problem.stretches.track)
     signatures = Signatures(gram, common_precision(fit.problem), system.by_common.shape[-1])
-    return _tested(signatures, blocks), whiteness(fit, system)
+    return _tested(fit, signatures, blocks), whiteness(fit, system)
 
 
-def _tested(signatures: Signatures, blocks: list[Block]) -> list[_Tested]:
+def _tested(fit: Fit, signatures: Signatures, blocks: list[Block]) -> list[_Tested]:
     """Every block that the data show at all."""
     efficient = signatures.efficient()
     information = efficient.total
     score, at = efficient.score.sum(axis=0), 0
-    seen: list[tuple[Block, Array]] = []
+    seen: list[tuple[Block, str]] = []
     directions: list[Array] = []
     for block in blocks:
         own = slice(at, at + block.columns.shape[-1])
@@ -82,7 +84,9 @@ def _tested(signatures: Signatures, blocks: list[Block]) -> list[_Tested]:
         turn = _leading(information[own, own], signatures.tracks, own, len(score))
         if turn.shape[1]:
             strengths = np.linalg.solve(information[own, own] + np.eye(own.stop - own.start), score[own])
-            seen.append((block, strengths.reshape(3, -1)))
+            strengths = strengths.reshape(len(block.axes), -1)
+            words = drift(fit, block, strengths) if block.kind == RECORDING else where(block, strengths)
+            seen.append((block, words))
             directions.append(turn)
     patterns = judge_patterns(signatures, directions)
     return [_Tested(*of, pattern) for of, pattern in zip(seen, patterns, strict=True)]
@@ -108,7 +112,7 @@ def _generic(tested: _Tested, start: _Tested | None, quieter: float, count: int)
     first = max(left, 0.0 if start is None else start.pattern.explained - start.pattern.rank)
     return GenericTest(
         name=tested.block.kind,
-        where=where(tested.block, tested.strengths),
+        where=tested.where,
         p_value=min(1.0, count * tested.pattern.p_value),
         share=left / first if first > 0.0 else 0.0,
     )

@@ -47,18 +47,18 @@ Quantities = Mapping[str, Array]
 
 @dataclass(frozen=True)
 class Block:
-    """p columns: f quantities along 3 axes, axis by axis.
+    """p columns: f quantities along a axes (3 in space), axis by axis.
 
     Attributes:
-        kind: `flight`, `contact` or `measurement`.
-        quantities: (f,) in words.  axes: (3,) in words.
+        kind: `flight`, `contact`, `measurement` or `recording`.
+        quantities: (f,) in words.  axes: (a,) in words.
         values: (m, f) of the quantities at the places where the pattern acts.
-        columns: (n, 3 k + 3, 3 f) whitened answers of the samples.
+        columns: (n, 3 k + 3, a f) whitened answers of the samples.
     """
 
     kind: str
     quantities: tuple[str, ...]
-    axes: tuple[str, str, str]
+    axes: tuple[str, ...]
     values: Array
     columns: Array
 
