@@ -94,7 +94,8 @@ class Plan:
         unlabelled: names of those planted where no spin is labelled.
         pairs: names of two planted together.
         sizes: of those planted with labels.
-        seeds: of each at its typical size.  side_seeds: at other sizes, of pairs, and without labels.
+        seeds: of each at its typical size; the true model is fitted to the first of them.
+        side_seeds: of each at other sizes, and of pairs.  unlabelled_seeds: where no spin is labelled.
         ratios, detection_seeds: sizes over the ideal test's, and seeds at each, where the detection limit is sought.
         nulls: datasets that lack nothing.
         unknown, unknown_seeds: physics outside the catalogue.
@@ -107,6 +108,7 @@ class Plan:
     sizes: tuple[float, ...]
     seeds: int
     side_seeds: int
+    unlabelled_seeds: int
     ratios: tuple[float, ...]
     detection_seeds: int
     nulls: int
@@ -124,10 +126,11 @@ FULL: Final = Plan(
     unlabelled=_without_labels(list(PLANTS)),
     pairs=PAIRS,
     sizes=(0.5, 1.0, 2.0),
-    seeds=5,
-    side_seeds=2,
+    seeds=4,
+    side_seeds=1,
+    unlabelled_seeds=2,
     ratios=(1.0, 1.5, 2.0, 3.0),
-    detection_seeds=3,
+    detection_seeds=2,
     nulls=100,
     unknown=tuple(UNKNOWN),
     unknown_seeds=3,
@@ -140,6 +143,7 @@ QUICK: Final = Plan(
     sizes=(1.0,),
     seeds=1,
     side_seeds=1,
+    unlabelled_seeds=1,
     ratios=(),
     detection_seeds=0,
     nulls=5,
@@ -160,12 +164,12 @@ def naming_cases(plan: Plan, seed: int) -> Iterator[Case]:
     """Every effect in every size, pairs, and effects where no spin is labelled."""
     for number, name, size in product(range(seed, seed + plan.seeds), plan.effects, plan.sizes):
         if size == 1.0 or (PLANTS[name].sized and number < seed + plan.side_seeds):
-            yield replace(planted_case("naming", name, size, number), repair=size == 1.0)
+            yield replace(planted_case("naming", name, size, number), repair=size == 1.0 and number == seed)
     for number, (one, other) in product(range(seed, seed + plan.side_seeds), plan.pairs):
         texts = (*PLANTS[one].texts(1.0), *PLANTS[other].texts(1.0))
         left_out = tuple(name for name in (one, other) if PLANTS[name].left_out)
         yield Case("pairs", f"{one}+{other}", 1.0, number, (one, other), left_out, (texts,))
-    for number, name in product(range(seed, seed + plan.side_seeds), plan.unlabelled):
+    for number, name in product(range(seed, seed + plan.unlabelled_seeds), plan.unlabelled):
         yield replace(planted_case("no_labels", name, 1.0, number), recording=Recording(labels=False))
 
 

@@ -21,7 +21,7 @@ from ballfg.estimate.configure import dataset_settings, dataset_surfaces
 from ballfg.estimate.settings import MEASURED
 from ballfg.tracks import Dataset
 
-SCALES = (1.0, 0.3, 0.1, 0.03)
+SCALES = (0.03, 0.1, 0.3, 1.0)
 """Of the usual process noise; the likelihood is flat between neighbours."""
 MOST_PREDICTED = 15
 """Tracks that are predicted for it, evenly over those given."""
