@@ -6,6 +6,7 @@ First a few generic terms, which a person can read; only if those do not help, a
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import cast
 
 import numpy as np
 
@@ -20,7 +21,11 @@ from ballfg.dynamics.architecture import Architecture
 from ballfg.dynamics.learned import LearnedModel, build
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.spin_embedding import SpinEmbedding
+from ballfg.estimate.as_measured import plainly_measured
 from ballfg.estimate.configure import dataset_settings, dataset_surfaces
+from ballfg.estimate.settings import Settings
+from ballfg.estimate.smoother import Smoother
+from ballfg.estimate.through_measurement import ThroughMeasurement
 from ballfg.learning.distributed import Ranks
 from ballfg.learning.end_to_end import EndToEnd
 from ballfg.learning.learnables import Learnables, NoiseScales
@@ -89,21 +94,34 @@ def learned_residual(base: AnalyticModel, dataset: Dataset, tracks: Sequence[Tra
 
     Args: base: calibrated; its noise and launcher stay.
     """
-    settings = dataset_settings(dataset, base)
+    tracks, settings = _as_happened(base, dataset, tracks)
+    if len(tracks) < LEAST_LEARNED:
+        return None
     seconds = OBSERVED * float(np.median([track.duration for track in tracks]))
-    made = shots_of(tracks, base, dataset_surfaces(dataset), settings, samples=None, seconds=seconds)
+    plain = cast(AnalyticModel, plainly_measured(base))
+    made = shots_of(tracks, plain, dataset_surfaces(dataset), settings, samples=None, seconds=seconds)
     shots = [shot for _, shot in made if isinstance(shot, Shot)]
     if len(shots) < LEAST_LEARNED:
         return None
-    model = build(Architecture.of("mnn+gs", residual=True), radius=base.radius, base=base, seed=0)
+    model = build(Architecture.of("mnn+gs", residual=True), radius=base.radius, base=plain, seed=0)
     launcher = None if settings.launcher is None else settings.launcher.embedding
     noise = NoiseScales(settings.process, position=settings.position_scale, learned=False)
     loss = LossConfig(position_scale=POSITION_SCALE)
     trainee = EndToEnd(shots, Learnables(model, launcher, noise), loss)
     if not _trained(trainee, len(shots), TrainConfig(optimizer=OptimizerConfig(epochs=EPOCHS), loss=loss)):
         return None
-    model.trained = base.trained
+    model.base, model.trained = base, base.trained
     return model.requires_grad_(False)
+
+
+def _as_happened(base: AnalyticModel, dataset: Dataset, tracks: Sequence[Track]) -> tuple[list[Track], Settings]:
+    """Tracks without what the model's measurement did to them, those of which it can be undone, and their settings."""
+    settings = dataset_settings(dataset, base)
+    if base.measures_plainly:
+        return list(tracks), settings
+    through = ThroughMeasurement(Smoother, base, dataset_surfaces(dataset), settings)
+    undone = [through.undo(track) for track in tracks]
+    return [u.track for u in undone if u.settled], through.smoother.settings
 
 
 def _trained(trainee: EndToEnd, count: int, config: TrainConfig) -> bool:

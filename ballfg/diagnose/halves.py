@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,6 +16,7 @@ from ballfg.estimate.as_measured import plainly_measured
 from ballfg.estimate.batch import map_tracks
 from ballfg.estimate.configure import dataset_settings, dataset_surfaces
 from ballfg.estimate.launcher import Launcher
+from ballfg.estimate.position_noise import estimate_position_noise
 from ballfg.estimate.settings import Settings
 from ballfg.estimate.smoother import Smoother
 from ballfg.tracks import Dataset, Track
@@ -62,10 +63,12 @@ def halves_of(dataset: Dataset, model: AnalyticModel, jobs: int, watch: Callable
     tracks, excluded = _chosen(dataset)
     settings, surfaces = dataset_settings(dataset, model), dataset_surfaces(dataset)
     launcher = launcher_labels(dataset, tracks, settings)
-    smoother = Smoother(plainly_measured(model), surfaces, settings)
+    louder = _louder(tracks, settings)
+    heard = replace(settings, position_scale=louder * settings.position_scale)
+    smoother = Smoother(plainly_measured(model), surfaces, heard)
     watch(f"estimating {len(tracks)} tracks")
-    finding = stretches_of(smoother, tracks[::2], launcher, jobs)
-    judging = stretches_of(smoother, tracks[1::2], launcher, jobs)
+    finding, judging = (stretches_of(smoother, half, launcher, jobs) for half in (tracks[::2], tracks[1::2]))
+    finding, judging = (replace(half, sigmas=half.sigmas / louder) for half in (finding, judging))
     parts = [list(map_tracks(_JudgedPart(smoother), half, len(half), jobs)) for half in (tracks[::2], tracks[1::2])]
     found_on, judged = (tuple(part for part in half if part is not None) for half in parts)
     lost = len(tracks) - len(np.unique(finding.track)) - len(np.unique(judging.track))
@@ -84,6 +87,16 @@ def _chosen(dataset: Dataset) -> tuple[list[Track], list[str]]:
     kept = set(np.linspace(0, count - 1, min(count, MOST_TRACKS)).round().astype(int).tolist())
     excluded = [] if len(kept) == count else [f"of {count} tracks {len(kept)}, evenly spread, were looked at"]
     return [track for i, track in enumerate(dataset) if i in kept], excluded
+
+
+def _louder(tracks: Sequence[Track], settings: Settings) -> float:
+    """By how much the noise that tracks show exceeds what is stated, at least 1.
+
+    Outliers are told by their distance from where the ball is expected. Taken for less noise than there is, that would
+    leave out ordinary samples which differ from their neighbours: those that stay err alike, as if a force were missing.
+    """
+    shown = estimate_position_noise(tracks)
+    return max(1.0, float(np.max(shown / (settings.position_scale * np.asarray(settings.position_noise)))))
 
 
 def launcher_labels(dataset: Dataset, tracks: list[Track], settings: Settings) -> Launcher:
