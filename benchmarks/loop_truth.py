@@ -40,7 +40,7 @@ def true_errors(case: Case, dataset: Dataset) -> Errors:
     problem = Problem(truth, finding, {**declared_free(declared), **planted_free(case)})
     start = start_from(problem, halves.settings.spin_label_noise, halves.settings.spin_prior)
     fitted = calibrated_model(fit(problem, *start), halves.launcher.embedding)
-    model = with_process_noise(fitted, halves.found_on, dataset, 1)
+    model = with_process_noise(fitted, halves.found_on, dataset, 1).model
     return prediction_errors(model, halves.judged, halves.surfaces, dataset_settings(dataset, model), 1)
 
 

@@ -14,7 +14,7 @@ from ballfg.diagnose.halves import Halves, halves_of
 from ballfg.diagnose.judge import prediction_errors
 from ballfg.diagnose.loop import Search, search_effects
 from ballfg.diagnose.problem import Fit
-from ballfg.diagnose.process import with_process_noise
+from ballfg.diagnose.process import Predicting, with_process_noise
 from ballfg.diagnose.residuals import residuals_of
 from ballfg.diagnose.result import Diagnosis, Errors, Fallback, GenericTest, Unexplained, Value, Verdict
 from ballfg.diagnose.wording import sentence
@@ -59,16 +59,14 @@ def diagnose(
         )
     tell = watch or _silent
     halves = halves_of(dataset, model, jobs, tell)
-    first, search = search_effects(halves, model, tuple(catalogue or EFFECTS.values()), tell)
+    predict = partial(_predicting, halves=halves, jobs=jobs)
+    search = search_effects(halves, model, tuple(catalogue or EFFECTS.values()), predict, tell)
     tell("predicting the judging half")
     judge = partial(_errors, halves, jobs)
-    corrected = _predicting(first, halves, jobs)
-    named = before = judge(corrected)
-    if search.findings:
-        corrected = _predicting(search.fit, halves, jobs)
-        named = judge(corrected)
+    before = judge(search.declared.model)
+    named = judge(search.predicting.model) if search.findings else before
     tell("looking at what is left")
-    tests = generic_tests(search.fit, first)
+    tests = generic_tests(search.fit, search.first)
     verdict = _verdict(search, tests)
     helped = None
     if verdict is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in _alarms(tests)):
@@ -89,8 +87,8 @@ def diagnose(
         calibrated=_calibrated(search.fit, model),
         noise=_noise(search.fit, halves),
         unexplained=unexplained,
-        model=corrected if helped is None else helped.model,
-        residuals_before=residuals_of(first),
+        model=search.predicting.model if helped is None else helped.model,
+        residuals_before=residuals_of(search.first),
         residuals_after=residuals_of(search.fit),
         excluded=halves.excluded,
     )
@@ -100,7 +98,7 @@ def _silent(line: str) -> None:
     """Watches nothing."""
 
 
-def _predicting(fit: Fit, halves: Halves, jobs: int) -> AnalyticModel:
+def _predicting(fit: Fit, halves: Halves, jobs: int) -> Predicting:
     """A fitted model with the process noise that predicts the finding half best."""
     model = calibrated_model(fit, halves.launcher.embedding)
     return with_process_noise(model, halves.found_on, halves.dataset, jobs)

@@ -67,11 +67,11 @@ def fallback(
     terms = sparse_terms(before)
     if terms is not None:
         after = fit_with_terms(before, terms)
-        model = with_process_noise(calibrated_model(after, embedding), parts, dataset, 1)
+        model = with_process_noise(calibrated_model(after, embedding), parts, dataset, 1).model
         errors = judge(model)
         if errors.prediction_rmse_mm < most:
             return Fallback("sparse terms", describe(terms, after), now, errors, model)
-    base = with_process_noise(calibrated_model(before, embedding), parts, dataset, 1)
+    base = with_process_noise(calibrated_model(before, embedding), parts, dataset, 1).model
     network = learned_residual(base, dataset, tracks)
     if network is None:
         return None

@@ -12,6 +12,7 @@ from ballfg.diagnose.halves import Halves
 from ballfg.diagnose.hypothesis import declared_free, hypotheses, with_effects
 from ballfg.diagnose.judge import HeldOut, held_out
 from ballfg.diagnose.problem import Fit, Problem
+from ballfg.diagnose.process import Predicting
 from ballfg.diagnose.result import Candidate, Finding, Standing, Value
 from ballfg.diagnose.scene import scene_of
 from ballfg.diagnose.trace import ALARM, Refit, Scored, explained, refit, refit_driven, score_all, shortlist
@@ -25,6 +26,9 @@ CONFIRMED = 0.05
 """An effect stays only if its gain on the judging half would arise by chance less often than this."""
 LABELLED = 0.5
 """Share of flights whose spin must be labelled for an effect that multiplies spins to show in a score test."""
+WORSE = 1.1
+"""Ratio of prediction errors beyond which an effect is not added, however much better whole tracks are fitted with it:
+a wrong name for what is lacking bends the motion to the samples, and predictions pay for it."""
 ALIKE = 6.0
 """BIC difference below which two effects cannot be told apart: odds of 20 to 1."""
 
@@ -34,33 +38,55 @@ class Search:
     """The state of the loop.
 
     Attributes:
-        fit: of the model so far.  findings, rounds: as in `Diagnosis`.
+        first: fit of the declared model.  declared: that model, as it predicts.
+        fit: of the model so far.  predicting: that model, as it predicts.
+        findings, rounds: as in `Diagnosis`.
     """
 
+    first: Fit
+    declared: Predicting
     fit: Fit
+    predicting: Predicting
     findings: list[Finding] = field(default_factory=list)
     rounds: list[tuple[Candidate, ...]] = field(default_factory=list)
 
 
+Predict = Callable[[Fit], Predicting]
+"""A fitted model as it predicts."""
+
+
 def search_effects(
-    halves: Halves, model: AnalyticModel, catalogue: Sequence[type[Effect]], watch: Callable[[str], None]
-) -> tuple[Fit, Search]:
+    halves: Halves,
+    model: AnalyticModel,
+    catalogue: Sequence[type[Effect]],
+    predict: Predict,
+    watch: Callable[[str], None],
+) -> Search:
     """Add effects until nothing helps.
 
-    Args: halves: the data.  model: as declared.  catalogue: effects to look for.  watch: is told of progress.
-    Returns: the fit of the declared model, and the search at its end.
+    Args:
+        halves: the data.  model: as declared.  catalogue: effects to look for.
+        predict: makes a fit predict the tracks that it was fitted to.  watch: is told of progress.
+    Returns: the search at its end.
     """
     declared = with_effects(model)
     problem = Problem(declared, followed(declared, halves.finding), declared_free(declared))
     watch(f"fitting the declared model to {len(halves.finding)} flights")
     first = fit(problem, *start_from(problem, halves.settings.spin_label_noise, halves.settings.spin_prior))
-    search = Search(first)
-    while len(search.findings) < MOST_EFFECTS and _round(search, halves, catalogue, watch):
+    predicting = predict(first)
+    search = Search(first, predicting, first, predicting)
+    while len(search.findings) < MOST_EFFECTS and _round(search, halves, catalogue, predict, watch):
         pass
-    return first, search
+    return search
 
 
-def _round(search: Search, halves: Halves, catalogue: Sequence[type[Effect]], watch: Callable[[str], None]) -> bool:
+def _round(
+    search: Search,
+    halves: Halves,
+    catalogue: Sequence[type[Effect]],
+    predict: Predict,
+    watch: Callable[[str], None],
+) -> bool:
     """One round; whether an effect was added."""
     model = search.fit.problem.model
     assert isinstance(model, AnalyticModel)
@@ -82,20 +108,20 @@ def _round(search: Search, halves: Halves, catalogue: Sequence[type[Effect]], wa
     scored.sort(key=explained, reverse=True)
     refits.sort(key=lambda r: r.delta_bic)
     standing: dict[str, Standing] = {}
-    winner, evidence = _confirmed(search.fit, refits, halves, standing)
-    if winner is not None and evidence is not None:
+    winner = _confirmed(search, refits, halves, predict, standing)
+    added = "nothing helps"
+    if winner is not None:
+        name = winner.refit.scored.hypothesis.name
         alike = tuple(
             r.scored.hypothesis.name
             for r in refits
-            if r.scored.hypothesis.name not in (winner.scored.hypothesis.name, *standing)
-            and r.delta_bic - winner.delta_bic < ALIKE
+            if r.scored.hypothesis.name not in (name, *standing) and r.delta_bic - winner.refit.delta_bic < ALIKE
         )
-        standing |= dict.fromkeys(alike, Standing.ALIKE) | {winner.scored.hypothesis.name: Standing.ADDED}
-        settled = fit(winner.fit.problem, winner.fit.unknowns, winner.fit.noise)
-        search.findings.append(_finding(winner, settled, alike, evidence))
-        search.fit = settled
+        standing |= dict.fromkeys(alike, Standing.ALIKE) | {name: Standing.ADDED}
+        search.findings.append(_finding(winner, alike))
+        search.fit, search.predicting = winner.settled, winner.predicting
+        added = f"{name} added"
     search.rounds.append(_ranking(scored, refits, standing))
-    added = "nothing helps" if winner is None else f"{winner.scored.hypothesis.name} added"
     watch(f"round {len(search.rounds)}: {added}")
     return winner is not None
 
@@ -108,22 +134,39 @@ def _shaped(before: Fit, scored: Scored) -> list[Scored]:
     return [Scored(frame, None, scored.p_value) for frame in frames]
 
 
+@dataclass(frozen=True)
+class _Confirmed:
+    """A refit that helps on the judging half, its noise settled, and as it predicts."""
+
+    refit: Refit
+    evidence: HeldOut
+    settled: Fit
+    predicting: Predicting
+
+
 def _confirmed(
-    before: Fit, refits: Sequence[Refit], halves: Halves, standing: dict[str, Standing]
-) -> tuple[Refit | None, HeldOut | None]:
-    """The best refit that helps on the judging half too; `standing` tells of those that did not."""
+    search: Search, refits: Sequence[Refit], halves: Halves, predict: Predict, standing: dict[str, Standing]
+) -> _Confirmed | None:
+    """The best refit that helps on the judging half and predicts no worse; `standing` tells of those that did not."""
+    most = WORSE * search.predicting.errors.prediction_rmse_mm
     for candidate in refits:
         if candidate.delta_bic >= 0.0:
             break
-        evidence = held_out(before, candidate.fit, halves.judging)
-        if evidence.p_value < CONFIRMED:
-            return candidate, evidence
-        standing[candidate.scored.hypothesis.name] = Standing.NOT_HELPFUL
-    return None, None
+        name = candidate.scored.hypothesis.name
+        evidence = held_out(search.fit, candidate.fit, halves.judging)
+        if evidence.p_value >= CONFIRMED:
+            standing[name] = Standing.NOT_HELPFUL
+            continue
+        settled = fit(candidate.fit.problem, candidate.fit.unknowns, candidate.fit.noise)
+        predicting = predict(settled)
+        if predicting.errors.prediction_rmse_mm <= most:
+            return _Confirmed(candidate, evidence, settled, predicting)
+        standing[name] = Standing.MISLEADING
+    return None
 
 
-def _finding(winner: Refit, settled: Fit, alike: tuple[str, ...], evidence: HeldOut) -> Finding:
-    hypothesis = winner.scored.hypothesis
+def _finding(winner: _Confirmed, alike: tuple[str, ...]) -> Finding:
+    hypothesis, settled = winner.refit.scored.hypothesis, winner.settled
     names = {hypothesis.parameter(c.name): c.name for c in hypothesis.effect.coefficients}
     fitted = values_of(settled, [n for n in names if n in settled.problem.free], {})
     units = {c.name: c.unit for c in hypothesis.effect.coefficients}
@@ -135,11 +178,11 @@ def _finding(winner: Refit, settled: Fit, alike: tuple[str, ...], evidence: Held
         sentence=hypothesis.effect.sentence,
         decide=hypothesis.effect.decide,
         parameters={names[n]: value for n, value in (fitted | exact).items()},
-        p_value=winner.scored.p_value,
-        delta_bic=winner.delta_bic,
+        p_value=winner.refit.scored.p_value,
+        delta_bic=winner.refit.delta_bic,
         indistinguishable_from=alike,
-        held_out_gain=evidence.gain,
-        held_out_p=evidence.p_value,
+        held_out_gain=winner.evidence.gain,
+        held_out_p=winner.evidence.p_value,
     )
 
 

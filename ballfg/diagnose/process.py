@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
 
 from ballfg.diagnose.judge import JudgedTrack, prediction_errors
+from ballfg.diagnose.result import Errors
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.trained import Trained
 from ballfg.estimate.configure import dataset_settings, dataset_surfaces
@@ -29,25 +30,33 @@ SCALED = ("acceleration", "spin", "contact_velocity", "contact_tangential", "con
 """What is scaled; a hit remains a hit."""
 
 
+@dataclass(frozen=True)
+class Predicting:
+    """A model with the process noise that predicts best, and its errors on tracks that it was fitted to."""
+
+    model: AnalyticModel
+    errors: Errors
+
+
 def with_process_noise(
     model: AnalyticModel, tracks: Sequence[JudgedTrack], dataset: Dataset, jobs: int
-) -> AnalyticModel:
+) -> Predicting:
     """The model with the process noise that predicts tracks best.
 
-    Args: model: with `trained`; changed in place and returned.  tracks: those that it was fitted to.
+    Args: model: with `trained`, which is replaced.  tracks: those that it was fitted to.
     """
-    likelihoods = []
+    tried: list[Errors] = []
     some = tracks[:: math.ceil(len(tracks) / MOST_PREDICTED)]
     trained = cast(Trained, model.trained)
     for scale in SCALES:
         model.trained = _scaled(trained, scale)
         settings = dataset_settings(dataset, model)
-        errors = prediction_errors(model, some, dataset_surfaces(dataset), settings, jobs)
-        likelihoods.append(errors.log_likelihood)
-        if len(likelihoods) > 1 and likelihoods[-1] < likelihoods[-2]:
+        tried.append(prediction_errors(model, some, dataset_surfaces(dataset), settings, jobs))
+        if len(tried) > 1 and tried[-1].log_likelihood < tried[-2].log_likelihood:
             break  # it has one maximum
-    model.trained = _scaled(trained, SCALES[int(np.argmax(likelihoods))])
-    return model
+    best = int(np.argmax([errors.log_likelihood for errors in tried]))
+    model.trained = _scaled(trained, SCALES[best])
+    return Predicting(model, tried[best])
 
 
 def _scaled(trained: Trained, scale: float) -> Trained:

@@ -8,6 +8,7 @@ import pytest
 from ballfg.diagnose import fallback
 from ballfg.diagnose.hypothesis import with_effects
 from ballfg.dynamics import EFFECTS, nominal_model
+from ballfg.dynamics.trained import Trained
 from ballfg.simulate import SimulationConfig, dataset_info, simulate
 from ballfg.tracks import read_dataset, write_dataset
 
@@ -30,7 +31,9 @@ def short(monkeypatch):
 
 def stretched():
     """A model whose cameras see lengths along x too large by 2 %."""
-    return with_effects(nominal_model(), EFFECTS["scale"](x=0.02))
+    model = with_effects(nominal_model(), EFFECTS["scale"](x=0.02))
+    model.trained = Trained(process_noise={"acceleration": 0.05})
+    return model
 
 
 def test_a_network_upon_a_model_with_a_measurement_effect(dataset, short):
@@ -45,8 +48,9 @@ def test_tracks_lose_what_the_measurement_did(dataset):
     tracks, _ = fallback._as_happened(stretched(), dataset, list(dataset))
     assert len(tracks) == COUNT
     for happened, track in zip(tracks, dataset, strict=True):
-        np.testing.assert_allclose(happened.positions[:, 0] * 1.02, track.positions[:, 0], rtol=0, atol=1e-5)
-        np.testing.assert_allclose(happened.positions[:, 1:], track.positions[:, 1:], rtol=0, atol=1e-5)
+        of_noise = 4 * 0.02 * dataset.info.position_noise  # shifts are those of estimated places
+        np.testing.assert_allclose(happened.positions[:, 0] * 1.02, track.positions[:, 0], rtol=0, atol=of_noise)
+        np.testing.assert_allclose(happened.positions[:, 1:], track.positions[:, 1:], rtol=0, atol=1e-9)
 
 
 def test_few_tracks_make_no_network(dataset, short):

@@ -9,7 +9,8 @@ import pytest
 
 from ballfg.diagnose.hypothesis import declared_free, has_effect
 from ballfg.diagnose.loop import search_effects
-from ballfg.diagnose.result import Standing
+from ballfg.diagnose.process import Predicting
+from ballfg.diagnose.result import Errors, Standing
 from ballfg.dynamics import EFFECTS
 from ballfg.estimate.settings import Settings
 
@@ -25,13 +26,23 @@ def shots(make_ball, make_launches, make_shots, seed, **truth):
     return make_shots(make_ball(**truth), make_launches(14, seed), seed, duration=0.6, rate=50.0).stretches
 
 
+def predicting(fitted, rmse):
+    """A fit that predicts with some error, in mm: the search asks for no more."""
+    return Predicting(fitted.problem.model, Errors(rmse, rmse, 1.0, 0.0, np.array([rmse])))
+
+
+def predicts_well(fitted):
+    return predicting(fitted, 10.0)
+
+
 @pytest.fixture(scope="module")
 def tilted(make_ball, make_launches, make_shots):
     """A search on shots over a table that leans by 1.1 degrees."""
     truth = {"table_tilt": {"x": 0.02, "y": 0.0}}
     data = (shots(make_ball, make_launches, make_shots, seed, **truth) for seed in (71, 72))
     said = []
-    return *search_effects(halves(*data), make_ball(), CATALOGUE, said.append), said
+    search = search_effects(halves(*data), make_ball(), CATALOGUE, predicts_well, said.append)
+    return search.first, search, said
 
 
 def test_the_effect_that_is_there_comes_first(tilted):
@@ -73,7 +84,24 @@ def test_every_round_ranks_every_candidate(tilted):
 
 def test_nothing_is_added_where_nothing_is(make_ball, make_launches, make_shots):
     data = (shots(make_ball, make_launches, make_shots, seed) for seed in (73, 74))
-    first, search = search_effects(halves(*data), make_ball(), CATALOGUE, lambda line: None)
+    search = search_effects(halves(*data), make_ball(), CATALOGUE, predicts_well, lambda line: None)
     assert search.findings == []
-    assert search.fit is first
+    assert search.fit is search.first
     assert len(search.rounds) == 1
+
+
+def test_what_predicts_worse_is_not_added(make_ball, make_launches, make_shots):
+    """However much better it fits: the predictions' errors here grow by a half with every effect."""
+    data = (
+        shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.02, "y": 0.0}) for seed in (71, 72)
+    )
+
+    def predict(fitted):
+        return predicting(fitted, 15.0 if has_effect(fitted.problem.model, "table_tilt") else 10.0)
+
+    search = search_effects(halves(*data), make_ball(), [EFFECTS["table_tilt"]], predict, lambda line: None)
+    assert search.findings == []
+    assert search.fit is search.first
+    (row,) = search.rounds[0]
+    assert row.standing is Standing.MISLEADING
+    assert row.delta_bic < -20.0
