@@ -48,9 +48,10 @@ def drift(fit: Fit, block: Block, strengths: Array) -> str:
     """
     most = int(np.argmax(np.abs(strengths[0])))
     name, coefficient = block.quantities[most], fit.problem.free[block.quantities[most]]
-    value, change = fit.unknowns.values[name], strengths[0, most] * coefficient.sigma
+    change = np.array((-1.0, 1.0)) * strengths[0, most] * coefficient.sigma
+    first, last = np.clip(fit.unknowns.values[name] + change, coefficient.low, coefficient.high)
     unit = "" if coefficient.unit == "1" else f" {coefficient.unit}"
     return (
-        f"recording: {name} changes from {value - change:.3g} to {value + change:.3g}{unit} between the first tracks "
+        f"recording: {name} changes from {first:.3g} to {last:.3g}{unit} between the first tracks "
         "and the last"
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -86,16 +86,28 @@ def shortlist(scored: Sequence[Scored]) -> list[Scored]:
 
 
 def refit(before: Fit, scored: Scored) -> Refit:
-    """The joint fit with a hypothesis in the model, from where it is absent: the first step goes where its score points."""
+    """The joint fit with a hypothesis in the model, from where it is absent: the first step goes where its score points.
+
+    An effect that balls usually have (friction, say) is also started at its usual strength, for its absence may be a
+    minimum of its own: without friction, spins are fitted that friction contradicts.
+    """
     hypothesis, problem = scored.hypothesis, with_hypothesis(before.problem, scored.hypothesis)
     parameters = dict(problem.model.named_parameters())
-    values = {name: float(parameters[name]) for name in hypothesis.free()}
+    absent = {name: float(parameters[name]) for name in hypothesis.free()}
+    listed = {hypothesis.parameter(c.name): c.default for c in hypothesis.effect.coefficients}
+    usual = {name: listed[name] if name in hypothesis.columns else value for name, value in absent.items()}
+    tried = [_from(before, hypothesis, problem, values) for values in ([absent] if usual == absent else [absent, usual])]
+    after = min(tried, key=lambda fitted: fitted.cost)
+    chosen = 0.0 if hypothesis.strengths else SEARCHED
+    return Refit(scored, after, delta_bic(before, after) + chosen)
+
+
+def _from(before: Fit, hypothesis: Hypothesis, problem: Problem, values: Mapping[str, float]) -> Fit:
+    """The fit of a problem with a hypothesis in it, started where the fit before ended, and at some values of it."""
     unknowns = replace(before.unknowns, values={**before.unknowns.values, **values})
     if hypothesis.shape and not hypothesis.strengths:
         unknowns = replace(unknowns, starts=_starts_with_labels(problem, unknowns.starts))
-    after = fit(problem, unknowns, before.noise, settle_noise=False)
-    chosen = 0.0 if hypothesis.strengths else SEARCHED
-    return Refit(scored, after, delta_bic(before, after) + chosen)
+    return fit(problem, unknowns, before.noise, settle_noise=False)
 
 
 def with_hypothesis(problem: Problem, hypothesis: Hypothesis) -> Problem:

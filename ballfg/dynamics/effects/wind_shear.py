@@ -23,7 +23,7 @@ class WindShear(FlightEffect):
     decide = "Shoot at different heights in one direction, or hold a thread at two heights."
     coefficients = (
         *(Coefficient(axis, 0.0, 0.3, "1/s", -20.0, 20.0) for axis in "xy"),
-        Coefficient("reference", 1.0, 0.0, "m", -100.0, 100.0, absent=None),
+        Coefficient("reference", 1.0, 0.5, "m", -100.0, 100.0, absent=None),
     )
     x: Tensor
     y: Tensor
