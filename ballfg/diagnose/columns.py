@@ -47,7 +47,9 @@ def _columns(fit: Fit, candidates: Sequence[Hypothesis]) -> Array:
     Those that act on the ball are taken together, and so are those that act on its measurement: the latter call for
     states at further moments, which is dear where rows are many.
     """
-    groups = [[i for i, h in enumerate(candidates) if (h.effect.kind == "measurement") is late] for late in (False, True)]
+    groups = [
+        [i for i, h in enumerate(candidates) if (h.effect.kind == "measurement") is late] for late in (False, True)
+    ]
     parts: dict[int, Array] = {}
     for group in groups:
         ends = np.cumsum([len(candidates[i].strengths) for i in group])[:-1]

@@ -56,7 +56,7 @@ class _WrittenZeros(TorchFunctionMode):
         types: Sequence[type],
         args: Sequence[Any] = (),
         kwargs: Mapping[str, Any] | None = None,
-    ) -> Any:  # noqa: ANN401 - whatever torch's function returns
+    ) -> Any:
         if func in ARITHMETIC:
             moving = [isinstance(a, Tensor) and forward.unpack_dual(a).tangent is not None for a in args]
             if any(moving):

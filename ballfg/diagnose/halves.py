@@ -92,8 +92,9 @@ def _chosen(dataset: Dataset) -> tuple[list[Track], list[str]]:
 def _louder(tracks: Sequence[Track], settings: Settings) -> float:
     """By how much the noise that tracks show exceeds what is stated, at least 1.
 
-    Outliers are told by their distance from where the ball is expected. Taken for less noise than there is, that would
-    leave out ordinary samples which differ from their neighbours: those that stay err alike, as if a force were missing.
+    Outliers are told by their distance from where the ball is expected. With less noise expected than there
+    is, that would leave out ordinary samples which differ from their neighbours: those that stay err alike, as if a
+    force were missing.
     """
     shown = estimate_position_noise(tracks)
     return max(1.0, float(np.max(shown / (settings.position_scale * np.asarray(settings.position_noise)))))

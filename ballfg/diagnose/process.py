@@ -38,9 +38,7 @@ class Predicting:
     errors: Errors
 
 
-def with_process_noise(
-    model: AnalyticModel, tracks: Sequence[JudgedTrack], dataset: Dataset, jobs: int
-) -> Predicting:
+def with_process_noise(model: AnalyticModel, tracks: Sequence[JudgedTrack], dataset: Dataset, jobs: int) -> Predicting:
     """The model with the process noise that predicts tracks best.
 
     Args: model: with `trained`, which is replaced.  tracks: those that it was fitted to.

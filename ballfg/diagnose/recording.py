@@ -51,7 +51,4 @@ def drift(fit: Fit, block: Block, strengths: Array) -> str:
     change = np.array((-1.0, 1.0)) * strengths[0, most] * coefficient.sigma
     first, last = np.clip(fit.unknowns.values[name] + change, coefficient.low, coefficient.high)
     unit = "" if coefficient.unit == "1" else f" {coefficient.unit}"
-    return (
-        f"recording: {name} changes from {first:.3g} to {last:.3g}{unit} between the first tracks "
-        "and the last"
-    )
+    return f"recording: {name} changes from {first:.3g} to {last:.3g}{unit} between the first tracks and the last"

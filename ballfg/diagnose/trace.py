@@ -86,7 +86,7 @@ def shortlist(scored: Sequence[Scored]) -> list[Scored]:
 
 
 def refit(before: Fit, scored: Scored) -> Refit:
-    """The joint fit with a hypothesis in the model, from where it is absent: the first step goes where its score points.
+    """The joint fit with a hypothesis in the model, from where it is absent: the first step goes where its score says.
 
     An effect that balls usually have (friction, say) is also started at its usual strength, for its absence may be a
     minimum of its own: without friction, spins are fitted that friction contradicts.
@@ -96,7 +96,9 @@ def refit(before: Fit, scored: Scored) -> Refit:
     absent = {name: float(parameters[name]) for name in hypothesis.free()}
     listed = {hypothesis.parameter(c.name): c.default for c in hypothesis.effect.coefficients}
     usual = {name: listed[name] if name in hypothesis.columns else value for name, value in absent.items()}
-    tried = [_from(before, hypothesis, problem, values) for values in ([absent] if usual == absent else [absent, usual])]
+    tried = [
+        _from(before, hypothesis, problem, values) for values in ([absent] if usual == absent else [absent, usual])
+    ]
     after = min(tried, key=lambda fitted: fitted.cost)
     chosen = 0.0 if hypothesis.strengths else SEARCHED
     return Refit(scored, after, delta_bic(before, after) + chosen)

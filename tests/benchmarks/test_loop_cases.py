@@ -106,7 +106,9 @@ def test_cases_have_names_and_random_streams_of_their_own() -> None:
     assert len({case.name for case in cases}) == len(cases)
     assert len({case.stream for case in cases}) == len(cases)
     named = [case for case in cases if case.part == "naming"]
-    assert len(named) == FULL.seeds * len(PLANTS) + FULL.side_seeds * 2 * (len(PLANTS) - 1)  # the label frame has one size
+    assert len(named) == FULL.seeds * len(PLANTS) + FULL.side_seeds * 2 * (
+        len(PLANTS) - 1
+    )  # the label frame has one size
     assert [case.size for case in cases if case.part == "detection"][:3] == [0.15, 0.225, 0.3]
     assert not any("spin_label" in case.subject for case in cases if case.part == "no_labels")
     assert all(case.recording.labels is (case.part != "no_labels") for case in cases if case.part != "silence")

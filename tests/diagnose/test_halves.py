@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from ballfg.diagnose import halves as module
 from ballfg.diagnose.halves import halves_of, launcher_labels
@@ -14,7 +15,7 @@ from ballfg.dynamics import nominal_model
 from ballfg.estimate.configure import dataset_settings
 from ballfg.simulate import SimulationConfig, write_simulation
 from ballfg.simulate.config import MeasurementNoise
-from ballfg.tracks import Dataset, read_dataset
+from ballfg.tracks import Dataset, read_dataset, write_dataset
 
 SHORT = {"topspin": [0, 1], "sidespin": [-1, 0, 1], "speed": [10, 12]}
 
@@ -45,6 +46,18 @@ def test_every_second_track_finds_and_the_others_judge(split, dataset):
     assert [j.track.name for j in halves.judged] == dataset.names[1::2]
     assert halves.excluded == ()
     assert said == ["estimating 8 tracks"]
+
+
+def test_noise_that_is_louder_than_stated_is_no_outlier(tmp_path):
+    """Twice the noise that the dataset states: a gate at the stated one would leave out every tenth sample."""
+    louder = written(tmp_path / "louder", noise=MeasurementNoise(position=0.006, dropout=0.0, outliers=0.0, jitter=0.0))
+    info = replace(louder.info, position_noise=0.003)
+    write_dataset(tmp_path / "misjudged", info, iter(louder), "csv")
+    misjudged = halves_of(read_dataset(tmp_path / "misjudged"), nominal_model(), 1, lambda line: None)
+    right = halves_of(louder, nominal_model(), 1, lambda line: None)
+    assert int(misjudged.finding.used.sum()) >= 0.99 * int(right.finding.used.sum())
+    stated = misjudged.finding.sigmas[misjudged.finding.used]
+    assert torch.allclose(stated, torch.full_like(stated, 0.003), rtol=1e-9)
 
 
 def test_outliers_have_no_part(split, dataset):

@@ -92,9 +92,7 @@ def test_nothing_is_added_where_nothing_is(make_ball, make_launches, make_shots)
 
 def test_what_predicts_worse_is_not_added(make_ball, make_launches, make_shots):
     """However much better it fits: the predictions' errors here grow by a half with every effect."""
-    data = (
-        shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.02, "y": 0.0}) for seed in (71, 72)
-    )
+    data = (shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.02, "y": 0.0}) for seed in (71, 72))
 
     def predict(fitted):
         return predicting(fitted, 15.0 if has_effect(fitted.problem.model, "table_tilt") else 10.0)

@@ -64,6 +64,8 @@ def test_columns_are_those_of_the_coefficients_from_minus_to_plus_one_sigma(calm
 
 def test_one_track_tells_nothing_of_changes(calm_fit):
     stretches = calm_fit.problem.stretches
-    alone = replace(calm_fit, problem=replace(calm_fit.problem, stretches=replace(stretches, track=np.zeros_like(stretches.track))))
+    alone = replace(
+        calm_fit, problem=replace(calm_fit.problem, stretches=replace(stretches, track=np.zeros_like(stretches.track)))
+    )
     system = linearise(calm_fit.problem, calm_fit.unknowns, calm_fit.noise, calm_fit.predicted)
     assert recording_block(alone, system) is None

@@ -67,6 +67,26 @@ def test_the_refit_finds_the_wind(wind_refit):
         assert value.sigma < 0.1
 
 
+def test_friction_is_found_though_its_absence_is_a_minimum(make_ball, make_launches, make_shots, make_fit):
+    """Without friction spins are fitted that friction contradicts; from its usual strength the way is open."""
+    shots = make_shots(make_ball(), make_launches(12, 21), 21, rate=50.0).stretches
+    before = make_fit(without_effect(make_ball(), "friction"), shots)
+    after = refit(before, Scored(hypothesis("friction"), None, 0.0))
+    found = values_of(after.fit, ["contact.friction.mu"], {})["contact.friction.mu"]
+    assert after.delta_bic < -100.0
+    assert abs(found.value - 0.25) < 4 * found.sigma
+
+
+def test_a_shear_is_found_with_its_reference(make_ball, make_launches, make_shots, make_fit):
+    """The height at which the air stands still is fitted: what is tried at first is the middle of the data."""
+    true = {"x": 0.8, "y": 0.0, "reference": 0.9}
+    shots = make_shots(make_ball(wind_shear=true), make_launches(12, 22), 22, rate=50.0).stretches
+    after = refit(make_fit(make_ball(), shots), Scored(hypothesis("wind_shear", reference=1.2), None, 0.0))
+    names = [f"flight.wind_shear.{n}" for n in ("x", "reference")]
+    for value, truth in zip(values_of(after.fit, names, {}).values(), (0.8, 0.9), strict=True):
+        assert abs(value.value - truth) < 4 * value.sigma
+
+
 def test_bic_counts_tracks(windy_fit, wind_refit):
     gain = 2.0 * (windy_fit.cost - wind_refit.fit.cost)
     assert wind_refit.delta_bic == pytest.approx(-gain + 3 * np.log(16), rel=1e-12)
