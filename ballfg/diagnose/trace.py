@@ -132,15 +132,18 @@ def refit_driven(before: Fit, hypothesis: Hypothesis) -> Refit:
     """The fit with an effect that multiplies spins nobody labelled.
 
     A coefficient times a spin of mean zero has no slope at zero. With the coefficient at its usual value the spins
-    have one: launcher settings and single shots find theirs, and the ratio of marginal likelihoods is the test.
+    have one: launcher settings and single shots find theirs, and the ratio of marginal likelihoods is the test. They
+    find theirs first, at that value: spins that only bounces had told may have the wrong sign, and the coefficient
+    would take it over.
     """
     assert isinstance(before.problem.model, AnalyticModel)
     listed = {hypothesis.parameter(c.name): c for c in hypothesis.effect.coefficients}
     free = {**before.problem.free, **{name: listed[name] for name in hypothesis.columns}}
     model = with_effects(before.problem.model, hypothesis.effect())
     problem = replace(before.problem, model=model, free=free)
+    usual = fit(replace(problem, free=before.problem.free), before.unknowns, before.noise, settle_noise=False)
     values = {name: c.default for name, c in listed.items()}
-    unknowns = replace(before.unknowns, values={**before.unknowns.values, **values})
+    unknowns = replace(usual.unknowns, values={**usual.unknowns.values, **values})
     after = fit(problem, unknowns, before.noise, settle_noise=False)
     taken = 2.0 * (_narrowness(after) - _narrowness(before))
     gain = 2.0 * (before.cost - after.cost) - taken
