@@ -48,6 +48,12 @@ class Hypothesis:
         """Parameter names of the strengths."""
         return tuple(self.parameter(c) for c in self.strengths)
 
+    @property
+    def usual(self) -> bool:
+        """Whether balls usually have the effect: its nominal strength is not zero, and its absence far from it."""
+        listed = {c.name: c for c in self.effect.coefficients}
+        return any(listed[n].default != listed[n].absent for n in self.strengths)
+
     def free(self) -> dict[str, Coefficient]:
         """What a refit estimates beside what was free before: strengths, and shapes that are uncertain."""
         listed = {c.name: c for c in self.effect.coefficients}

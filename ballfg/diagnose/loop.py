@@ -9,13 +9,23 @@ from ballfg.diagnose.calibrated import values_of
 from ballfg.diagnose.fit import fit, followed, start_from
 from ballfg.diagnose.frames import frame_hypotheses
 from ballfg.diagnose.halves import Halves
-from ballfg.diagnose.hypothesis import declared_free, hypotheses, with_effects
+from ballfg.diagnose.hypothesis import Hypothesis, declared_free, has_effect, hypotheses, with_effects
 from ballfg.diagnose.judge import HeldOut, held_out
 from ballfg.diagnose.problem import Fit, Problem
 from ballfg.diagnose.process import Predicting
 from ballfg.diagnose.result import Candidate, Finding, Standing, Value
 from ballfg.diagnose.scene import scene_of
-from ballfg.diagnose.trace import ALARM, Refit, Scored, explained, refit, refit_driven, score_all, shortlist
+from ballfg.diagnose.trace import (
+    ALARM,
+    Refit,
+    Scored,
+    explained,
+    refit,
+    refit_driven,
+    refit_usual,
+    score_all,
+    shortlist,
+)
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.effects.spin_label_frame import SpinLabelFrame
@@ -97,9 +107,19 @@ def _round(
     driven = [h for h in candidates if h.effect.multiplies_spin and unknown]
     scored = score_all(search.fit, [h for h in candidates if h not in driven])
     refits = []
-    for candidate in shortlist(scored):
+    leading = shortlist(scored)
+    called = {candidate.hypothesis.name for candidate in leading}
+    for candidate in leading:
         watch(f"round {len(search.rounds) + 1}: fitting with {candidate.hypothesis.name}")
         refits += [refit(search.fit, shaped) for shaped in _shaped(search.fit, candidate)]
+    for place, candidate in enumerate(scored):
+        if candidate.hypothesis.name in called or not _left_out(model, candidate.hypothesis):
+            continue
+        watch(f"round {len(search.rounds) + 1}: fitting with {candidate.hypothesis.name}, which balls usually have")
+        fitted = refit_usual(search.fit, candidate.hypothesis)
+        if fitted.scored.p_value < ALARM:
+            scored[place] = fitted.scored
+            refits.append(fitted)
     for hypothesis in driven:
         watch(f"round {len(search.rounds) + 1}: fitting with {hypothesis.name} and spins that nobody labelled")
         fitted = refit_driven(search.fit, hypothesis)
@@ -124,6 +144,11 @@ def _round(
     search.rounds.append(_ranking(scored, refits, standing))
     watch(f"round {len(search.rounds)}: {added}")
     return winner is not None
+
+
+def _left_out(model: AnalyticModel, hypothesis: Hypothesis) -> bool:
+    """Whether balls usually have the effect and the model has not."""
+    return hypothesis.usual and not has_effect(model, hypothesis.name)
 
 
 def _shaped(before: Fit, scored: Scored) -> list[Scored]:

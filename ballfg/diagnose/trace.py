@@ -146,8 +146,23 @@ def refit_driven(before: Fit, hypothesis: Hypothesis) -> Refit:
     unknowns = replace(usual.unknowns, values={**usual.unknowns.values, **values})
     after = fit(problem, unknowns, before.noise, settle_noise=False)
     taken = 2.0 * (_narrowness(after) - _narrowness(before))
-    gain = 2.0 * (before.cost - after.cost) - taken
     freedom = 3 * problem.stretches.settings.shape[1] + len(hypothesis.columns)
+    return _by_likelihood(before, after, hypothesis, taken, freedom)
+
+
+def refit_usual(before: Fit, hypothesis: Hypothesis) -> Refit:
+    """The fit with an effect that balls usually have, whatever its score says.
+
+    From its absence to its usual strength is a long way, on which a slope at absence may say nothing: without friction
+    a ball keeps its spin through a bounce, and nothing tells what friction would do to the spin that was fitted to it.
+    """
+    after = refit(before, Scored(hypothesis, None, 1.0)).fit
+    return _by_likelihood(before, after, hypothesis, 0.0, len(hypothesis.columns))
+
+
+def _by_likelihood(before: Fit, after: Fit, hypothesis: Hypothesis, taken: float, freedom: int) -> Refit:
+    """A refit that its likelihood ratio judges, less what is `taken` for spins that became free."""
+    gain = 2.0 * (before.cost - after.cost) - taken
     estimate = np.array([after.unknowns.values[name] for name in hypothesis.columns])
     p_value = float(stats.chi2.sf(max(gain, 0.0), freedom))
     score = Score(estimate, np.full(len(estimate), np.nan), gain, p_value, freedom)
