@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ballfg.diagnose.hypothesis import declared_free, has_effect
+from ballfg.diagnose.hypothesis import declared_free, has_effect, without_effect
 from ballfg.diagnose.loop import search_effects
 from ballfg.diagnose.process import Predicting
 from ballfg.diagnose.result import Errors, Standing
@@ -103,3 +103,13 @@ def test_what_predicts_worse_is_not_added(make_ball, make_launches, make_shots):
     (row,) = search.rounds[0]
     assert row.standing is Standing.MISLEADING
     assert row.delta_bic < -20.0
+
+
+def test_what_balls_usually_have_is_found_though_no_score_calls(make_ball, make_launches, make_shots):
+    """Friction, left out: its score at absence says little, and its absence is a minimum of its own."""
+    data = (shots(make_ball, make_launches, make_shots, seed) for seed in (75, 76))
+    declared = without_effect(make_ball(), "friction")
+    search = search_effects(halves(*data), declared, [EFFECTS["friction"]], predicts_well, lambda line: None)
+    (finding,) = search.findings
+    assert finding.name == "friction"
+    assert abs(finding.parameters["mu"].value - 0.25) < 4 * finding.parameters["mu"].sigma
