@@ -54,6 +54,15 @@ class Hypothesis:
         listed = {c.name: c for c in self.effect.coefficients}
         return any(listed[n].default != listed[n].absent for n in self.strengths)
 
+    def strain(self, values: Mapping[str, float]) -> float:
+        """By how many standard deviations of its prior the furthest strength is from its usual value.
+
+        Args: values: by parameter name.
+        """
+        listed = {c.name: c for c in self.effect.coefficients}
+        far = (abs(values[self.parameter(n)] - listed[n].default) / _spread(listed[n]) for n in self.strengths)
+        return max(far, default=0.0)
+
     def free(self) -> dict[str, Coefficient]:
         """What a refit estimates beside what was free before: strengths, and shapes that are uncertain."""
         listed = {c.name: c for c in self.effect.coefficients}

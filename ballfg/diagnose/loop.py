@@ -39,6 +39,9 @@ LABELLED = 0.5
 WORSE = 1.1
 """Ratio of prediction errors beyond which an effect is not added, however much better whole tracks are fitted with it:
 a wrong name for what is lacking bends the motion to the samples, and predictions pay for it."""
+BEYOND = 10.0
+"""Prior standard deviations from its usual value within which a coefficient is plausible. A name that must be stretched
+further (air that moves at 20 m/s through a part of the room) stands for something else."""
 ALIKE = 6.0
 """BIC difference below which two effects cannot be told apart: odds of 20 to 1."""
 
@@ -172,12 +175,15 @@ class _Confirmed:
 def _confirmed(
     search: Search, refits: Sequence[Refit], halves: Halves, predict: Predict, standing: dict[str, Standing]
 ) -> _Confirmed | None:
-    """The best refit that helps on the judging half and predicts no worse; `standing` tells of those that did not."""
+    """The best plausible refit that helps on the judging half and predicts no worse; `standing` tells of the others."""
     most = WORSE * search.predicting.errors.prediction_rmse_mm
     for candidate in refits:
         if candidate.delta_bic >= 0.0:
             break
         name = candidate.scored.hypothesis.name
+        if candidate.scored.hypothesis.strain(candidate.fit.unknowns.values) > BEYOND:
+            standing[name] = Standing.IMPLAUSIBLE
+            continue
         evidence = held_out(search.fit, candidate.fit, halves.judging)
         if evidence.p_value >= CONFIRMED:
             standing[name] = Standing.NOT_HELPFUL

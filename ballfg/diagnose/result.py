@@ -65,6 +65,7 @@ class Standing(enum.Enum):
     ALIKE = "cannot be told from the one added"
     WEAKER = "explains less"
     NOT_HELPFUL = "did not help on the other half"
+    IMPLAUSIBLE = "would have to be stronger than is plausible"
     MISLEADING = "fits whole tracks better and predicts them worse"
     NOT_NEEDED = "not needed"
     INVISIBLE = "cannot be seen in these data"

@@ -117,3 +117,25 @@ def test_declared_coefficients_that_are_estimated(make_ball):
     assert "flight.gravity.g" not in free  # exact
     assert "flight.drag_speed.reference" not in free  # a shape
     assert {"flight.drag.k", "flight.magnus.k", "contact.restitution.e", "flight.drag_speed.slope"} <= set(free)
+
+
+def test_strain_is_the_distance_from_the_usual_value_in_prior_sigmas():
+    gust = Hypothesis(EFFECTS["gust_region"], {"center_x": 3.0}, ("x", "y", "z"))
+    values = {"flight.gust_region.x": 20.0, "flight.gust_region.y": -0.5, "flight.gust_region.z": 0.0}
+    assert gust.strain(values) == pytest.approx(40.0)  # sigma 0.5 m/s
+    friction = Hypothesis(EFFECTS["friction"], {}, ("mu",))
+    assert friction.strain({"contact.friction.mu": 0.25}) == 0.0
+    assert Hypothesis(EFFECTS["spin_label_frame"], {"yy": -1.0}, ()).strain({}) == 0.0
+
+
+def test_usual_effects_are_those_with_a_nominal_strength():
+    assert {n for n in ("drag", "magnus", "friction", "wind", "drag_spin", "time_offset") if usual(n)} == {
+        "drag",
+        "magnus",
+        "friction",
+    }
+
+
+def usual(name):
+    strengths = tuple(c.name for c in EFFECTS[name].coefficients if c.absent is not None)
+    return Hypothesis(EFFECTS[name], {}, strengths).usual
