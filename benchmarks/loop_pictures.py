@@ -15,7 +15,7 @@ from ballfg.benchmarks.loop_cases import Case
 from ballfg.benchmarks.loop_ideal import Ideal
 from ballfg.benchmarks.loop_limit import NAMED, Curve, share
 from ballfg.benchmarks.loop_record import Record
-from ballfg.benchmarks.loop_rows import ALL, of_part, power_curves
+from ballfg.benchmarks.loop_rows import ALL, detectable, of_part, power_curves
 from ballfg.benchmarks.pictures import save
 from ballfg.benchmarks.results import Row
 
@@ -26,6 +26,8 @@ COLUMNS: Final = 5
 """Panels side by side."""
 NOTHING: Final = "nothing"
 """Column of the diagnoses that named no effect."""
+FEW_DECADES: Final = 100.0
+"""Ratio of the largest to the smallest size up to which more than the decades are numbered."""
 POINTS: Final = 200
 """Of a drawn curve."""
 
@@ -33,8 +35,9 @@ POINTS: Final = 200
 def power_picture(
     cases: Sequence[Case], records: Mapping[str, Record], ideals: Mapping[str, Ideal], path: Path
 ) -> Path:
-    """Share named right against the size, an effect a panel, with the ideal test's power."""
-    curves = power_curves(cases, records, ideals)
+    """Share named right against the size, a panel for each effect that can be seen, with the ideal test's power."""
+    seen = detectable(ideals)
+    curves = {name: found for name, found in power_curves(cases, records, ideals).items() if name in seen}
     rows = -(-len(curves) // COLUMNS)
     figure, panels = plt.subplots(
         rows, COLUMNS, figsize=(2.9 * COLUMNS, 2.3 * rows + 0.8), sharey=True, squeeze=False, layout="constrained"
@@ -69,13 +72,13 @@ def _draw_power(axes: Axes, sizes: Sequence[float], outcomes: Sequence[bool], cu
     axes.plot(grid, curve.at(grid), color=LOOP_COLOUR, linewidth=1.0, alpha=0.6, label="curve through the loop's")
     axes.axhline(NAMED, color="black", linewidth=0.5, linestyle=":")
     axes.set(xscale="log", ylim=(-0.05, 1.05))
-    _plain_sizes(axes)
+    _plain_sizes(axes, (1.0, 2.0, 5.0) if high < FEW_DECADES * low else (1.0,))
     axes.grid(visible=True, alpha=0.25)
 
 
-def _plain_sizes(axes: Axes) -> None:
-    """Numbers as 0.05, not as powers of ten, at 1, 2 and 5 of each decade of the horizontal axis."""
-    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+def _plain_sizes(axes: Axes, marked: tuple[float, ...] = (1.0, 2.0, 5.0)) -> None:
+    """Numbers as 0.05, not as powers of ten, at some multiples of each decade of the horizontal axis."""
+    axes.xaxis.set_major_locator(LogLocator(subs=marked))
     axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
 
