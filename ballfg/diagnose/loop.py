@@ -181,14 +181,14 @@ def _confirmed(
         if candidate.delta_bic >= 0.0:
             break
         name = candidate.scored.hypothesis.name
-        if candidate.scored.hypothesis.strain(candidate.fit.unknowns.values) > BEYOND:
-            standing[name] = Standing.IMPLAUSIBLE
-            continue
         evidence = held_out(search.fit, candidate.fit, halves.judging)
         if evidence.p_value >= CONFIRMED:
             standing[name] = Standing.NOT_HELPFUL
             continue
         settled = fit(candidate.fit.problem, candidate.fit.unknowns, candidate.fit.noise)
+        if candidate.scored.hypothesis.strain(settled.unknowns.values) > BEYOND:
+            standing[name] = Standing.IMPLAUSIBLE
+            continue
         predicting = predict(settled)
         if predicting.errors.prediction_rmse_mm <= most:
             return _Confirmed(candidate, evidence, settled, predicting)

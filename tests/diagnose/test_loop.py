@@ -7,6 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from ballfg.diagnose import loop
 from ballfg.diagnose.hypothesis import declared_free, has_effect, without_effect
 from ballfg.diagnose.loop import search_effects
 from ballfg.diagnose.process import Predicting
@@ -113,3 +114,13 @@ def test_what_balls_usually_have_is_found_though_no_score_calls(make_ball, make_
     (finding,) = search.findings
     assert finding.name == "friction"
     assert abs(finding.parameters["mu"].value - 0.25) < 4 * finding.parameters["mu"].sigma
+
+
+def test_what_would_have_to_be_implausibly_strong_is_not_added(make_ball, make_launches, make_shots, monkeypatch):
+    """The tilt found is 1.1 degrees, 4 prior sigmas: beyond what counts as plausible here."""
+    data = (shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.02, "y": 0.0}) for seed in (71, 72))
+    monkeypatch.setattr(loop, "BEYOND", 3.0)
+    search = search_effects(halves(*data), make_ball(), [EFFECTS["table_tilt"]], predicts_well, lambda line: None)
+    assert search.findings == []
+    (row,) = search.rounds[0]
+    assert row.standing is Standing.IMPLAUSIBLE
