@@ -101,35 +101,8 @@ def _round(
     watch: Callable[[str], None],
 ) -> bool:
     """One round; whether an effect was added."""
-    model = search.fit.problem.model
-    assert isinstance(model, AnalyticModel)
-    listed = hypotheses(model, scene_of(search.fit), catalogue)
-    candidates = [h for h in listed if not set(h.columns) & set(search.fit.problem.free)]
-    watch(f"round {len(search.rounds) + 1}: testing {len(candidates)} hypotheses")
-    unknown = search.fit.problem.stretches.labelled.mean() < LABELLED
-    driven = [h for h in candidates if h.effect.multiplies_spin and unknown]
-    scored = score_all(search.fit, [h for h in candidates if h not in driven])
-    refits = []
-    leading = shortlist(scored)
-    called = {candidate.hypothesis.name for candidate in leading}
-    for candidate in leading:
-        watch(f"round {len(search.rounds) + 1}: fitting with {candidate.hypothesis.name}")
-        refits += [refit(search.fit, shaped) for shaped in _shaped(search.fit, candidate)]
-    for place, candidate in enumerate(scored):
-        if candidate.hypothesis.name in called or not _left_out(model, candidate.hypothesis):
-            continue
-        watch(f"round {len(search.rounds) + 1}: fitting with {candidate.hypothesis.name}, which balls usually have")
-        fitted = refit_usual(search.fit, candidate.hypothesis)
-        if fitted.scored.p_value < ALARM:
-            scored[place] = fitted.scored
-            refits.append(fitted)
-    for hypothesis in driven:
-        watch(f"round {len(search.rounds) + 1}: fitting with {hypothesis.name} and spins that nobody labelled")
-        fitted = refit_driven(search.fit, hypothesis)
-        scored.append(fitted.scored)
-        refits += [fitted] if fitted.scored.p_value < ALARM else []
-    scored.sort(key=explained, reverse=True)
-    refits.sort(key=lambda r: r.delta_bic)
+    number = len(search.rounds) + 1
+    scored, refits = _tried(search.fit, catalogue, lambda line: watch(f"round {number}: {line}"))
     standing: dict[str, Standing] = {}
     winner = _confirmed(search, refits, halves, predict, standing)
     added = "nothing helps"
@@ -145,8 +118,41 @@ def _round(
         search.fit, search.predicting = winner.settled, winner.predicting
         added = f"{name} added"
     search.rounds.append(_ranking(scored, refits, standing))
-    watch(f"round {len(search.rounds)}: {added}")
+    watch(f"round {number}: {added}")
     return winner is not None
+
+
+def _tried(
+    before: Fit, catalogue: Sequence[type[Effect]], tell: Callable[[str], None]
+) -> tuple[list[Scored], list[Refit]]:
+    """Every hypothesis, the one that explains most first; refits of those that call, the best first."""
+    model = before.problem.model
+    assert isinstance(model, AnalyticModel)
+    listed = hypotheses(model, scene_of(before), catalogue)
+    candidates = [h for h in listed if not set(h.columns) & set(before.problem.free)]
+    tell(f"testing {len(candidates)} hypotheses")
+    unknown = before.problem.stretches.labelled.mean() < LABELLED
+    driven = [h for h in candidates if h.effect.multiplies_spin and unknown]
+    scored = score_all(before, [h for h in candidates if h not in driven])
+    refits, leading = [], shortlist(scored)
+    called = {candidate.hypothesis.name for candidate in leading}
+    for candidate in leading:
+        tell(f"fitting with {candidate.hypothesis.name}")
+        refits += [refit(before, shaped) for shaped in _shaped(before, candidate)]
+    for place, candidate in enumerate(scored):
+        if candidate.hypothesis.name in called or not _left_out(model, candidate.hypothesis):
+            continue
+        tell(f"fitting with {candidate.hypothesis.name}, which balls usually have")
+        fitted = refit_usual(before, candidate.hypothesis)
+        if fitted.scored.p_value < ALARM:
+            scored[place] = fitted.scored
+            refits.append(fitted)
+    for hypothesis in driven:
+        tell(f"fitting with {hypothesis.name} and spins that nobody labelled")
+        fitted = refit_driven(before, hypothesis)
+        scored.append(fitted.scored)
+        refits += [fitted] if fitted.scored.p_value < ALARM else []
+    return sorted(scored, key=explained, reverse=True), sorted(refits, key=lambda r: r.delta_bic)
 
 
 def _left_out(model: AnalyticModel, hypothesis: Hypothesis) -> bool:
