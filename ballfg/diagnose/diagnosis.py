@@ -74,6 +74,7 @@ def diagnose(
         tracks = [part.track for part in halves.found_on]
         helped = fallback(search.fit, halves.launcher.embedding, dataset, tracks, named, judge)
     unexplained = _unexplained(verdict, tests, helped)
+    residuals = residuals_of(search.first)
     return Diagnosis(
         dataset=dataset.info.name,
         verdict=verdict,
@@ -88,8 +89,8 @@ def diagnose(
         noise=_noise(search.fit, halves),
         unexplained=unexplained,
         model=search.predicting.model if helped is None else helped.model,
-        residuals_before=residuals_of(search.first),
-        residuals_after=residuals_of(search.fit),
+        residuals_before=residuals,
+        residuals_after=residuals if search.fit is search.first else residuals_of(search.fit),
         excluded=halves.excluded,
     )
 

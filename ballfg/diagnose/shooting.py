@@ -14,14 +14,15 @@ import torch
 from torch import Tensor
 
 from ballfg.dynamics.contact import contact_time
-from ballfg.dynamics.integrate import derivative, fly, rk4_from
+from ballfg.dynamics.integrate import MAX_STEP, derivative, fly, rk4_from
 from ballfg.dynamics.model import BallModel, take_rows
 from ballfg.dynamics.paths import hermite
 from ballfg.state import VELOCITY
 
 LONGEST_STEP, LONGEST_WAY = 0.04, 0.4
-"""s and m of one integration step: twice those of a rollout, save for balls of 20 m/s. A flight of a second then ends
-within a micrometre of the rollout's, far below what any camera sees."""
+"""s and m of one integration step: twice those of a rollout, and the rollout's own from 20 m/s on. A flight of a second
+then ends within a micrometre of the rollout's, far below what any camera sees. However wild a state that a fit tries,
+steps become no shorter."""
 LEAST_ARC = 1e-3
 """s. An arc between two contacts is taken to last at least so long when its steps are laid out."""
 
@@ -115,7 +116,8 @@ def shoot(model: BallModel, start: Tensor, heights: Tensor, guesses: Tensor, end
 def _fly_arc(model: BallModel, rows: Tensor, state: Tensor, begun: Tensor, duration: Tensor) -> Arc:
     duration = duration.clamp_min(LEAST_ARC)
     fastest = float(state[:, VELOCITY].detach().square().sum(-1).nan_to_num(nan=0.0).max().sqrt())
-    count = max(1, math.ceil(float(duration.max()) / min(LONGEST_STEP, LONGEST_WAY / max(fastest, 1.0))))
+    longest = min(LONGEST_STEP, max(MAX_STEP, LONGEST_WAY / max(fastest, 1.0)))
+    count = max(1, math.ceil(float(duration.max()) / longest))
     step = (duration / count).unsqueeze(-1)
     nodes, slopes = [state], [derivative(model.rates, state)]
     for _ in range(count):
