@@ -1,0 +1,100 @@
+"""Cameras: torch's projection against OpenCV's, rays against projection, derivatives against differences."""
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from ballfg.vision import Camera, CameraBank
+
+DISTORTIONS = {
+    0: [],
+    4: [-0.2, 0.05, 0.001, -0.002],
+    5: [-0.2, 0.05, 0.001, -0.002, 0.01],
+    8: [-0.2, 0.05, 0.001, -0.002, 0.01, 0.02, -0.01, 0.003],
+    12: [-0.2, 0.05, 0.001, -0.002, 0.01, 0.02, -0.01, 0.003, 0.001, -0.002, 0.0015, 0.0005],
+    14: [-0.2, 0.05, 0.001, -0.002, 0.01, 0.02, -0.01, 0.003, 0.001, -0.002, 0.0015, 0.0005, 0.02, -0.03],
+}
+
+
+def camera(count: int = 5, **changes: object) -> Camera:
+    fields = {
+        "name": "left",
+        "size": (1280, 720),
+        "matrix": [[1000.0, 0, 640.0], [0, 1010.0, 350.0], [0, 0, 1]],
+        "distortion": DISTORTIONS[count],
+        "rvec": [1.2, -0.9, 0.7],
+        "tvec": [0.1, 0.3, 3.0],
+    }
+    return Camera(**(fields | changes))
+
+
+def points(camera: Camera, n: int = 200) -> np.ndarray:
+    rng = np.random.default_rng(0)
+    local = np.column_stack((rng.uniform(-1.2, 1.2, (n, 2)), rng.uniform(2.0, 5.0, n)))
+    return (local - camera.tvec) @ camera.rotation
+
+
+@pytest.mark.parametrize("count", list(DISTORTIONS))
+def test_torch_projects_as_opencv(count: int) -> None:
+    bent = camera(count)
+    bank = CameraBank([camera(0, name="other", tvec=[0, 0, 5.0]), bent])
+    world = points(bent)
+    opencv, _ = cv2.projectPoints(world, bent.rvec, bent.tvec, bent.matrix, bent.distortion)
+    number = torch.ones(len(world), dtype=torch.int64)
+    np.testing.assert_allclose(bank.project(torch.from_numpy(world), number).numpy(), opencv[:, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("count", list(DISTORTIONS))
+def test_rays_lead_to_what_was_projected(count: int) -> None:
+    bent = camera(count)
+    world = points(bent)
+    rays = bent.rays(bent.project(world))
+    towards = world - bent.centre
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    np.testing.assert_allclose(rays, towards, atol=1e-9)
+
+
+def test_jacobian_agrees_with_differences() -> None:
+    bent = camera(14)
+    bank = CameraBank([bent])
+    world = points(bent, 20)
+    number = torch.zeros(len(world), dtype=torch.int64)
+    _, jacobian = bank.jacobian(torch.from_numpy(world), number)
+    for axis in range(3):
+        step = np.eye(3)[axis] * 1e-5
+        slope = (bent.project(world + step) - bent.project(world - step)) / 2e-5
+        np.testing.assert_allclose(jacobian[..., axis].numpy(), slope, rtol=1e-6, atol=1e-5)
+
+
+def test_what_is_behind_the_camera_is_not_seen() -> None:
+    bent = camera()
+    behind = bent.centre - bent.rotation[2]
+    assert np.isnan(bent.project(behind)).all()
+    assert not bent.in_view(behind)
+    bank = CameraBank([bent])
+    assert bank.project(torch.from_numpy(behind)[None], torch.zeros(1, dtype=torch.int64)).isnan().all()
+
+
+def test_view_ends_at_the_image() -> None:
+    plain = camera(0)
+    rays = plain.rays([[-0.4, 0.0], [-0.6, 0.0], [1279.4, 719.4], [1279.6, 719.0]])
+    assert plain.in_view(plain.centre + 2.0 * rays).tolist() == [True, False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"matrix": np.eye(2)}, "camera 'left': matrix must have shape"),
+        ({"matrix": [[1000, 0, 640], [0, -1000, 360], [0, 0, 1]]}, "fx, fy > 0"),
+        ({"distortion": [0.1, 0.2, 0.3]}, "distortion must have one of 0, 4, 5, 8, 12, 14 coefficients; got 3"),
+        ({"rvec": [0, 0, np.nan]}, "rvec must be finite"),
+        ({"tvec": "here"}, "tvec must be numbers"),
+        ({"size": (0, 720)}, "size must be width and height"),
+        ({"name": " "}, "printable text"),
+        ({"time_offset": np.inf}, "time_offset must be finite"),
+    ],
+)
+def test_refuses(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(ValueError, match=message.replace("(", r"\(")):
+        camera(**changes)
