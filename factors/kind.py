@@ -14,7 +14,7 @@ import copy
 from abc import ABC, abstractmethod
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass
-from typing import ClassVar, TypeVar
+from typing import ClassVar, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -152,6 +152,12 @@ class FactorKind(ABC):
     def group(self) -> Hashable:
         """Kinds with equal groups can be merged (see `merge`)."""
         return (type(self), self.dim, self.variables.shape[1], self.loss)
+
+    def with_loss(self, loss: Loss) -> Self:
+        """The same factors with another loss."""
+        other = copy.copy(self)
+        other.loss = loss
+        return other
 
     def linearize(self, values: Values) -> Rows:
         """All factors at a point."""

@@ -36,6 +36,11 @@ class Loss:
         if not self.scale > 0.0:
             raise ValueError(f"scale must be positive; got {self.scale}")
 
+    @property
+    def convex(self) -> Loss:
+        """The loss itself where it has one minimum only; in place of a logarithmic one the linear one."""
+        return Loss("huber", self.scale) if self.name == "cauchy" else self
+
     def value(self, norm: Array) -> Array:
         """(n,) rho of norms (n,)."""
         if self.name == "huber":

@@ -25,6 +25,7 @@ from ballfg.estimate.problem import (
     trackwise_model,
 )
 from ballfg.estimate.result import Estimate, Status, leave_one_out
+from ballfg.estimate.second_start import search_twice
 from ballfg.estimate.segmentation import Contact, Segmentation, physics_of, segment
 from ballfg.estimate.settings import Settings, sample_sigmas
 from ballfg.factors.covariance import Covariances, marginal_covariances
@@ -157,7 +158,7 @@ class Smoother(Estimator):
         for _ in range(MAX_REFINEMENTS):
             graph = build_graph(track, self.trackwise, events, sigma, self.settings)
             graph = graph if earlier is None else earlier.join(graph)
-            minimum = yield from self.optimizer.search(graph, values)
+            minimum = yield from search_twice(self.optimizer, graph, values)
             solution = Solution(events, graph, minimum)
             seen[_places(events.contacts)] = solution
             refined = _refined(track.times, solution)
