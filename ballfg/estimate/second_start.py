@@ -1,6 +1,6 @@
 """Minimising from a rough start: what a robust loss has set aside on the way is asked once more.
 
-Cauchy's loss lets go. On the way from a rough start a spin may leave its label so far behind that the label hardly pulls
+Cauchy's loss lets go. On the way from a rough start a spin may leave its label so far behind that it hardly pulls
 any more; the search then ends in another minimum, or on a slope. Where a label ends like that, convex losses lead to
 where it holds, and the search begins again from there; the lower minimum is the answer.
 """

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 Array = NDArray[np.float64]
 
 DISTORTIONS: Final = (0, 4, 5, 8, 12, 14)
-"""Lengths of OpenCV's distortion vectors: none; k1 k2 p1 p2; k3; k4 k5 k6; thin prism s1-s4; tilted sensor tau_x tau_y."""
+"""Lengths of distortion vectors in OpenCV: none; k1 k2 p1 p2; k3; k4 k5 k6; thin prism s1-s4; tilt tau_x tau_y."""
 _PRECISELY: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-12)
 """OpenCV undoes distortion by five steps of a fixed point unless it is told to go on: 0.1 pixel off in a wide lens."""
 
