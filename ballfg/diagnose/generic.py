@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.diagnose.clustered import Pattern, judge_patterns
+from ballfg.diagnose.label_check import LABEL, LabelCheck, check_labels
 from ballfg.diagnose.patterns import EVERYWHERE, PLAUSIBLE, UNIT, Block, blocks_of
 from ballfg.diagnose.problem import Fit, common_precision, linearise
 from ballfg.diagnose.recording import RECORDING, drift, recording_block
@@ -47,12 +48,15 @@ def generic_tests(fit: Fit, reference: Fit | None = None) -> tuple[GenericTest, 
 
     Args: reference: the fit at the start, to which shares refer; None: this one.
     """
-    found, drift = _examine(fit)
-    start, first = (found, drift) if reference is None or reference is fit else _examine(reference)
+    now = _examine(fit)
+    start = now if reference is None or reference is fit else _examine(reference)
     quieter = 1.0 if reference is None else _noise_square(fit) / _noise_square(reference)
-    count = len(found) + 1
-    tests = [_generic(tested, _of_block(start, tested.block), quieter, count) for tested in found]
-    return tuple(sorted([*tests, _time(drift, first, count)], key=lambda t: t.p_value))
+    count = len(now.found) + 1 + (now.labels is not None)
+    tests = [_generic(tested, _of_block(start.found, tested.block), quieter, count) for tested in now.found]
+    tests.append(_time(now.drift, start.drift, count))
+    if now.labels is not None and start.labels is not None:
+        tests.append(_label(now.labels, start.labels, count))
+    return tuple(sorted(tests, key=lambda t: t.p_value))
 
 
 def _noise_square(fit: Fit) -> float:
@@ -60,7 +64,16 @@ def _noise_square(fit: Fit) -> float:
     return float((fit.noise.position**2).mean())
 
 
-def _examine(fit: Fit) -> tuple[list[_Tested], Whiteness]:
+@dataclass(frozen=True)
+class _Examined:
+    """All tests of one fit."""
+
+    found: list[_Tested]
+    drift: Whiteness
+    labels: LabelCheck | None
+
+
+def _examine(fit: Fit) -> _Examined:
     system = linearise(fit.problem, fit.unknowns, fit.noise, fit.predicted)
     drifting = recording_block(fit, system)
     blocks = [*blocks_of(fit), *([] if drifting is None else [drifting])]
@@ -68,7 +81,7 @@ def _examine(fit: Fit) -> tuple[list[_Tested], Whiteness]:
     whole = System(system.residual, system.by_start, columns)
     gram = by_track(whole.eliminated().gram, fit.problem.stretches.track)
     signatures = Signatures(gram, common_precision(fit.problem), system.by_common.shape[-1])
-    return _tested(fit, signatures, blocks), whiteness(fit, system)
+    return _Examined(_tested(fit, signatures, blocks), whiteness(fit, system), check_labels(fit, system))
 
 
 def _tested(fit: Fit, signatures: Signatures, blocks: list[Block]) -> list[_Tested]:
@@ -144,4 +157,14 @@ def _time(drift: Whiteness, start: Whiteness, count: int) -> GenericTest:
         where=f"time: samples within {1e3 * drift.reach:.0f} ms err alike, by {1e3 * drift.drift:.2g} mm",
         p_value=min(1.0, count * drift.p_value),
         share=(drift.drift / whole) ** 2 if whole > 0.0 else 0.0,
+    )
+
+
+def _label(labels: LabelCheck, start: LabelCheck, count: int) -> GenericTest:
+    now, first = len(labels.contradicted), len(start.contradicted)
+    return GenericTest(
+        name=LABEL,
+        where=labels.where,
+        p_value=min(1.0, count * labels.p_value),
+        share=now / max(now, first) if now else 0.0,
     )
