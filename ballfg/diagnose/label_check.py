@@ -1,9 +1,9 @@
 """Do spin labels contradict the flights they belong to?
 
 A label is compared with the spin that the flight alone shows, the label left out: the squared distance over both their
-uncertainties is a chi-square with three degrees of freedom. Labels that all err alike (another scale, another frame,
-noise that is stated too small) raise the distances of all tracks, which effects explain or a common scale takes up; a
-label that stands out among the others belongs to another shot, or was measured wrongly.
+uncertainties is a chi-square with three degrees of freedom. Noise that is stated too small raises the distances of all
+tracks, which a common scale takes up; a label that stands out among the others belongs to another shot, or was measured
+wrongly. Where most are off by several times their noise, no misjudged noise explains that: labels and model disagree.
 """
 
 from __future__ import annotations
@@ -26,6 +26,10 @@ OPEN_SPIN = 2000.0
 """rad/s. Prior of each component of a spin that the flight does not show: twice the fastest strokes."""
 STANDS_OUT = 0.005
 """Probability, corrected for the number of labels, below which a label is counted as contradicted."""
+FAR = 9.0
+"""Square of the multiple of its noise by which a label must be off to count where most are: three times."""
+MISJUDGED = 1.3**2
+"""Square of the factor by which a stated noise may be wrong without anything else being wrong."""
 
 Array = NDArray[np.float64]
 
@@ -35,16 +39,16 @@ class LabelCheck:
     """The test.
 
     Attributes:
-        p_value: of the label that stands out most, corrected for the number of labels.
-        contradicted: names of the tracks whose labels stand out, the worst first.
+        p_value: of the label that stands out most, corrected for the number of labels, or that most are far off.
+        contradicted: names of the tracks whose labels stand out or, where most are, are far off, the worst first.
         labels: how many there are.
-        furthest: rad/s, largest distance of a contradicted label from the spin that the flight shows.
+        typical: rad/s, median distance of a contradicted label from the spin that the flight shows.
     """
 
     p_value: float
     contradicted: tuple[str, ...]
     labels: int
-    furthest: float
+    typical: float
 
     @property
     def where(self) -> str:
@@ -52,7 +56,7 @@ class LabelCheck:
         shown = ", ".join(self.contradicted[:4]) + (", ..." if len(self.contradicted) > 4 else "")
         return (
             f"label: {len(self.contradicted)} of {self.labels} spin labels contradict their flights, "
-            f"by up to {self.furthest:.0f} rad/s (tracks {shown})"
+            f"typically by {self.typical:.0f} rad/s (tracks {shown})"
         )
 
 
@@ -65,14 +69,19 @@ def check_labels(fit: Fit, system: System) -> LabelCheck | None:
     if len(rows) < LEAST_LABELS:
         return None
     distance, off = _distances(fit, system, rows)
-    scale = max(1.0, float(np.median(distance)) / stats.chi2.median(3))
+    usual = stats.chi2.median(3)
+    scale = max(1.0, float(np.median(distance)) / usual)
     # the scale is itself estimated: F in place of chi-square
-    p_values = len(rows) * stats.f.sf(distance / (3.0 * scale), 3, len(rows) - 1)
-    order = np.argsort(p_values, kind="stable")
-    out = order[p_values[order] < STANDS_OUT]
-    names = tuple(fit.problem.stretches.names[rows[i]] for i in out)
+    alone = len(rows) * stats.f.sf(distance / (3.0 * scale), 3, len(rows) - 1)
+    far = distance > FAR * usual
+    most = float(stats.binom.sf(far.sum() - 1, len(rows), stats.chi2.sf(FAR * usual / MISJUDGED, 3)))
+    out = np.flatnonzero(far if scale > FAR else alone < STANDS_OUT)
+    out = out[np.argsort(-distance[out], kind="stable")]
     return LabelCheck(
-        min(1.0, float(p_values.min())), names, len(rows), float(off[out].max()) if len(out) else float("nan")
+        p_value=min(1.0, float(alone.min()), most if scale > FAR else 1.0),
+        contradicted=tuple(fit.problem.stretches.names[rows[i]] for i in out),
+        labels=len(rows),
+        typical=float(np.median(off[out])) if len(out) else float("nan"),
     )
 
 
