@@ -117,8 +117,8 @@ class GenericTest:
     """A test for a pattern that needs no name.
 
     Attributes:
-        name: `flight`, `contact`, `measurement`, `recording` (coefficients from track to track) or `time` (whiteness
-            along the tracks).
+        name: `flight`, `contact`, `measurement`, `recording` (coefficients from track to track), `label` (spin labels
+            against flights) or `time` (whiteness along the tracks).
         where: in words, on what the pattern depends and how large it is.
         p_value: probability of such a pattern by chance.
         share: part of what was there at the start that this pattern would still explain.
