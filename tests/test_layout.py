@@ -11,6 +11,7 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     ("state",),
     ("tracks",),
+    ("vision",),
     ("dynamics",),
     ("simulate", "factors"),
     ("estimate",),

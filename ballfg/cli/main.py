@@ -10,11 +10,14 @@ from collections.abc import Sequence
 
 import typer
 
+from ballfg.cli.calibrate_cameras import calibrate_cameras
 from ballfg.cli.diagnose import diagnose
 from ballfg.cli.errors import guarded
 from ballfg.cli.estimate import estimate
 from ballfg.cli.predict import predict
+from ballfg.cli.render import render
 from ballfg.cli.simulate import simulate
+from ballfg.cli.track import track
 
 app = typer.Typer(
     name="ballfg",
@@ -28,6 +31,9 @@ app.command()(estimate)
 app.command()(predict)
 app.command()(diagnose)
 app.command()(simulate)
+app.command()(render)
+app.command()(track)
+app.command(name="calibrate-cameras")(calibrate_cameras)
 
 
 @app.callback(invoke_without_command=True)

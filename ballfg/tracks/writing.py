@@ -47,7 +47,7 @@ def write_dataset(
     if file_format not in ("csv", "parquet"):
         raise ValueError(f"file_format must be 'csv' or 'parquet'; got {file_format!r}. Choose one of them.")
     path = Path(folder)
-    with _staging(path) as stage:
+    with staging(path) as stage:
         write_info(stage / INFO_FILE, info)
         with (stage / _SPOOL).open("x", encoding="utf-8") as spool:
             label_names = _write_tracks(stage / f"tracks.{file_format}", info, tracks, spool)
@@ -58,7 +58,7 @@ def write_dataset(
 
 
 @contextmanager
-def _staging(folder: Path) -> Iterator[Path]:
+def staging(folder: Path) -> Iterator[Path]:
     """A hidden folder inside `folder`; gone afterwards, as is `folder` itself if it was made here for nothing."""
     if not folder.parent.is_dir():
         raise FileNotFoundError(f"folder must be in an existing folder; {folder.parent} is none. Create it first.")

@@ -1,0 +1,186 @@
+"""`ballfg calibrate-cameras`: from images of a board and points of the table to `cameras.yaml`."""
+
+from __future__ import annotations
+
+import enum
+import json
+import re
+from collections.abc import Iterable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from ballfg.cli.progress import progress
+
+if TYPE_CHECKING:
+    from ballfg.vision.boards import Board, Image
+    from ballfg.vision.calibration_report import Calibration
+    from ballfg.vision.camera import Camera
+    from ballfg.vision.intrinsics import Intrinsics
+    from ballfg.vision.table_points import TableFile
+
+OURS: Final = (".yaml", ".yml")
+THEIRS: Final = (".xml", ".json")
+"""Endings of files of cameras: ours, and those of OpenCV's FileStorage."""
+
+_lens_option, _place_option = (
+    partial(typer.Option, rich_help_panel=panel) for panel in ("Lens, from images of a board", "Place, from the table")
+)
+
+
+class BoardKind(enum.StrEnum):
+    """Boards whose corners can be found."""
+
+    CHESSBOARD = "chessboard"
+    CHARUCO = "charuco"
+
+
+def calibrate_cameras(
+    out: Annotated[Path, typer.Option(help="File to write: .yaml, or .xml or .json as OpenCV writes them.")],
+    images: Annotated[
+        list[str] | None,
+        _lens_option(help="NAME=PLACE: camera and folder, pattern or file of its images; may be repeated."),
+    ] = None,
+    board: Annotated[BoardKind, _lens_option(help="The board.")] = BoardKind.CHESSBOARD,
+    squares: Annotated[str, _lens_option(help="Squares in a row x rows, the outermost ones too, as 10x7.")] = "",
+    square: Annotated[float, _lens_option(help="Side of a square, m.")] = 0.0,
+    marker: Annotated[float, _lens_option(help="Side of a ChArUco marker, m.")] = 0.0,
+    dictionary: Annotated[str, _lens_option(help="ArUco dictionary of the markers.")] = "4X4_100",
+    legacy: Annotated[bool, _lens_option("--legacy", help="The board was printed by OpenCV before 4.6.")] = False,
+    distortion: Annotated[int, _lens_option(help="Coefficients: 0, 4, 5, 8, 12 or 14.")] = 5,
+    intrinsics: Annotated[
+        Path | None, typer.Option(help="File of cameras whose lenses are known, instead of images.")
+    ] = None,
+    table: Annotated[Path | None, _place_option(help="File with the pixels of the table's corners.")] = None,
+    view: Annotated[
+        list[str] | None, _place_option(help="NAME=IMAGE: what the table is drawn into; may be repeated.")
+    ] = None,
+) -> None:
+    """Find each camera's lens from images of a board, and its place from the corners of the table.
+
+    Example: ballfg calibrate-cameras --squares 10x7 --square 0.025 --images left=calib/left --images
+    right=calib/right --table table.yaml --out cameras.yaml
+
+    Beside the file two others say how well the cameras are known: OUT_calibration.json and .png. Without --table only
+    the lenses are written, for a later --intrinsics.
+    """
+    from ballfg.vision.boards import read_grey
+    from ballfg.vision.table_points import read_table
+    from ballfg.vision.whole_file import check_writable
+
+    if out.suffix.lower() not in (*OURS, *THEIRS):
+        raise ValueError(f"out must end in {', '.join((*OURS, *THEIRS))}; got {out}. Choose the format by the ending.")
+    check_writable(out)
+    if (intrinsics is None) == (images is None):
+        raise ValueError("either --images or --intrinsics must be given, and not both. Lenses come from one of them.")
+    if intrinsics is not None and table is None:
+        raise ValueError("--intrinsics must come with --table; got no --table. Without it there is nothing to find.")
+    places = _grouped("images", images or ())
+    shown = {name: read_grey(Path(paths[-1])) for name, paths in _grouped("view", view or ()).items()}
+    marked = None if table is None else read_table(table)
+    if intrinsics is not None:
+        lenses = _known(intrinsics)
+        _check_same(lenses, str(intrinsics), marked, table, shown)
+        found = [_placed(camera, None, marked) for camera in lenses.values()]
+    else:
+        _check_same(places, "--images", marked, table, shown)
+        pattern = _board(board, squares, square, marker, dictionary, legacy)
+        fitted = [_lens(name, where, pattern, distortion) for name, where in places.items()]
+        found = [_placed(lens.camera, lens, marked) for lens in fitted]
+    _write(out, found, shown, marked)
+
+
+def _grouped(option: str, words: Iterable[str]) -> dict[str, list[str]]:
+    """Places by camera. Raises: ValueError: a word that is not NAME=PLACE."""
+    grouped: dict[str, list[str]] = {}
+    for word in words:
+        name, equals, place = word.partition("=")
+        if not (name and equals and place):
+            raise ValueError(f"--{option} must be NAME=PLACE, as left=calib/left; got {word!r}. Name the camera.")
+        grouped.setdefault(name, []).append(place)
+    return grouped
+
+
+def _known(path: Path) -> dict[str, Camera]:
+    from ballfg.vision.camera_file import read_cameras
+
+    return {camera.name: camera for camera in read_cameras(path, posed=False)}
+
+
+def _check_same(
+    cameras: Iterable[str], where: str, marked: TableFile | None, table: Path | None, shown: Iterable[str]
+) -> None:
+    """Refuses a camera that is named in one place only."""
+    cameras = set(cameras)
+    for name in sorted(set(shown) - cameras):
+        raise ValueError(f"--view names camera {name!r}, which {where} does not ({_listed(cameras)}). Rename it.")
+    if marked is None:
+        return
+    for name in sorted(cameras ^ set(marked.cameras)):
+        here, there = (where, table) if name in cameras else (table, where)
+        raise ValueError(f"{here} names camera {name!r}, which {there} does not. Add it there, or leave it out.")
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(sorted(names))
+
+
+def _board(kind: BoardKind, squares: str, square: float, marker: float, dictionary: str, legacy: bool) -> Board:
+    from ballfg.vision.boards import Charuco, Chessboard
+
+    match = re.fullmatch(r"(\d+)x(\d+)", squares)
+    if match is None:
+        raise ValueError(f"--squares must be squares in a row x rows, as 10x7; got {squares!r}. Count them.")
+    columns, rows = int(match[1]), int(match[2])
+    if kind is BoardKind.CHESSBOARD:
+        return Chessboard(columns, rows, square)
+    return Charuco(columns, rows, square, marker, dictionary.upper().removeprefix("DICT_"), legacy)
+
+
+def _lens(name: str, places: Iterable[str], board: Board, distortion: int) -> Intrinsics:
+    from ballfg.vision.boards import find_views, image_files, suggested
+    from ballfg.vision.intrinsics import calibrate_intrinsics
+
+    files = image_files(places)
+    views = list(progress(find_views(files, board), len(files), f"images of {name} searched"))
+    if not any(len(one.pixels) for one in views):
+        hint = suggested(files, board)
+        if hint:
+            raise ValueError(f"camera {name!r}: --squares must be those of the board; got another number.{hint}")
+    return calibrate_intrinsics(name, views, distortion)
+
+
+def _placed(camera: Camera, lens: Intrinsics | None, marked: TableFile | None) -> Calibration:
+    from ballfg.vision.calibration_report import Calibration
+    from ballfg.vision.extrinsics import calibrate_extrinsics
+
+    if marked is None:
+        return Calibration(camera, lens, None)
+    place = calibrate_extrinsics(camera, marked.cameras[camera.name])
+    return Calibration(place.camera, lens, place)
+
+
+def _write(out: Path, found: list[Calibration], shown: Mapping[str, Image], marked: TableFile | None) -> None:
+    from ballfg.vision.calibration_picture import calibration_picture
+    from ballfg.vision.calibration_report import content, summary
+    from ballfg.vision.camera_file import write_cameras
+    from ballfg.vision.camera_storage import write_opencv
+    from ballfg.vision.table_points import TABLE_HEIGHT
+    from ballfg.vision.whole_file import whole_file
+
+    figure = calibration_picture(found, shown, TABLE_HEIGHT if marked is None else marked.table_height)
+    report, picture = (out.with_name(f"{out.stem}_calibration{ending}") for ending in (".json", ".png"))
+    with whole_file(report) as temporary:
+        text = json.dumps([content(one) for one in found], indent=2, allow_nan=False, ensure_ascii=False)
+        temporary.write_text(text + "\n", encoding="utf-8")
+    with whole_file(picture) as temporary:
+        figure.savefig(temporary)
+    write = write_cameras if out.suffix.lower() in OURS else write_opencv
+    write(out, [one.camera for one in found], posed=marked is not None)
+    for one in found:
+        for line in summary(one):
+            print(line)
+    print(f"{out}: {len(found)} camera{'s' if len(found) > 1 else ''}{'' if marked else ', lenses only'}")
+    print(f"how well they are known: {report}, {picture}")

@@ -1,0 +1,116 @@
+"""`ballfg render`: synthetic videos of balls over a table, with the truth beside them."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ballfg.cli.inputs import OwnEffects, know_effects
+from ballfg.cli.progress import progress
+
+if TYPE_CHECKING:
+    from ballfg.simulate.scene import Clock
+
+_cameras, _picture, _balls, _files = (
+    partial(typer.Option, rich_help_panel=panel) for panel in ("Cameras", "Picture", "Balls", "Files")
+)
+
+
+def render(
+    out: Annotated[Path, _files(help="Folder of the scene: new or empty.")],
+    seed: Annotated[int, typer.Option(help="Seed: the same one gives the same files, to the byte.")] = 0,
+    shots: Annotated[int, _balls(help="Balls, launched one after the other.")] = 6,
+    interval: Annotated[float, _balls(help="From launch to launch, s; below 1.3 two balls fly at once.")] = 2.0,
+    settings: Annotated[str, _balls(help="Launcher levels, as topspin=-3,sidespin=-5..5,speed=9.")] = "",
+    effect: Annotated[
+        list[str] | None, _balls(help="An effect that nobody declares, as wind.x=0.3; may be repeated.")
+    ] = None,
+    effects: OwnEffects = None,
+    rate: Annotated[float, _cameras(help="Frames per second, Hz.")] = 120.0,
+    exposure: Annotated[float, _cameras(help="How long the shutter is open, s.")] = 0.002,
+    unsynchronised: Annotated[bool, _cameras("--unsynchronised", help="Cameras expose at different moments.")] = False,
+    offset: Annotated[
+        list[str] | None, _cameras(help="A camera whose stamps are late by so many s, as left=0.004; may be repeated.")
+    ] = None,
+    dropout: Annotated[float, _cameras(help="Probability of a dropped frame.")] = 0.0,
+    jitter: Annotated[float, _cameras(help="Jitter of the stamps, s.")] = 0.0,
+    size: Annotated[str, _cameras(help="Width and height of the images, pixels.")] = "1280x720",
+    distance: Annotated[float, _cameras(help="From each camera to the middle of the flights, m.")] = 3.0,
+    colour: Annotated[str, _picture(help="Of the ball: white or orange.")] = "white",
+    noise: Annotated[float, _picture(help="Noise of a dark pixel, grey levels.")] = 2.0,
+    flicker: Annotated[float, _picture(help="How much the lamps flicker, relative.")] = 0.03,
+    distractors: Annotated[bool, _picture(help="Whether other things than the ball move.")] = True,
+    images: Annotated[bool, _files("--images", help="Write PNG images in place of videos: nothing is lost.")] = False,
+    force: Annotated[bool, _files("--force", help="Replace a rendered scene.")] = False,
+) -> None:
+    """Write videos of simulated balls over a table as three cameras see them, with the truth beside them.
+
+    Example: ballfg render --out scene --shots 6 --rate 120 --exposure 0.002 --unsynchronised
+
+    The cameras are in cameras.yaml, the frames' stamps in NAME_stamps.csv. truth.csv has the true states over time,
+    visible.csv where each ball truly is in each frame, scene.yaml everything that was asked for.
+    """
+    from ballfg.simulate import parse_effects, parse_settings
+    from ballfg.simulate.cameras import table_rig
+    from ballfg.simulate.scene import SceneConfig, record, write_scene
+    from ballfg.simulate.scene.writing import check_folder
+
+    know_effects(effects)
+    check_folder(out, force=force)
+    cameras = table_rig(_size(size), distance)
+    names = [camera.name for camera in cameras]
+    look: dict[str, Any] = {"colour": colour, "noise": noise, "flicker": flicker, "distractors": distractors}
+    config = SceneConfig(
+        shots=shots,
+        interval=interval,
+        seed=seed,
+        settings=parse_settings(settings) if settings else {},
+        undeclared=parse_effects(effect or ()),
+        rate=rate,
+        exposure=exposure,
+        clocks=_clocks(names, rate, seed, offset or (), unsynchronised=unsynchronised),
+        dropout=dropout,
+        jitter=jitter,
+        **look,
+    )
+    recording = record(config, cameras)
+    total = recording.image_count
+    write_scene(out, recording, images=images, force=force, watch=lambda drawn: progress(drawn, total, "frames drawn"))
+    kind = "images" if images else "a video"
+    typer.echo(f"wrote {total} frames to {out}: {kind} and stamps for each of {', '.join(names)}; cameras.yaml")
+    typer.echo(f"wrote the truth to {out}: truth.csv, visible.csv, scene.yaml")
+
+
+def _clocks(
+    names: list[str], rate: float, seed: int, offsets: tuple[str, ...] | list[str], *, unsynchronised: bool
+) -> dict[str, Clock]:
+    """Clocks by camera, from the command line's words."""
+    from dataclasses import replace
+
+    from ballfg.simulate.scene import Clock, free_running
+
+    clocks = {name: Clock() for name in names}
+    if unsynchronised:
+        clocks = free_running(names, rate, seed)
+    for text in offsets:
+        name, _, seconds = text.partition("=")
+        if name not in clocks:
+            raise ValueError(f"--offset must name a camera, {', '.join(names)}; got {text!r}. Write left=0.004.")
+        try:
+            late = float(seconds)
+        except ValueError:
+            raise ValueError(f"--offset must read CAMERA=SECONDS; got {text!r}. Write left=0.004.") from None
+        clocks[name] = replace(clocks[name], offset=late)
+    return clocks
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Width and height from a text such as 1280x720."""
+    width, _, height = text.partition("x")
+    try:
+        return int(width), int(height)
+    except ValueError:
+        raise ValueError(f"--size must read WIDTHxHEIGHT; got {text!r}. Write 1280x720.") from None

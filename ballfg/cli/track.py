@@ -1,0 +1,154 @@
+"""`ballfg track`: cameras to tracks."""
+
+from __future__ import annotations
+
+import enum
+import os
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, cast
+
+import typer
+
+from ballfg.cli.inputs import default_jobs
+from ballfg.cli.progress import progress
+
+if TYPE_CHECKING:
+    from ballfg.vision import Camera
+    from ballfg.vision.detector import Colour as BallColour
+    from ballfg.vision.tracking import Tracking
+    from ballfg.vision.tracking_dataset import Streams
+
+
+class Colour(enum.StrEnum):
+    """Of the ball."""
+
+    WHITE = "white"
+    ORANGE = "orange"
+
+
+def track(
+    recordings: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="VIDEO",
+            help="Videos or folders of images, each named as its camera or as NAME=PATH; or one detections.csv.",
+        ),
+    ],
+    cameras: Annotated[Path, typer.Option(help="File of the calibrated cameras.")],
+    out: Annotated[Path, typer.Option(help="Folder of the dataset: new or empty.")],
+    stamps: Annotated[
+        list[str] | None,
+        typer.Option(help="NAME=FILE.csv, a camera's stamps (column t), instead of its video's; may be repeated."),
+    ] = None,
+    without: Annotated[list[str] | None, typer.Option(help="Leave a camera out; may be repeated.")] = None,
+    colour: Annotated[Colour | None, typer.Option(help="Of the ball; any without it.")] = None,
+    detector: Annotated[str | None, typer.Option(help="FILE.py:NAME, a detector of your own, to run.")] = None,
+    ball: Annotated[str, typer.Option(help="table-tennis, tennis or a ball file (YAML).")] = "table-tennis",
+    table_height: Annotated[
+        float | None, typer.Option(help="z of the table's surface, m.", show_default="that of the ball's table")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the dataset.", show_default="the folder's")] = None,
+    overlay: Annotated[bool, typer.Option(help="Write the overlay video.")] = True,
+    force: Annotated[bool, typer.Option("--force", help="Replace an earlier result.")] = False,
+    jobs: Annotated[int, typer.Option(min=1, help="Processes.", show_default="one per core")] = default_jobs(),
+) -> None:
+    """From the videos of calibrated cameras to a dataset of tracks, with pictures to check them by.
+
+    Example: ballfg track left.mp4 middle.mp4 right.mp4 --cameras cameras.yaml --out shots
+
+    The dataset holds tracks.csv, detections.csv (all candidates) and cameras.yaml.
+    overlay.mp4 shows the views with what was found, contact_sheet.png each track.
+    """
+    _quiet_codecs()
+    from ballfg.simulate.balls import ball_kind
+    from ballfg.tracks import DatasetInfo
+    from ballfg.vision.camera_file import read_cameras
+    from ballfg.vision.recordings import without as others
+    from ballfg.vision.tracking_dataset import check_folder, write_tracking
+    from ballfg.vision.tracking_report import disagreement, no_ball, summary
+
+    kind = ball_kind(ball)
+    height = kind.surfaces.table_height if table_height is None else table_height
+    check_folder(out, [cameras, *(Path(text) for text in recordings)], force=force)
+    files = " ".join(Path(text).name for text in recordings)
+    info = DatasetInfo(name or out.resolve().name, height, kind.ball, source=f"ballfg track {files}")
+    rig = others(read_cameras(cameras), without or ())
+    streams: Streams | None = None
+    if len(recordings) == 1 and recordings[0].lower().endswith(".csv"):
+        _refuse(stamps=stamps, colour=colour, detector=detector)
+        tracking = _from_table(Path(recordings[0]), rig, without or ())
+    else:
+        tracking, streams = _from_videos(recordings, rig, stamps or (), colour, detector, jobs)
+    if (doubt := disagreement(tracking)) is not None:
+        print(f"note: {doubt}", file=sys.stderr)
+    info = replace(info, rate=tracking.rate)
+    written = write_tracking(
+        out, tracking, info, table=kind.surfaces.extent, streams=streams, overlay=overlay, watch=progress
+    )
+    if not tracking.balls:
+        raise ValueError(f"{no_ball(tracking)} {out} holds an empty dataset; look at {', '.join(written[4:])} there.")
+    points = sum(len(ball.times) for ball in tracking.balls)
+    print(f"{out}: {len(tracking.balls)} tracks of {points} points; wrote {', '.join(written)}")
+    for line in summary(tracking):
+        print(line)
+
+
+def _refuse(**options: object) -> None:
+    """Raises ValueError for an option that only videos have a use for."""
+    for name, value in options.items():
+        if value is not None:
+            raise ValueError(
+                f"--{name} must not be given with detections: it is about videos; got {value}. Leave it out."
+            )
+
+
+def _quiet_codecs() -> None:
+    """FFmpeg and OpenCV print what they think of a file, unless they are told not to before OpenCV is loaded."""
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+
+def _from_videos(
+    recordings: Sequence[str],
+    rig: Sequence[Camera],
+    stamps: Sequence[str],
+    colour: Colour | None,
+    detector: str | None,
+    jobs: int,
+) -> tuple[Tracking, Streams]:
+    """What was found, and what gives each video's frames once more."""
+    from ballfg.vision.detect import learn_detector
+    from ballfg.vision.detector import DetectorSettings
+    from ballfg.vision.detector_file import load_detector
+    from ballfg.vision.recordings import match_videos, stamp_files
+    from ballfg.vision.tracking import track_videos
+    from ballfg.vision.video import open_video
+
+    videos, files = match_videos(recordings, rig), stamp_files(stamps, rig)
+    if detector is not None and colour is not None:
+        raise ValueError("--colour must not be given with --detector: it is about ballfg's own. Leave one of them out.")
+    settings = DetectorSettings(colour=cast("BallColour | None", colour))
+    make = partial(learn_detector, settings=settings) if detector is None else load_detector(detector)
+    tracking = track_videos(
+        videos,
+        rig,
+        make,
+        stamps=files,
+        jobs=jobs,
+        watch=lambda frames, total: progress(frames, total, "frames searched"),
+    )
+    return tracking, [open_video(path, files.get(name)).frames for name, path in videos.items()]
+
+
+def _from_table(path: Path, rig: Sequence[Camera], without: Sequence[str]) -> Tracking:
+    from ballfg.vision.detections_table import read_detections
+    from ballfg.vision.tracking import track_detections
+
+    detections, notes = read_detections(path, rig, without)
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)
+    return track_detections(detections, rig)

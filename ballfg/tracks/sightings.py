@@ -1,0 +1,110 @@
+"""One ball as several cameras saw it: pixels, each at its own camera's stamp."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+ROUNDING = 1e-6
+"""Relative to the trace: a covariance that was computed in single precision is symmetric up to this."""
+
+
+@dataclass(frozen=True, eq=False)
+class Sightings:
+    """One ball as cameras saw it, rows in order of true time. Arrays are copied; every field is checked.
+
+    A camera sees a ball once in a frame, so the stamps of each camera increase. Stamps of different cameras are on
+    clocks of their own and are not compared.
+
+    Raises: ValueError: a wrong shape, a number that is not finite, a camera's number out of range, stamps of one camera
+        that do not increase, a covariance that is not symmetric and positive definite; the message names the row.
+    """
+
+    cameras: tuple[str, ...]
+    """Names of the rig's cameras, those too that never saw the ball."""
+
+    camera: NDArray[np.int64]
+    """(m,) number of the camera that saw the ball: an index into `cameras`."""
+
+    times: Array
+    """(m,) s, stamps as the camera wrote them."""
+
+    pixels: Array
+    """(m, 2) px, where the ball's centre was in the middle of the exposure."""
+
+    covariances: Array
+    """(m, 2, 2) px^2."""
+
+    def __post_init__(self) -> None:
+        names = tuple(self.cameras)
+        if not names or len(set(names)) < len(names):
+            raise ValueError(f"cameras must be different names, at least one; got {list(names)}. Rename or add some.")
+        object.__setattr__(self, "cameras", names)
+        times = _floats("times", self.times, np.asarray(self.times).shape)
+        if times.ndim != 1 or len(times) == 0:
+            raise ValueError(f"times must have shape (m,) with m >= 1; got {times.shape}. Pass one stamp per sighting.")
+        m = len(times)
+        camera = np.asarray(self.camera)
+        if camera.shape != (m,) or camera.dtype.kind not in "iu" or not ((camera >= 0) & (camera < len(names))).all():
+            raise ValueError(
+                f"camera must be ({m},) whole numbers from 0 to {len(names) - 1}; got {camera.tolist()}. "
+                "Number the cameras in the order of their names."
+            )
+        object.__setattr__(self, "camera", camera.astype(np.int64))
+        object.__setattr__(self, "times", times)
+        object.__setattr__(self, "pixels", _floats("pixels", self.pixels, (m, 2)))
+        object.__setattr__(self, "covariances", _floats("covariances", self.covariances, (m, 2, 2)))
+        self._check_stamps()
+        _check_covariances(self.covariances)
+
+    def _check_stamps(self) -> None:
+        for number, name in enumerate(self.cameras):
+            rows = np.flatnonzero(self.camera == number)
+            wrong = np.flatnonzero(np.diff(self.times[rows]) <= 0.0)
+            if wrong.size:
+                first, second = (int(row) for row in rows[wrong[0] : wrong[0] + 2])
+                raise ValueError(
+                    f"times of camera {name!r} must increase; times[{second}]={self.times[second]} <= "
+                    f"times[{first}]={self.times[first]}. Sort the rows, and keep one sighting a frame."
+                )
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def taken(self, rows: ArrayLike) -> Sightings:
+        """Some of the rows.
+
+        Args: rows: (k,) their numbers, ascending, or (m,) bool.
+        Raises: ValueError: if none is left.
+        """
+        kept = np.asarray(rows)
+        return Sightings(self.cameras, self.camera[kept], self.times[kept], self.pixels[kept], self.covariances[kept])
+
+
+def _floats(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{field} must be an array of numbers; {error}. Pass one row per sighting.") from None
+    if array.shape != shape:
+        raise ValueError(f"{field} must have shape {shape}; got {array.shape}. Pass one row per sighting.")
+    if not np.isfinite(array).all():
+        row = int(np.argwhere(~np.isfinite(array))[0][0])
+        raise ValueError(f"{field} must be finite; {field}[{row}]={array[row].tolist()}. Drop that sighting.")
+    return array
+
+
+def _check_covariances(covariances: Array) -> None:
+    a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
+    symmetric = np.abs(covariances[:, 1, 0] - b) <= ROUNDING * (a + c)
+    good = symmetric & (a > 0.0) & (c > 0.0) & (a * c > b * b)
+    if not good.all():
+        row = int(np.argmin(good))
+        raise ValueError(
+            f"covariances must be symmetric and positive definite; covariances[{row}]={covariances[row].tolist()}. "
+            "Give the variance of u and v in px^2."
+        )

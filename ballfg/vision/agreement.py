@@ -1,0 +1,279 @@
+"""Do the cameras agree? If not: is there one that, had it been nudged since its calibration, would explain everything?
+
+Each camera in turn is turned and moved (six numbers) together with all points until the reprojection error is least,
+the other cameras held. A nudged camera then explains the disagreement, and no other one does. Three cameras are needed:
+of two that disagree either may be wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from ballfg.vision.camera import Camera
+from ballfg.vision.paths import path
+from ballfg.vision.seen_ball import SeenBall
+from ballfg.vision.triangulate import triangulate
+
+Array = NDArray[np.float64]
+
+LEAST_MISFIT: Final = 3.0
+"""Squared error, relative to that of noise, up to which cameras agree: half a pixel where centres are good to 0.3."""
+LEAST_EXPLAINED: Final = 0.8
+"""Share of what is beyond noise that a culprit must explain."""
+CLEARLY: Final = 4.0
+"""How many times as much every other camera must leave unexplained: correcting the wrong one of three cameras may halve
+the disagreement or do better, but never ends it."""
+CLEARLY_WORSE: Final = 1.5
+"""And how many times the squared error must be left, noise included."""
+LEAST_POINTS: Final = 20
+"""Seen by three cameras or more, to say anything: six numbers are fitted to them."""
+MOST_POINTS: Final = 600
+"""That are used, evenly spread over those there are: more do not change the answer."""
+_LOOSE: Final = 20.0
+"""px, noise with which points are made of views that may be wrong."""
+_FAR: Final = 9.0
+"""Median squared errors at which a point counts half."""
+_STEPS: Final = 8
+"""Gauss-Newton steps; a camera turned by five degrees is right after six."""
+_TURNED: Final = 0.1
+"""rad, standard deviation of a nudge's turn: keeps the fit in place where the points are too few to tell."""
+_MOVED: Final = 0.3
+"""m, that of its shift."""
+
+
+@dataclass(frozen=True)
+class CameraAgreement:
+    """What the other cameras say about one."""
+
+    residual: float
+    """px, median distance of its sightings from the points of the others; NaN if fewer than two others saw them."""
+
+    explained: float
+    """Share of the disagreement beyond noise that is gone once this camera is corrected; NaN where there is none."""
+
+    rotation: float
+    """Degrees, turn of that correction."""
+
+    shift: float
+    """m, shift of its centre in that correction."""
+
+    corrected: float
+    """px, the median distance with the corrected camera; NaN where `residual` is."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Whether calibrated cameras agree about the balls that they saw."""
+
+    culprit: str | None
+    """The one camera whose correction explains the disagreement; None if they agree or if no single one does."""
+
+    by_camera: Mapping[str, CameraAgreement]
+    """By name, in the rig's order; empty where too little was seen by three cameras."""
+
+    misfit: float
+    """Median squared reprojection error over that of the noise: about 1 where cameras agree; NaN if not known."""
+
+    sentence: str
+    """All this for a reader."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Scene:
+    """Points that at least three cameras saw."""
+
+    pixels: Array
+    """(n, c, 2), NaN where not seen."""
+    weights: Array
+    """(n, c, 2, 2) inverse covariances; zero where not seen."""
+    points: Array
+    """(n, 3) m, first guess."""
+    expected: Array
+    """(n,) median of the squared error that noise alone makes."""
+
+
+def check_agreement(balls: Sequence[SeenBall], cameras: Sequence[Camera]) -> Agreement:
+    """Says whether the cameras agree and, if not, which one has moved.
+
+    Args: balls: as `associate` gives them, for the same cameras.
+    Source: docs/associate.md.
+    """
+    cameras = list(cameras)
+    pixels, covariances = _views(balls, cameras)
+    scene = _scene(cameras, pixels, covariances)
+    if len(scene.points) < LEAST_POINTS:
+        few = f"{len(scene.points)} points were seen by three cameras or more; {LEAST_POINTS} are needed to check them."
+        return Agreement(None, {}, float("nan"), f"Whether the cameras agree is not known: {few}")
+    before = _misfit(scene, cameras, _refined(scene, cameras, scene.points, None)[0])
+    by_camera = {}
+    for k, camera in enumerate(cameras):
+        points, corrected = _refined(scene, cameras, scene.points, k)
+        rest = _misfit(scene, corrected, points)
+        excess = before - 1.0
+        turn = np.linalg.norm(cv2.Rodrigues(corrected[k].rotation @ camera.rotation.T)[0])
+        by_camera[camera.name] = CameraAgreement(
+            _against_others(scene, cameras, k),
+            float((before - max(rest, 1.0)) / excess) if before > LEAST_MISFIT else float("nan"),
+            float(np.degrees(turn)),
+            float(np.linalg.norm(corrected[k].centre - camera.centre)),
+            _against_others(scene, corrected, k),
+        )
+    culprit = _culprit(by_camera, before) if before > LEAST_MISFIT else None
+    return Agreement(culprit, by_camera, before, _sentence(culprit, by_camera, before))
+
+
+def _views(balls: Sequence[SeenBall], cameras: list[Camera]) -> tuple[Array, Array]:
+    """Where every camera saw the balls at their points' times: pixels (n, c, 2), covariances; NaN where it did not."""
+    pixels, covariances = [np.zeros((0, len(cameras), 2))], [np.zeros((0, len(cameras), 2, 2))]
+    for ball in balls:
+        seen = ball.sightings
+        places = np.full((len(ball), len(cameras), 2), np.nan)
+        spreads = np.full((len(ball), len(cameras), 2, 2), np.nan)
+        for k, camera in enumerate(cameras):
+            rows = seen.camera == seen.cameras.index(camera.name)
+            if rows.any():
+                line = path(seen.times[rows] - camera.time_offset, seen.pixels[rows], seen.covariances[rows])
+                places[:, k], spreads[:, k] = line.at(ball.times)
+        pixels.append(places)
+        covariances.append(spreads)
+    return np.concatenate(pixels), np.concatenate(covariances)
+
+
+def _scene(cameras: list[Camera], pixels: Array, covariances: Array) -> _Scene:
+    seen = np.asarray(np.isfinite(pixels).all(axis=-1))
+    rows = np.flatnonzero(seen.sum(axis=1) >= 3)
+    rows = (
+        rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_POINTS)).astype(int))] if len(rows) else rows
+    )
+    loose = np.broadcast_to(_LOOSE**2 * np.eye(2), covariances[rows].shape)
+    points = triangulate(cameras, pixels[rows], loose).points if len(cameras) > 1 else np.zeros((0, 3))
+    rows, points = rows[np.isfinite(points).all(axis=1)], points[np.isfinite(points).all(axis=1)]
+    weights = np.zeros(covariances[rows].shape)
+    weights[seen[rows]] = np.linalg.inv(covariances[rows][seen[rows]])
+    expected = chi2.median(2 * seen[rows].sum(axis=1) - 3)
+    return _Scene(pixels[rows], weights, points, expected)
+
+
+def _errors(scene: _Scene, cameras: list[Camera], points: Array) -> Array:
+    """(n, c, 2) px, seen minus projected; zero where not seen."""
+    projected = np.stack([camera.project(points) for camera in cameras], axis=1)
+    return np.nan_to_num(scene.pixels - projected, nan=0.0)
+
+
+def _squares(scene: _Scene, errors: Array) -> Array:
+    return np.asarray(np.einsum("nci,ncij,ncj->n", errors, scene.weights, errors))
+
+
+def _misfit(scene: _Scene, cameras: list[Camera], points: Array) -> float:
+    return float(np.median(_squares(scene, _errors(scene, cameras, points)) / scene.expected))
+
+
+def _refined(scene: _Scene, cameras: list[Camera], points: Array, nudged: int | None) -> tuple[Array, list[Camera]]:
+    """Gauss-Newton on all points and, if one is named, on a camera's pose: the points and the cameras then."""
+    cameras = list(cameras)
+    start = None if nudged is None else np.concatenate((cameras[nudged].rvec, cameras[nudged].tvec))
+    for _ in range(_STEPS):
+        errors = _errors(scene, cameras, points)
+        slopes = [_slopes(camera, points) for camera in cameras]
+        by_point = np.stack([pose[..., 3:] @ camera.rotation for pose, camera in zip(slopes, cameras, strict=True)], 1)
+        weighted = scene.weights @ by_point
+        information = np.einsum("ncij,ncik->njk", by_point, weighted)
+        gradient = np.einsum("ncij,nci->nj", weighted, errors)
+        points = points + np.linalg.solve(information, gradient[..., None])[..., 0]
+        if nudged is not None and start is not None:
+            mixed = np.einsum("nij,nik->njk", weighted[:, nudged], slopes[nudged])
+            removed = np.linalg.solve(information, mixed)
+            pose = np.concatenate((cameras[nudged].rvec, cameras[nudged].tvec))
+            weight = scene.weights[:, nudged]
+            change = _pose_step(
+                _trust(scene, errors), weight, slopes[nudged], errors[:, nudged], mixed, removed, gradient, pose - start
+            )
+            points = points - removed @ change
+            cameras[nudged] = _posed(cameras[nudged], pose + change)
+    return points, cameras
+
+
+def _trust(scene: _Scene, errors: Array) -> Array:
+    """(n,) Cauchy weights: points far worse than the median count less."""
+    squares = _squares(scene, errors)
+    return np.asarray(1.0 / (1.0 + squares / (_FAR * (np.median(squares) + 1.0))))
+
+
+def _pose_step(
+    trust: Array,
+    weight: Array,
+    slopes: Array,
+    errors: Array,
+    mixed: Array,
+    removed: Array,
+    gradient: Array,
+    nudge: Array,
+) -> Array:
+    """(6,) the step of a camera's pose once the points are eliminated from the normal equations (Schur complement).
+
+    Args:
+        trust: (n,) of the points.
+        weight: (n, 2, 2) of the camera's sightings.
+        slopes: (n, 2, 6) derivatives of the projection by the pose.
+        errors: (n, 2) px, seen minus projected.
+        mixed: (n, 3, 6) block of the normal equations between points and pose.
+        removed: (n, 3, 6) the points' own blocks' inverse times `mixed`.
+        gradient: (n, 3) of the points.
+        nudge: (6,) by how much the pose is already off the calibrated one.
+    """
+    weighted = weight @ slopes
+    prior = np.diag([_TURNED**-2] * 3 + [_MOVED**-2] * 3)
+    schur = np.einsum("n,nij,nik->jk", trust, weighted, slopes) - np.einsum("n,nji,njk->ik", trust, mixed, removed)
+    target = np.einsum("n,nij,ni->j", trust, weighted, errors) - np.einsum("n,nji,nj->i", trust, removed, gradient)
+    return np.asarray(np.linalg.solve(schur + prior, target - prior @ nudge))
+
+
+def _slopes(camera: Camera, points: Array) -> Array:
+    """(n, 2, 6) derivatives of the projection by rvec and tvec."""
+    _, jacobian = cv2.projectPoints(points, camera.rvec, camera.tvec, camera.matrix, camera.distortion)
+    return np.asarray(jacobian[:, :6], dtype=np.float64).reshape(-1, 2, 6)
+
+
+def _posed(camera: Camera, pose: Array) -> Camera:
+    return Camera(camera.name, camera.size, camera.matrix, camera.distortion, pose[:3], pose[3:], camera.time_offset)
+
+
+def _against_others(scene: _Scene, cameras: list[Camera], k: int) -> float:
+    """px, median distance of a camera's sightings from the points that the others make."""
+    others = scene.pixels.copy()
+    others[:, k] = np.nan
+    points = triangulate(cameras, others, np.broadcast_to(_LOOSE**2 * np.eye(2), (*others.shape, 2))).points
+    distance = np.linalg.norm(scene.pixels[:, k] - cameras[k].project(points), axis=1)
+    return float(np.nanmedian(distance)) if np.isfinite(distance).any() else float("nan")
+
+
+def _culprit(by_camera: Mapping[str, CameraAgreement], misfit: float) -> str | None:
+    ranked = sorted(by_camera, key=lambda name: -by_camera[name].explained)
+    left, next_left = (1.0 - by_camera[name].explained for name in ranked[:2])
+    error, next_error = (1.0 + share * (misfit - 1.0) for share in (left, next_left))
+    clear = next_left >= CLEARLY * left and next_error >= CLEARLY_WORSE * error
+    return ranked[0] if left <= 1.0 - LEAST_EXPLAINED and clear else None
+
+
+def _sentence(culprit: str | None, by_camera: Mapping[str, CameraAgreement], misfit: float) -> str:
+    distances = ", ".join(f"{name} {seen.residual:.2f} px" for name, seen in by_camera.items())
+    if misfit <= LEAST_MISFIT:
+        return f"The cameras agree: each from the points of the others by {distances}."
+    if culprit is None:
+        return (
+            f"The cameras disagree, and no single one explains it (each from the points of the others by {distances}). "
+            "Calibrate them again, and check their time offsets."
+        )
+    seen = by_camera[culprit]
+    return (
+        f"Camera {culprit} has moved since its calibration: it is off by {seen.residual:.1f} px from the points of the "
+        f"others, {seen.corrected:.1f} px if turned by {seen.rotation:.2f} degrees and shifted by "
+        f"{1000 * seen.shift:.0f} mm. Calibrate it again."
+    )

@@ -1,0 +1,163 @@
+"""From every camera's candidates to balls in space; docs/associate.md tells how.
+
+Pieces of smooth motion in each image, pieces that show the same thing in several, points in space, pieces of one flight
+joined, candidates left lying picked up, and what does not fly like a ball thrown out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.tracks.sightings import Sightings
+from ballfg.vision.camera import Camera
+from ballfg.vision.clock import shared_stamps
+from ballfg.vision.completing import complete
+from ballfg.vision.detections import Detections
+from ballfg.vision.flights import is_ball, successions
+from ballfg.vision.gathering import SAME_SHUTTER, Footage, Gathered, Rows, gather
+from ballfg.vision.matching import Piece, match
+from ballfg.vision.seen_ball import SeenBall
+from ballfg.vision.tracklets import find_tracklets
+
+Array = NDArray[np.float64]
+
+_DISPUTED: Final = 2
+"""Frames in which two parts of one flight may both have a candidate: the last of the first part is a wrong one then."""
+
+
+@dataclass(frozen=True)
+class AssociationSettings:
+    """How candidates become balls.
+
+    Raises: ValueError: a number out of its range.
+    """
+
+    least_score: float = 0.3
+    """In [0, 1]; candidates that look less like a ball are not considered."""
+
+    least_points: int = 6
+    """Points of the shortest track that is kept; at least 3."""
+
+    interpolate: bool = True
+    """Whether cameras that do not share a shutter are brought to one time. False triangulates nearest frames as if they
+    were synchronised: up to half a frame wrong, which is what a comparison wants to show, and nothing else should."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.least_score <= 1.0:
+            raise ValueError(f"least_score must lie in [0, 1]; got {self.least_score}. Scores are probabilities.")
+        if self.least_points < 3:
+            raise ValueError(f"least_points must be at least 3; got {self.least_points}. Raise it.")
+
+
+def associate(
+    detections: Sequence[Detections], cameras: Sequence[Camera], settings: AssociationSettings | None = None
+) -> list[SeenBall]:
+    """The balls that several cameras saw, by their first point.
+
+    Cameras need not share a shutter or a rate, and frames may be missing. If they do share stamps, there are points at
+    those; else at the stamps of the camera that saw most of the ball, the others interpolated. Tracks start and end by
+    themselves; a ball is one track through bounces and short gaps.
+
+    Args:
+        detections: one for each camera, in any order.
+        cameras: at least two, with the detections' names.
+        settings: the default ones if None.
+    Raises: ValueError: cameras and detections that do not go together.
+    """
+    settings = settings or AssociationSettings()
+    footage = _footage(detections, cameras, settings)
+    pieces = _pieces(footage)
+    matching = match(pieces, footage.cameras)
+    footage = replace(footage, offset=matching.offset)
+    balls = [gather(footage, _rows_of([pieces[i] for i in group], len(cameras))) for group in matching.groups]
+    balls = _joined(footage, [ball for ball in balls if len(ball.track.times) >= 2])
+    balls = _joined(footage, complete(footage, balls))
+    balls = [ball for ball in balls if len(ball.track.times) >= settings.least_points and is_ball(ball.track)]
+    seen = [_seen_ball(footage, ball) for ball in balls]
+    return sorted(seen, key=lambda ball: float(ball.times[0]))
+
+
+def _footage(detections: Sequence[Detections], cameras: Sequence[Camera], settings: AssociationSettings) -> Footage:
+    """The recording without what does not look like a ball."""
+    names = [camera.name for camera in cameras]
+    by_name = {seen.camera: seen for seen in detections}
+    if len(names) < 2 or len(set(names)) < len(names):
+        raise ValueError(f"cameras must be two or more with different names; got {names}. Add or rename cameras.")
+    if len(by_name) < len(detections) or set(by_name) != set(names):
+        raise ValueError(
+            f"detections must be one for each of the cameras {names}; got those of {[d.camera for d in detections]}. "
+            "Leave out cameras without detections, or rename."
+        )
+    ordered = [by_name[name] for name in names]
+    chosen = [seen.select(seen.scores >= settings.least_score) for seen in ordered]
+    frames = [seen.frames - camera.time_offset for seen, camera in zip(chosen, cameras, strict=True)]
+    return Footage(list(cameras), chosen, shared_stamps(frames, SAME_SHUTTER), settings.interpolate)
+
+
+def _pieces(footage: Footage) -> list[Piece]:
+    pieces = []
+    for number, (camera, seen) in enumerate(zip(footage.cameras, footage.detections, strict=True)):
+        focal = float(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]))
+        pieces += [Piece(number, rows, footage.path(number, rows)) for rows in find_tracklets(seen, focal)]
+    return pieces
+
+
+def _rows_of(pieces: Sequence[Piece], cameras: int) -> list[Rows]:
+    none = np.zeros(0, dtype=np.int64)
+    return [np.sort(np.concatenate([none, *(p.rows for p in pieces if p.camera == c)])) for c in range(cameras)]
+
+
+def _joined(footage: Footage, balls: list[Gathered]) -> list[Gathered]:
+    """The balls with those put together that are parts of one flight."""
+    following = dict(successions([ball.track for ball in balls]))
+    later = set(following.values())
+    joined = []
+    for number in range(len(balls)):
+        if number in later:
+            continue
+        chain = [number]
+        while chain[-1] in following and _may_follow(footage, balls[chain[-1]], balls[following[chain[-1]]]):
+            chain.append(following[chain[-1]])
+        rest = following.get(chain[-1])
+        while rest is not None:
+            joined.append(balls[rest])
+            rest = following.get(rest)
+        if len(chain) == 1:
+            joined.append(balls[number])
+            continue
+        parts = zip(footage.detections, *(balls[i].rows for i in chain), strict=True)
+        joined.append(gather(footage, [_undisputed(seen, np.concatenate(rows)) for seen, *rows in parts]))
+    return joined
+
+
+def _may_follow(footage: Footage, one: Gathered, other: Gathered) -> bool:
+    """Whether hardly any camera saw both in one frame; where one did, one of the candidates is wrong."""
+    frames = [seen.frame for seen in footage.detections]
+    pairs = zip(frames, one.rows, other.rows, strict=True)
+    return all(np.isin(frame[mine], frame[theirs]).sum() <= _DISPUTED for frame, mine, theirs in pairs)
+
+
+def _undisputed(seen: Detections, rows: Rows) -> Rows:
+    """Ascending, without those of frames that have two."""
+    _, position, count = np.unique(seen.frame[rows], return_inverse=True, return_counts=True)
+    return np.sort(rows[count[position] == 1])
+
+
+def _seen_ball(footage: Footage, ball: Gathered) -> SeenBall:
+    camera = np.repeat(np.arange(len(ball.rows)), [len(rows) for rows in ball.rows])
+    pairs = list(zip(footage.detections, ball.rows, strict=True))
+    stamps = np.concatenate([seen.times[rows] for seen, rows in pairs])
+    order = np.argsort(stamps - np.array([c.time_offset for c in footage.cameras])[camera], kind="stable")
+    sightings = Sightings(
+        tuple(c.name for c in footage.cameras),
+        camera[order],
+        stamps[order],
+        np.concatenate([seen.pixels[rows] for seen, rows in pairs])[order],
+        np.concatenate([seen.covariances[rows] for seen, rows in pairs])[order],
+    )
+    return SeenBall(ball.track.times, ball.track.values, ball.covariances, sightings, ball.views)

@@ -1,0 +1,185 @@
+"""What a camera sees without the ball: learned from frames of the recording, followed slowly, in flickering light."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+Image = NDArray[np.uint8]
+
+SHRINK: Final = 4
+"""Pixels of the image per pixel of the small picture in which candidates are looked for."""
+GRID: Final = (16, 9)
+"""Blocks, across and down, whose brightness tells how bright the light is; their median is no moving thing."""
+BRIGHT: Final = (8.0, 245.0)
+"""Grey levels between which a block is asked: darker ones are noise, brighter ones are clipped."""
+STRIPS: Final = 32
+"""A frame refreshes one of so many strips of the background: all of it would cost more than the search."""
+WEIGHT: Final = 0.08
+"""Of a frame in the strip that it refreshes; what is not the ball fades in over STRIPS / WEIGHT = 400 frames."""
+COVERED_WEIGHT: Final = 0.008
+"""The same where something was found: a passing ball leaves 0.5 of 60 grey levels, a moved chair is gone in 4000
+frames."""
+SIGMAS: Final = 5.0
+"""Noise sigmas of the small picture, at that place, that a change must exceed to be looked at."""
+LEAST_CHANGE: Final = 5.0
+"""Grey levels that it must exceed besides: compression and rounding make errors that the frames learned from lack."""
+ROUNDING: Final = 1.0 / 12.0
+"""Grey levels^2, variance of rounding to whole ones. It keeps a noise-free video's covariance regular."""
+
+
+class Background:
+    """Background, its noise, and the brightness of the light in the present frame.
+
+    Args: images: at least three, of one size (h, w, 3), in which nothing but the background is in the same place in
+        half of them. Fifteen are plenty.
+
+    Attributes:
+        full: (h, w, 3) float32, grey levels at the mean light.
+        small: (h/4, w/4, 3) float32, the same, shrunk.
+        threshold: (h/4, w/4) uint8 grey levels: what differs by more is not noise.
+        noise: (3, 3) grey levels^2, covariance of a pixel's channels.
+        blotches: px, at least one, across which noise is shared: compression and interpolated colours make blotches. A
+            fit to an edge, a line of pixels, has that many times the variance that noise of single pixels would give.
+        gains: (3,) light of the present frame over the mean light, by channel; set by `follow`.
+
+    Raises: ValueError: too few images, or of several sizes.
+    """
+
+    def __init__(self, images: Sequence[Image]) -> None:
+        if len(images) < 3:
+            raise ValueError(
+                f"images must be at least three to learn a background; got {len(images)}. Pass more frames."
+            )
+        shapes = {image.shape for image in images}
+        if len(shapes) > 1 or len(images[0].shape) != 3 or images[0].shape[2] != 3:
+            raise ValueError(f"images must have one shape (h, w, 3); got {sorted(shapes)}. Pass frames of one camera.")
+        grids = np.stack([_grid(shrunk(image)) for image in images])
+        self._grid = np.maximum(np.median(grids, axis=0), 1.0)
+        gains = [_gains(grid, self._grid) for grid in grids]
+        level = [_lit(image, 1.0 / gain, cv2.CV_8U) for image, gain in zip(images, gains, strict=True)]
+        middle = _median(level)
+        self.noise = _noise(level, middle)
+        self.full = _mean_near(level, middle, 3.0 * float(np.sqrt(self.noise.max())))
+        self.small = np.asarray(shrunk(self.full), dtype=np.float32)
+        self.blotches = _blotches(level, self.full, self.noise)
+        self.threshold = self._thresholds([shrunk(image) for image in level])
+        self.gains: Array = np.ones(3)
+        self._strip = 0
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width, px."""
+        return (self.full.shape[0], self.full.shape[1])
+
+    def _thresholds(self, smalls: list[Image]) -> Image:
+        """Where the picture is restless - noise, edges under compression, leaves - a change must be larger."""
+        spread = _median([cv2.absdiff(small, self.small.astype(np.uint8)) for small in smalls])
+        restless = cv2.dilate(spread.max(axis=2), np.ones((3, 3), dtype=np.uint8))
+        sigma = np.hypot(1.4826 * restless, np.sqrt(self.noise.max()) / SHRINK)
+        return np.minimum(LEAST_CHANGE + SIGMAS * sigma, 255.0).astype(np.uint8)
+
+    def follow(self, small: Image) -> Image:
+        """The change (h/4, w/4) uint8 grey levels in a frame's small picture, of the channel that differs most."""
+        self.gains = _gains(_grid(small), self._grid)
+        expected = _lit(self.small, self.gains, cv2.CV_8U)
+        blue, green, red = cv2.split(cv2.absdiff(small, expected))
+        return np.asarray(cv2.max(cv2.max(blue, green), red), dtype=np.uint8)
+
+    def patch(self, rows: slice, columns: slice) -> Array32:
+        """(rows, columns, 3) background of the present frame, grey levels."""
+        return np.asarray(self.full[rows, columns] * self.gains.astype(np.float32), dtype=np.float32)
+
+    def absorb(self, image: Image, small: Image, found: Image) -> None:
+        """Takes a frame's light and clouds into the background.
+
+        Args: image: the frame.  small: it, shrunk.  found: (h/4, w/4) uint8, 255 where something is in front.
+        """
+        height, width = self.shape
+        rows = slice(self._strip * height // STRIPS, (self._strip + 1) * height // STRIPS)
+        self._strip = (self._strip + 1) % STRIPS
+        if rows.stop == rows.start:
+            return
+        covered = cv2.dilate(found, np.ones((3, 3), dtype=np.uint8))
+        top, bottom = rows.start * found.shape[0] // height, -(-rows.stop * found.shape[0] // height)
+        here = cv2.resize(covered[top:bottom], (width, rows.stop - rows.start), interpolation=cv2.INTER_NEAREST)
+        _absorb(self.full[rows], _lit(image[rows], 1.0 / self.gains, cv2.CV_32F), np.asarray(here, dtype=np.uint8))
+        self.small[top:bottom] = shrunk(self.full[top * SHRINK : bottom * SHRINK])[: bottom - top]
+
+
+def shrunk(image: Image | Array32) -> NDArray:
+    """An image (h, w, 3) at a quarter of its size (means of 4 x 4 pixels); a rest of fewer than 4 pixels is cut off."""
+    height, width = (side // SHRINK * SHRINK for side in image.shape[:2])
+    if min(height, width) == 0:
+        raise ValueError(f"an image must have at least {SHRINK} x {SHRINK} pixels; got {image.shape}.")
+    half = cv2.resize(image[:height, :width], (width // 2, height // 2), interpolation=cv2.INTER_AREA)
+    return cv2.resize(half, (width // SHRINK, height // SHRINK), interpolation=cv2.INTER_AREA)
+
+
+def _lit(image: NDArray, gains: Array, depth: int) -> NDArray:
+    """An image (h, w, 3) in a light that is brighter by gains (3,), in OpenCV's depth."""
+    return cv2.multiply(image, np.append(gains, 0.0), dtype=depth)
+
+
+def _absorb(background: Array32, level: NDArray, covered: Image) -> None:
+    cv2.accumulateWeighted(level, background, WEIGHT, cv2.bitwise_not(covered))
+    cv2.accumulateWeighted(level, background, COVERED_WEIGHT, covered)
+
+
+def _grid(small: NDArray) -> Array32:
+    """(9, 16, 3) means of blocks."""
+    return np.asarray(cv2.resize(small, GRID, interpolation=cv2.INTER_AREA), dtype=np.float32)
+
+
+def _gains(grid: Array32, reference: Array32) -> Array:
+    """(3,) median over blocks of the ratio to the reference; one where no block is bright enough."""
+    known = ((reference > BRIGHT[0]) & (reference < BRIGHT[1])).all(axis=2)
+    if not known.any():
+        return np.ones(3)
+    ratios = grid[known] / reference[known]
+    middle = len(ratios) // 2
+    return np.maximum(np.partition(ratios, middle, axis=0)[middle], 1.0 / BRIGHT[0]).astype(np.float64)
+
+
+def _median(images: Sequence[NDArray]) -> Image:
+    """Pixelwise median (the upper one of two) by a sorting network: neighbours change places until all are in order."""
+    ranks = [np.asarray(image) for image in images]
+    for turn in range(len(ranks)):
+        for i in range(turn % 2, len(ranks) - 1, 2):
+            ranks[i], ranks[i + 1] = cv2.min(ranks[i], ranks[i + 1]), cv2.max(ranks[i], ranks[i + 1])
+    return np.asarray(ranks[len(ranks) // 2], dtype=np.uint8)
+
+
+def _mean_near(images: Sequence[NDArray], middle: Image, near: float) -> Array32:
+    """(h, w, 3) mean of what lies within `near` of the median: its noise is a quarter of the median's rounding."""
+    total = np.zeros(middle.shape, dtype=np.float32)
+    count = np.zeros(middle.shape, dtype=np.float32)
+    for image in images:
+        close = (cv2.absdiff(image, middle) <= max(near, 1.0)).astype(np.float32)
+        count += close
+        total += close * image
+    return np.asarray(np.where(count > 0, total / np.maximum(count, 1.0), middle), dtype=np.float32)
+
+
+def _noise(images: Sequence[NDArray], middle: Image) -> Array:
+    """(3, 3) covariance of the channels about the median, of those pixels where nothing passed."""
+    stride = max(1, middle.shape[0] * middle.shape[1] // 20000)
+    flat = middle.reshape(-1, 3)[::stride].astype(np.float64)
+    rest = np.concatenate([image.reshape(-1, 3)[::stride] - flat for image in images])
+    far = np.abs(rest).max(axis=1)
+    calm = rest[far <= 3.0 * (np.median(far) + 1.0)]
+    return np.asarray(np.cov(calm.T, bias=True) * len(images) / (len(images) - 1) + ROUNDING * np.eye(3))
+
+
+def _blotches(images: Sequence[NDArray], mean: Array32, noise: Array) -> float:
+    """Root of the area that shares its noise: the variance in means of 4 x 4 pixels, times 16, over that of a pixel."""
+    rest = np.concatenate([shrunk(image - mean).reshape(-1, 3) for image in images[:: max(1, len(images) // 4)]])
+    far = np.abs(rest).max(axis=1)
+    calm = rest[far <= 3.0 * np.median(far) + ROUNDING]
+    return max(1.0, float(np.sqrt((calm**2).mean(axis=0).sum() * SHRINK**2 / np.trace(noise))))

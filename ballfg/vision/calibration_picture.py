@@ -1,0 +1,138 @@
+"""Picture of a calibration: what the lens leaves of the corners, view by view, and the table where it should be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Final
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from numpy.typing import NDArray
+
+from ballfg.vision.boards import Image
+from ballfg.vision.calibration_report import Calibration
+from ballfg.vision.camera import Camera
+from ballfg.vision.extrinsics import Extrinsics
+from ballfg.vision.intrinsics import CELLS, Intrinsics
+from ballfg.vision.table_points import TABLE_HEIGHT, table_outline
+
+Array = NDArray[np.float64]
+
+BLUE, VERMILION, GREY = "#0072b2", "#d55e00", "#8c8c8c"
+OUTLINED: Final = withStroke(linewidth=1.5, foreground="white")
+"""For letters that must be read over any image."""
+ARROW: Final = 0.05
+"""Of the image's width: the length at which a residual of three times the median is drawn."""
+PARTS: Final = 40
+"""Of a line: how finely it is drawn, since the lens bends it."""
+PANEL: Final = (5.0, 3.4)
+"""Inches, width and height of a panel."""
+DPI: Final = 120
+
+
+def calibration_picture(
+    found: Sequence[Calibration], images: Mapping[str, Image], table_height: float = TABLE_HEIGHT
+) -> Figure:
+    """One row a camera: residuals of the corners, error of each view, the table in the image.
+
+    Args:
+        found: at least one, each with a lens or a place.
+        images: by the camera's name, grey, what the table's outline is drawn into; white without one.
+        table_height: m, z of the table's surface.
+    """
+    kinds: list[Callable[[Axes, Calibration], None]] = []
+    if any(one.lens is not None for one in found):
+        kinds += [_corners, _views]
+    if any(one.place is not None for one in found):
+        kinds.append(lambda axes, one: _table(axes, one, images.get(one.camera.name), table_height))
+    width, height = PANEL
+    figure = Figure(figsize=(width * len(kinds), height * len(found) + 0.3), dpi=DPI, layout="constrained")
+    panels = figure.subplots(len(found), len(kinds), squeeze=False)
+    for row, one in zip(panels, found, strict=True):
+        for axes, draw in zip(row, kinds, strict=True):
+            draw(axes, one)
+    return figure
+
+
+def _corners(axes: Axes, found: Calibration) -> None:
+    lens = found.lens
+    if lens is None:
+        axes.set_axis_off()
+        return
+    pixels = np.concatenate([fitted.view.pixels for fitted in lens.views])
+    residuals = np.concatenate([fitted.residuals for fitted in lens.views])
+    _image_axes(axes, found.camera)
+    width, height = found.camera.size
+    for side, count, line in ((width, CELLS[0], axes.axvline), (height, CELLS[1], axes.axhline)):
+        for place in np.linspace(0, side, count + 1)[1:-1]:
+            line(place - 0.5, color=GREY, linewidth=0.3)
+    typical = float(np.median(np.linalg.norm(residuals, axis=1)))
+    longer = ARROW * width / (3.0 * typical) if typical > 0.0 else 1.0
+    axes.quiver(*pixels.T, *(longer * residuals).T, angles="xy", scale_units="xy", scale=1, width=0.002, color=BLUE)
+    axes.set_title(
+        f"{found.camera.name}: corners as seen minus as projected, x{longer:.0f}\n"
+        f"RMS {lens.rms:.2f} px; corners in {lens.coverage:.0%} of the cells",
+        size=9,
+    )
+
+
+def _views(axes: Axes, found: Calibration) -> None:
+    lens = found.lens
+    if lens is None:
+        axes.set_axis_off()
+        return
+    fitted = [*lens.views, *lens.left_out]
+    colours = [BLUE] * len(lens.views) + [VERMILION] * len(lens.left_out)
+    places = np.arange(len(fitted))
+    axes.bar(places, [one.rms for one in fitted], color=colours)
+    axes.axhline(lens.rms, color=GREY, linewidth=0.8)
+    if lens.left_out:  # a wrong view is worse by so much that the others could not be seen beside it
+        axes.set_yscale("log")
+    axes.set_xticks(places, [one.view.name for one in fitted], rotation=90, size=6)
+    axes.set_ylabel("RMS, px")
+    axes.set_title(f"{found.camera.name}: error of each view{_orange(lens)}", size=9)
+
+
+def _orange(lens: Intrinsics) -> str:
+    return "; orange: left out" if lens.left_out else ""
+
+
+def _table(axes: Axes, found: Calibration, image: Image | None, table_height: float) -> None:
+    place = found.place
+    if place is None:
+        axes.set_axis_off()
+        return
+    if image is not None:
+        axes.imshow(image, cmap="gray", vmin=0, vmax=255)
+    _image_axes(axes, found.camera)
+    for line in table_outline(table_height):
+        axes.plot(*_drawn(found.camera, line).T, color=VERMILION, linewidth=1.0)
+    axes.plot(*place.marked.pixels.T, "o", color=BLUE, markersize=6, fillstyle="none")
+    for name, pixel in zip(place.marked.names, place.marked.pixels, strict=True):
+        axes.annotate(name, pixel, (4, 4), textcoords="offset points", size=6, color=BLUE, path_effects=[OUTLINED])
+    axes.set_title(_place_title(place), size=9)
+
+
+def _place_title(place: Extrinsics) -> str:
+    return (
+        f"{place.camera.name}: the table as projected; circles: as marked\n"
+        f"RMS {place.rms:.2f} px; camera ± {1e3 * place.centre_sigma:.1f} mm, ± {np.degrees(place.turn_sigma):.2f}°"
+    )
+
+
+def _drawn(camera: Camera, line: Array) -> Array:
+    """(k, 2) px along a line (2, 3) m; NaN outside the image, where distortion means nothing."""
+    share = np.linspace(0.0, 1.0, PARTS + 1)[:, None]
+    points = (1.0 - share) * line[0] + share * line[1]
+    return np.where(camera.in_view(points)[:, None], camera.project(points), np.nan)
+
+
+def _image_axes(axes: Axes, camera: Camera) -> None:
+    width, height = camera.size
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    axes.set_aspect("equal")
+    axes.set_xlabel("u, px")
+    axes.set_ylabel("v, px")

@@ -1,0 +1,136 @@
+"""Videos through detectors: one after the other, or each camera in a process of its own."""
+
+from __future__ import annotations
+
+import multiprocessing
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
+from pathlib import Path
+from queue import Queue
+from typing import Final
+
+import cv2
+import joblib
+
+from ballfg.vision.detections import Candidates, Detections, Detector
+from ballfg.vision.detector import BallDetector, DetectorSettings
+from ballfg.vision.video import Video, open_video
+
+SAMPLE: Final = 15
+"""Frames from which a background is learned: what stands in the same place in eight of them is background."""
+TELLS: Final = 20
+"""Frames after which a process says how far it is."""
+
+Watch = Callable[[Iterable[int], int], Iterable[int]]
+"""Hands the numbers of finished frames through, given with their total (an estimate); for instance to show progress."""
+
+
+def learn_detector(video: Video, settings: DetectorSettings | None = None) -> BallDetector:
+    """The detector of a video's camera: its background learned from frames spread over the recording."""
+    return BallDetector.learn(video.sample(SAMPLE), settings)
+
+
+def detect(video: Video, camera: str, detector: Detector, watch: Watch | None = None) -> Detections:
+    """All candidates of a video.
+
+    Args:
+        video: of one camera.
+        camera: its name.
+        detector: called with each frame in order; for instance `learn_detector(video)`, or one of your own.
+        watch: see `Watch`; it is given the frames as they are done.
+    Raises: ValueError: a video that turns out unreadable, see `Video.frames`. TypeError: a detector that does not give
+        `Candidates`.
+    """
+    seen: list[tuple[float, Candidates]] = []
+    for _ in (watch or _unwatched)(_run(video, detector, seen), video.count):
+        pass
+    return Detections.of_frames(camera, seen)
+
+
+def detect_all(
+    videos: Mapping[str, Path],
+    make: Callable[[Video], Detector] = learn_detector,
+    *,
+    stamps: Mapping[str, Path] | None = None,
+    jobs: int = 1,
+    watch: Watch | None = None,
+) -> dict[str, Detections]:
+    """All candidates of several cameras' videos.
+
+    Args:
+        videos: camera -> file or folder.
+        make: the detector of an opened video; called in the process that runs it.
+        stamps: camera -> CSV file, for those whose stamps are not the container's.
+        jobs: processes; no more than cameras are of use.
+        watch: see `Watch`; it is given the frames of all cameras together.
+    Raises: as `open_video` and `detect`.
+    """
+    opened = {name: open_video(path, (stamps or {}).get(name)) for name, path in videos.items()}
+    watch = watch or _unwatched
+    if jobs == 1 or len(opened) < 2:
+        total = sum(video.count for video in opened.values())
+        seen: dict[str, list[tuple[float, Candidates]]] = {name: [] for name in opened}
+        steps = (step for name, video in opened.items() for step in _run(video, make(video), seen[name]))
+        for _ in watch(steps, total):
+            pass
+        return {name: Detections.of_frames(name, frames) for name, frames in seen.items()}
+    return _in_processes(opened, make, jobs, watch)
+
+
+def _in_processes(
+    videos: Mapping[str, Video], make: Callable[[Video], Detector], jobs: int, watch: Watch
+) -> dict[str, Detections]:
+    with multiprocessing.Manager() as manager:
+        told = manager.Queue()
+        pool = joblib.Parallel(n_jobs=min(jobs, len(videos)), return_as="generator")
+        found = pool(joblib.delayed(_job)(video, name, make, told) for name, video in videos.items())
+        for _ in watch(_told(told, len(videos)), sum(video.count for video in videos.values())):
+            pass
+        return dict(zip(videos, found, strict=True))
+
+
+def _job(video: Video, camera: str, make: Callable[[Video], Detector], told: Queue[int | None]) -> Detections:
+    """One camera, in a process of its own; says how many frames are done, and None at the end, come what may."""
+    cv2.setNumThreads(1)
+    try:
+        return detect(video, camera, make(video), partial(_telling, told))
+    finally:
+        told.put(None)
+
+
+def _telling(told: Queue[int | None], frames: Iterable[int], total: int) -> Iterator[int]:
+    number = 0
+    for number in frames:
+        if (number + 1) % TELLS == 0:
+            told.put(TELLS)
+        yield number
+    told.put((number + 1) % TELLS)
+
+
+def _told(told: Queue[int | None], running: int) -> Iterator[int]:
+    """Counts the frames that the processes say are done, until each has ended."""
+    number = 0
+    while running:
+        done = told.get()
+        if done is None:
+            running -= 1
+            continue
+        yield from range(number, number + done)
+        number += done
+
+
+def _run(video: Video, detector: Detector, seen: list[tuple[float, Candidates]]) -> Iterator[int]:
+    """Collects stamps and candidates; yields the number of each frame that is done."""
+    for number, (stamp, image) in enumerate(video.frames()):
+        candidates = detector(image)
+        if not isinstance(candidates, Candidates):
+            raise TypeError(
+                f"a detector must return Candidates; got {type(candidates).__name__} for frame {number}. "
+                "Make them with Candidates.at(pixels, sigma)."
+            )
+        seen.append((stamp, candidates))
+        yield number
+
+
+def _unwatched(frames: Iterable[int], total: int) -> Iterable[int]:
+    return frames

@@ -1,0 +1,205 @@
+"""What a camera saw: the candidates of one frame, the candidates of a recording, and the contract of a detector."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+_ROUNDING: Final = 1e-6
+"""Relative to the trace: a covariance that was computed in single precision is symmetric up to this."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """What may be a ball in one frame: k candidates, in any order. Arrays are copied, converted and checked.
+
+    Raises: ValueError: a wrong shape, a pixel that is not finite, a covariance that is not positive definite, a score
+        outside [0, 1]; the message names the field and the candidate.
+    """
+
+    pixels: Array
+    """(k, 2) px, where the ball's centre was in mid exposure; (0, 0) is the centre of the top left pixel."""
+
+    covariances: Array
+    """(k, 2, 2) px^2."""
+
+    scores: Array
+    """(k,) in [0, 1], how ball-like."""
+
+    streaks: Array
+    """(k, 2, 2) px, centre at the shutter's opening and closing, in unknown order; NaN where not blurred."""
+
+    def __post_init__(self) -> None:
+        _check_fields(self, "candidates")
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @classmethod
+    def none(cls) -> Candidates:
+        """Of a frame in which nothing looks like a ball."""
+        return cls(np.zeros((0, 2)), np.zeros((0, 2, 2)), np.zeros(0), np.zeros((0, 2, 2)))
+
+    @classmethod
+    def at(cls, pixels: ArrayLike, sigma: float, scores: ArrayLike | None = None) -> Candidates:
+        """Of a detector that gives centres only.
+
+        Args: pixels: (k, 2).  sigma: px, of each coordinate.  scores: (k,) in [0, 1]; 1 by default.
+        """
+        centres = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
+        count = len(centres)
+        covariances = np.tile(sigma**2 * np.eye(2), (count, 1, 1))
+        return cls(
+            centres,
+            covariances,
+            np.ones(count) if scores is None else np.asarray(scores, dtype=np.float64),
+            np.full((count, 2, 2), np.nan),
+        )
+
+
+Detector = Callable[[NDArray[np.uint8]], Candidates]
+"""Any callable from an image (h, w, 3) in BGR to its candidates. It may remember earlier frames: it is called once a
+frame, in their order, and serves one camera only."""
+
+
+@dataclass(frozen=True, eq=False)
+class Detections:
+    """All candidates of one camera over a recording, good and bad ones. Arrays are copied, converted and checked.
+
+    Raises: ValueError: as `Candidates`; stamps that do not increase, or frame numbers that are out of order or range.
+        TypeError: a name that is not text.
+    """
+
+    camera: str
+    """Name of the camera."""
+
+    frames: Array
+    """(f,) s, stamps of all frames, strictly increasing, as the camera writes them."""
+
+    frame: NDArray[np.int64]
+    """(n,) number of the frame in which each candidate was seen, not decreasing."""
+
+    pixels: Array
+    """(n, 2) px, where the ball's centre was in mid exposure; (0, 0) is the centre of the top left pixel."""
+
+    covariances: Array
+    """(n, 2, 2) px^2."""
+
+    scores: Array
+    """(n,) in [0, 1], how ball-like."""
+
+    streaks: Array
+    """(n, 2, 2) px, centre at the shutter's opening and closing, in unknown order; NaN where not blurred."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.camera, str):
+            raise TypeError(f"camera must be a name; got {self.camera!r}. Put it in quotes.")
+        what = f"detections of camera {self.camera!r}"
+        object.__setattr__(self, "frames", _numbers(what, "frames", self.frames, (np.asarray(self.frames).size,)))
+        _check_increasing(what, self.frames)
+        _check_fields(self, what)
+        frame = np.array(self.frame, dtype=np.int64)
+        if frame.shape != (len(self.pixels),):
+            raise ValueError(f"{what}: frame must have shape ({len(self.pixels)},); got {frame.shape}.")
+        if len(frame) and not (frame[0] >= 0 and frame[-1] < len(self.frames) and (np.diff(frame) >= 0).all()):
+            raise ValueError(
+                f"{what}: frame must be numbers from 0 to {len(self.frames) - 1} in order; got {frame.tolist()[:8]}. "
+                "Sort the candidates by frame."
+            )
+        frame.setflags(write=False)
+        object.__setattr__(self, "frame", frame)
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+    @property
+    def times(self) -> Array:
+        """(n,) s, the stamp of each candidate, as the camera writes it."""
+        return np.asarray(self.frames[self.frame])
+
+    def in_frame(self, number: int) -> Candidates:
+        """The candidates of one frame."""
+        rows = slice(*np.searchsorted(self.frame, (number, number + 1)))
+        return Candidates(self.pixels[rows], self.covariances[rows], self.scores[rows], self.streaks[rows])
+
+    def select(self, keep: NDArray[np.bool_]) -> Detections:
+        """Those candidates of which keep (n,) is true; all frames stay."""
+        return Detections(
+            self.camera,
+            self.frames,
+            self.frame[keep],
+            self.pixels[keep],
+            self.covariances[keep],
+            self.scores[keep],
+            self.streaks[keep],
+        )
+
+    def best_scores(self, count: int = 3) -> Array:
+        """The highest scores, best first; at most `count`, fewer where there are fewer candidates."""
+        return np.sort(self.scores)[::-1][:count].copy()
+
+    @classmethod
+    def of_frames(cls, camera: str, seen: Iterable[tuple[float, Candidates]]) -> Detections:
+        """Joins the candidates of frames, given with the frames' stamps (s) in their order."""
+        stamps: list[float] = []
+        found = [Candidates.none()]
+        for stamp, candidates in seen:
+            stamps.append(stamp)
+            found.append(candidates)
+        return cls(
+            camera,
+            np.array(stamps, dtype=np.float64),
+            np.repeat(np.arange(len(stamps)), [len(candidates) for candidates in found[1:]]),
+            np.concatenate([candidates.pixels for candidates in found]),
+            np.concatenate([candidates.covariances for candidates in found]),
+            np.concatenate([candidates.scores for candidates in found]),
+            np.concatenate([candidates.streaks for candidates in found]),
+        )
+
+
+def _numbers(what: str, field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
+    """A read-only copy in float64."""
+    array = np.array(value, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"{what}: {field} must have shape {shape}; got {array.shape}.")
+    array.setflags(write=False)
+    return array
+
+
+def _check_increasing(what: str, stamps: Array) -> None:
+    wrong = np.flatnonzero(~(np.diff(stamps) > 0.0))
+    if len(wrong):
+        i = int(wrong[0]) + 1
+        raise ValueError(
+            f"{what}: frames must be strictly increasing; frames[{i}]={stamps[i]} after {stamps[i - 1]}. "
+            "Sort the frames or correct the stamps."
+        )
+    if not np.isfinite(stamps).all():
+        raise ValueError(f"{what}: frames must be finite; got {stamps[~np.isfinite(stamps)][0]}.")
+
+
+def _check_fields(owner: Candidates | Detections, what: str) -> None:
+    """What the candidates of a frame and those of a recording have in common."""
+    count = len(np.asarray(owner.pixels))
+    shapes = {"pixels": (count, 2), "covariances": (count, 2, 2), "scores": (count,), "streaks": (count, 2, 2)}
+    for field, shape in shapes.items():
+        object.__setattr__(owner, field, _numbers(what, field, getattr(owner, field), shape))
+    for field in ("pixels", "covariances", "scores"):
+        finite = np.isfinite(getattr(owner, field))
+        _refuse(~finite.all(axis=tuple(range(1, finite.ndim))), what, field, "be finite")
+    c = owner.covariances
+    definite = (c[:, 0, 0] > 0.0) & (c[:, 0, 0] * c[:, 1, 1] > c[:, 0, 1] * c[:, 1, 0])
+    skew = np.abs(c[:, 0, 1] - c[:, 1, 0]) > _ROUNDING * (c[:, 0, 0] + c[:, 1, 1])
+    _refuse(~definite | skew, what, "covariances", "be symmetric and positive definite")
+    _refuse((owner.scores < 0.0) | (owner.scores > 1.0), what, "scores", "lie in [0, 1]")
+
+
+def _refuse(wrong: NDArray[np.bool_], what: str, field: str, rule: str) -> None:
+    if wrong.any():
+        raise ValueError(f"{what}: {field} must {rule}; those of candidate {int(np.argmax(wrong))} do not.")

@@ -1,0 +1,137 @@
+"""Candidates from a table: `detections.csv`, of a detector of any kind, as a recording of each camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+from numpy.typing import NDArray
+
+from ballfg.tracks import csv_errors
+from ballfg.tracks.detections_file import CAMERA, NOISE, SCORE, UNSTATED
+from ballfg.tracks.hints import did_you_mean
+from ballfg.tracks.rows import KEY
+from ballfg.vision.camera import Camera
+from ballfg.vision.detections import Detections
+
+Array = NDArray[np.float64]
+
+REQUIRED: Final = ("t", CAMERA, "u", "v")
+OPTIONAL: Final = (*NOISE, SCORE)
+UNUSED: Final = (KEY,)
+"""Columns that may be there and are not needed: which ball a row belongs to is found anew."""
+SURE: Final = 1.0
+"""Score of all rows of a table without one: somebody has chosen them."""
+_RULES: Final = {
+    "sigma_u": ("positive", lambda x: x > 0.0),
+    "sigma_v": ("positive", lambda x: x > 0.0),
+    "rho_uv": ("between -1 and 1", lambda x: np.abs(x) < 1.0),
+    "score": ("0 to 1", lambda x: (x >= 0.0) & (x <= 1.0)),
+}
+
+
+def read_detections(
+    path: Path, cameras: Sequence[Camera], ignored: Sequence[str] = ()
+) -> tuple[list[Detections], list[str]]:
+    """The candidates of each camera.
+
+    A camera's frames are the stamps at which it has a row: rows at one stamp are candidates of one frame. The order of
+    rows is free.
+
+    Args:
+        path: `t` (s, as the camera writes it), `camera`, `u`, `v` (px), optionally `sigma_u`, `sigma_v` (px), `rho_uv`
+            and `score`.
+        cameras: of the rig.
+        ignored: names of cameras whose rows are passed over.
+    Returns: detections in the order of the cameras, and what was ignored, one sentence each.
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a column that is missing, a cell out of its range, an unknown camera, a camera without rows; the
+            message names file, line and column.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: must be a table of detections; there is none. Correct the path.")
+    header = csv_errors.read_header(path)
+    _check_header(path, header)
+    names, values = _read(path, [name for name in header if name in (*REQUIRED, *OPTIONAL)])
+    _check_values(path, values)
+    _check_cameras(path, names, cameras, ignored)
+    known = (*REQUIRED, *OPTIONAL, *UNUSED)
+    notes = [f"{path.name}: column {name!r} ignored" for name in header if name not in known]
+    return [_of_camera(camera.name, names == camera.name, values) for camera in cameras], notes
+
+
+def _check_header(path: Path, header: Sequence[str]) -> None:
+    for name in REQUIRED:
+        if name not in header:
+            raise ValueError(
+                f"{path}: column {name!r} is missing; expected {','.join(REQUIRED)}, got {','.join(header)}. "
+                f"Add or rename it.{did_you_mean(name, [other for other in header if other not in REQUIRED])}"
+            )
+    twice = [name for name in (*REQUIRED, *OPTIONAL) if list(header).count(name) > 1]
+    if twice:
+        raise ValueError(f"{path}: column {twice[0]!r} must appear once; got {','.join(header)}. Rename one of them.")
+
+
+def _read(path: Path, columns: Sequence[str]) -> tuple[NDArray[np.str_], dict[str, Array]]:
+    """(n,) names of the cameras, and the numbers (n,) of each other column."""
+    numeric = [name for name in columns if name != CAMERA]
+    convert = pa_csv.ConvertOptions(
+        column_types={CAMERA: pa.string(), **dict.fromkeys(numeric, pa.float64())},
+        include_columns=list(columns),
+        null_values=[],
+    )
+    try:
+        table = pa_csv.read_csv(path, pa_csv.ReadOptions(use_threads=False), convert_options=convert)
+    except pa.ArrowInvalid as error:
+        raise csv_errors.explain(path, numeric, str(error)) from None
+    values = {name: np.asarray(table.column(name).to_numpy(), dtype=np.float64) for name in numeric}
+    unstated = UNSTATED | {SCORE: SURE}
+    values |= {name: np.full(table.num_rows, value) for name, value in unstated.items() if name not in values}
+    return np.array(table.column(CAMERA).to_pylist(), dtype=np.str_), values
+
+
+def _check_values(path: Path, values: dict[str, Array]) -> None:
+    for name, column in values.items():
+        rule, holds = _RULES.get(name, ("finite", np.isfinite))
+        wrong = ~(np.isfinite(column) & holds(column))
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            (line,) = csv_errors.lines_of_rows(path, [row])
+            raise ValueError(
+                f"{path}, line {line}, column {name!r}: must be {rule}; got {column[row]:g}. "
+                "Correct it or delete the line."
+            )
+
+
+def _check_cameras(path: Path, names: NDArray[np.str_], cameras: Sequence[Camera], ignored: Sequence[str]) -> None:
+    known = [camera.name for camera in cameras]
+    strange = ~np.isin(names, [*known, *ignored])
+    if strange.any():
+        row = int(np.argmax(strange))
+        (line,) = csv_errors.lines_of_rows(path, [row])
+        raise ValueError(
+            f"{path}, line {line}, column 'camera': must be a camera: {', '.join(known)}; got {str(names[row])!r}. "
+            f"Rename it, add it to the cameras' file, or delete its rows.{did_you_mean(str(names[row]), known)}"
+        )
+    blind = [name for name in known if not (names == name).any()]
+    if blind:
+        raise ValueError(
+            f"{path}: every camera must have rows; got none of {' and '.join(map(repr, blind))}. "
+            f"Add them, or leave the camera out with --without {blind[0]}."
+        )
+
+
+def _of_camera(name: str, rows: NDArray[np.bool_], values: dict[str, Array]) -> Detections:
+    mine = {column: numbers[rows] for column, numbers in values.items()}
+    frames, frame = np.unique(mine["t"], return_inverse=True)
+    order = np.argsort(frame, kind="stable")
+    across = mine["rho_uv"] * mine["sigma_u"] * mine["sigma_v"]
+    covariances = np.stack((mine["sigma_u"] ** 2, across, across, mine["sigma_v"] ** 2), axis=-1).reshape(-1, 2, 2)
+    pixels = np.column_stack((mine["u"], mine["v"]))
+    streaks = np.full((len(order), 2, 2), np.nan)
+    return Detections(name, frames, frame[order], pixels[order], covariances[order], mine["score"][order], streaks)

@@ -1,0 +1,177 @@
+"""The detector that ballfg brings: background, regions, a swept disc fitted to each, a score of how ball-like it is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final, Literal
+
+import numpy as np
+
+from ballfg.vision.background import Array, Background, Image
+from ballfg.vision.detections import Candidates
+from ballfg.vision.regions import Region, find_regions
+from ballfg.vision.scoring import score
+from ballfg.vision.streak import LOOK, Look, Patch, StreakFit, fit_streak, start
+
+Colour = Literal["white", "orange"]
+
+MODEL_ERROR: Final = 0.02
+"""px per px of blotches, sigma that every centre has besides the noise's: the disc's edge is not quite the lens's, and
+compression, which makes the blotches, moves edges."""
+LEARNS: Final = 0.8
+"""Score from which a candidate teaches what edge and shading to expect."""
+FORGETS: Final = 0.98
+"""Of what was learned, per teaching candidate: the light on the ball changes as it flies."""
+SUREST: Final = (0.15, 0.08, 0.08)
+"""Least sigmas of the expected edge (px) and shading: they change along a flight, and may be learned wrong."""
+VISIBLE_STREAK: Final = 3.0
+"""px, and sigmas of its length: a shorter streak is given as not blurred, since its direction is chance."""
+
+
+@dataclass(frozen=True)
+class DetectorSettings:
+    """What is known about the balls' images.
+
+    Raises: ValueError: sizes that are not positive or out of order, an unknown colour.
+    """
+
+    diameter: tuple[float, float] = (4.0, 40.0)
+    """px, least and greatest diameter."""
+
+    longest_streak: float = 60.0
+    """px that a ball moves at most while the shutter is open."""
+
+    colour: Colour | None = None
+    """Of the ball; None: any, lighter or darker than what is behind it."""
+
+    most: int = 6
+    """Candidates per frame that are looked at closely."""
+
+    def __post_init__(self) -> None:
+        low, high = self.diameter
+        if not 0.0 < low < high < np.inf:
+            raise ValueError(f"diameter must be two increasing positive numbers, px; got {self.diameter}.")
+        if not 0.0 <= self.longest_streak < np.inf:
+            raise ValueError(f"longest_streak must be positive or zero, px; got {self.longest_streak}.")
+        if self.colour not in (None, "white", "orange"):
+            raise ValueError(f"colour must be 'white', 'orange' or None; got {self.colour!r}. None takes any colour.")
+        if self.most < 1:
+            raise ValueError(f"most must be at least 1; got {self.most}.")
+
+
+class BallDetector:
+    """Finds small fast balls before a background that hardly moves. One per camera; call it with each frame in order.
+
+    Args: background: of the camera.  settings: what is known about the ball.
+    """
+
+    def __init__(self, background: Background, settings: DetectorSettings | None = None) -> None:
+        self.background = background
+        self.settings = settings or DetectorSettings()
+        self._look = Look.unknown()
+
+    @classmethod
+    def learn(cls, images: Sequence[Image], settings: DetectorSettings | None = None) -> BallDetector:
+        """From frames spread over the recording, see `Background`."""
+        return cls(Background(images), settings)
+
+    def __call__(self, image: Image) -> Candidates:
+        """The candidates of the next frame (h, w, 3) in BGR.
+
+        Raises: ValueError: an image of another size than the background's.
+        """
+        if image.shape != self.background.full.shape:
+            raise ValueError(
+                f"image must have the background's shape {self.background.full.shape}; got {image.shape}. "
+                "Learn a detector for each camera."
+            )
+        known = self.settings
+        regions = find_regions(self.background, image, known.diameter[1], known.longest_streak, known.most)
+        rated = [found for region in regions if (found := self._fitted(image, region)) is not None]
+        for fit, rating in rated:
+            if rating >= LEARNS:
+                self._look = learned(self._look, fit, self.background.blotches)
+        return _candidates(rated, MODEL_ERROR * self.background.blotches)
+
+    def _fitted(self, image: Image, region: Region) -> tuple[StreakFit, float] | None:
+        """The swept disc that explains a region, in pixels of the image, and its score; None where none does."""
+        behind = self.background.patch(region.rows, region.columns)
+        change = region.free_of(image[region.rows, region.columns] - behind)
+        behind = region.free_of(behind)
+        patch = patch_of(change, behind, region, self.background.noise)
+        first = None if patch is None else start(patch, self._look)
+        if patch is None or first is None or not self._plausible(first):
+            return None
+        fit = fit_streak(patch, first, self._look)
+        height, width = self.background.shape
+        x, y = fit.centre
+        if not (-0.5 <= x < width - 0.5 and -0.5 <= y < height - 0.5 and self._plausible(fit.values)):
+            return None
+        fit = replace(fit, covariance=fit.covariance * self.background.blotches)
+        return fit, score(fit, patch, change, behind, self.settings.diameter, self.settings.colour)
+
+    def _plausible(self, values: Array) -> bool:
+        """Whether radius and streak are within a factor of two of what is asked for."""
+        low, high = self.settings.diameter
+        return bool(low / 4.0 <= values[4] <= high and np.hypot(*values[2:4]) <= self.settings.longest_streak)
+
+
+def patch_of(change: np.ndarray, behind: np.ndarray, region: Region, noise: Array) -> Patch | None:
+    """The region's pixels along the colour by which it differs from its background; None where it does not.
+
+    Args:
+        change, behind: (m, 3) grey levels, difference to the background and the background, of the free pixels.
+        region: where they are.
+        noise: (3, 3) grey levels^2, covariance of the channels.
+    """
+    strength = np.abs(change).max(axis=1)
+    colour = change[strength > 0.5 * strength.max()].mean(axis=0).astype(np.float64)
+    direction = np.linalg.solve(noise, colour)
+    length = np.linalg.norm(direction)
+    if not length > 0.0:
+        return None
+    direction /= length
+    along = direction.astype(np.float32)
+    shade = behind @ along
+    return Patch(
+        *region.places(),
+        change @ along,
+        shade - shade.mean(),
+        float(shade.mean()),
+        float(np.sqrt(direction @ noise @ direction)),
+    )
+
+
+def learned(look: Look, fit: StreakFit, blotches: float) -> Look:
+    """What to expect after another ball was seen: means weighted by information, which ages towards the first.
+
+    Args: look: expected up to now.  fit: made with it.  blotches: px across which noise is shared.
+    """
+    doubt = max(fit.scatter, 1.0) ** 2 * blotches
+    first = Look.unknown()
+    old = FORGETS * (look.information - first.information)
+    pull = (look.information + fit.tells) @ (fit.values[LOOK] - look.mean) / doubt
+    new = fit.tells / doubt
+    information = first.information + old + new
+    mean = np.linalg.solve(information, first.information @ first.mean + (old + new) @ look.mean + pull)
+    scale = np.minimum(1.0, np.array(SUREST) ** -1.0 / np.sqrt(np.diagonal(information)))
+    return Look(np.asarray(mean, dtype=np.float64), information * np.outer(scale, scale))
+
+
+def _candidates(rated: Sequence[tuple[StreakFit, float]], floor: float) -> Candidates:
+    """Of the fits of a frame with their scores; floor: px, sigma added to that of each centre."""
+    if not rated:
+        return Candidates.none()
+    covariances = np.stack([fit.covariance for fit, _ in rated])
+    centres = np.stack([fit.centre for fit, _ in rated])
+    halves = np.stack([fit.half for fit, _ in rated])
+    lengths = 2.0 * np.hypot(halves[:, 0], halves[:, 1])
+    spread = 2.0 * np.sqrt(np.trace(covariances[:, 2:4, 2:4], axis1=1, axis2=2))
+    halves[(lengths < VISIBLE_STREAK) | (lengths < VISIBLE_STREAK * spread)] = np.nan
+    return Candidates(
+        centres,
+        covariances[:, :2, :2] + floor**2 * np.eye(2),
+        np.array([rating for _, rating in rated]),
+        np.stack((centres - halves, centres + halves), axis=1),
+    )

@@ -1,0 +1,72 @@
+"""A detector of one's own, from a Python file."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from types import ModuleType
+
+from ballfg.tracks.hints import did_you_mean
+from ballfg.vision.detections import Detector
+from ballfg.vision.video import Video
+
+Maker = Callable[[Video], Detector]
+"""Makes the detector of a camera from its video."""
+
+
+def load_detector(text: str) -> Maker:
+    """Runs a Python file and takes a detector from it: a function of an image, or a class of such things.
+
+    Args: text: `FILE.py:NAME`; the file is one that you trust: all of its code runs.
+    Returns: what makes the detector of a camera, fit to be sent to other processes: the function as it is, or an
+        instance of the class, made without arguments.
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a text of another form, a file that does not run, or a name that is no callable of it.
+    """
+    file, colon, name = text.rpartition(":")
+    if not (colon and file and name.isidentifier()):
+        raise ValueError(f"detector must be FILE.py:NAME; got {text!r}. Name the callable after a colon.")
+    path = Path(file).resolve()
+    if not path.is_file():
+        raise FileNotFoundError(f"detector: {path} does not exist. A detector of one's own is one Python file.")
+    found = vars(_run(path))
+    if not callable(found.get(name)):
+        own = [word for word, item in found.items() if callable(item) and not word.startswith("_")]
+        problem = "is not callable" if name in found else "is not defined there"
+        raise ValueError(
+            f"{path} must define the callable {name!r}; it {problem}. Correct the name.{did_you_mean(name, own)}"
+        )
+    return partial(_made, found[name])
+
+
+def _made(found: Detector | type[Detector], video: Video) -> Detector:
+    """The detector of a camera, which serves no other; `video` is what makers are called with."""
+    return found() if isinstance(found, type) else found
+
+
+def _run(path: Path) -> ModuleType:
+    """The module of a file, under a name that no import finds: other processes then get its functions as a whole."""
+    module = ModuleType(f"ballfg detector {path}")
+    sys.modules[module.__name__] = module  # dataclasses look their module up
+    try:
+        exec(compile(path.read_bytes(), path, "exec"), module.__dict__)
+    except Exception as error:  # whatever the user's code raises is the user's to mend
+        raise ValueError(f"{path} must run as Python; {_where(error, path)}. Mend it there.") from error
+    finally:
+        del sys.modules[module.__name__]
+    return module
+
+
+def _where(error: Exception, path: Path) -> str:
+    """What happened, and in which line of the file."""
+    if isinstance(error, SyntaxError) and error.filename == str(path):
+        return f"line {error.lineno}: SyntaxError: {error.msg}"
+    line, trace = "", error.__traceback__
+    while trace is not None:
+        if trace.tb_frame.f_code.co_filename == str(path):
+            line = f"line {trace.tb_lineno}: "
+        trace = trace.tb_next
+    return f"{line}{type(error).__name__}: {error}"

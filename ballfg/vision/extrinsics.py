@@ -1,0 +1,210 @@
+"""Where a camera stands: its pose from points of the world that it sees, for instance the table's corners."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.vision.camera import Camera
+from ballfg.vision.table_points import Marked
+
+Array = NDArray[np.float64]
+
+MIN_POINTS: Final = 4
+"""Three points have up to four poses."""
+FLAT: Final = 0.01
+"""Of the points' extent: less out of line or out of plane than that is none at all."""
+MAX_RMS: Final = 10.0
+"""Times the sigma of a pixel: beyond it a point has a wrong name or stands elsewhere."""
+CLEARLY: Final = 9.0
+"""By which the second best pose must be worse, in sums of squared whitened residuals: three sigmas."""
+_REFINE: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+
+
+@dataclass(frozen=True, eq=False)
+class Extrinsics:
+    """A camera whose place is known."""
+
+    camera: Camera
+
+    marked: Marked
+    """What it was found from."""
+
+    covariance: Array
+    """(6, 6) of a small turn of the camera about the world's axes (rad) and of its centre (m), for an exact lens."""
+
+    @property
+    def residuals(self) -> Array:
+        """(n, 2) px, points as seen minus as projected."""
+        return np.asarray(self.marked.pixels - self.camera.project(self.marked.points))
+
+    @property
+    def rms(self) -> float:
+        """px, root mean square length of the residuals."""
+        return _rms(self.residuals)
+
+    @property
+    def turn_sigma(self) -> float:
+        """rad, standard deviation of the camera's direction: of its worst axis."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3])[-1]))
+
+    @property
+    def centre_sigma(self) -> float:
+        """m, standard deviation of the camera's place: along its worst axis."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:])[-1]))
+
+
+def calibrate_extrinsics(lens: Camera, marked: Marked) -> Extrinsics:
+    """The lens put where it sees the marked points where they were seen.
+
+    Every pose that could be meant is refined: a flat target has two. One from which the points would be seen from
+    below is not meant.
+
+    Args:
+        lens: a camera; its pose has no part.
+        marked: at least four points, not in one line.
+    Raises: ValueError: too few points or all in a line, none in the image, no pose that explains them, or two that
+        do; the message names the camera.
+    Source: T. Collins, A. Bartoli, "Infinitesimal plane-based pose estimation", IJCV 109, 2014 (OpenCV's IPPE);
+        for points out of a plane G. Terzakis, M. Lourakis, "A consistently fast and globally optimal solution to the
+        perspective-n-point problem", ECCV 2020 (SQPNP).
+    """
+    flat = _check_points(lens, marked)
+    poses = sorted(_poses(lens, marked, flat), key=lambda camera: _squares(camera, marked))
+    above = [camera for camera in poses if not flat or _is_above(camera, marked.points)]
+    if not above:
+        raise ValueError(
+            f"camera {lens.name!r}: points must be seen from above; these are mirrored, as if seen from below. "
+            "Swap left and right, or correct the points."
+        )
+    best = Extrinsics(above[0], marked, np.zeros((6, 6)))
+    _check_fit(best)
+    if len(above) > 1 and _squares(above[1], marked) - _squares(above[0], marked) < CLEARLY and _apart(*above[:2]):
+        raise ValueError(
+            f"camera {lens.name!r}: points must tell one pose; two explain them alike. "
+            "Mark more points, farther apart or at other heights."
+        )
+    return replace(best, covariance=_covariance(best))
+
+
+def _check_points(lens: Camera, marked: Marked) -> bool:
+    """Whether the points lie in a plane; refuses those that cannot tell a pose."""
+    if len(marked.points) < MIN_POINTS:
+        raise ValueError(
+            f"camera {lens.name!r}: at least {MIN_POINTS} points must be marked; got {len(marked.points)} "
+            f"({', '.join(marked.names)}). Mark more."
+        )
+    extent = np.linalg.svd(marked.points - marked.points.mean(axis=0), compute_uv=False)
+    seen = np.linalg.svd(marked.pixels - marked.pixels.mean(axis=0), compute_uv=False)
+    if extent[1] < FLAT * extent[0] or seen[1] < FLAT * seen[0]:
+        raise ValueError(
+            f"camera {lens.name!r}: points must not lie in one line; {', '.join(marked.names)} do. "
+            "Mark points on both sides of the table."
+        )
+    inside = ((marked.pixels >= -0.5) & (marked.pixels <= np.array(lens.size) - 0.5)).all(axis=1)
+    if not inside.all():
+        first = int(np.argmin(inside))
+        raise ValueError(
+            f"camera {lens.name!r}: pixels must lie in the image of {lens.size[0]}x{lens.size[1]}; "
+            f"{marked.names[first]} is at {marked.pixels[first].tolist()}. Correct it, or the camera's size."
+        )
+    return bool(extent[2] < FLAT * extent[1])
+
+
+def _poses(lens: Camera, marked: Marked, flat: bool) -> list[Camera]:
+    """Refined poses, those of the camera in front of the points."""
+    points, pixels = np.ascontiguousarray(marked.points), np.ascontiguousarray(marked.pixels)
+    given = (points, pixels, lens.matrix, lens.distortion)
+    method = cv2.SOLVEPNP_IPPE if flat else cv2.SOLVEPNP_SQPNP
+    try:
+        _, rvecs, tvecs, _ = cv2.solvePnPGeneric(*given, flags=method)
+        refined = [
+            cv2.solvePnPRefineLM(*given, rvec.copy(), tvec.copy(), criteria=_REFINE)
+            for rvec, tvec in zip(rvecs, tvecs, strict=True)
+        ]
+    except cv2.error:
+        refined = []
+    cameras = [
+        replace(lens, rvec=np.ravel(rvec), tvec=np.ravel(tvec))
+        for rvec, tvec in refined
+        if np.isfinite(rvec).all() and np.isfinite(tvec).all()
+    ]
+    cameras = [camera for camera in cameras if (camera.depth(points) > 0.0).all()]
+    if not cameras:
+        raise ValueError(
+            f"camera {lens.name!r}: points must be explained by some pose; there is none with them all in front of "
+            "the camera. Check which point is which."
+        )
+    return cameras
+
+
+def _squares(camera: Camera, marked: Marked) -> float:
+    """Sum of squared whitened residuals."""
+    return float(((camera.project(marked.points) - marked.pixels) ** 2).sum() / marked.sigma**2)
+
+
+def _is_above(camera: Camera, points: Array) -> bool:
+    """Whether the camera stands above the points' plane; one upright has two sides that are both good."""
+    centre = points.mean(axis=0)
+    normal = np.linalg.svd(points - centre)[2][2]
+    return bool((camera.centre - centre) @ normal * normal[2] >= 0.0)
+
+
+def _apart(one: Camera, other: Camera) -> bool:
+    """Whether two poses are not the same one found twice."""
+    return bool(np.linalg.norm(one.centre - other.centre) > FLAT * np.linalg.norm(one.tvec))
+
+
+def _rms(residuals: Array) -> float:
+    return float(np.sqrt((residuals**2).sum(axis=1).mean()))
+
+
+def _check_fit(found: Extrinsics) -> None:
+    if found.rms <= MAX_RMS * found.marked.sigma:
+        return
+    culprit = _culprit(found)
+    raise ValueError(
+        f"camera {found.camera.name!r}: points must be explained within {MAX_RMS * found.marked.sigma:g} px; "
+        f"got {found.rms:.1f}. {culprit}Check names and pixels, and that the lens is this camera's."
+    )
+
+
+def _culprit(found: Extrinsics) -> str:
+    """A sentence that names the one point without which all is well, if there is one."""
+    marked = found.marked
+    for i in range(len(marked.names)):
+        rest = Marked(
+            (*marked.names[:i], *marked.names[i + 1 :]),
+            np.delete(marked.points, i, axis=0),
+            np.delete(marked.pixels, i, axis=0),
+            marked.sigma,
+        )
+        if len(rest.names) <= MIN_POINTS:
+            return ""
+        cameras = _poses(found.camera, rest, _check_points(found.camera, rest))
+        if min(_rms(camera.project(rest.points) - rest.pixels) for camera in cameras) <= MAX_RMS / 3 * marked.sigma:
+            return f"Without {marked.names[i]!r} the others agree. "
+    return ""
+
+
+def _covariance(found: Extrinsics) -> Array:
+    """(6, 6) of a small turn about the world's axes and of the centre, from the slope of the pixels by both."""
+    camera, marked = found.camera, found.marked
+    projected = cv2.projectPoints(marked.points, camera.rvec, camera.tvec, camera.matrix, camera.distortion)
+    by_pose = np.asarray(projected[1], dtype=np.float64)[:, :6]
+    rotation, slope = cv2.Rodrigues(camera.rvec)
+    slopes = np.asarray(slope, dtype=np.float64).reshape(3, 3, 3)  # of the rotation, by the three of rvec
+    turns = np.stack([_axis(rotation.T @ by_r) for by_r in slopes], axis=1)
+    centres = np.stack([-by_r.T @ camera.tvec for by_r in slopes], axis=1)
+    moved = np.block([[turns, np.zeros((3, 3))], [centres, -rotation.T]])
+    sigma = max(marked.sigma, found.rms / np.sqrt(2.0))
+    return np.asarray(sigma**2 * moved @ np.linalg.inv(by_pose.T @ by_pose) @ moved.T)
+
+
+def _axis(skew: Array) -> Array:
+    """(3,) vector whose cross product is the skew matrix (3, 3)."""
+    return np.array([skew[2, 1] - skew[1, 2], skew[0, 2] - skew[2, 0], skew[1, 0] - skew[0, 1]]) / 2.0

@@ -1,0 +1,102 @@
+"""Balls in the making: which candidates of which camera are one ball, and the points in space that they make."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.vision.camera import Camera
+from ballfg.vision.clock import nearest
+from ballfg.vision.detections import Detections
+from ballfg.vision.paths import Path, path
+from ballfg.vision.triangulate import triangulate
+
+Array = NDArray[np.float64]
+Rows = NDArray[np.int64]
+
+SAME_SHUTTER: Final = 2e-4
+"""s, stamps of different cameras that are closer belong to one shutter: at 15 m/s the ball moves 3 mm."""
+
+
+@dataclass(frozen=True, eq=False)
+class Footage:
+    """A recording: what its cameras saw, on one clock."""
+
+    cameras: Sequence[Camera]
+    detections: Sequence[Detections]
+    """One for each camera, in the cameras' order."""
+    shared: Array | None
+    """(k,) s, true time of the stamps if the cameras share a shutter."""
+    interpolate: bool
+    """Whether a camera is asked where the ball was at another's stamp; else its nearest frame is taken."""
+    offset: float = 0.0
+    """px, error of the calibration, added to every pixel's noise."""
+
+    def frames(self, camera: int) -> Array:
+        """(f,) s, true times of a camera's frames."""
+        return np.asarray(self.detections[camera].frames - self.cameras[camera].time_offset)
+
+    def path(self, camera: int, rows: Rows) -> Path:
+        """Candidates of one camera as a path over true time."""
+        seen = self.detections[camera]
+        return path(self.frames(camera)[seen.frame[rows]], seen.pixels[rows], seen.covariances[rows])
+
+
+@dataclass(frozen=True, eq=False)
+class Gathered:
+    """A ball in the making."""
+
+    rows: tuple[Rows, ...]
+    """For each camera the numbers of its candidates, ascending; never two of one frame."""
+    track: Path
+    """Its points in space over true time, with the covariances that noise gives them."""
+    covariances: Array
+    """(n, 3, 3) m^2, the calibration's error included."""
+    views: NDArray[np.int64]
+    """(n,) cameras that made each point."""
+
+
+def gather(footage: Footage, rows: Sequence[Rows]) -> Gathered:
+    """The points that candidates of several cameras make; none where fewer than two agree.
+
+    Args: rows: for each camera the numbers of its candidates, one a frame at most, ascending.
+    """
+    times = _stamps(footage, rows)
+    pixels = np.full((len(times), len(rows), 2), np.nan)
+    covariances = np.full((len(times), len(rows), 2, 2), np.nan)
+    for camera, mine in enumerate(rows):
+        if len(mine) and len(times):
+            pixels[:, camera], covariances[:, camera] = _seen_at(footage, camera, mine, times)
+    made = triangulate(footage.cameras, pixels, covariances + footage.offset**2 * np.eye(2))
+    found = np.isfinite(made.points).all(axis=1)
+    used = made.used[found]
+    noise = np.trace(covariances[found], axis1=2, axis2=3) / 2.0
+    share = np.mean(noise / (noise + footage.offset**2), axis=1, where=used)
+    track = path(times[found], made.points[found], made.covariances[found] * share[:, None, None])
+    return Gathered(tuple(rows), track, made.covariances[found], used.sum(axis=1).astype(np.int64))
+
+
+def _stamps(footage: Footage, rows: Sequence[Rows]) -> Array:
+    """(k,) s, true times at which a point is wanted: stamps of the shared shutter or of the camera that saw most."""
+    most = int(np.argmax([len(mine) for mine in rows]))
+    stamps = footage.shared if footage.shared is not None else footage.frames(most)
+    seen = [footage.frames(c)[footage.detections[c].frame[mine[[0, -1]]]] for c, mine in enumerate(rows) if len(mine)]
+    if not seen:
+        return np.zeros(0)
+    first, last = np.min(seen), np.max(seen)
+    return np.asarray(stamps[(stamps >= first - SAME_SHUTTER) & (stamps <= last + SAME_SHUTTER)])
+
+
+def _seen_at(footage: Footage, camera: int, rows: Rows, times: Array) -> tuple[Array, Array]:
+    """Where a camera saw the ball at some times: pixels (k, 2) and covariances (k, 2, 2); NaN where it did not."""
+    line = footage.path(camera, rows)
+    if footage.interpolate:
+        return line.at(times)
+    near = nearest(line.times, times)
+    taken = np.abs(line.times[near] - times) <= 0.5 * float(np.median(np.diff(footage.frames(camera))))
+    pixels = np.where(taken[:, None], line.values[near], np.nan)
+    return pixels, np.where(taken[:, None, None], line.covariances[near], np.nan)

@@ -1,0 +1,294 @@
+"""The lens of a camera from views of a board: OpenCV's calibration, and whether the views can tell what it says."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.vision.boards import View
+from ballfg.vision.camera import DISTORTIONS, Camera
+from ballfg.vision.lens_covariance import covariance_of_lens, pixel_grid, sigma_of_rays
+
+Array = NDArray[np.float64]
+
+MIN_VIEWS: Final = 8
+"""A view tells two numbers about the lens (Zhang 2000, section 2.3); eight are enough to tell errors from the lens."""
+MIN_TURN: Final = np.radians(10.0)
+"""rad that some two boards must be turned against each other. Parallel boards cannot tell a long lens from a near
+board: OpenCV then reports tiny deviations of a focal length that is wrong by half."""
+MAX_FOCAL_SIGMA: Final = 0.02
+"""Relative standard deviation of the focal length: 2 % are 6 cm at a distance of 3 m."""
+MIN_COVERAGE: Final = 0.4
+"""Of the image's cells that hold corners: outside, the distortion is not measured but extrapolated."""
+CELLS: Final = (8, 5)
+"""Across and down, into which the image is divided for that."""
+OUTLYING: Final = 3.0
+"""Times the median of the views' errors: a view beyond it has a wrong corner or moved while it was exposed."""
+MIN_OUTLYING: Final = 0.15
+"""px. A view as good as that is kept, however good the others are."""
+MAX_LEFT_OUT: Final = 1 / 3
+"""Of the views: if more disagree with the rest, it is not they that are wrong."""
+MAX_RAY_SIGMA: Final = 1.0
+"""px, standard deviation of where the lens puts a ray: 3 mm at a distance of 3 m."""
+RAYS: Final = 0.95
+"""Of the image in which that must hold: the outermost corners of a wide lens hardly ever see a board."""
+MAX_FOLD: Final = 0.05
+"""px. Distortion undone and done again must lead back to each pixel, or the model folds the image there."""
+_CRITERIA: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-12)
+_FIX_RADIAL: Final = cv2.CALIB_FIX_K1 | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
+_FLAGS: Final = {
+    0: _FIX_RADIAL | cv2.CALIB_ZERO_TANGENT_DIST,
+    4: cv2.CALIB_FIX_K3,
+    5: 0,
+    8: cv2.CALIB_RATIONAL_MODEL,
+    12: cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL,
+    14: cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_THIN_PRISM_MODEL | cv2.CALIB_TILTED_MODEL,
+}
+
+
+@dataclass(frozen=True, eq=False)
+class FittedView:
+    """A view with the pose of its board and what the lens leaves of it."""
+
+    view: View
+
+    rvec: Array
+    """(3,) rad, rotation from the board to the camera."""
+
+    tvec: Array
+    """(3,) m, the board's origin in the camera's frame."""
+
+    residuals: Array
+    """(n, 2) px, corners as seen minus as projected."""
+
+    @property
+    def normal(self) -> Array:
+        """(3,) the board's normal in the camera's frame."""
+        return np.asarray(cv2.Rodrigues(self.rvec)[0], dtype=np.float64)[:, 2]
+
+    @property
+    def rms(self) -> float:
+        """px, root mean square length of the residuals."""
+        return float(np.sqrt((self.residuals**2).sum(axis=1).mean()))
+
+
+@dataclass(frozen=True, eq=False)
+class Intrinsics:
+    """A calibrated lens."""
+
+    camera: Camera
+    """At the world's origin, unturned: its place is not known."""
+
+    covariance: Array
+    """(4 + k, 4 + k) of fx, fy, cx, cy (px) and the k coefficients of the distortion."""
+
+    views: tuple[FittedView, ...]
+    """Those that it rests on."""
+
+    left_out: tuple[FittedView, ...]
+    """Those that disagree with them, in the order in which that was found."""
+
+    missed: tuple[str, ...]
+    """Names of the images in which no board was found."""
+
+    coverage: float
+    """Share of the image's cells that hold corners."""
+
+    @property
+    def sigmas(self) -> Array:
+        """(4 + k,) standard deviations of fx, fy, cx, cy (px) and the coefficients of the distortion."""
+        return np.asarray(np.sqrt(np.diag(self.covariance)))
+
+    @property
+    def ray_sigma(self) -> tuple[float, float]:
+        """px, standard deviation of where the lens puts a ray: the most in `RAYS` of the image, and in all of it."""
+        sigmas = np.sort(sigma_of_rays(self.camera, self.covariance))
+        return float(sigmas[int(RAYS * (len(sigmas) - 1))]), float(sigmas[-1])
+
+    @property
+    def rms(self) -> float:
+        """px, root mean square length of the residuals of `views`."""
+        return float(np.sqrt((np.concatenate([v.residuals for v in self.views]) ** 2).sum(axis=1).mean()))
+
+
+def calibrate_intrinsics(name: str, views: Sequence[View], distortion: int = 5) -> Intrinsics:
+    """Matrix and distortion of a camera.
+
+    Args:
+        name: of the camera.
+        views: of one board that lay at different places, turned differently; those without corners are counted only.
+        distortion: how many coefficients: 0, 4, 5, 8, 12 or 14.
+    Raises:
+        ValueError: too few views, images of several sizes, views that cannot tell the focal length, corners in a
+            small part of the image only, or too many views that disagree; the message names the camera.
+    Source: Z. Zhang, "A flexible new technique for camera calibration", IEEE PAMI 22 (11), 2000; OpenCV's
+        `calibrateCamera`.
+    """
+    if distortion not in DISTORTIONS:
+        lengths = ", ".join(map(str, DISTORTIONS))
+        raise ValueError(f"distortion must be one of {lengths} coefficients; got {distortion}. 5 do for most lenses.")
+    missed = tuple(view.name for view in views if len(view.pixels) == 0)
+    used = [view for view in views if len(view.pixels)]
+    _check_views(name, used, missed)
+    fitted = _fit(name, used, distortion)
+    left_out: list[View] = []
+    while (worst := _outlying(fitted)) is not None:
+        left_out.append(used.pop(worst))
+        if len(used) < MIN_VIEWS or len(left_out) > MAX_LEFT_OUT * (len(used) + len(left_out)):
+            names = ", ".join(view.name for view in left_out)
+            raise ValueError(
+                f"camera {name!r}: views must agree on one lens; {len(left_out)} of {len(used) + len(left_out)} do not "
+                f"({names}). Check that board and focus were never changed, and delete blurred images."
+            )
+        fitted = _fit(name, used, distortion)
+    _check_fit(name, fitted)
+    outside = tuple(_pose(fitted.camera, view) for view in left_out)
+    return replace(fitted, left_out=outside, missed=missed)
+
+
+def turn(normals: Array) -> float:
+    """rad, the largest angle between two of the directions (n, 3)."""
+    return float(np.arccos(np.clip((normals @ normals.T).min(), -1.0, 1.0)))
+
+
+def coverage(size: tuple[int, int], pixels: Array) -> float:
+    """Share of the cells of an image of `size` that hold any of pixels (n, 2)."""
+    cells = np.clip((pixels + 0.5) / np.array(size) * CELLS, 0, np.array(CELLS) - 1).astype(int)
+    return len(np.unique(cells, axis=0)) / (CELLS[0] * CELLS[1])
+
+
+def _check_views(name: str, used: Sequence[View], missed: Sequence[str]) -> None:
+    if len(used) < MIN_VIEWS:
+        lack = f" No board (or hardly any of it) in {', '.join(missed)}." if missed else ""
+        raise ValueError(
+            f"camera {name!r}: at least {MIN_VIEWS} images must show the board; got {len(used)} of "
+            f"{len(used) + len(missed)}.{lack} Check squares and kind of board, or take more, turned differently."
+        )
+    for view in used:
+        if view.size != used[0].size:
+            raise ValueError(
+                f"camera {name!r}: images must have one size; {used[0].name} has {_size(used[0].size)} and {view.name} "
+                f"{_size(view.size)} pixels. Take them all as the videos will be."
+            )
+
+
+def _size(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"
+
+
+def _fit(name: str, views: Sequence[View], distortion: int) -> Intrinsics:
+    points = [np.ascontiguousarray(view.points, dtype=np.float32) for view in views]
+    pixels = [np.ascontiguousarray(view.pixels, dtype=np.float32) for view in views]
+    size = views[0].size
+    try:
+        with _one_thread():
+            _, matrix, coefficients, rvecs, tvecs = cv2.calibrateCamera(
+                points, pixels, size, np.eye(3), np.zeros(0), flags=_FLAGS[distortion], criteria=_CRITERIA
+            )
+        bent = np.array(np.ravel(coefficients)[:distortion], dtype=np.float64)
+        camera = Camera(name, size, np.array(matrix, dtype=np.float64), bent, np.zeros(3), np.zeros(3))
+    except (cv2.error, ValueError):
+        raise ValueError(
+            f"camera {name!r}: views must tell the lens; no lens explains them. "
+            "Turn the board to different sides, up to 45 degrees, and check that it is flat."
+        ) from None
+    fitted = tuple(
+        _fitted(camera, view, np.ravel(rvec), np.ravel(tvec))
+        for view, rvec, tvec in zip(views, rvecs, tvecs, strict=True)
+    )
+    share = coverage(size, np.concatenate([view.pixels for view in views]))
+    return Intrinsics(camera, _covariance(camera, fitted), fitted, (), (), share)
+
+
+def _covariance(camera: Camera, views: Sequence[FittedView]) -> Array:
+    return covariance_of_lens(
+        camera, [(fitted.view.points, fitted.rvec, fitted.tvec, fitted.residuals) for fitted in views]
+    )
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """OpenCV on one thread: on several it adds in another order each time, and the last digits differ."""
+    threads = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(threads)
+
+
+def _fitted(camera: Camera, view: View, rvec: Array, tvec: Array) -> FittedView:
+    projected, _ = cv2.projectPoints(view.points, rvec, tvec, camera.matrix, camera.distortion)
+    return FittedView(view, rvec, tvec, view.pixels - np.asarray(projected, dtype=np.float64).reshape(-1, 2))
+
+
+def _pose(camera: Camera, view: View) -> FittedView:
+    """A view that had no part in the calibration, with the pose that suits it best."""
+    _, rvec, tvec = cv2.solvePnP(view.points, view.pixels, camera.matrix, camera.distortion)
+    return _fitted(camera, view, np.ravel(rvec), np.ravel(tvec))
+
+
+def _outlying(fitted: Intrinsics) -> int | None:
+    """The view that disagrees most with the others, if one does."""
+    errors = np.array([view.rms for view in fitted.views])
+    worst = int(errors.argmax())
+    return worst if errors[worst] > max(OUTLYING * float(np.median(errors)), MIN_OUTLYING) else None
+
+
+def _check_fit(name: str, fitted: Intrinsics) -> None:
+    turned = turn(np.stack([view.normal for view in fitted.views]))
+    if turned < MIN_TURN:
+        raise ValueError(
+            f"camera {name!r}: boards must be turned against each other by {np.degrees(MIN_TURN):.0f} degrees or more; "
+            f"got {np.degrees(turned):.1f}. Parallel boards cannot tell the focal length: turn it all ways."
+        )
+    sigma = float((fitted.sigmas[:2] / fitted.camera.matrix[[0, 1], [0, 1]]).max())
+    if not sigma <= MAX_FOCAL_SIGMA:
+        raise ValueError(
+            f"camera {name!r}: the focal length must be known to {100 * MAX_FOCAL_SIGMA:g} %; got {100 * sigma:.1f} %. "
+            "Take more images, with the board near and turned to all sides, up to 45 degrees."
+        )
+    if fitted.coverage < MIN_COVERAGE:
+        raise ValueError(
+            f"camera {name!r}: corners must lie in {100 * MIN_COVERAGE:.0f} % of the image or more; "
+            f"got {100 * fitted.coverage:.0f} %. Take images with the board near all borders and corners of the image."
+        )
+    sigma, _ = fitted.ray_sigma
+    if not sigma <= MAX_RAY_SIGMA:
+        raise ValueError(
+            f"camera {name!r}: the lens must be known to {MAX_RAY_SIGMA:g} px in {RAYS:.0%} of the image; "
+            f"got {sigma:.1f} px. Take images with the board in its corners, or fewer coefficients than "
+            f"{len(fitted.camera.distortion)}."
+        )
+    _check_fold(fitted.camera)
+
+
+def _check_fold(camera: Camera) -> None:
+    """Refuses a distortion that cannot be undone somewhere in the image."""
+    pixels = pixel_grid(camera)
+    plane = camera.normalized(pixels)
+    again = camera.project(np.column_stack((plane, np.ones(len(plane)))))
+    apart = float(np.linalg.norm(again - pixels, axis=1).max())
+    if not apart <= MAX_FOLD or _has_pole(camera, float((plane**2).sum(axis=1).max())):
+        raise ValueError(
+            f"camera {camera.name!r}: the distortion must be possible to undo; it folds a part of the image. "
+            f"Take images with the board in all its corners, or fewer coefficients than {len(camera.distortion)}."
+        )
+
+
+def _has_pole(camera: Camera, limit: float) -> bool:
+    """Whether a rational distortion is infinite somewhere up to a squared radius of the plane at z = 1.
+
+    Where a lens needs no denominator, it and the numerator share zeros, but not exactly.
+    """
+    if len(camera.distortion) < 8:
+        return False
+    zeros = np.roots([*camera.distortion[7:4:-1], 1.0])
+    real = zeros[np.abs(zeros.imag) < 1e-9].real
+    return bool(((real > 0.0) & (real < limit)).any())

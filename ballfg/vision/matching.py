@@ -1,0 +1,219 @@
+"""Which pieces of different cameras show the same thing: those whose rays meet, frame after frame.
+
+How far rays of right pairs miss each other is not known beforehand: a camera that was nudged by half a degree is off by
+nine pixels. It is measured first, for each pair of cameras, on the pairs of pieces that choose each other over a long
+time; then everything is judged by that scale.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.vision.camera import Camera
+from ballfg.vision.epipolar import epipolar_miss
+from ballfg.vision.paths import Path
+
+Array = NDArray[np.float64]
+
+WORST_OFFSET: Final = 5.0
+"""px, standard deviation of a calibration's error, as long as the recording has not said otherwise."""
+LEAST_OFFSET: Final = 0.3
+"""px, a calibration is never taken to be better than this when pieces are matched."""
+_SIGNIFICANT: Final = 0.5
+"""Share of the noise's variance by which rays of right pairs must miss each other more than noise would."""
+_MEDIAN_SQUARE: Final = 0.4549
+"""Median of the square of a standard normal number."""
+_GATE: Final = 9.0
+"""Squared deviations at which two pieces do not belong together: 3 sigma of calibration and noise together."""
+_LEAST_COMMON: Final = 2
+"""Times at which both pieces must be known; a track that ends just after a bounce has no more."""
+_LEAST_SUPPORT: Final = 1.5
+"""Common times that must speak for a pair, less what speaks against it."""
+_LONG: Final = 8
+"""Common times from which a pair of pieces says something about the calibration."""
+_SPEEDING: Final = 2.0
+"""By how much faster than both pieces something may move between them: at a bounce or a hit."""
+_NEARBY: Final = 15.0
+"""px, how far apart two successive pieces of one camera may be at least, however slow they are."""
+
+
+@dataclass(frozen=True, eq=False)
+class Piece:
+    """A smoothly moving thing in one camera."""
+
+    camera: int
+    """Number of the camera."""
+
+    rows: NDArray[np.int64]
+    """(k,) its candidates."""
+
+    path: Path
+    """Where it was in the image, over true time."""
+
+    @property
+    def start(self) -> float:
+        """s, true time of the first sample."""
+        return float(self.path.times[0])
+
+    @property
+    def end(self) -> float:
+        """s, true time of the last sample."""
+        return float(self.path.times[-1])
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """Two pieces of different cameras at their common times."""
+
+    first: int
+    second: int
+    misses: Array
+    """(k,) px, what is left between the rays; NaN where they do not meet in front."""
+    variances: Array
+    """(k,) px^2, of the misses by noise and interpolation."""
+
+    def support(self, offset: float) -> float:
+        """In common times: how many speak for the pair, less what speaks against it. `offset`: px, of calibration."""
+        square = self.misses**2 / (self.variances + offset**2)
+        square = np.where(np.isnan(square), 2.0 * _GATE, np.minimum(square, 2.0 * _GATE))
+        return float((1.0 - square / _GATE).sum())
+
+
+@dataclass(frozen=True)
+class Matching:
+    """What belongs together."""
+
+    groups: list[list[int]]
+    """Numbers of pieces that show the same thing, in the order of the first; pieces that match no other left out."""
+
+    offset: float
+    """px, by how much rays of one thing miss each other beyond noise, in the worst pair of cameras; 0 if by none."""
+
+
+def match(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> Matching:
+    """Groups the pieces that show the same thing. A group holds no two pieces of a camera at the same time."""
+    pairs = _pairs(pieces, cameras)
+    offsets = _offsets(pieces, pairs, len(cameras))
+    supported = []
+    for pair in pairs:
+        offset = offsets.get((pieces[pair.first].camera, pieces[pair.second].camera), WORST_OFFSET)
+        support = pair.support(min(max(offset, LEAST_OFFSET), 2.0 * WORST_OFFSET))
+        if support > _LEAST_SUPPORT:
+            supported.append((support, pair.first, pair.second))
+    supported.sort(key=lambda link: (-link[0], link[1], link[2]))
+    against = {(pair.first, pair.second) for pair in pairs} - {(first, second) for _, first, second in supported}
+    return Matching(_grouped(pieces, supported, against), max(offsets.values(), default=0.0))
+
+
+def _pairs(pieces: Sequence[Piece], cameras: Sequence[Camera]) -> list[_Pair]:
+    """All pairs of pieces of different cameras that overlap, compared in one call for each pair of cameras."""
+    pairs = []
+    for one, other in combinations(range(len(cameras)), 2):
+        meeting: list[tuple[int, int]] = []
+        seen: list[tuple[Array, Array, Array, Array]] = []
+        for i, j in _overlapping(pieces, one, other):
+            common = _common(pieces[i], pieces[j])
+            if len(common[0]) >= _LEAST_COMMON:
+                meeting.append((i, j))
+                seen.append(common)
+        if not meeting:
+            continue
+        pixels, spread, others, other_spread = (np.concatenate(arrays) for arrays in zip(*seen, strict=True))
+        misses, slopes = epipolar_miss(cameras[one], cameras[other], pixels, others)
+        variances = _along(slopes[:, :2], spread) + _along(slopes[:, 2:], other_spread)
+        ends = np.cumsum([len(common[0]) for common in seen])[:-1]
+        cut = zip(meeting, np.split(misses, ends), np.split(variances, ends), strict=True)
+        pairs += [_Pair(i, j, miss, variance) for (i, j), miss, variance in cut]
+    return pairs
+
+
+def _overlapping(pieces: Sequence[Piece], one: int, other: int) -> list[tuple[int, int]]:
+    """Pieces of one camera with those of another that were there at the same time."""
+    theirs = np.array([j for j, piece in enumerate(pieces) if piece.camera == other], dtype=int)
+    starts, ends = np.array([pieces[j].start for j in theirs]), np.array([pieces[j].end for j in theirs])
+    return [
+        (i, int(j))
+        for i, piece in enumerate(pieces)
+        if piece.camera == one
+        for j in theirs[(starts < piece.end) & (ends > piece.start)]
+    ]
+
+
+def _common(first: Piece, second: Piece) -> tuple[Array, Array, Array, Array]:
+    """Pixels and covariances of both pieces at those samples of the sparser one at which the other is known."""
+    swap = len(first.path.times) > len(second.path.times)
+    sparse, dense = (second, first) if swap else (first, second)
+    inside = (sparse.path.times >= dense.start) & (sparse.path.times <= dense.end)
+    values, covariances = dense.path.at(sparse.path.times[inside])
+    known = np.isfinite(values).all(axis=1)
+    mine = sparse.path.values[inside][known], sparse.path.covariances[inside][known]
+    theirs = values[known], covariances[known]
+    return (*theirs, *mine) if swap else (*mine, *theirs)
+
+
+def _along(slopes: Array, covariances: Array) -> Array:
+    return np.asarray(np.einsum("ni,nij,nj->n", slopes, covariances, slopes))
+
+
+def _offsets(pieces: Sequence[Piece], pairs: Sequence[_Pair], count: int) -> dict[tuple[int, int], float]:
+    """px, by how much rays of right pairs miss each other beyond noise, for pairs of cameras that tell."""
+    best: dict[tuple[int, int], tuple[float, _Pair]] = {}
+    for pair in pairs:
+        support = pair.support(WORST_OFFSET)
+        for piece, camera in ((pair.first, pieces[pair.second].camera), (pair.second, pieces[pair.first].camera)):
+            if support > best.get((piece, camera), (0.0, pair))[0]:
+                best[piece, camera] = (support, pair)
+    offsets = {}
+    for one, other in combinations(range(count), 2):
+        squares, variances = [np.zeros(0)], [np.zeros(0)]
+        for (piece, camera), (_, pair) in best.items():
+            mutual = best.get((pair.second, one), (0.0, None))[1] is pair
+            if pieces[piece].camera == one and camera == other and mutual and len(pair.misses) >= _LONG:
+                squares.append(pair.misses**2)
+                variances.append(pair.variances)
+        square, variance = np.concatenate(squares), np.concatenate(variances)
+        known = np.isfinite(square)
+        if known.any():
+            beyond = float(np.median(square[known] / variance[known])) / _MEDIAN_SQUARE - 1.0
+            noise = float(np.median(variance[known]))
+            offsets[one, other] = float(np.sqrt(beyond * noise)) if beyond > _SIGNIFICANT else 0.0
+    return offsets
+
+
+def _grouped(
+    pieces: Sequence[Piece], supported: Sequence[tuple[float, int, int]], against: set[tuple[int, int]]
+) -> list[list[int]]:
+    """Joins pieces along their links, the best supported first, unless that puts together what cannot be one thing."""
+    group_of = {number: [number] for _, *ends in supported for number in ends}
+    for _, first, second in supported:
+        one, other = group_of[first], group_of[second]
+        if one is not other and all(_may_join(pieces, a, b, against) for a in one for b in other):
+            one.extend(other)
+            for number in other:
+                group_of[number] = one
+    groups = {id(group): sorted(group) for group in group_of.values() if len(group) > 1}
+    return sorted(groups.values())
+
+
+def _may_join(pieces: Sequence[Piece], a: int, b: int, against: set[tuple[int, int]]) -> bool:
+    if pieces[a].camera != pieces[b].camera:
+        return (a, b) not in against and (b, a) not in against
+    first, second = sorted((pieces[a], pieces[b]), key=lambda piece: piece.start)
+    apart = second.start - first.end
+    if apart <= 0.0:
+        return False
+    speed = max(_speed(first.path), _speed(second.path))
+    distance = float(np.linalg.norm(second.path.values[0] - first.path.values[-1]))
+    return distance <= _SPEEDING * speed * apart + _NEARBY
+
+
+def _speed(path: Path) -> float:
+    """px/s, mean over the piece."""
+    lengths = np.linalg.norm(np.diff(path.values, axis=0), axis=1)
+    return float(lengths.sum() / (path.times[-1] - path.times[0]))

@@ -1,0 +1,113 @@
+"""The overlay: all views side by side as a video, with candidates, balls, trails, names and a line of time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import cv2
+import numpy as np
+
+from ballfg.vision.palette import bgr
+from ballfg.vision.playback import Image, Schedule, play, schedule
+from ballfg.vision.tracking import Tracking
+from ballfg.vision.view_painter import ViewPainter, write
+
+Watch = Callable[[Iterable[Any], int, str], Iterable[Any]]
+"""Hands items through and shows how far it is: (items, how many, what they are)."""
+
+VIEW_WIDTH: Final = 640
+"""px of one view: three side by side make 1920, the width of a screen."""
+IN_A_ROW: Final = 3
+"""Views side by side; more go below."""
+PLAYED_AT: Final = 30.0
+"""Hz at which every frame is shown: slow motion for a camera of 120 Hz, smooth on any screen."""
+STRIP: Final = 30
+"""px, height of the line of time."""
+BAR: Final = 6
+"""px, height of a track's bar."""
+BARS: Final = 2 * BAR + 3
+"""px from the upper lane of bars to the bottom."""
+MARGIN: Final = 12
+"""px left and right of it."""
+PAPER, INK = (40, 40, 40), (235, 235, 235)
+"""Colours of the line of time and of its cursor and text."""
+
+
+def write_overlay(
+    path: Path, tracking: Tracking, streams: Sequence[Iterator[tuple[float, Image]]], watch: Watch | None = None
+) -> int:
+    """Writes the overlay video (mp4).
+
+    Args:
+        path: a new file; its folder exists.
+        tracking: what was found.
+        streams: the frames of each camera once more, from the first on.
+        watch: shows how far it is.
+    Returns: the number of its frames.
+    Raises: OSError: the video cannot be written.
+    """
+    painter = OverlayPainter(tracking)
+    moments = schedule(tracking.detections, tracking.cameras)
+    video = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), PLAYED_AT, painter.size)
+    if not video.isOpened():
+        raise OSError(f"{path}: OpenCV cannot write this video. Check the disk, or go without the overlay.")
+    try:
+        frames = painter.paint_all(moments, streams)
+        for frame in frames if watch is None else watch(frames, len(moments.times), "overlay frames drawn"):
+            video.write(frame)
+    finally:
+        video.release()
+    return len(moments.times)
+
+
+class OverlayPainter:
+    """Lays the views out and draws them.
+
+    Args: tracking: what was found.
+
+    Attributes: size: width and height of the overlay, px.
+    """
+
+    def __init__(self, tracking: Tracking) -> None:
+        self._tracking = tracking
+        self._views = [ViewPainter(tracking, i, VIEW_WIDTH) for i in range(len(tracking.cameras))]
+        columns = min(IN_A_ROW, len(self._views))
+        self._height = max(view.size[1] for view in self._views)
+        rows = math.ceil(len(self._views) / columns)
+        self._corners = [(i // columns * self._height, i % columns * VIEW_WIDTH) for i in range(len(self._views))]
+        height = rows * self._height + STRIP
+        self.size = (columns * VIEW_WIDTH, height + height % 2)  # the codec wants even sides
+
+    def paint_all(self, moments: Schedule, streams: Sequence[Iterator[tuple[float, Image]]]) -> Iterator[Image]:
+        """One picture a moment."""
+        if len(moments.times) == 0:
+            return
+        first, last = float(moments.times[0]), float(moments.times[-1])
+        line = self._line_of_time(first, last)
+        for time, frames, images in zip(moments.times, moments.frames, play(moments, streams), strict=True):
+            page = np.zeros((self.size[1], self.size[0], 3), np.uint8)
+            for view, (top, left), frame, image in zip(self._views, self._corners, frames, images, strict=True):
+                painted = view.paint(image, int(frame), float(time))
+                page[top : top + len(painted), left : left + VIEW_WIDTH] = painted
+            page[-STRIP:] = line
+            x = self._place(float(time), first, last)
+            cv2.line(page, (x, self.size[1] - STRIP), (x, self.size[1] - 1), INK, 1)
+            write(page, f"{time:.3f} s", (min(x + 5, self.size[0] - 75), self.size[1] - STRIP + 12), INK, 0.4)
+            yield page
+
+    def _line_of_time(self, first: float, last: float) -> Image:
+        """The strip at the bottom: each track a bar in its colour, from its first point to its last."""
+        line = np.full((STRIP, self.size[0], 3), PAPER, np.uint8)
+        for track, ball in enumerate(self._tracking.balls):
+            start, end = (self._place(float(ball.times[i]), first, last) for i in (0, -1))
+            top = STRIP - BARS + track % 2 * (BAR + 1)  # two lanes: the next track may begin before one ends
+            cv2.rectangle(line, (start, top), (max(end, start + 1), top + BAR - 1), bgr(track), cv2.FILLED)
+        return line
+
+    def _place(self, time: float, first: float, last: float) -> int:
+        """Where a time stands, px from the left."""
+        share = (time - first) / (last - first) if last > first else 0.0
+        return round(MARGIN + share * (self.size[0] - 1 - 2 * MARGIN))

@@ -1,0 +1,114 @@
+"""Which file is which camera's: videos matched to the cameras of a rig, and checked against them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+from ballfg.tracks.hints import did_you_mean
+from ballfg.vision.camera import Camera
+
+SAME_SHAPE: Final = 0.01
+"""Share by which a video's proportions may differ from the camera's where it is taken for the same picture, scaled."""
+
+
+def match_videos(given: Sequence[str], cameras: Sequence[Camera]) -> dict[str, Path]:
+    """The video of each camera.
+
+    Args:
+        given: paths, each with a camera's name as its stem, or `name=path`.
+        cameras: of the rig.
+    Returns: camera -> path, in the order of the cameras.
+    Raises: ValueError: a video of no camera, two of one, or a camera without one.
+    """
+    names = [camera.name for camera in cameras]
+    found: dict[str, Path] = {}
+    for text in given:
+        name, path = named_path(text, names)
+        if name not in names:
+            raise ValueError(
+                f"video {text!r} must be of a camera: {', '.join(names)}; got {name!r}. Rename it, or write "
+                f"NAME={path}.{did_you_mean(name, names)}"
+            )
+        if name in found:
+            raise ValueError(f"camera {name!r} must have one video; got {found[name]} and {path}. Drop one of them.")
+        found[name] = path
+    missing = [name for name in names if name not in found]
+    if missing:
+        listed = " and ".join(map(repr, missing))
+        raise ValueError(
+            f"every camera must have a video; got none for {listed}. Give it as {missing[0]}=FILE, "
+            f"or leave the camera out with --without {missing[0]}."
+        )
+    return {name: found[name] for name in names}
+
+
+def named_path(text: str, names: Sequence[str]) -> tuple[str, Path]:
+    """The name and the path that a word of the command line means: `name=path`, or a path with the name as its stem."""
+    name, equals, rest = text.partition("=")
+    if equals and rest and (name in names or not Path(text).exists()):
+        return name, Path(rest)
+    path = Path(text)
+    return (path.name if path.is_dir() else path.stem), path
+
+
+def stamp_files(given: Sequence[str], cameras: Sequence[Camera]) -> dict[str, Path]:
+    """The files of stamps of some cameras.
+
+    Args: given: `name=path`.  cameras: of the rig.
+    Raises: ValueError: a word without a name, a name of no camera, or one that comes twice.
+    """
+    names = [camera.name for camera in cameras]
+    found: dict[str, Path] = {}
+    for text in given:
+        name, equals, path = text.partition("=")
+        if not (equals and path):
+            raise ValueError(f"stamps must be NAME=FILE; got {text!r}. Put the camera's name before the file.")
+        if name not in names or name in found:
+            problem = "is given twice" if name in found else "is no camera's"
+            raise ValueError(f"stamps must be one file a camera; {name!r} {problem}. Cameras: {', '.join(names)}.")
+        found[name] = Path(path)
+    return found
+
+
+def without(cameras: Sequence[Camera], names: Sequence[str]) -> list[Camera]:
+    """The cameras that are left.
+
+    Raises: ValueError: a name of no camera.
+    """
+    known = [camera.name for camera in cameras]
+    for name in names:
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise ValueError(f"without must name a camera: {', '.join(known)}; got {name!r}. Correct it.{hint}")
+    return [camera for camera in cameras if camera.name not in names]
+
+
+def check_sizes(sizes: Mapping[str, tuple[int, int]], cameras: Sequence[Camera]) -> None:
+    """Refuses a calibration of another resolution than the video's.
+
+    Args: sizes: camera -> width and height of its video, px.
+    Raises: ValueError: naming the camera, both sizes and what to do.
+    """
+    for camera in cameras:
+        size = sizes[camera.name]
+        if size != camera.size:
+            raise ValueError(
+                f"camera {camera.name!r} must be calibrated at the size of its video; got {_by(camera.size)} in the "
+                f"cameras' file and a video of {_by(size)}. {_remedy(camera.size, size)}"
+            )
+
+
+def _by(size: tuple[int, int]) -> str:
+    return f"{size[0]}x{size[1]}"
+
+
+def _remedy(calibrated: tuple[int, int], filmed: tuple[int, int]) -> str:
+    across, down = (new / old for new, old in zip(filmed, calibrated, strict=True))
+    if abs(across / down - 1.0) > SAME_SHAPE:
+        return "Calibrate it again at that size: the pictures have different proportions."
+    return (
+        f"If the whole picture was scaled, set size to [{filmed[0]}, {filmed[1]}] and multiply fx, fy by {across:.6g}; "
+        f"cx, cy become {across:.6g} (c + 0.5) - 0.5. If it was cropped, calibrate again."
+    )

@@ -1,0 +1,61 @@
+"""Reading YAML that people write: safe loader only, no key twice, every key known."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ballfg.tracks.fields import kind
+from ballfg.tracks.hints import did_you_mean
+
+
+class _UniqueKeyLoader(yaml.SafeLoader):
+    """The safe loader, which takes the last of two equal keys in silence; this one refuses them."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """The mapping. Raises: ConstructorError: if a key comes twice."""
+        keys = [key.value for key, _ in node.value]
+        for key, _ in node.value:
+            if keys.count(key.value) > 1:
+                raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' stands twice", key.start_mark)
+        return super().construct_mapping(node, deep)
+
+
+def read_mapping(path: Path) -> dict[Any, Any]:
+    """The content of a YAML file that must be a mapping.
+
+    Raises: FileNotFoundError: no such file. ValueError: not YAML, a key twice, no mapping; the message names the file.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"{path}: must be a file that exists. Correct the path.")
+    try:
+        content = yaml.load(path.read_text(encoding="utf-8-sig"), Loader=_UniqueKeyLoader)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: must be YAML; {' '.join(str(error).split())}. Correct it.") from None
+    return mapping(f"{path}: the content", content)
+
+
+def mapping(what: str, content: Any) -> dict[Any, Any]:
+    """The content itself. Raises: ValueError: if it is not a mapping with something in it."""
+    if not isinstance(content, dict) or not content:
+        got = "an empty one" if content == {} else kind(content)
+        raise ValueError(f"{what} must be a mapping; got {got}. Write it as 'key: value'.")
+    return content
+
+
+def check_keys(where: str, content: dict[Any, Any], known: Collection[str], needed: Collection[str]) -> None:
+    """Raises: ValueError: a key that is not known, or a needed one that is missing; `where` begins the message."""
+    absent = [key for key in known if key not in content]
+    for key in content:
+        if key not in known:
+            hint = did_you_mean(str(key), absent)
+            raise ValueError(
+                f"{where}: fields must be among {', '.join(known)}; got {key!r}.{hint} Rename or delete it."
+            )
+    for key in needed:
+        if content.get(key) is None:
+            got = ", ".join(map(str, content)) or "nothing"
+            raise ValueError(f"{where}: field {key!r} is required; got {got}. Add it.")

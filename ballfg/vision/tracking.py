@@ -1,0 +1,168 @@
+"""What cameras recorded, turned into balls: detections, tracks, and whether the cameras agree."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.tracks import Track
+from ballfg.vision.agreement import Agreement, check_agreement
+from ballfg.vision.associate import associate
+from ballfg.vision.camera import Camera
+from ballfg.vision.detect import Watch, detect_all, learn_detector
+from ballfg.vision.detections import Detections, Detector
+from ballfg.vision.recordings import check_sizes
+from ballfg.vision.seen_ball import SeenBall
+from ballfg.vision.video import Video, open_video
+
+Array = NDArray[np.float64]
+
+FEWEST: Final = 2
+"""Cameras: one alone does not see how far away a ball is."""
+DIGITS: Final = 3
+"""Of the number that is a track's name, at least: names then sort as their tracks do."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """One ball in one camera."""
+
+    frames: NDArray[np.int64]
+    """(m,) numbers of the camera's frames, increasing."""
+
+    pixels: Array
+    """(m, 2) px."""
+
+
+@dataclass(frozen=True, eq=False)
+class Tracking:
+    """The balls of a recording."""
+
+    cameras: tuple[Camera, ...]
+    """The rig."""
+
+    detections: tuple[Detections, ...]
+    """All candidates of each camera, in the order of `cameras`."""
+
+    balls: tuple[SeenBall, ...]
+    """In the order of their first points."""
+
+    agreement: Agreement | None
+    """Whether the cameras agree; None where there is no ball to ask."""
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the tracks: 000, 001, ..."""
+        digits = max(DIGITS, len(str(len(self.balls))))
+        return [f"{number:0{digits}d}" for number in range(len(self.balls))]
+
+    @property
+    def tracks(self) -> list[Track]:
+        """The balls' points with their standard deviations."""
+        return [
+            Track(name, ball.times, ball.points, np.sqrt(np.diagonal(ball.covariances, axis1=1, axis2=2)))
+            for name, ball in zip(self.names, self.balls, strict=True)
+        ]
+
+    @property
+    def rate(self) -> float | None:
+        """Points per second of the balls, Hz, to six digits; None where there is no ball."""
+        if not self.balls:
+            return None
+        step = float(np.median(np.concatenate([np.diff(ball.times) for ball in self.balls])))
+        return float(f"{1.0 / step:.6g}")
+
+    def seen(self, ball: SeenBall, camera: int) -> Seen:
+        """The frames in which a camera, by its number, saw a ball, and where."""
+        rows = ball.sightings.camera == camera
+        frames = np.searchsorted(self.detections[camera].frames, ball.sightings.times[rows])
+        return Seen(frames.astype(np.int64), ball.sightings.pixels[rows])
+
+    def rows(self, ball: SeenBall, camera: int) -> NDArray[np.int64]:
+        """(m,) which of a camera's candidates a ball was seen by."""
+        detections, seen = self.detections[camera], self.seen(ball, camera)
+        first, end = (np.searchsorted(detections.frame, seen.frames, side) for side in ("left", "right"))
+        found = [
+            low + int(np.argmin(np.abs(detections.pixels[low:high] - pixel).sum(axis=1)))
+            for low, high, pixel in zip(first.tolist(), end.tolist(), seen.pixels, strict=True)
+        ]
+        return np.array(found, dtype=np.int64)
+
+
+def track_videos(
+    videos: Mapping[str, Path],
+    cameras: Sequence[Camera],
+    make: Callable[[Video], Detector] = learn_detector,
+    *,
+    stamps: Mapping[str, Path] | None = None,
+    jobs: int = 1,
+    watch: Watch | None = None,
+) -> Tracking:
+    """Balls from the videos of a rig.
+
+    Args:
+        videos: camera -> file or folder of images, for each of the cameras.
+        cameras: at least two, calibrated at the videos' sizes.
+        make: the detector of a camera, from its opened video.
+        stamps: camera -> CSV file, for those whose stamps are not the container's.
+        jobs: processes.
+        watch: shows how far the search is, see `ballfg.vision.detect.Watch`.
+    Raises: FileNotFoundError: a file is missing. ValueError: as `open_video`, `check_sizes` and `track_detections`.
+    """
+    check_count(cameras)
+    check_sizes({name: open_video(path, (stamps or {}).get(name)).size for name, path in videos.items()}, cameras)
+    found = detect_all(videos, make, stamps=stamps, jobs=jobs, watch=watch)
+    return track_detections(list(found.values()), cameras)
+
+
+def track_detections(detections: Sequence[Detections], cameras: Sequence[Camera]) -> Tracking:
+    """Balls from the candidates of a rig.
+
+    Args:
+        detections: one for each of the cameras, in any order.
+        cameras: at least two, with names of their own.
+    Raises: ValueError: a camera without detections or detections without a camera, too few cameras, or recordings
+        that do not overlap in time.
+    """
+    check_count(cameras)
+    by_name = {seen.camera: seen for seen in detections}
+    wanted, given = sorted(camera.name for camera in cameras), sorted(seen.camera for seen in detections)
+    if wanted != given or len(set(wanted)) < len(wanted):
+        raise ValueError(f"detections must be one for each camera; got {given} for {wanted}. Match their names.")
+    ordered = tuple(by_name[camera.name] for camera in cameras)
+    check_overlap(ordered, cameras)
+    balls = tuple(associate(ordered, cameras))
+    return Tracking(tuple(cameras), ordered, balls, check_agreement(balls, cameras) if balls else None)
+
+
+def check_count(cameras: Sequence[Camera]) -> None:
+    """Refuses too few cameras. Raises: ValueError."""
+    if len(cameras) < FEWEST:
+        raise ValueError(f"cameras must be at least {FEWEST}; got {len(cameras)}. One alone does not see distance.")
+
+
+def check_overlap(detections: Sequence[Detections], cameras: Sequence[Camera]) -> None:
+    """Refuses a camera that filmed when no other did: a clock or a file is another recording's.
+
+    Raises: ValueError: naming the camera and when each one filmed.
+    """
+    spans: dict[str, tuple[float, float]] = {}
+    for seen, camera in zip(detections, cameras, strict=True):
+        if len(seen.frames):
+            spans[camera.name] = (seen.frames[0] - camera.time_offset, seen.frames[-1] - camera.time_offset)
+    for name, (start, end) in spans.items():
+        if len(spans) > 1 and not any(start <= last and first <= end for first, last in _others(spans, name)):
+            when = "; ".join(f"{other!r} {first:g} to {last:g} s" for other, (first, last) in spans.items())
+            raise ValueError(
+                f"videos must overlap in time; camera {name!r} overlaps with no other: {when} (true time). "
+                "Check stamps and time_offset, or that the files are of one recording."
+            )
+
+
+def _others(spans: Mapping[str, tuple[float, float]], name: str) -> list[tuple[float, float]]:
+    return [span for other, span in spans.items() if other != name]

@@ -1,0 +1,33 @@
+"""What was tracked, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from ballfg.vision.agreement import LEAST_MISFIT
+from ballfg.vision.tracking import Tracking
+
+
+def summary(tracking: Tracking) -> Iterator[str]:
+    """Lines: what each camera saw, and what became of it."""
+    for number, (camera, seen) in enumerate(zip(tracking.cameras, tracking.detections, strict=True)):
+        used = sum(int((ball.sightings.camera == number).sum()) for ball in tracking.balls)
+        yield f"  {camera.name}: {len(seen.frames)} frames, {len(seen)} candidates, {used} of them a ball"
+
+
+def disagreement(tracking: Tracking) -> str | None:
+    """What is to be said about the calibration; None where the cameras agree or too little was seen to tell."""
+    found = tracking.agreement
+    if found is None or not (found.culprit is not None or found.misfit > LEAST_MISFIT):
+        return None
+    return found.sentence
+
+
+def no_ball(tracking: Tracking) -> str:
+    """One sentence with the best scores of each camera, for a recording in which no ball was found."""
+    best = "; ".join(
+        f"{seen.camera}: {', '.join(f'{score:.2f}' for score in seen.best_scores()) or 'no candidate'}"
+        f" in {len(seen.frames)} frames"
+        for seen in tracking.detections
+    )
+    return f"no ball was found. Best candidates' scores (1 is a ball): {best}."

@@ -1,0 +1,234 @@
+"""Triangulation: where the rays of several cameras meet, how sure that is, and which of the cameras say so."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2
+
+from ballfg.vision.camera import Camera
+
+Array = NDArray[np.float64]
+Flags = NDArray[np.bool_]
+
+MISSED: Final = 1e-6
+"""Share of right candidates that the tests may refuse: a wrong one that close to the truth does no harm."""
+MAX_SIGMA: Final = 0.5
+"""m, standard deviation along the least certain direction from which rays count as parallel: then there is no point."""
+_GATES: Final = tuple(float(chi2.isf(MISSED, degrees)) for degrees in (1, 2))
+"""Bounds of squared whitened residuals: of two rays that miss each other (1), of a further view (2)."""
+_STEPS: Final = 3
+"""Gauss-Newton steps; from the point halfway between two rays the second already moves it by less than a micrometre."""
+_HOPELESS: Final = 1e-6
+"""Information, in units of 1 / `MAX_SIGMA`^2, below which a normal matrix is singular up to rounding."""
+_TINY_ANGLE: Final = 1e-12
+"""Squared sine below which two rays are parallel to the precision of float64: halfway between them is then nowhere."""
+_HALF_PIXEL: Final = 0.5
+"""px, step of the differences that say how far a pixel reaches in the undistorted image."""
+
+
+@dataclass(frozen=True, eq=False)
+class Triangulated:
+    """Points and what speaks for them. A row without a point has NaN there and in its covariance, and uses no view."""
+
+    points: Array
+    """(n, 3) m, world."""
+
+    covariances: Array
+    """(n, 3, 3) m^2."""
+
+    used: Flags
+    """(n, c) whether the view took part; wrong ones do not."""
+
+    residuals: Array
+    """(n, c, 2) px, what was seen minus the point's projection, of views that did not take part too; NaN where none."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Views:
+    """What c cameras see, in the planes z = 1 of their own frames, where projection is a division."""
+
+    rotations: Array
+    """(c, 3, 3) from the world to the cameras."""
+    translations: Array
+    """(c, 3) m."""
+    planes: Array
+    """(n, c, 2); zero where nothing is seen."""
+    weights: Array
+    """(n, c, 2, 2) inverse covariances of `planes`."""
+    seen: Flags
+    """(n, c)"""
+
+    def project(self, points: Array) -> tuple[Array, Array, Array]:
+        """Points (n, 3) -> their planes' coordinates (n, c, 2), derivatives (n, c, 2, 3) and depths (n, c) m."""
+        local = np.einsum("cij,nj->nci", self.rotations, points) + self.translations
+        depths = local[..., 2]
+        safe = np.where(depths > 0.0, depths, np.nan)[..., None]
+        planes = local[..., :2] / safe
+        derivatives = (self.rotations[:, :2] - planes[..., None] * self.rotations[:, None, 2]) / safe[..., None]
+        return planes, derivatives, depths
+
+    def rows(self, chosen: NDArray[np.intp]) -> _Views:
+        """The same cameras, other rows."""
+        return _Views(self.rotations, self.translations, self.planes[chosen], self.weights[chosen], self.seen[chosen])
+
+
+def triangulate(cameras: Sequence[Camera], pixels: ArrayLike, covariances: ArrayLike) -> Triangulated:
+    """Points that several cameras see at the same time; wrong candidates are left out, not averaged in.
+
+    Every pair of views proposes a point. A proposal counts if its two rays meet, in front of both cameras, within the
+    noise; the views that agree with it join it. The largest agreement wins, then the closest, and is solved by
+    Gauss-Newton on the weighted reprojection error. There is no point where no pair agrees, where two proposals of two
+    views each agree equally well but not with each other, or where the rays are nearly parallel (`MAX_SIGMA`).
+
+    Args:
+        cameras: c of them, at least two.
+        pixels: (n, c, 2) px, where each camera saw it; NaN where it did not.
+        covariances: (n, c, 2, 2) px^2 of `pixels`; not read where those are NaN.
+    Raises: ValueError: shapes that do not fit, fewer than two cameras, covariances that are not positive definite.
+    Source: docs/derivations/triangulation.md; Hartley, Zisserman, Multiple View Geometry (2004), sections 12.2 and 5.2.
+    """
+    cameras = list(cameras)
+    pixels, covariances = _checked(len(cameras), pixels, covariances)
+    views = _views(cameras, pixels, covariances)
+    points, used = _consensus(views)
+    points, spread = _refined(views, points, used)
+    found = np.asarray(np.isfinite(points).all(axis=1) & (_in_front(views, points) | ~used).all(axis=1))
+    found[found] &= np.linalg.eigvalsh(spread[found])[:, -1] <= MAX_SIGMA**2
+    points[~found], spread[~found], used[~found] = np.nan, np.nan, False
+    residuals = np.full(pixels.shape, np.nan)
+    for c, camera in enumerate(cameras):
+        residuals[found, c] = pixels[found, c] - camera.project(points[found])
+    return Triangulated(points, spread, used, residuals)
+
+
+def _checked(count: int, pixels: ArrayLike, covariances: ArrayLike) -> tuple[Array, Array]:
+    pixels = np.asarray(pixels, dtype=np.float64)
+    covariances = np.asarray(covariances, dtype=np.float64)
+    if count < 2:
+        raise ValueError(f"cameras must be at least two to triangulate; got {count}. Add a camera.")
+    if pixels.ndim != 3 or pixels.shape[1:] != (count, 2):
+        raise ValueError(f"pixels must have shape (n, {count}, 2) for {count} cameras; got {pixels.shape}")
+    if covariances.shape != (*pixels.shape, 2):
+        raise ValueError(f"covariances must have shape {(*pixels.shape, 2)}; got {covariances.shape}")
+    seen = covariances[np.isfinite(pixels).all(axis=-1)]
+    bad = ~((seen[:, 0, 0] > 0.0) & (np.linalg.det(seen) > 0.0)) if len(seen) else np.zeros(0, dtype=bool)
+    if bad.any():
+        raise ValueError(f"covariances must be positive definite, px^2; got {seen[bad][0].tolist()}")
+    return pixels, covariances
+
+
+def _views(cameras: list[Camera], pixels: Array, covariances: Array) -> _Views:
+    seen = np.asarray(np.isfinite(pixels).all(axis=-1))
+    planes = np.zeros(pixels.shape)
+    weights = np.zeros(covariances.shape)
+    for c, camera in enumerate(cameras):
+        rows = seen[:, c]
+        planes[rows, c] = camera.normalized(pixels[rows, c])
+        reach = plane_by_pixel(camera, pixels[rows, c])
+        weights[rows, c] = np.linalg.inv(reach @ covariances[rows, c] @ np.swapaxes(reach, 1, 2))
+    rotations = np.stack([camera.rotation for camera in cameras])
+    return _Views(rotations, np.stack([camera.tvec for camera in cameras]), planes, weights, seen)
+
+
+def plane_by_pixel(camera: Camera, pixels: Array) -> Array:
+    """(n, 2, 2) derivatives of `camera.normalized` by the pixels (n, 2), from central differences."""
+    steps = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]) * _HALF_PIXEL
+    around = camera.normalized(pixels[:, None] + steps)
+    return np.stack((around[:, 0] - around[:, 1], around[:, 2] - around[:, 3]), axis=-1) / (2.0 * _HALF_PIXEL)
+
+
+def _consensus(views: _Views) -> tuple[Array, Flags]:
+    """For every row the proposal with most views, then least error: points (n, 3) (NaN: none), its views (n, c)."""
+    n, c = views.seen.shape
+    points = np.full((n, 3), np.nan)
+    used = np.zeros((n, c), dtype=bool)
+    count = np.zeros(n, dtype=int)
+    error = np.full(n, np.inf)
+    unclear = np.zeros(n, dtype=bool)
+    for i, j in combinations(range(c), 2):
+        rows = np.flatnonzero(views.seen[:, i] & views.seen[:, j])
+        proposed, agree, cost = _proposal(views.rows(rows), i, j)
+        votes = agree.sum(axis=1)
+        same = (agree == used[rows]).all(axis=1)
+        rival = (votes == 2) & (count[rows] == 2) & ~same
+        better = (votes >= 2) & ((votes > count[rows]) | ((votes == count[rows]) & (cost < error[rows])))
+        unclear[rows] = np.where(votes > np.maximum(count[rows], 1), False, unclear[rows] | rival)
+        to = rows[better]
+        points[to], used[to], count[to], error[to] = proposed[better], agree[better], votes[better], cost[better]
+    unclear &= count == 2
+    points[unclear], used[unclear] = np.nan, False
+    return points, used
+
+
+def _proposal(views: _Views, i: int, j: int) -> tuple[Array, Flags, Array]:
+    """The point (n, 3) of views i and j, who agrees with it (n, c), and their squared whitened error (n,).
+
+    A further view is judged by its residual's covariance, its own and that of the point: S + J P J'.
+    """
+    pair = np.zeros(views.seen.shape, dtype=bool)
+    pair[:, [i, j]] = True
+    points, spread = _refined(views, _halfway(views, i, j), pair)
+    planes, derivatives, depths = views.project(points)
+    residuals = planes - views.planes
+    cost = np.einsum("nci,ncij,ncj->nc", residuals, views.weights, residuals)
+    meets = (cost[:, i] + cost[:, j] <= _GATES[0]) & (depths[:, i] > 0.0) & (depths[:, j] > 0.0)
+    agree = pair & meets[:, None]
+    total = cost[:, i] + cost[:, j]
+    for k in set(range(views.seen.shape[1])) - {i, j}:
+        rows = np.flatnonzero(meets & views.seen[:, k] & (depths[:, k] > 0.0))
+        by_point = derivatives[rows, k]
+        covariance = np.linalg.inv(views.weights[rows, k]) + by_point @ spread[rows] @ np.swapaxes(by_point, 1, 2)
+        missed = np.linalg.solve(covariance, residuals[rows, k][..., None])[..., 0]
+        distance = np.einsum("ni,ni->n", missed, residuals[rows, k])
+        agree[rows, k] = distance <= _GATES[1]
+        total[rows] += np.where(agree[rows, k], distance, 0.0)
+    return points, agree, total
+
+
+def _halfway(views: _Views, i: int, j: int) -> Array:
+    """(n, 3) the middle of the shortest line between the rays of two views; NaN where they are parallel."""
+    first, second = (_directions(views, c) for c in (i, j))
+    centres = [-views.rotations[c].T @ views.translations[c] for c in (i, j)]
+    between = centres[1] - centres[0]
+    cosine = np.einsum("ni,ni->n", first, second)
+    sine2 = 1.0 - cosine**2
+    sine2[sine2 < _TINY_ANGLE] = np.nan
+    along_first, along_second = first @ between, second @ between
+    near = (along_first - cosine * along_second) / sine2
+    far = (cosine * along_first - along_second) / sine2
+    return np.asarray(0.5 * (centres[0] + near[:, None] * first + centres[1] + far[:, None] * second))
+
+
+def _directions(views: _Views, c: int) -> Array:
+    local = np.concatenate((views.planes[:, c], np.ones((len(views.planes), 1))), axis=1)
+    return np.asarray(local @ views.rotations[c] / np.linalg.norm(local, axis=1, keepdims=True))
+
+
+def _refined(views: _Views, points: Array, used: Flags) -> tuple[Array, Array]:
+    """Gauss-Newton on the weighted error in the planes: points (n, 3) and covariances (n, 3, 3); NaN where it fails."""
+    points = points.copy()
+    spread = np.full((len(points), 3, 3), np.nan)
+    weights = views.weights * used[..., None, None]
+    for _ in range(_STEPS):
+        planes, derivatives, _ = views.project(points)
+        derivatives = np.where(used[..., None, None], derivatives, 0.0)
+        residuals = np.where(used[..., None], planes - views.planes, 0.0)
+        weighted = weights @ derivatives
+        information = np.einsum("ncij,ncik->njk", derivatives, weighted)
+        gradient = np.einsum("ncij,nci->nj", weighted, residuals)
+        solvable = np.isfinite(information).all(axis=(1, 2))
+        solvable[solvable] &= np.linalg.eigvalsh(information[solvable])[:, 0] * MAX_SIGMA**2 > _HOPELESS
+        points[~solvable], spread[~solvable] = np.nan, np.nan
+        spread[solvable] = np.linalg.inv(information[solvable])
+        points[solvable] -= np.einsum("nij,nj->ni", spread[solvable], gradient[solvable])
+    return points, spread
+
+
+def _in_front(views: _Views, points: Array) -> Flags:
+    return views.project(points)[2] > 0.0

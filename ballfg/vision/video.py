@@ -1,0 +1,192 @@
+"""Frames with their stamps: from a video file or a folder of images, stamped by the container or by a CSV file."""
+
+from __future__ import annotations
+
+import re
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.vision.stamps import Array, read_stamps
+
+Image = NDArray[np.uint8]
+
+IMAGES: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
+"""Endings of what counts as an image in a folder; other files are left alone."""
+SHORT: Final = (3, 0.02)
+"""Frames, and share of them, that may be missing at the end of what the container announces: it often estimates."""
+
+
+class Video(ABC):
+    """Frames of one camera, which can be read more than once.
+
+    Attributes:
+        name: the file's or folder's, without ending.
+        path: of it.
+        size: width and height, px.
+        count: frames; where stamps come from the container, what it announces.
+    """
+
+    def __init__(self, path: Path, size: tuple[int, int], count: int, stamps: Array | None) -> None:
+        self.name = path.stem if path.is_file() else path.name
+        self.path = path
+        self.size = size
+        self.count = count
+        self._stamps = stamps
+
+    def frames(self) -> Iterator[tuple[float, Image]]:
+        """Stamp (s) and image (h, w, 3), BGR, of each frame in turn.
+
+        Raises: ValueError: stamps that do not increase, an image of another size, frames that are fewer or more than
+            the stamps or, by over 2 %, fewer than announced.
+        """
+        last = -np.inf
+        number = -1
+        for number, (stamp, image) in enumerate(self._decoded()):
+            if self._stamps is not None:
+                if number >= len(self._stamps):
+                    raise ValueError(self._mismatch("more"))
+                stamp = float(self._stamps[number])
+            if not stamp > last:
+                raise ValueError(
+                    f"stamps of {self.path} must increase; frame {number} has {stamp:.6f} s after {last:.6f} s. "
+                    "Give a CSV file with the stamps of the frames."
+                )
+            last = stamp
+            yield stamp, image
+        self._check_count(number + 1)
+
+    def _check_count(self, read: int) -> None:
+        if self._stamps is not None and read < len(self._stamps):
+            raise ValueError(self._mismatch(f"only {read}"))
+        if self._stamps is None and self.count - read > max(SHORT[0], SHORT[1] * self.count):
+            raise ValueError(
+                f"video {self.path} must be whole; it announces {self.count} frames and ends after {read}. "
+                "Copy it again, or give a CSV file with stamps for those that are there."
+            )
+
+    def _mismatch(self, found: str) -> str:
+        rows = 0 if self._stamps is None else len(self._stamps)
+        return f"stamps must have one row a frame; {self.path} has {found} frames and the file {rows} rows. Correct it."
+
+    @abstractmethod
+    def sample(self, count: int) -> list[Image]:
+        """At most `count` images spread over the recording."""
+
+    @abstractmethod
+    def _decoded(self) -> Iterator[tuple[float, Image]]:
+        """Each frame with the container's stamp."""
+
+
+class VideoFile(Video):
+    """Frames of a file that OpenCV's FFmpeg decodes. See `open_video`."""
+
+    def __init__(self, path: Path, stamps: Array | None) -> None:
+        capture = _capture(path)
+        there, image = capture.read()
+        if not there:
+            raise ValueError(f"video {path} must have at least one frame that can be decoded; got none. Convert it.")
+        count = max(int(capture.get(cv2.CAP_PROP_FRAME_COUNT)), 1)
+        capture.release()
+        super().__init__(path, (image.shape[1], image.shape[0]), count if stamps is None else len(stamps), stamps)
+
+    def sample(self, count: int) -> list[Image]:
+        """At most `count` images spread over the recording; those at its start where the file cannot be wound."""
+        capture = _capture(self.path)
+        images: list[Image] = []
+        for turn in range(min(count, self.count)):
+            capture.set(cv2.CAP_PROP_POS_FRAMES, turn * self.count // min(count, self.count))
+            there, image = capture.read()
+            if there:
+                images.append(np.asarray(image, dtype=np.uint8))
+        capture.release()
+        return images
+
+    def _decoded(self) -> Iterator[tuple[float, Image]]:
+        capture = _capture(self.path)
+        try:
+            while True:
+                there, image = capture.read()
+                if not there:
+                    return
+                yield 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC), np.asarray(image, dtype=np.uint8)
+        finally:
+            capture.release()
+
+
+class ImageFolder(Video):
+    """Frames of a folder of images, in the natural order of their names (2 before 10). See `open_video`."""
+
+    def __init__(self, path: Path, stamps: Array) -> None:
+        self._files = sorted((file for file in path.iterdir() if file.suffix.lower() in IMAGES), key=_natural)
+        if not self._files:
+            raise ValueError(f"folder {path} must hold images ({', '.join(IMAGES)}); got none. Check the path.")
+        image = _read(self._files[0])
+        super().__init__(path, (image.shape[1], image.shape[0]), len(self._files), stamps)
+        self._check_count(len(self._files))
+        if len(self._files) > len(stamps):
+            raise ValueError(self._mismatch(f"{len(self._files)}"))
+
+    def sample(self, count: int) -> list[Image]:
+        """At most `count` images spread over the recording."""
+        few = min(count, len(self._files))
+        return [self._image(self._files[turn * len(self._files) // few]) for turn in range(few)]
+
+    def _decoded(self) -> Iterator[tuple[float, Image]]:
+        return ((np.nan, self._image(file)) for file in self._files)
+
+    def _image(self, file: Path) -> Image:
+        image = _read(file)
+        size = (image.shape[1], image.shape[0])
+        if size != self.size:
+            raise ValueError(
+                f"images of {self.path} must have one size; {file.name} has {size}, the first {self.size}."
+            )
+        return image
+
+
+def open_video(path: str | PathLike[str], stamps: str | PathLike[str] | None = None) -> Video:
+    """Opens a video file or a folder of images.
+
+    Args:
+        path: a file that FFmpeg decodes, or a folder.
+        stamps: a CSV file with a column `t` (s), one row a frame, optionally a column `frame` that counts from 0.
+            Without it the container's stamps are taken: mp4 and avi keep them, webm rounds to ms. A folder needs it.
+    Raises:
+        FileNotFoundError: nothing is there. ValueError: it cannot be decoded, is empty, or the stamps do not fit.
+    """
+    place = Path(path)
+    if not place.exists():
+        raise FileNotFoundError(f"video {place} does not exist. Check the path.")
+    times = None if stamps is None else read_stamps(Path(stamps))
+    if place.is_file():
+        return VideoFile(place, times)
+    if times is None:
+        raise ValueError(f"stamps must be given for a folder of images; got none for {place}. Pass a CSV file.")
+    return ImageFolder(place, times)
+
+
+def _capture(path: Path) -> cv2.VideoCapture:
+    """Decoding on one thread: the cameras are what is spread over the cores."""
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
+    if not capture.isOpened():
+        raise ValueError(f"video {path} must be a file that FFmpeg decodes; it is not, or it is cut off. Convert it.")
+    return capture
+
+
+def _read(file: Path) -> Image:
+    image = cv2.imread(str(file), cv2.IMREAD_COLOR)
+    if image is None:
+        raise ValueError(f"image {file} must be readable; OpenCV cannot decode it. Write it again or remove it.")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _natural(file: Path) -> tuple[Sequence[tuple[int, str]], str]:
+    parts = re.split(r"(\d+)", file.stem)
+    return [(int(part), "") if part.isdigit() else (-1, part) for part in parts], file.name

@@ -1,0 +1,148 @@
+"""One camera's view with what was found in it: candidates, the balls that they were taken for, trails and stamps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.vision.palette import bgr
+from ballfg.vision.playback import Image
+from ballfg.vision.tracking import Tracking
+
+Array = NDArray[np.float64]
+Colour = tuple[int, int, int]
+
+TRAIL: Final = 0.4
+"""s of a ball's past that its trail shows: over a metre of flight, without filling the view."""
+LINGER: Final = 0.3
+"""s that the trail stays after the ball's last point, so that the end of a track can be seen."""
+RING: Final = 9.0
+"""px, radius of the ring round an associated ball on the scaled view: leaves the ball, some 6 px wide, visible."""
+BESIDE: Final = (12.0, -8.0)
+"""px from the ball to its name."""
+CANDIDATE: Final = 4.5
+"""px, radius of the ring round a candidate."""
+UNLIKELY, LIKELY = (130, 130, 130), (255, 255, 255)
+"""Colours of candidates of score 0 and 1; those between are mixed."""
+DIMMED: Final = 0.4
+"""Of its brightness is left of the view behind text."""
+CAPTION: Final = 22
+"""px, height of the line of text at the top."""
+_SHIFT: Final = 4
+"""Binary digits after the point that OpenCV draws with: a 16th of a pixel."""
+
+
+class ViewPainter:
+    """Draws one camera's frames at a smaller size.
+
+    Args:
+        tracking: what was found.
+        camera: number of the camera.
+        width: px of the drawn view; the height follows.
+    """
+
+    def __init__(self, tracking: Tracking, camera: int, width: int) -> None:
+        self._camera = tracking.cameras[camera]
+        self._detections = tracking.detections[camera]
+        self._names = tracking.names
+        self._balls = tracking.balls
+        self._scale = width / self._camera.size[0]
+        self.size = (width, max(1, round(self._camera.size[1] * self._scale)))
+        self._trails = [self._camera.project(ball.points) for ball in tracking.balls]
+        self._used: dict[int, list[tuple[int, Array]]] = {}
+        for track, ball in enumerate(tracking.balls):
+            seen = tracking.seen(ball, camera)
+            for frame, pixel in zip(seen.frames, seen.pixels, strict=True):
+                self._used.setdefault(int(frame), []).append((track, pixel))
+
+    def paint(self, image: Image | None, frame: int, time: float) -> Image:
+        """The view (h, w, 3) of one moment.
+
+        Args: image: (h, w, 3) as filmed, or None where the camera has none.  frame: its number.  time: s, true time.
+        """
+        if image is None:
+            view = np.zeros((self.size[1], self.size[0], 3), np.uint8)
+            caption(view, f"{self._camera.name}   no frame")
+            return view
+        view = np.asarray(cv2.resize(image, self.size, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+        used = self._used.get(frame, ())
+        clean = view.copy() if used else view
+        self._paint_trails(view, time)
+        self._paint_candidates(view, frame)
+        for track, pixel in used:
+            uncover(view, clean, self._scaled(pixel), RING)
+            self._ring(view, pixel, RING, bgr(track), 2)
+            write(view, self._names[track], self._scaled(pixel) + np.array(BESIDE), bgr(track))
+        caption(view, f"{self._camera.name}   frame {frame}   stamp {self._detections.frames[frame]:.4f} s")
+        return view
+
+    def _paint_trails(self, view: Image, time: float) -> None:
+        for track, (ball, pixels) in enumerate(zip(self._balls, self._trails, strict=True)):
+            if not ball.times[0] <= time <= ball.times[-1] + LINGER:
+                continue
+            recent = pixels[(ball.times > time - TRAIL) & (ball.times <= time)]
+            polyline(view, self._scaled(recent), bgr(track), 1)
+
+    def _paint_candidates(self, view: Image, frame: int) -> None:
+        candidates = self._detections.in_frame(frame)
+        balls = [pixel for _, pixel in self._used.get(frame, ())]
+        for pixel, score in zip(candidates.pixels, candidates.scores, strict=True):
+            if not any(np.array_equal(pixel, ball) for ball in balls):
+                self._ring(view, pixel, CANDIDATE, by_score(score), 1)
+
+    def _ring(self, view: Image, pixel: Array, radius: float, colour: Colour, thickness: int) -> None:
+        ring(view, self._scaled(pixel), radius, colour, thickness)
+
+    def _scaled(self, pixels: Array) -> Array:
+        """Places on the drawn view of places in the image: both count from the centre of the top left pixel."""
+        return np.asarray((pixels + 0.5) * self._scale - 0.5)
+
+
+def by_score(score: float) -> Colour:
+    """The colour of a candidate."""
+    blue, green, red = (round(low + score * (high - low)) for low, high in zip(UNLIKELY, LIKELY, strict=True))
+    return blue, green, red
+
+
+def ring(view: Image, centre: Array, radius: float, colour: Colour, thickness: int = 1) -> None:
+    """A circle at a place (2,) px between pixels."""
+    u, v = (round(float(x) * 2**_SHIFT) for x in centre)
+    cv2.circle(view, (u, v), round(radius * 2**_SHIFT), colour, thickness, cv2.LINE_AA, _SHIFT)
+
+
+def uncover(view: Image, clean: Image, centre: Array, radius: float) -> None:
+    """Puts back, inside a circle, what was there before something was drawn."""
+    disc = np.zeros(view.shape[:2], np.uint8)
+    ring(disc, centre, radius, (255, 255, 255), cv2.FILLED)
+    cv2.copyTo(clean, disc, view)
+
+
+def polyline(view: Image, places: Array, colour: Colour, thickness: int) -> None:
+    """Lines through places (n, 2) px; broken where they are NaN or far outside the view."""
+    limit = 4 * max(view.shape)
+    fine = np.isfinite(places).all(axis=1) & (np.abs(np.nan_to_num(places)) < limit).all(axis=1)
+    for piece in np.split(np.arange(len(places)), np.flatnonzero(~fine)):
+        inside = piece[fine[piece]]
+        if len(inside) > 1:
+            points = np.round(places[inside] * 2**_SHIFT).astype(np.int32)
+            cv2.polylines(view, [points], False, colour, thickness, cv2.LINE_AA, _SHIFT)
+
+
+def write(view: Image, text: str, at: Sequence[float] | Array, colour: Colour, scale: float = 0.45) -> None:
+    """Text at its lower left corner, on a dark plate; a letter that the font may lack is a question mark."""
+    plain = text.encode("ascii", "replace").decode()
+    left, bottom = (round(float(x)) for x in at)
+    (width, height), below = cv2.getTextSize(plain, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
+    plate = view[max(0, bottom - height - 2) : max(0, bottom + below), max(0, left - 2) : max(0, left + width + 2)]
+    plate[:] = (plate * DIMMED).astype(np.uint8)
+    cv2.putText(view, plain, (left, bottom), cv2.FONT_HERSHEY_SIMPLEX, scale, colour, 1, cv2.LINE_AA)
+
+
+def caption(view: Image, text: str) -> None:
+    """A line of text at the top."""
+    view[:CAPTION] = (view[:CAPTION] * DIMMED).astype(np.uint8)
+    write(view, text, (8.0, 15.0), (255, 255, 255))

@@ -1,0 +1,282 @@
+"""`ballfg track` as a user meets it: from videos or detections to a dataset, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from ballfg.cli.main import run
+from ballfg.simulate.cameras import table_rig
+from ballfg.simulate.scene import SceneConfig, record, write_scene
+from ballfg.tracks import read_dataset
+from ballfg.vision import Camera
+from ballfg.vision.camera_file import write_cameras
+
+RATE = 100.0
+SIZE = (320, 180)
+SPAN = 0.5  # s
+
+
+def status(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as exit_:
+        run([str(argument) for argument in arguments])
+    assert isinstance(exit_.value.code, int)
+    return exit_.value.code
+
+
+def camera(name: str, turn: float) -> Camera:
+    """2.5 m from the point above the middle of the table's near end, looking at it level, from a direction about z."""
+    upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    about_z = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
+    rotation = upright @ about_z
+    tvec = np.array([0.0, 0.0, 2.5]) - rotation @ (0.0, 0.0, 1.0)
+    matrix = [[250.0, 0.0, 159.5], [0.0, 250.0, 89.5], [0.0, 0.0, 1.0]]
+    return Camera(name, SIZE, matrix, np.zeros(5), cv2.Rodrigues(rotation)[0].ravel(), tvec)
+
+
+RIG = [camera("left", -0.7), camera("middle", 0.1), camera("right", 0.8)]
+
+
+def centre(times: np.ndarray) -> np.ndarray:
+    """(n, 3) m, a throw over the table."""
+    return np.column_stack((-0.8 + 3.2 * times, 0.1 * times, 0.9 + 1.8 * times - 4.905 * times**2))
+
+
+@pytest.fixture
+def rig(tmp_path: Path) -> Path:
+    path = tmp_path / "cameras.yaml"
+    write_cameras(path, RIG)
+    return path
+
+
+def table(path: Path, ball: bool = True) -> Path:
+    """Detections of the throw, or of nothing that moves like a ball."""
+    noise = np.random.default_rng(0)
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("t", "camera", "u", "v", "sigma_u", "sigma_v", "score"))
+        for model in RIG:
+            for t in np.arange(0.0, SPAN, 1.0 / RATE):
+                pixel = model.project(centre(np.array([t])))[0] if ball else noise.uniform((0, 0), SIZE)
+                u, v = pixel + 0.1 * noise.normal(size=2)
+                writer.writerow((t, model.name, u, v, 0.1, 0.1, 0.8 if ball else 0.4))
+    return path
+
+
+# --- detections ----------------------------------------------------------------------------------------------------
+
+
+def test_detections_become_a_dataset(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "shots"
+    assert status("track", table(tmp_path / "detections.csv"), "--cameras", rig, "--out", out) == 0
+    said = capsys.readouterr()
+    assert said.err == ""
+    assert said.out.startswith(f"{out}: 1 tracks of 50 points; wrote dataset.yaml, tracks.csv, detections.csv")
+    assert "  left: 50 frames, 50 candidates, 50 of them a ball" in said.out
+    dataset = read_dataset(out)
+    assert (dataset.info.name, dataset.info.table_height, dataset.info.rate) == ("shots", 0.76, 100.0)
+    (track,) = dataset
+    assert np.sqrt(((track.positions - centre(track.times)) ** 2).sum(axis=1).mean()) < 0.004
+    assert cv2.imread(str(out / "contact_sheet.png")) is not None
+
+
+def test_what_describes_the_dataset_can_be_given(rig: Path, tmp_path: Path) -> None:
+    out = tmp_path / "shots"
+    words = ("--name", "throws", "--table-height", 0.1, "--ball", "tennis", "--without", "middle")
+    assert status("track", table(tmp_path / "detections.csv"), "--cameras", rig, "--out", out, *words) == 0
+    info = read_dataset(out).info
+    assert (info.name, info.table_height, info.ball.radius) == ("throws", 0.1, 0.0335)
+    assert info.source == "ballfg track detections.csv"
+    assert "middle" not in (out / "cameras.yaml").read_text()
+
+
+def test_no_ball_says_how_good_the_best_were_and_leaves_an_empty_dataset(
+    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "shots"
+    given = table(tmp_path / "detections.csv", ball=False)
+    assert status("track", given, "--cameras", rig, "--out", out) == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert (
+        "no ball was found. Best candidates' scores (1 is a ball): left: 0.40, 0.40, 0.40 in 50 frames; middle" in said
+    )
+    assert "holds an empty dataset; look at contact_sheet.png there" in said
+    assert status("estimate", out, "--out", tmp_path / "states.csv") == 2
+    assert "must hold tracks; got a header without rows" in capsys.readouterr().err
+
+
+def test_a_camera_that_was_turned_is_named(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    nudge = cv2.Rodrigues(np.deg2rad([0.5, 0.0, 0.0]))[0]
+    turned = cv2.Rodrigues(nudge @ RIG[1].rotation)[0].ravel()
+    write_cameras(rig, [RIG[0], replace(RIG[1], rvec=turned, tvec=nudge @ RIG[1].tvec), RIG[2]])
+    given = table(tmp_path / "detections.csv")
+    assert status("track", given, "--cameras", rig, "--out", tmp_path / "shots") == 0
+    assert capsys.readouterr().err.startswith("note: Camera middle has moved since its calibration")
+
+
+def refused(capsys: pytest.CaptureFixture[str], *arguments: object) -> str:
+    assert status("track", *arguments) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("ballfg: error: ")
+    assert said.count("\n") == 1
+    return said
+
+
+def test_bad_detections_are_refused(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = table(tmp_path / "detections.csv")
+    words = (given, "--cameras", rig, "--out", tmp_path / "shots")
+    for options, message in (
+        (("--stamps", "left=a.csv"), "--stamps must not be given with detections"),
+        (("--colour", "white"), "--colour must not be given with detections"),
+        (("--without", "lft"), "without must name a camera: left, middle, right; got 'lft'"),
+        (("--without", "left", "--without", "right"), "cameras must be at least 2; got 1"),
+        (("--ball", "golf"), "ball must be table-tennis or tennis or a YAML file"),
+    ):
+        assert message in refused(capsys, *words, *options)
+    write_cameras(rig, RIG[:2])
+    assert "line 102, column 'camera': must be a camera: left, middle; got 'right'" in refused(capsys, *words)
+    assert not (tmp_path / "shots").exists()
+
+
+def test_what_is_there_is_not_lost(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = table(tmp_path / "detections.csv")
+    out = tmp_path / "shots"
+    words = (given, "--cameras", rig, "--out", out)
+    assert "lies in" in refused(capsys, given, "--cameras", rig, "--out", tmp_path)
+    assert status("track", *words) == 0
+    before = (out / "tracks.csv").read_bytes()
+    capsys.readouterr()
+    assert "Replace it with --force" in refused(capsys, *words)
+    assert status("track", *words, "--force") == 0
+    assert (out / "tracks.csv").read_bytes() == before
+
+
+# --- videos --------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two shots, the second while the first still flies, with everything else that moves in a room."""
+    folder = tmp_path_factory.mktemp("track") / "scene"
+    config = SceneConfig(shots=2, interval=0.7, seed=1, rate=60.0, settings={"speed": [9]})
+    write_scene(folder, record(config, table_rig((640, 360))))
+    return folder
+
+
+def videos(scene: Path) -> list[object]:
+    words: list[object] = [scene / f"{name}.mp4" for name in ("left", "right", "far")]
+    for name in ("left", "right", "far"):
+        words += ["--stamps", f"{name}={scene}/{name}_stamps.csv"]
+    return [*words, "--cameras", scene / "cameras.yaml"]
+
+
+def numbers(path: Path, *columns: str) -> dict[str, np.ndarray]:
+    """(n, k) of each trajectory."""
+    found: dict[str, list[list[float]]] = {}
+    with path.open(newline="") as file:
+        for row in csv.DictReader(file):
+            found.setdefault(row["trajectory"], []).append([float(row[name]) for name in columns])
+    return {name: np.array(rows) for name, rows in found.items()}
+
+
+def test_videos_become_the_tracks_that_were_flown(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "shots"
+    assert status("track", *videos(scene), "--out", out, "--jobs", 1) == 0
+    assert capsys.readouterr().out.startswith(f"{out}: 2 tracks of ")
+    truth = numbers(scene / "truth.csv", "t", "x", "y", "z")
+    visible = numbers(scene / "visible.csv", "t_true")
+    due, found = 0, 0
+    tracks = list(read_dataset(out))
+    assert len(tracks) == len(truth) == 2
+    squares = []
+    for track, (name, flown) in zip(tracks, truth.items(), strict=True):
+        true = np.column_stack([np.interp(track.times, flown[:, 0], flown[:, axis]) for axis in (1, 2, 3)])
+        squares.append(((track.positions - true) ** 2).sum(axis=1))
+        times, views = np.unique(visible[name], return_counts=True)
+        due += int((views >= 2).sum())
+        found += int(np.isin(times[views >= 2].round(6), track.times.round(6)).sum())
+    assert found >= 0.97 * due
+    assert np.sqrt(np.concatenate(squares).max()) < 0.05  # no false point
+    assert np.sqrt(np.concatenate(squares).mean()) < 0.005
+    overlay = cv2.VideoCapture(str(out / "overlay.mp4"))
+    assert int(overlay.get(cv2.CAP_PROP_FRAME_COUNT)) == len((scene / "left_stamps.csv").read_text().split()) - 1
+    assert (overlay.get(cv2.CAP_PROP_FRAME_WIDTH), overlay.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (1920, 390)
+
+
+def film(path: Path, size: tuple[int, int] = SIZE, frames: int = 20) -> Path:
+    """A video of noise on grey."""
+    noise = np.random.default_rng(1)
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 50.0, size)
+    for _ in range(frames):
+        writer.write(noise.normal(110, 2, (size[1], size[0], 3)).clip(0, 255).astype(np.uint8))
+    writer.release()
+    return path
+
+
+def stamps(path: Path, times: np.ndarray) -> Path:
+    path.write_text("t\n" + "".join(f"{t}\n" for t in times))
+    return path
+
+
+def test_bad_videos_are_refused(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    left, middle, right = (film(tmp_path / f"{model.name}.mp4") for model in RIG)
+    out = tmp_path / "shots"
+    words = ("--cameras", rig, "--out", out, "--jobs", 1)
+    assert "got none for 'middle'. Give it as middle=FILE, or leave the camera out with --without middle" in refused(
+        capsys, left, right, *words
+    )
+    assert "video 'side.mp4' must be of a camera: left, middle, right; got 'side'" in refused(
+        capsys, left, "side.mp4", *words
+    )
+    assert "does not exist" in refused(capsys, left, middle, f"right={tmp_path}/no.mp4", *words)
+    broken = tmp_path / "broken.mp4"
+    broken.write_bytes(right.read_bytes()[:2000])
+    assert "broken.mp4 must be a file that FFmpeg decodes" in refused(capsys, left, middle, f"right={broken}", *words)
+    small = film(tmp_path / "small.mp4", (160, 90))
+    assert "got 320x180 in the cameras' file and a video of 160x90" in refused(
+        capsys, left, middle, f"right={small}", *words
+    )
+    back = stamps(tmp_path / "back.csv", np.r_[np.arange(10), 8, np.arange(11, 20)] / 50.0)
+    assert "frame 10 has 0.16 s after 0.18 s" in refused(
+        capsys, left, middle, right, *words, "--stamps", f"left={back}"
+    )
+    later = stamps(tmp_path / "later.csv", 60.0 + np.arange(20) / 50.0)
+    assert "camera 'right' overlaps with no other: 'left' 0 to 0.38 s; 'middle' 0 to 0.38 s; 'right' 60 to" in refused(
+        capsys, left, middle, right, *words, "--stamps", f"right={later}"
+    )
+    assert not out.exists()
+
+
+def test_videos_without_a_ball_leave_pictures_to_look_at(
+    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "shots"
+    given = [film(tmp_path / f"{model.name}.mp4") for model in RIG]
+    said = refused(capsys, *given, "--cameras", rig, "--out", out, "--jobs", 1)
+    assert "no ball was found. Best candidates' scores (1 is a ball): left: no candidate in 20 frames" in said
+    assert "look at overlay.mp4, contact_sheet.png there" in said
+    assert (out / "tracks.csv").read_text().count("\n") == 1
+    assert {path.name for path in out.iterdir()} >= {"dataset.yaml", "detections.csv", "overlay.mp4"}
+
+
+def test_a_detector_of_ones_own_finds_what_it_looks_for(
+    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.py").write_text(
+        "from ballfg.vision.detections import Candidates\n"
+        "def corner(image):\n"
+        "    return Candidates.at([[5.0, 7.0]], sigma=0.3, scores=[0.25])\n"
+    )
+    given = [film(tmp_path / f"{model.name}.mp4") for model in RIG]
+    words = (*given, "--cameras", rig, "--out", tmp_path / "shots", "--detector", f"{tmp_path}/mine.py:corner")
+    assert "left: 0.25, 0.25, 0.25 in 20 frames" in refused(capsys, *words, "--no-overlay", "--jobs", 1)
+    assert not (tmp_path / "shots" / "overlay.mp4").exists()
+    assert "--colour must not be given with --detector" in refused(capsys, *words, "--colour", "orange", "--force")

@@ -1,0 +1,230 @@
+"""The pictures of a recording: the right frame of each camera at each time, the ball marked where it is."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from ballfg.tracks.sightings import Sightings
+from ballfg.vision import Camera
+from ballfg.vision.contact_sheet import MOST_TRACKS, ContactSheet
+from ballfg.vision.detections import Candidates, Detections
+from ballfg.vision.overlay import STRIP, VIEW_WIDTH, OverlayPainter, write_overlay
+from ballfg.vision.palette import bgr
+from ballfg.vision.playback import HELD, Image, nearest, play, schedule
+from ballfg.vision.seen_ball import SeenBall
+from ballfg.vision.strobe import HEIGHT, WIDTH, ZOOM, Strobe, tapped
+from ballfg.vision.tracking import Tracking
+from ballfg.vision.view_painter import RING
+
+SIZE = (640, 360)
+RATE = 100.0
+FRAMES = 60
+START, END = 10, 50
+BACKGROUND, BALL = (60, 90, 70), (240, 250, 245)
+RADIUS = 0.02
+
+
+def camera(name: str, turn: float) -> Camera:
+    """2 m from the origin, looking at it along +y, then turned about z."""
+    upright = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    about_z = np.array([[np.cos(turn), -np.sin(turn), 0.0], [np.sin(turn), np.cos(turn), 0.0], [0.0, 0.0, 1.0]])
+    matrix = [[500.0, 0.0, 319.5], [0.0, 500.0, 179.5], [0.0, 0.0, 1.0]]
+    return Camera(name, SIZE, matrix, np.zeros(5), cv2.Rodrigues(upright @ about_z)[0].ravel(), [0.0, 0.0, 2.0])
+
+
+RIG = (camera("left", -0.6), camera("right", 0.6))
+
+
+def centre(times: NDArray[np.float64]) -> NDArray[np.float64]:
+    s = times - START / RATE
+    return np.column_stack((-0.4 + 2.0 * s, 0.1 * s, 0.1 + 1.5 * s - 4.905 * s**2))
+
+
+def made(count: int = 1) -> Tracking:
+    """One flight, given as `count` balls."""
+    stamps = np.arange(FRAMES) / RATE
+    times = stamps[START:END]
+    points = centre(times)
+    nothing = Candidates.none()
+    detections = tuple(
+        Detections.of_frames(
+            model.name,
+            [
+                (t, Candidates.at(model.project(points[i - START]), 0.2) if START <= i < END else nothing)
+                for i, t in enumerate(stamps)
+            ],
+        )
+        for model in RIG
+    )
+    camera_numbers = np.tile([0, 1], len(times))
+    pixels = np.stack([model.project(points) for model in RIG], axis=1).reshape(-1, 2)
+    sightings = Sightings(
+        ("left", "right"), camera_numbers, np.repeat(times, 2), pixels, np.tile(0.04 * np.eye(2), (len(pixels), 1, 1))
+    )
+    covariances = np.tile(1e-6 * np.eye(3), (len(times), 1, 1))
+    ball = SeenBall(times, points, covariances, sightings, np.full(len(times), 2))
+    return Tracking(RIG, detections, (ball,) * count, None)
+
+
+def filmed(number: int) -> Iterator[tuple[float, Image]]:
+    for i in range(FRAMES):
+        image = np.full((SIZE[1], SIZE[0], 3), BACKGROUND, np.uint8)
+        if START <= i < END:
+            u, v = RIG[number].project(centre(np.array([i / RATE])))[0]
+            cv2.circle(image, (round(u * 16), round(v * 16)), 5 * 16, BALL, -1, cv2.LINE_AA, 4)
+        yield i / RATE, image
+
+
+# --- which frames stand side by side -------------------------------------------------------------------------------
+
+
+def test_the_frame_on_show_is_the_nearest_in_true_time() -> None:
+    left = Detections.of_frames("left", [(i / RATE, Candidates.none()) for i in range(FRAMES)])
+    late = 0.3  # s
+    stamps = late + 0.004 + np.arange(0, FRAMES, 2) / RATE
+    right = Detections.of_frames("right", [(float(t), Candidates.none()) for t in stamps])
+    moments = schedule((left, right), (RIG[0], replace(RIG[1], time_offset=late)))
+    assert np.array_equal(moments.times, left.frames)
+    assert np.array_equal(moments.frames[:, 0], np.arange(FRAMES))
+    apart = np.abs(right.frames[moments.frames[:, 1]] - late - moments.times)
+    every = np.abs(right.frames[None] - late - moments.times[:, None]).min(axis=1)
+    assert apart == pytest.approx(every)
+
+
+def test_a_frame_is_held_for_a_while_and_then_gone() -> None:
+    clock = np.array([0.0, 0.01, 0.5])
+    times = np.array([0.01 + 0.9 * HELD, 0.01 + 1.1 * HELD, 0.5 - 0.9 * HELD])
+    assert nearest(clock, times).tolist() == [1, -1, 2]
+    assert nearest(np.array([1.0]), np.array([0.0, 1.0])).tolist() == [-1, 0]
+    assert nearest(np.zeros(0), times).tolist() == [-1, -1, -1]
+
+
+def test_what_other_cameras_film_before_and_after_is_shown_too() -> None:
+    left = Detections.of_frames("left", [(1.0 + i / RATE, Candidates.none()) for i in range(20)])
+    right = Detections.of_frames("right", [(0.9 + i / RATE / 0.9, Candidates.none()) for i in range(15)])
+    moments = schedule((left, right), RIG)
+    assert moments.times[0] == pytest.approx(0.9)
+    assert (np.diff(moments.times) > 0).all()
+    assert set(left.frames) <= set(moments.times)
+    assert len(moments.times) == 20 + 9
+
+
+def test_playing_skips_and_repeats_frames_as_the_clock_wants() -> None:
+    moments = schedule(made().detections, RIG)
+    moments = replace(moments, frames=np.array([[0, -1], [2, 3], [2, 3], [5, -1]]), times=np.arange(4.0))
+    numbered = [iter([(0.0, np.full((1, 1, 3), i, np.uint8)) for i in range(9)]) for _ in RIG]
+    shown = [[None if image is None else int(image[0, 0, 0]) for image in images] for images in play(moments, numbered)]
+    assert shown == [[0, None], [2, 3], [2, 3], [5, None]]
+
+
+# --- the overlay ---------------------------------------------------------------------------------------------------
+
+
+def test_the_ball_is_ringed_in_its_colour_in_each_view() -> None:
+    tracking = made()
+    painter = OverlayPainter(tracking)
+    assert painter.size == (2 * VIEW_WIDTH, SIZE[1] + STRIP)
+    moments = schedule(tracking.detections, RIG)
+    pages = list(painter.paint_all(moments, [filmed(0), filmed(1)]))
+    assert len(pages) == FRAMES
+    page = pages[30].astype(int)
+    for number, model in enumerate(RIG):
+        u, v = model.project(centre(np.array([30 / RATE])))[0] + (number * VIEW_WIDTH, 0.0)
+        for across, down in ((-RING, 0.0), (0.0, RING)):
+            assert np.abs(page[round(v + down), round(u + across)] - bgr(0)).max() < 60
+        assert np.abs(page[round(v), round(u)] - BALL).max() < 30  # the ball itself stays in sight
+    assert np.abs(pages[5][100:200, :VIEW_WIDTH].astype(int) - BACKGROUND).max() == 0  # before there is a ball
+
+
+def test_the_video_has_a_frame_for_each_moment(tmp_path: Path) -> None:
+    path = tmp_path / "overlay.mp4"
+    watched: list[tuple[int, str]] = []
+
+    def watch(items: Iterator[Image], count: int, what: str) -> Iterator[Image]:
+        watched.append((count, what))
+        return items
+
+    assert write_overlay(path, made(), [filmed(0), filmed(1)], watch) == FRAMES
+    video = cv2.VideoCapture(str(path))
+    shapes = []
+    while (read := video.read())[0]:
+        shapes.append(read[1].shape)
+    assert shapes == [(SIZE[1] + STRIP, 2 * VIEW_WIDTH, 3)] * FRAMES
+    assert watched == [(FRAMES, "overlay frames drawn")]
+    with pytest.raises(OSError, match="cannot write this video"):
+        write_overlay(tmp_path / "no" / "overlay.mp4", made(), [filmed(0), filmed(1)])
+
+
+def test_a_view_without_a_frame_says_so() -> None:
+    tracking = made()
+    painter = OverlayPainter(tracking)
+    moments = replace(schedule(tracking.detections, RIG), times=np.zeros(1), frames=np.array([[0, -1]]))
+    (page,) = painter.paint_all(moments, [filmed(0), filmed(1)])
+    assert page[100:, VIEW_WIDTH : VIEW_WIDTH + 600][: SIZE[1] - 100].max() == 0
+
+
+# --- the contact sheet ---------------------------------------------------------------------------------------------
+
+
+def test_the_strobe_holds_balls_of_several_frames() -> None:
+    tracking = made()
+    strobe = Strobe(tracking, 0, 0, RADIUS)
+    for _ in tapped(filmed(0), [strobe]):
+        pass
+    picture = strobe.picture()
+    assert picture.shape == (HEIGHT + ZOOM, WIDTH, 3)
+    white = (picture[:HEIGHT].astype(int).min(axis=2) > 200).astype(np.uint8)
+    assert cv2.connectedComponents(white)[0] - 1 == len(strobe.frames) == 9
+    for place in range(5):  # close-ups: a ball in the middle of each
+        middle = picture[HEIGHT + ZOOM // 2, place * ZOOM + ZOOM // 2].astype(int)
+        assert np.abs(middle - BALL).max() < 20
+
+
+def test_a_camera_that_never_saw_the_ball_has_a_blank_picture() -> None:
+    tracking = made()
+    only_left = tracking.balls[0].sightings.taken(tracking.balls[0].sightings.camera == 0)
+    tracking = replace(tracking, balls=(replace(tracking.balls[0], sightings=only_left),))
+    strobe = Strobe(tracking, 0, 1, RADIUS)
+    assert strobe.count == 0
+    assert strobe.frames == set()
+    assert strobe.picture().shape == (HEIGHT + ZOOM, WIDTH, 3)
+
+
+def test_the_sheet_is_the_same_to_the_byte_and_has_a_row_a_track(tmp_path: Path) -> None:
+    heights = []
+    for count in (1, 2):
+        pages = []
+        for again in range(2 if count == 1 else 1):
+            sheet = ContactSheet(made(count), RADIUS, 0.0, (-0.5, 0.5, -0.3, 0.3))
+            for number in range(2):
+                for _ in tapped(filmed(number), sheet.pictures_of(number)):
+                    pass
+            sheet.write(tmp_path / f"{again}.png")
+            pages.append((tmp_path / f"{again}.png").read_bytes())
+        assert len(set(pages)) == 1
+        heights.append(cv2.imread(str(tmp_path / "0.png")).shape[0])
+    assert heights[1] > 1.6 * heights[0]
+
+
+def test_of_many_tracks_some_are_shown() -> None:
+    sheet = ContactSheet(made(5 * MOST_TRACKS), RADIUS, 0.0, None)
+    assert len(sheet.pictures_of(0)) == MOST_TRACKS
+
+
+def test_a_recording_without_a_ball_shows_its_candidates(tmp_path: Path) -> None:
+    sheet = ContactSheet(replace(made(), balls=()), RADIUS, 0.0, None)
+    (picture,) = sheet.pictures_of(1)
+    for _ in tapped(filmed(1), [picture]):
+        pass
+    drawn = picture.picture()  # type: ignore[attr-defined]
+    u, v = (RIG[1].project(centre(np.array([START / RATE])))[0] + 0.5) * WIDTH / SIZE[0] - 0.5
+    assert drawn[round(v), round(u + 3)].min() > 150
+    sheet.write(tmp_path / "sheet.png")
+    assert cv2.imread(str(tmp_path / "sheet.png")) is not None
