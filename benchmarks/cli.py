@@ -73,6 +73,22 @@ def estimators(
 
 
 @app.command()
+def cameras(out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = None) -> None:
+    """From rendered videos of three cameras to points, velocities and clocks, against the truth.
+
+    Recordings with one shutter and with three, one ball and two, dropped frames, a clock that is late, a camera that
+    was turned after its calibration; and what it costs.
+
+    Example: ballfg-bench cameras --out results/cameras
+    """
+    from ballfg.benchmarks.cameras import FULL, QUICK, run_cameras
+
+    results = _start("cameras", [], quick, seed)
+    pictures = run_cameras(results, _folder(out), QUICK if quick else FULL, jobs or default_jobs())
+    _finish(results, out, pictures)
+
+
+@app.command()
 def dynamics(
     data: Datasets = None,
     transfer: Transfer = None,

@@ -57,15 +57,15 @@ class SpinLabelFactors(PriorFactors):
 
 
 class CoefficientPriorFactors(PriorFactors):
-    """The coefficients of a track lie about the model's own values.
+    """The coefficients of a track lie about the model's own values, its passengers about what they are believed to be.
 
-    Args: model: with the coefficients.  sigma: (p,) standard deviations.
+    Args: model: with the coefficients.  sigma: (p,) standard deviations, those of passengers last.
     """
 
     def __init__(self, model: AugmentedModel, sigma: Array) -> None:
         _check_sigma(sigma)
         self.model = model
-        mean = self._means().detach().numpy()
+        mean = model.means().detach().numpy()
         super().__init__(np.array([COEFFICIENTS]), mean[None], np.diag(1.0 / sigma)[None])
 
     @property
@@ -73,14 +73,9 @@ class CoefficientPriorFactors(PriorFactors):
         """Besides the usual: the model."""
         return (*super().group, id(self.model))  # type: ignore[misc]
 
-    def _means(self) -> Tensor:
-        """(p,) the model's own values, as its parameters are now."""
-        parameters = dict(self.model.model.named_parameters())
-        return torch.stack([parameters[name] for name in self.model.names])
-
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, p) whitened residuals in torch, differentiable in the model's own values too."""
-        return self._whitened(inputs[0] - self._means())
+        return self._whitened(inputs[0] - self.model.means())
 
 
 def state_prior(state: int, mean: Array, sigma: Array) -> PriorFactors:

@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import OwnEffects, check_out, default_jobs, open_inputs, status_lines
+from ballfg.cli.inputs import (
+    OwnEffects,
+    Source,
+    check_out,
+    default_jobs,
+    open_inputs,
+    open_sighted,
+    source_of,
+    status_lines,
+)
 from ballfg.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -28,16 +37,27 @@ class Method(enum.StrEnum):
 
 
 def estimate(
-    dataset: Annotated[Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.")],
+    dataset: Annotated[Path, typer.Argument(help="Folder with dataset.yaml and tracks, or detections and cameras.")],
     out: Annotated[Path, typer.Option(help="Table to write; .csv or .parquet.")],
     method: Annotated[Method, typer.Option(help="The estimator.")] = Method.SMOOTHER,
     model: Annotated[Path | None, typer.Option(help="Model file; the nominal table-tennis model without it.")] = None,
+    source: Annotated[
+        Source | None,
+        typer.Option(
+            "--from",
+            help="Positions of tracks, or detections of cameras: detections.csv with cameras.yaml.",
+            show_default="positions where there is a table of tracks",
+        ),
+    ] = None,
     effects: OwnEffects = None,
     jobs: Annotated[int, typer.Option(min=1, help="Processes.", show_default="one per core")] = default_jobs(),
 ) -> None:
     """Position, velocity and spin with standard deviations, one row per stamp.
 
     They are the true ones where the model file holds measurement effects; the stamps stay as they are written.
+
+    From detections, smoother and online rest on every camera's pixels at its own stamp, and stamps are true times: less
+    the cameras' time offsets. The others use positions that are roughly triangulated.
 
     Example: ballfg estimate data/aimy --method smoother --out states.csv
     """
@@ -48,7 +68,8 @@ def estimate(
     rows = hits = 0
     with TableWriter(out) as table:
         check_out(out, dataset)
-        inputs = open_inputs(dataset, model, effects)
+        opened = open_inputs if (source or source_of(dataset)) is Source.POSITIONS else open_sighted
+        inputs = opened(dataset, model, effects)
         count = len(inputs.dataset)
         estimates = estimate_tracks(inputs.estimator(method.value), inputs.dataset, count, jobs)
         for result in progress(estimates, count, "tracks estimated"):

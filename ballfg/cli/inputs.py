@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import enum
 import os
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
 
 import typer
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
     from ballfg.dynamics import BallModel
     from ballfg.dynamics.surfaces import Surfaces
     from ballfg.estimate import Estimator, Settings
+    from ballfg.estimate.sighted_dataset import SightedDataset
     from ballfg.tracks import Dataset
 
 OwnEffects = Annotated[
@@ -27,11 +29,22 @@ DATASET_TABLES = ("tracks", "labels", "detections", "truth")
 """Names, without their endings, of the tables that a dataset's folder holds."""
 
 
-@dataclass(frozen=True)
-class Inputs:
-    """A dataset and how to look at it."""
+class Source(enum.StrEnum):
+    """What an estimate is made from, by the name of the option."""
 
-    dataset: Dataset
+    POSITIONS = "positions"
+    DETECTIONS = "detections"
+
+
+D = TypeVar("D")
+Opened = TypeVar("Opened", "Dataset", "SightedDataset")
+
+
+@dataclass(frozen=True)
+class Inputs(Generic[D]):
+    """A dataset, of positions or of what cameras saw, and how to look at it."""
+
+    dataset: D
     model: BallModel
     surfaces: Surfaces
     settings: Settings
@@ -51,17 +64,38 @@ def know_effects(files: Iterable[Path] | None) -> None:
         load_effects(file)
 
 
-def open_inputs(dataset: Path, model: Path | None, effects: Iterable[Path] | None = None) -> Inputs:
+def source_of(dataset: Path) -> Source:
+    """Positions where the folder has a table of tracks, or no detections either; else detections."""
+    from ballfg.tracks.dataset import TRACK_FILES
+    from ballfg.tracks.detections_file import DETECTIONS_FILE
+
+    tracks = any((dataset / name).is_file() for name in TRACK_FILES)
+    return Source.POSITIONS if tracks or not (dataset / DETECTIONS_FILE).is_file() else Source.DETECTIONS
+
+
+def open_inputs(dataset: Path, model: Path | None, effects: Iterable[Path] | None = None) -> Inputs[Dataset]:
     """Open and check everything before any work starts; what was repaired is said on stderr."""
+    from ballfg.tracks import read_dataset
+
+    know_effects(effects)
+    return _inputs(read_dataset(dataset), model)
+
+
+def open_sighted(dataset: Path, model: Path | None, effects: Iterable[Path] | None = None) -> Inputs[SightedDataset]:
+    """`open_inputs` for what cameras saw."""
+    from ballfg.estimate.sighted_dataset import read_sighted
+
+    know_effects(effects)
+    return _inputs(read_sighted(dataset), model)
+
+
+def _inputs(data: Opened, model: Path | None) -> Inputs[Opened]:
     import torch
 
     from ballfg.dynamics import load_model, nominal_model
     from ballfg.estimate import dataset_settings, dataset_surfaces
-    from ballfg.tracks import read_dataset
 
     torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
-    know_effects(effects)
-    data = read_dataset(dataset)
     for note in data.notes:
         print(f"note: {note}", file=sys.stderr)
     radius = data.info.ball.radius

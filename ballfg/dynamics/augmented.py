@@ -6,7 +6,7 @@ written for a `BallModel` (flight, contacts, rollouts, their Jacobians) works on
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -22,11 +22,16 @@ class AugmentedModel(BallModel):
     Args:
         model: any ball model.
         names: parameter names as in `model.named_parameters()`, for instance `flight.drag.k`.
+        passengers: further coefficients in the columns after those, which the motion does not look at, with what they
+            are believed to be: time offsets of cameras, for instance.
+
+    Attributes:
+        names: of the parameters.  passengers: names of the others.
 
     Raises: ValueError: if a name is not a scalar parameter of the model.
     """
 
-    def __init__(self, model: BallModel, names: Sequence[str]) -> None:
+    def __init__(self, model: BallModel, names: Sequence[str], passengers: Mapping[str, float] | None = None) -> None:
         super().__init__(model.radius, model.inertia_factor)
         parameters = dict(model.named_parameters())
         for name in names:
@@ -35,11 +40,24 @@ class AugmentedModel(BallModel):
                 raise ValueError(f"'{name}' is not a scalar parameter of the model; there are: {scalars}")
         self.model = model
         self.names = tuple(names)
+        believed = dict(passengers or {})
+        self.passengers = tuple(believed)
+        self._believed = torch.tensor(list(believed.values()), dtype=torch.float64)
         self._level = model.surface_slope(torch.zeros(STATE_DIM, dtype=torch.float64)) is None
+
+    @property
+    def width(self) -> int:
+        """How many columns follow the state."""
+        return len(self.names) + len(self.passengers)
+
+    def means(self) -> Tensor:
+        """(p,) the model's own values, as its parameters are now, and what the passengers are believed to be."""
+        parameters = dict(self.model.named_parameters())
+        return torch.cat((*(parameters[name].reshape(1) for name in self.names), self._believed))
 
     def bound(self, state: Tensor) -> BallModel:
         """The model with each state's own coefficients."""
-        columns = state[..., STATE_DIM:].split(1, dim=-1)
+        columns = [state[..., STATE_DIM + k : STATE_DIM + k + 1] for k in range(len(self.names))]
         return substitute(self.model, dict(zip(self.names, columns, strict=True)))
 
     def rates(self, state: Tensor) -> Rates:
@@ -86,4 +104,4 @@ class AugmentedModel(BallModel):
 
     def append(self, state: Tensor, coefficients: Tensor) -> Tensor:
         """Augmented states (n, 9 + p) from states (n, 9) and coefficients (p,) or (n, p)."""
-        return torch.cat((state, coefficients.expand(*state.shape[:-1], len(self.names))), dim=-1)
+        return torch.cat((state, coefficients.expand(*state.shape[:-1], self.width)), dim=-1)

@@ -9,8 +9,11 @@ from ballfg.estimate.online import Online
 from ballfg.estimate.registry import ESTIMATORS, make_estimator
 from ballfg.estimate.result import Estimate, Status
 from ballfg.estimate.settings import Settings, uncertain
+from ballfg.estimate.sighted import SightedTrack, in_order, sighted_track
+from ballfg.estimate.sighted_dataset import SightedDataset, read_sighted
 from ballfg.estimate.sliding_window import SlidingWindow
 from ballfg.estimate.smoother import Smoother
+from ballfg.estimate.time_offsets import TimeOffsets, estimate_time_offsets
 
 __all__ = [
     "ESTIMATORS",
@@ -20,12 +23,19 @@ __all__ = [
     "Launcher",
     "Online",
     "Settings",
+    "SightedDataset",
+    "SightedTrack",
     "SlidingWindow",
     "Smoother",
     "Status",
+    "TimeOffsets",
     "dataset_settings",
     "dataset_surfaces",
+    "estimate_time_offsets",
     "estimate_tracks",
+    "in_order",
     "make_estimator",
+    "read_sighted",
+    "sighted_track",
     "uncertain",
 ]

@@ -11,6 +11,7 @@ from ballfg.dynamics.trained import Trained
 from ballfg.estimate.launcher import Launcher
 from ballfg.estimate.position_noise import estimate_position_noise
 from ballfg.estimate.settings import MEASURED, Settings, uncertain
+from ballfg.estimate.sighted_dataset import SightedDataset
 from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
 from ballfg.tracks import Dataset, DatasetInfo
 
@@ -18,8 +19,8 @@ TRACKS_FOR_NOISE = 50
 """How many tracks the measurement noise is estimated from, when a dataset does not state it."""
 
 
-def dataset_settings(dataset: Dataset, model: BallModel) -> Settings:
-    """Settings for measured tracks.
+def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Settings:
+    """Settings for measured tracks; those that cameras saw bring the noise of each sighting themselves.
 
     The position noise is the dataset's; where it states none, it is estimated from the scatter of the first tracks
     about short polynomials. The coefficients of an analytic model are estimated with each track, within their priors; a
@@ -28,6 +29,8 @@ def dataset_settings(dataset: Dataset, model: BallModel) -> Settings:
     info, trained = dataset.info, model.trained
     if info.position_noise is not None:
         noise = (info.position_noise,) * 3
+    elif isinstance(dataset, SightedDataset):
+        noise = Settings().position_noise
     else:
         x, y, z = estimate_position_noise(islice(iter(dataset), TRACKS_FOR_NOISE)).tolist()
         noise = (x, y, z)
@@ -64,6 +67,6 @@ def launcher_of(info: DatasetInfo, model: BallModel) -> Launcher | None:
     return Launcher(trained.launcher, trained.spin_noise, {"group": info.name})
 
 
-def dataset_surfaces(dataset: Dataset) -> Surfaces:
+def dataset_surfaces(dataset: Dataset | SightedDataset) -> Surfaces:
     """The dataset's table, of unknown extent, and the floor below it."""
     return Surfaces.table_tennis(dataset.info.table_height)

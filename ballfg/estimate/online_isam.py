@@ -8,7 +8,7 @@ torch call; the callbacks find their answers ready. docs/derivations/online.md e
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
@@ -18,6 +18,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.estimate.launcher import SpinLabel
 from ballfg.estimate.motion import FLIGHT, Motion
 from ballfg.estimate.online_interval import Interval, IntervalMaker, coefficient_count, evaluate, store
+from ballfg.estimate.online_sighting import Sighting, prepare
 from ballfg.estimate.problem import coefficient_means, start_priors
 from ballfg.estimate.settings import Settings
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
@@ -53,7 +54,8 @@ class Sample:
         factor: multiple of that with which it takes part.
         motion: how the ball got here from the sample before.
         label: what is known of the spin, on the first sample of a track.
-        slots: where iSAM2 keeps the sample's own factors: position first, then priors.
+        slots: where iSAM2 keeps the sample's own factors: what was measured first, then priors.
+        sightings: what cameras saw at this moment; where there are some, the position only helps to find events.
     """
 
     time: float
@@ -63,6 +65,7 @@ class Sample:
     motion: Motion = FLIGHT
     label: SpinLabel | None = None
     slots: tuple[int, ...] = ()
+    sightings: list[Sighting] = field(default_factory=list)
 
     @property
     def sigma(self) -> Array:
@@ -75,7 +78,7 @@ class Update:
     """What one update did.
 
     Attributes:
-        innovation: (3,) whitened; NaN where nothing predicted the sample.
+        innovation: (3,) whitened, (2,) of a sighting; NaN where nothing predicted the sample.
         evaluated: factors of the motion evaluated, the new one among them.
         calls: torch calls for them.
         variables: states that iSAM2 eliminated again.
@@ -183,6 +186,10 @@ class IncrementalWindow:
         It is the new state's linearisation point only: closer to the final answer than the prediction, it saves
         relinearisations, and a robust loss gets a weight near the one that it ends with.
         """
+        if sample.sightings:
+            for sighting in sample.sightings:
+                predicted, covariance = sighting.corrected(predicted, covariance)
+            return predicted, sample.sightings[0].innovation
         innovation = sample.position - predicted[POSITION]
         noise = np.diag(sample.sigma**2)
         inverse = np.linalg.inv(np.linalg.cholesky(covariance[POSITION, POSITION] + noise))
@@ -208,6 +215,8 @@ class IncrementalWindow:
         if shared:
             self.coefficient_theta = self.coefficient_theta + self.coefficient_delta
             self.coefficient_delta = np.zeros(self.p)
+        seen = [(sighting, k) for k in np.flatnonzero(moved) for sighting in self.samples[k].sightings]
+        prepare([sighting for sighting, _ in seen], self.theta[[k for _, k in seen]])
         either = moved[:-1] | moved[1:] | shared
         touched = [interval for k in np.flatnonzero(either) if (interval := self.intervals[k]) is not None]
         begins = [interval.index - self.first for interval in touched]
@@ -235,7 +244,9 @@ class IncrementalWindow:
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         if interval is not None:
             graph.push_back(interval.bridge.factor(0))
-        graph.push_back(self._position_factor(sample, key - STATE_KEY))
+        prepare(sample.sightings, np.tile(state, (len(sample.sightings), 1)))
+        for factor in self._measured(sample, key - STATE_KEY):
+            graph.push_back(factor)
         for prior in priors:
             graph.push_back(Bridge(prior, "row").factor(0, [key - STATE_KEY]))
         values.insert(key, state)
@@ -255,6 +266,12 @@ class IncrementalWindow:
         self.theta = np.concatenate((self.theta, state[None]))
         self._read_back()
         return int(self._result.getVariablesReeliminated())
+
+    def _measured(self, sample: Sample, state: int) -> list[gtsam.NonlinearFactor]:
+        """The factors of what was measured at a sample."""
+        if sample.sightings:
+            return [sighting.factor(state) for sighting in sample.sightings]
+        return [self._position_factor(sample, state)]
 
     def _position_factor(self, sample: Sample, state: int) -> gtsam.NonlinearFactor:
         """The observation's factor; without a robust loss it is linear, and GTSAM never has to ask for it."""

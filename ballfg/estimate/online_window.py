@@ -6,7 +6,9 @@ import gtsam
 import numpy as np
 
 from ballfg.estimate.online_isam import IncrementalWindow, Sample, Update
+from ballfg.estimate.online_sighting import Sighting, prepare
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
+from ballfg.state import STATE_DIM
 
 
 class Window(IncrementalWindow):
@@ -28,6 +30,24 @@ class Window(IncrementalWindow):
         self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), slots, {})
         self.theta = self.theta[:count]
         self._read_back()
+
+    def attach(self, sighting: Sighting) -> Update:
+        """One more sighting of the newest sample, which holds it already.
+
+        Raises: RuntimeError or ValueError: as `append`.
+        """
+        _, count, calls = self._relinearize(None)
+        sighting.corrected(self.states[-1], self.newest_covariance[:STATE_DIM, :STATE_DIM])
+        prepare([sighting], self.theta[-1:])
+        newest = STATE_KEY + self.first + len(self.samples) - 1
+        graph = gtsam.NonlinearFactorGraph()
+        graph.push_back(sighting.factor(newest - STATE_KEY))
+        last = {newest: 1, COEFFICIENT_KEY: 2} if self.p and len(self.theta) > 1 else {}
+        slots = self._update(graph, gtsam.Values(), [], last)
+        sample = self.samples[-1]
+        sample.slots = (*slots, *sample.slots)
+        self._read_back()
+        return Update(sighting.innovation, count, calls, int(self._result.getVariablesReeliminated()))
 
     def reweigh(self, numbers: list[int]) -> None:
         """Put in anew the factors of the positions of some samples of the window, whose noise has changed."""

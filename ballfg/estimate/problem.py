@@ -2,7 +2,8 @@
 
 Every interval between two samples gets one dynamics factor: free flight, flight through the contacts found in it, or
 rest on a surface; a hit adds its jump to the process noise. An interval that nothing links (a long gap with a hit in
-it) gets none. Every sample gets a position factor, the first state of each linked piece a prior.
+it) gets none. Every sample gets a position factor, or in a track that cameras saw every sighting a camera factor; the
+first state of each linked piece gets a prior.
 """
 
 from __future__ import annotations
@@ -20,6 +21,8 @@ from ballfg.estimate.launcher import SpinLabel
 from ballfg.estimate.motion import motions_of
 from ballfg.estimate.segmentation import Contact, Quality, Segmentation
 from ballfg.estimate.settings import Settings, sample_sigmas, spin_start
+from ballfg.estimate.sighted import SightedTrack
+from ballfg.factors.camera import FIXED, CameraFactors
 from ballfg.factors.dynamics import ContactFactors, FlightFactors, RestFactors
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.kind import FactorKind, Values
@@ -46,15 +49,41 @@ class Events:
     segmentation: Segmentation
 
 
-def trackwise_model(model: BallModel, settings: Settings) -> BallModel:
-    """The model, augmented by the coefficients that are estimated for each track."""
-    return AugmentedModel(model, tuple(settings.coefficients)) if settings.coefficients else model
+def trackwise_model(model: BallModel, settings: Settings, track: Track | None = None) -> BallModel:
+    """The model, augmented by the coefficients that are estimated for each track.
+
+    Args:
+        model: the ball.
+        settings: name the coefficients, and the cameras whose time offsets are estimated.
+        track: for one that cameras saw, these offsets are among the coefficients.
+    Raises: ValueError: if the settings name a camera that the track does not have.
+    """
+    offsets = {}
+    if isinstance(track, SightedTrack):
+        names = track.sightings.cameras
+        for name in settings.time_offsets:
+            if name not in names:
+                raise ValueError(f"time_offsets must name cameras of the track, {', '.join(names)}; got {name!r}")
+            offsets[PASSENGER + name] = -float(track.moved[names.index(name)])
+    plain = not (settings.coefficients or offsets)
+    return model if plain else AugmentedModel(model, tuple(settings.coefficients), offsets)
+
+
+PASSENGER = "time_offset."
+"""What the name of a camera's time offset begins with among the passengers of an `AugmentedModel`."""
 
 
 def coefficient_means(model: BallModel, settings: Settings) -> Array:
     """(p,) the model's own values of the coefficients that are estimated."""
     parameters = dict(model.named_parameters())
     return np.array([float(parameters[name].detach()) for name in settings.coefficients])
+
+
+def coefficient_sigmas(model: BallModel, settings: Settings) -> Array:
+    """(p,) prior standard deviations of the coefficients of a model from `trackwise_model`, time offsets last."""
+    offsets = model.passengers if isinstance(model, AugmentedModel) else ()
+    own = [settings.time_offsets[name.removeprefix(PASSENGER)] for name in offsets]
+    return np.array([*settings.coefficients.values(), *own])
 
 
 def effective_sigmas(track: Track, segmentation: Segmentation, settings: Settings) -> Array:
@@ -72,15 +101,41 @@ def build_graph(track: Track, model: BallModel, events: Events, sigma: Array, se
         track: stamps, positions, labels.
         model: the ball, from `trackwise_model`.
         events: contacts, hits, rests.
-        sigma: (n, 3) m, of the positions.
+        sigma: (n, 3) m, of the positions; those of a track that cameras saw take no part.
         settings: noise and priors.
+    Returns: the graph; its first kind holds what was measured.
     """
-    kinds: list[FactorKind] = [PositionFactors(np.arange(len(track)), track.positions, sigma, settings.loss)]
+    kinds: list[FactorKind] = [_measured(track, model, sigma, settings)]
     kinds += _dynamics(track.times, model, events, settings)
     kinds += _priors(track, events.segmentation, settings)
     if isinstance(model, AugmentedModel):
-        kinds.append(CoefficientPriorFactors(model, np.array(list(settings.coefficients.values()))))
+        kinds.append(CoefficientPriorFactors(model, coefficient_sigmas(model, settings)))
     return BallGraph(tuple(kinds))
+
+
+def _measured(track: Track, model: BallModel, sigma: Array, settings: Settings) -> FactorKind:
+    """What was measured: positions, or the pixels of a track that cameras saw."""
+    if not isinstance(track, SightedTrack):
+        return PositionFactors(np.arange(len(track)), track.positions, sigma, settings.loss)
+    seen = track.sightings
+    return CameraFactors(
+        track.state,
+        seen.camera,
+        seen.pixels,
+        seen.covariances,
+        track.bank,
+        track.delay,
+        _columns(seen.cameras, model),
+        settings.sighting_loss,
+    )
+
+
+def _columns(cameras: tuple[str, ...], model: BallModel) -> NDArray[np.int64] | None:
+    """(cameras,) which coefficient is each camera's time offset; None where none is estimated."""
+    if not (isinstance(model, AugmentedModel) and model.passengers):
+        return None
+    names = (*model.names, *model.passengers)
+    return np.array([names.index(PASSENGER + c) if PASSENGER + c in names else FIXED for c in cameras])
 
 
 def contact_kinds(graph: BallGraph) -> list[ContactFactors]:
@@ -174,5 +229,5 @@ UNINFORMATIVE_SPIN = 2000.0
 def initial_values(states: Array, model: BallModel, settings: Settings) -> Values:
     """A start for the minimisation from states (n, 9)."""
     if isinstance(model, AugmentedModel):
-        return Values(states, coefficient_means(model.model, settings))
+        return Values(states, np.append(coefficient_means(model.model, settings), np.zeros(len(model.passengers))))
     return Values(states, np.zeros(0))

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.estimate.segmentation import Contact
+from ballfg.factors.covariance import Covariances
 from ballfg.factors.kind import Rows
 from ballfg.factors.linear import weighted
 from ballfg.state import POSITION
@@ -49,7 +50,8 @@ class Estimate:
         status: how the estimation ended.
         whitened: (n, 3) whitened innovations. For a filter: measured minus predicted position; for a smoother:
             measured position minus its prediction from all other samples. Each divided by its standard deviation:
-            standard normal where model and noise are right. NaN where a method has none.
+            standard normal where model and noise are right. NaN where a method has none. Of a `SightedTrack`, (m, 2):
+            one row a sighting, pixels in place of positions.
         coefficient_names: of the p model parameters that were estimated with the track.
         coefficients: (p,).  coefficient_covariance: (p, p).
         cross_covariances: (n, 9, p) between each state and the coefficients.
@@ -58,6 +60,9 @@ class Estimate:
         quality: (n,) `segmentation.Quality` of each sample.
         error: objective at the minimum; NaN for methods without one.
         iterations: linear solutions of a minimisation, 0 for methods without one.
+        cameras: names of the c cameras of a `SightedTrack`, where an estimate was made from its sightings.
+        time_offsets: (c,) s, of the cameras: their own, or as estimated. `times` are true by these.
+        time_offset_covariance: (c, c) s^2, zero for those that were not estimated.
     """
 
     name: str
@@ -75,6 +80,9 @@ class Estimate:
     quality: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
     error: float = np.nan
     iterations: int = 0
+    cameras: tuple[str, ...] = ()
+    time_offsets: Array = field(default_factory=lambda: np.zeros(0))
+    time_offset_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     @property
     def sigmas(self) -> Array:
@@ -83,7 +91,7 @@ class Estimate:
 
     @property
     def nis(self) -> Array:
-        """(n,) squared length of the whitened innovations: chi-square with 3 degrees of freedom."""
+        """(n,) squared length of the whitened innovations: chi-square with as many degrees of freedom as they have."""
         return np.asarray((self.whitened**2).sum(axis=-1))
 
 
@@ -117,3 +125,32 @@ def leave_one_out(states: Array, covariances: Array, measured: Array, sigma: Arr
     distance = measured - states[:, POSITION] - (covariance @ pull[..., None])[..., 0]
     covariance[:, axes, axes] += sigma**2
     return whiten_innovation(distance, np.asarray(covariance, dtype=np.float64))
+
+
+def leave_sighting_out(sightings: Rows, covariances: Covariances) -> Array:
+    """(m, 2) whitened innovations of a smoother: each sighting against its prediction from all others.
+
+    As `leave_one_out`, in pixels that are whitened by their noise: with H the Jacobian of a sighting and S = H P H^T
+    its share of what is known of it, the others know what it will show to C = S (1 - S)^-1, and see it at a distance
+    -(r + C r) from there; for a robust loss, H and r in S and in the pull are the weighted ones. The covariance of that
+    is 1 + C.
+
+    Args:
+        sightings: the camera factors, linearised at the minimum.
+        covariances: of the states there and of the coefficients.
+    """
+    state = sightings.variables[:, 0]
+    plain, (residual, jacobians) = np.concatenate(sightings.jacobians, axis=-1), weighted(sightings)
+    pulled = np.concatenate(jacobians, axis=-1)
+    joint = covariances.states[state]
+    if len(jacobians) > 1:
+        cross = covariances.cross[state]
+        both = np.broadcast_to(covariances.coefficients, (len(state), *covariances.coefficients.shape))
+        joint = np.block([[joint, cross], [cross.swapaxes(-1, -2), both]])
+    gain = joint @ pulled.swapaxes(-1, -2)
+    # a sighting that alone decides what it shows leaves nothing: bound C, the whitened distance goes to zero
+    left = np.linalg.inv((1.0 + LEAST_INFORMATION) * np.eye(2) - pulled @ gain)
+    others = joint + gain @ left @ gain.swapaxes(-1, -2)
+    pull = pulled.swapaxes(-1, -2) @ residual[..., None]
+    distance = -sightings.residual - (plain @ others @ pull)[..., 0]
+    return whiten_innovation(distance, np.eye(2) + plain @ others @ plain.swapaxes(-1, -2))

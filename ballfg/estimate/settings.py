@@ -46,6 +46,14 @@ class Settings:
     """Loss on each measured position. `Loss("squared")` where there are no outliers. Gross outliers are found and set
     aside beforehand; Huber's loss bounds what a missed one does and leaves good samples their full weight."""
 
+    sighting_loss: Loss = field(default_factory=lambda: Loss("cauchy", 5.0))
+    """Loss on each sighting of a camera, on the norm of two whitened pixels. Nobody sets wrong candidates aside
+    beforehand; Cauchy's loss lets go of them, and costs good sightings 7 % of their weight."""
+
+    time_offsets: Mapping[str, float] = field(default_factory=dict)
+    """s, prior standard deviation of the time offset by name of camera, where offsets are estimated with each track;
+    the prior's mean is the camera's own. Leave out one camera: a shift of all of them together cannot be seen."""
+
     spin_loss: Loss = field(default_factory=lambda: Loss("huber", 2.0))
     """Loss on the spin prior: a strong spin is rare but not against nature."""
 
@@ -70,6 +78,9 @@ class Settings:
         for name, sigma in self.coefficients.items():
             if not (np.isfinite(sigma) and sigma > 0):
                 raise ValueError(f"coefficients['{name}'] must be a positive standard deviation; got {sigma}")
+        for name, sigma in self.time_offsets.items():
+            if not (np.isfinite(sigma) and sigma > 0):
+                raise ValueError(f"time_offsets['{name}'] must be a positive standard deviation in s; got {sigma}")
 
     def spin_label(self, track: Track) -> SpinLabel | None:
         """What is known of a track's first spin: its label, else what its launcher settings say, else None."""

@@ -17,17 +17,20 @@ from ballfg.estimate.initial import initial_states, move_contacts
 from ballfg.estimate.motion import contacts_by_interval
 from ballfg.estimate.near_contact import widen_near_contacts
 from ballfg.estimate.problem import (
+    PASSENGER,
     Events,
     build_graph,
+    coefficient_sigmas,
     contact_kinds,
     effective_sigmas,
     initial_values,
     trackwise_model,
 )
-from ballfg.estimate.result import Estimate, Status, leave_one_out
+from ballfg.estimate.result import Estimate, Status, leave_one_out, leave_sighting_out
 from ballfg.estimate.second_start import search_twice
 from ballfg.estimate.segmentation import Contact, Segmentation, physics_of, segment
 from ballfg.estimate.settings import Settings, sample_sigmas
+from ballfg.estimate.sighted import SightedTrack, retimed
 from ballfg.factors.covariance import Covariances, marginal_covariances
 from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum
@@ -50,6 +53,13 @@ BROKEN = 8.0
 
 LEAST_POSITION_SIGMA = 0.05
 """m. A position in a track that no graph explains is not trusted better than that."""
+
+OFFSET_ROUNDS = 6
+"""How often stamps may be moved by the time offsets that were estimated; 4 ms need three."""
+FIRST_STEPS = 15
+"""Linear solutions of the first round, after which stamps move anyhow."""
+OFFSET_SETTLED = 1e-5
+"""s. An offset that moves by less is settled: the path bends by a nanometre meanwhile."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +96,9 @@ class Smoother(Estimator):
     Contacts, hits, outliers are found by the segmentation; contacts are then refined by the estimate: one whose
     estimated time lies outside its interval moves to where it belongs, and the graph is solved again.
 
+    A `SightedTrack` is estimated from its sightings, not from its positions; with `settings.time_offsets`, stamps move
+    by the offsets that were found, until those stay.
+
     Args:
         model: the ball.  surfaces: what it may bounce on.  settings: noise and priors.
         optimizer: settings of the minimisation.
@@ -106,10 +119,39 @@ class Smoother(Estimator):
 
     def estimate(self, track: Track) -> Estimate:
         """The states of a track, one per stamp, with the covariances of the Laplace approximation."""
+        if not (isinstance(track, SightedTrack) and self.settings.time_offsets):
+            return self.estimate_as_timed(track)
+        first = self.first_look()
+        for k in range(OFFSET_ROUNDS):
+            estimate = (self if k else first).estimate_as_timed(track)
+            known = np.array([camera.time_offset for camera in track.cameras])
+            if estimate.status is Status.FAILED:
+                return estimate
+            if k > 0 and np.abs(estimate.time_offsets - known).max() < OFFSET_SETTLED:
+                return estimate
+            track = retimed(track, estimate.time_offsets)
+        return replace(estimate, status=Status.NOT_CONVERGED)
+
+    def first_look(self) -> Smoother:
+        """The smoother for while stamps are milliseconds off.
+
+        A flight then seems to be full of hits, which would only let the offsets go; and where contacts do not fit, no
+        step is good, while the offsets are nearly right after a few.
+        """
+        calm = replace(self.settings, find_events=False)
+        return Smoother(self.model, self.surfaces, calm, replace(self.optimizer, max_iterations=FIRST_STEPS))
+
+    def estimate_as_timed(self, track: Track) -> Estimate:
+        """`estimate` with the stamps as they are: time offsets are estimated, but stamps do not move by them."""
         segmentation = self.segment(track)
         sigma = effective_sigmas(track, segmentation, self.settings)
         solution = self.solve(track, segmentation, sigma)
         return self.result(track, sigma, solution)
+
+    def _ball(self, track: Track) -> BallModel:
+        """The model with what is estimated along with this track."""
+        sighted = isinstance(track, SightedTrack) and bool(self.settings.time_offsets)
+        return trackwise_model(self.model, self.settings, track) if sighted else self.trackwise
 
     def segment(self, track: Track) -> Segmentation:
         """The events in a track."""
@@ -146,24 +188,24 @@ class Smoother(Estimator):
         self, track: Track, segmentation: Segmentation, sigma: Array, earlier: Earlier | None
     ) -> Search[Solution]:
         """Minimise, move contacts to where the estimate says they are, and minimise again until they stay."""
-        events = Events(segmentation.contacts, segmentation)
+        events, ball = Events(segmentation.contacts, segmentation), self._ball(track)
         if earlier is None:
             label = self.settings.spin_label(track)
             states = initial_states(track, events.contacts, segmentation, self.model, label)
-            values = initial_values(states, self.trackwise, self.settings)
+            values = initial_values(states, ball, self.settings)
         else:
             values = earlier.start
         seen: dict[tuple[tuple[int, float], ...], Solution] = {}
         settled: tuple[Solution, ...] = ()
         for _ in range(MAX_REFINEMENTS):
-            graph = build_graph(track, self.trackwise, events, sigma, self.settings)
+            graph = build_graph(track, ball, events, sigma, self.settings)
             graph = graph if earlier is None else earlier.join(graph)
             minimum = yield from search_twice(self.optimizer, graph, values)
             solution = Solution(events, graph, minimum)
             seen[_places(events.contacts)] = solution
             refined = _refined(track.times, solution)
             if _places(refined) == _places(events.contacts):
-                unseen = () if settled else _contacts_at_ends(track.times, solution, self.trackwise, self.surfaces)
+                unseen = () if settled else _contacts_at_ends(track.times, solution, ball, self.surfaces)
                 if not unseen:  # a contact that only the end of the track suggests must also explain it better
                     return min((*settled, solution), key=lambda s: s.minimum.error)
                 settled = (solution,)
@@ -171,7 +213,7 @@ class Smoother(Estimator):
             if _places(refined) in seen:
                 break
             values = move_contacts(
-                solution.minimum.values, track.times, _places(events.contacts), _places(refined), self.trackwise
+                solution.minimum.values, track.times, _places(events.contacts), _places(refined), ball
             )
             events = Events(refined, segmentation)
         return min(seen.values(), key=lambda s: s.minimum.error)
@@ -181,14 +223,14 @@ class Smoother(Estimator):
         minimum, segmentation = solution.minimum, solution.events.segmentation
         n, p = len(track), len(minimum.values.coefficients)
         states, contacts = minimum.values.states, _timed(track.times, solution)
+        ball = self._ball(track)
         if minimum.step is None:
-            covariances = _prior_covariances(n, p, sigma, self.settings)
-            whitened = np.full((n, 3), np.nan)
+            covariances = _prior_covariances(n, sigma, self.settings, coefficient_sigmas(ball, self.settings))
         else:
             covariances = marginal_covariances(minimum.step.bayes_net, n, p)
-            samples = solution.graph.kinds[0].linearize(minimum.values)
-            whitened = leave_one_out(states, covariances.states, track.positions, sigma, samples)
-        return Estimate(
+        names = ball.names if isinstance(ball, AugmentedModel) else ()
+        own, rest = slice(0, len(names)), slice(len(names), p)
+        estimate = Estimate(
             name=track.name,
             times=track.times,
             states=states,
@@ -196,17 +238,47 @@ class Smoother(Estimator):
                 track.times, states, covariances.states, contacts, self.model, self.surfaces
             ),
             status=_status(minimum, n),
-            whitened=whitened,
-            coefficient_names=self.trackwise.names if isinstance(self.trackwise, AugmentedModel) else (),
-            coefficients=minimum.values.coefficients,
-            coefficient_covariance=covariances.coefficients,
-            cross_covariances=covariances.cross,
+            whitened=_whitened(track, sigma, solution, covariances),
+            coefficient_names=names,
+            coefficients=minimum.values.coefficients[own],
+            coefficient_covariance=covariances.coefficients[own, own],
+            cross_covariances=covariances.cross[..., own],
             contacts=contacts,
             hits=segmentation.hits,
             quality=segmentation.quality,
             error=minimum.error,
             iterations=minimum.iterations,
         )
+        if not isinstance(track, SightedTrack):
+            return estimate
+        found = ball.passengers if isinstance(ball, AugmentedModel) else ()
+        return _with_offsets(
+            estimate, track, found, minimum.values.coefficients[rest], covariances.coefficients[rest, rest]
+        )
+
+
+def _whitened(track: Track, sigma: Array, solution: Solution, covariances: Covariances) -> Array:
+    """The innovations of positions (n, 3) or sightings (m, 2); NaN where there is no linear solution."""
+    minimum = solution.minimum
+    if minimum.step is None:
+        return np.full((len(track.sightings), 2) if isinstance(track, SightedTrack) else (len(track), 3), np.nan)
+    samples = solution.graph.kinds[0].linearize(minimum.values)
+    if isinstance(track, SightedTrack):
+        return leave_sighting_out(samples, covariances)
+    return leave_one_out(minimum.values.states, covariances.states, track.positions, sigma, samples)
+
+
+def _with_offsets(
+    estimate: Estimate, track: SightedTrack, passengers: tuple[str, ...], found: Array, covariance: Array
+) -> Estimate:
+    """The estimate with the time offsets of all cameras of the track, those too that were not estimated."""
+    names = track.sightings.cameras
+    rows = [names.index(name.removeprefix(PASSENGER)) for name in passengers]
+    offsets = np.array([camera.time_offset for camera in track.cameras])
+    offsets[rows] += found
+    spread = np.zeros((len(names), len(names)))
+    spread[np.ix_(rows, rows)] = covariance
+    return replace(estimate, cameras=names, time_offsets=offsets, time_offset_covariance=spread)
 
 
 def _worst_break(solution: Solution) -> int | None:
@@ -285,11 +357,10 @@ def _status(minimum: Minimum, samples: int) -> Status:
     return Status.OK if at_minimum else Status.NOT_CONVERGED
 
 
-def _prior_covariances(n: int, p: int, sigma: Array, settings: Settings) -> Covariances:
-    """What is known of each state by itself, where the graph could not be solved."""
+def _prior_covariances(n: int, sigma: Array, settings: Settings, coefficients: Array) -> Covariances:
+    """What is known of each state by itself, where the graph could not be solved; sigmas (p,) of the coefficients."""
     spread = np.empty((n, STATE_DIM))
     spread[:, POSITION] = np.maximum(sigma, LEAST_POSITION_SIGMA)
     spread[:, VELOCITY], spread[:, SPIN] = settings.velocity_prior, settings.spin_prior
     states = spread[..., None] ** 2 * np.eye(STATE_DIM)
-    coefficients = np.diag([s**2 for s in settings.coefficients.values()]).reshape(p, p)
-    return Covariances(states, coefficients, np.zeros((n, STATE_DIM, p)))
+    return Covariances(states, np.diag(coefficients**2), np.zeros((n, STATE_DIM, len(coefficients))))

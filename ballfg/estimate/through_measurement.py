@@ -22,6 +22,7 @@ from ballfg.estimate.as_measured import LabelMap, measured_positions, plainly_me
 from ballfg.estimate.estimator import Estimator
 from ballfg.estimate.result import Estimate, Status
 from ballfg.estimate.settings import Settings, sample_sigmas
+from ballfg.estimate.sighted import SightedTrack
 from ballfg.estimate.smoother import Smoother
 from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks import SPIN_LABELS, Track
@@ -66,7 +67,7 @@ class ThroughMeasurement(Estimator):
         kind: the estimator.
         model: the ball, with measurement effects.  surfaces: what it may bounce on.  settings: noise and priors.
 
-    Raises: ValueError: if the model's spin labels do not tell the spin.
+    Raises: ValueError: if the model's spin labels do not tell the spin; from `estimate`, for a `SightedTrack`.
     """
 
     name = "through-measurement"
@@ -95,6 +96,11 @@ class ThroughMeasurement(Estimator):
 
     def undo(self, track: Track) -> Undone:
         """The track as it happened, and what the smoother makes of it; of shifts that do not settle, the steadiest."""
+        if isinstance(track, SightedTrack):
+            raise ValueError(
+                "model must have no measurement effects for a track that cameras saw: they act on positions, and there "
+                "are none. Leave the model's section measurement empty, or estimate from positions."
+            )
         track = self._as_timed(track)
         sigma = sample_sigmas(self.settings, len(track), track.sigmas)
         shift = self._first_shift(track)

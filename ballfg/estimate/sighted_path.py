@@ -1,0 +1,181 @@
+"""A rough path straight from sightings: at each moment a short parabola through the rays around it.
+
+A ray says two things about a point on it, both linear in the point, so a free fall p + v t + g t^2 / 2 is a linear
+least-squares problem in (p, v) over the sightings of any cameras at any times: nothing is interpolated, and no two
+cameras need a common shutter. Windows lie about the moment, before it and after it; of these the one that promises the
+smallest error counts, its own residuals taken into account, so that no bounce lies within the window that is used. A
+window of one camera alone does not count: all points on its rays fit, those at the camera best.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.state import STANDARD_GRAVITY, Z
+from ballfg.tracks.sightings import Sightings
+from ballfg.vision.camera import Camera
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+AROUND: Final = ((-1.6, 1.6), (-2.2, 0.0), (0.0, 2.2), (-1.2, 0.0), (0.0, 1.2))
+"""Windows about a moment, in periods of the slowest camera: each holds two sightings or more of every camera."""
+BEFORE: Final = ((-3.2, 0.0), (-2.2, 0.0), (-1.2, 0.0))
+"""Windows for a stream, in which nothing later is known."""
+LEAST_SPARE: Final = 2
+"""Equations beyond the six unknowns, for residuals to tell whether a window holds a bounce."""
+ROUNDS: Final = 4
+"""Solutions of a window: the first takes all depths for equal, the others weigh wrong candidates down."""
+ROBUST: Final = 5.0
+"""Scale of Cauchy's loss on a sighting, in standard deviations of its noise."""
+SPEED: Final = 30.0
+"""m/s, standard deviation of the velocity before anything was seen: bounds what a single camera leaves open."""
+SPREAD: Final = 100.0
+"""m, standard deviation of the position before anything was seen, about the cameras."""
+
+
+@dataclass(frozen=True)
+class Path:
+    """Positions at some moments.
+
+    Attributes:
+        positions: (n, 3) m.  velocities: (n, 3) m/s.
+        sigmas: (n, 3) m, standard deviations; larger where residuals are larger than the noise of the pixels.
+    """
+
+    positions: Array
+    velocities: Array
+    sigmas: Array
+
+    def joined(self, other: Path) -> Path:
+        """This path, then another."""
+        return Path(
+            np.concatenate((self.positions, other.positions)),
+            np.concatenate((self.velocities, other.velocities)),
+            np.concatenate((self.sigmas, other.sigmas)),
+        )
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Sightings as linear equations A X = b of the point seen, in units of x/z and y/z times depth.
+
+    Attributes:
+        times: (m,) s, true, ascending.
+        camera: (m,) number of the camera.
+        matrix: (m, 2, 3).  target: (m, 2).
+        root: (m, 2, 2) whitens a residual divided by the depth.
+        depth_row: (m, 4): depth = row[:3] X + row[3].
+        period: s, of the slowest camera.
+    """
+
+    times: Array
+    camera: Index
+    matrix: Array
+    target: Array
+    root: Array
+    depth_row: Array
+    period: float
+
+    @classmethod
+    def of(cls, sightings: Sightings, times: Array, cameras: Sequence[Camera]) -> Rays:
+        """The rays of sightings, with their true times (m,) s and the cameras in the order of their numbers."""
+        m = len(sightings)
+        plane, root = np.empty((m, 2)), np.linalg.inv(np.linalg.cholesky(sightings.covariances))
+        rotation = np.stack([camera.rotation for camera in cameras])[sightings.camera]
+        tvec = np.stack([camera.tvec for camera in cameras])[sightings.camera]
+        periods = []
+        for number, camera in enumerate(cameras):
+            (rows,) = np.nonzero(sightings.camera == number)
+            plane[rows] = camera.normalized(sightings.pixels[rows])
+            root[rows] = root[rows] @ camera.matrix[:2, :2]
+            periods += [float(np.median(np.diff(times[rows])))] if len(rows) > 1 else []
+        matrix = rotation[:, :2] - plane[..., None] * rotation[:, 2:]
+        target = plane * tvec[:, 2:] - tvec[:, :2]
+        depth_row = np.concatenate((rotation[:, 2], tvec[:, 2:]), axis=1)
+        return cls(times, sightings.camera, matrix, target, root, depth_row, max(periods, default=0.0))
+
+    def joined(self, later: Rays, most: int, period: float) -> Rays:
+        """These rays and later ones, the newest `most` of them, with the period that is now known, s."""
+
+        def newest(mine: Array, others: Array) -> Array:
+            return np.concatenate((mine, others))[-most:]
+
+        return Rays(
+            newest(self.times, later.times),
+            np.concatenate((self.camera, later.camera))[-most:],
+            newest(self.matrix, later.matrix),
+            newest(self.target, later.target),
+            newest(self.root, later.root),
+            newest(self.depth_row, later.depth_row),
+            period,
+        )
+
+
+def rough_path(rays: Rays, moments: Array, windows: Sequence[tuple[float, float]] = AROUND) -> Path:
+    """Where the ball was at moments (n,) s, by the best of several windows about each.
+
+    Args:
+        rays: of all sightings that may be used.
+        moments: s.
+        windows: begin and end of each about the moment, in periods of the slowest camera.
+    """
+    sides = np.array(windows) * rays.period
+    found = _parabolas(rays, np.tile(moments, len(sides)), *np.repeat(sides.T, len(moments), axis=1))
+    best = np.argmin(found.sigmas.max(axis=1).reshape(len(sides), -1), axis=0)
+    rows = best * len(moments) + np.arange(len(moments))
+    return Path(found.positions[rows], found.velocities[rows], found.sigmas[rows])
+
+
+def _parabolas(rays: Rays, moments: Array, begin: Array, end: Array) -> Path:
+    """The free falls through the sightings from begin (n,) to end (n,) s about moments (n,) s."""
+    slack = 1e-3 * rays.period  # a sighting at the very end of a window belongs to it
+    low = np.searchsorted(rays.times, moments + begin - slack)
+    high = np.searchsorted(rays.times, moments + end + slack)
+    rows = low[:, None] + np.arange(max(int((high - low).max()), 1))
+    inside = rows < high[:, None]
+    rows = np.minimum(rows, len(rays.times) - 1)
+    since = rays.times[rows] - moments[:, None]
+    matrix = rays.matrix[rows]
+    fall = 0.5 * STANDARD_GRAVITY * since**2
+    target = rays.target[rows] + matrix[..., Z] * fall[..., None]
+    equations = np.concatenate((matrix, matrix * since[..., None, None]), axis=-1)
+    unknown, covariance, misfit = _robust(rays, rows, inside, equations, target, since)
+    spare = 2 * inside.sum(axis=1) - 6
+    camera = rays.camera[rows]
+    several = (inside & (camera != camera[:, :1])).any(axis=1)
+    scale = np.where((spare >= LEAST_SPARE) & several, np.maximum(misfit / np.maximum(spare, 1), 1.0), np.inf)
+    sigmas = np.sqrt(scale[:, None] * np.diagonal(covariance, axis1=1, axis2=2)[:, :3])
+    return Path(unknown[:, :3], unknown[:, 3:], sigmas)
+
+
+def _robust(
+    rays: Rays, rows: Index, inside: NDArray[np.bool_], equations: Array, target: Array, since: Array
+) -> tuple[Array, Array, Array]:
+    """Solutions (n, 6) by reweighted least squares, covariances (n, 6, 6), twice the sum of the losses (n,)."""
+    prior = np.diag([SPREAD**-2.0] * 3 + [SPEED**-2.0] * 3)
+    count = rows.shape[1]
+    base, depth_row = rays.root[rows], rays.depth_row[rows]
+    depth, weight = np.ones(inside.shape), inside.astype(np.float64)
+    for _ in range(ROUNDS):
+        root = base / depth[..., None, None]
+        whitened = (root @ equations).reshape(-1, 2 * count, 6)
+        wanted = (root @ target[..., None]).reshape(-1, 2 * count, 1)
+        pulled = whitened.swapaxes(1, 2) * np.repeat(weight, 2, axis=1)[:, None]
+        information = pulled @ whitened + prior
+        unknown = np.linalg.solve(information, pulled @ wanted)
+        square = ((whitened @ unknown - wanted) ** 2).reshape(-1, count, 2).sum(axis=-1)
+        weight = inside / (1.0 + square / ROBUST**2)
+        point = unknown[:, None, :3, 0] + since[..., None] * unknown[:, None, 3:, 0]
+        depth = np.maximum((depth_row[..., :3] * point).sum(axis=-1) + depth_row[..., 3], NEAREST)
+    loss = ROBUST**2 * (np.log1p(square / ROBUST**2) * inside).sum(axis=1)
+    return np.asarray(unknown[..., 0]), np.asarray(np.linalg.inv(information)), np.asarray(loss)
+
+
+NEAREST: Final = 0.05
+"""m, least depth that a ball may have while its window is solved."""

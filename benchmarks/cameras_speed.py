@@ -1,0 +1,68 @@
+"""What tracking costs: three video streams through detection and association, and live updates from sightings."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.benchmarks.cameras_clocks import sighted
+from ballfg.benchmarks.cameras_scenes import Filmed, Scenario, draw
+from ballfg.dynamics import nominal_model
+from ballfg.estimate import Online, uncertain
+from ballfg.vision import Detections, associate, detect_all
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class StreamTimes:
+    """Wall-clock times of one recording.
+
+    Attributes:
+        frames: of each camera.
+        searching: s, videos to candidates, with the start of the processes.
+        associating: s, candidates to balls.
+    """
+
+    frames: int
+    searching: float
+    associating: float
+
+    @property
+    def rate(self) -> float:
+        """Frames per second of each camera, everything included."""
+        return self.frames / (self.searching + self.associating)
+
+
+def stream_times(scenario: Scenario, jobs: int) -> StreamTimes:
+    """Draws the videos, then times what `ballfg track` does before it draws pictures."""
+    recording = scenario.recording()
+    with TemporaryDirectory() as folder:
+        scene = Path(folder) / "scene"
+        draw(recording, scene, f"{scenario.name}, timed")
+        start = time.perf_counter()
+        found: dict[str, Detections] = detect_all(
+            {camera.name: scene / f"{camera.name}.mp4" for camera in recording.cameras}, jobs=jobs
+        )
+        searched = time.perf_counter()
+        associate(list(found.values()), recording.cameras)
+        end = time.perf_counter()
+    return StreamTimes(min(len(d.frames) for d in found.values()), searched - start, end - searched)
+
+
+def push_times(filmed: Filmed) -> Array:
+    """(n,) ms, of each sighting that the online estimator takes in, those of all balls."""
+    settings, taken = uncertain(nominal_model()), []
+    for track in sighted(filmed):
+        online = Online(nominal_model(), filmed.recording.config.ball.surfaces, settings, cameras=track.cameras)
+        seen = track.sightings
+        for camera, at, pixel, covariance in zip(seen.camera, seen.times, seen.pixels, seen.covariances, strict=True):
+            start = time.perf_counter()
+            online.push_sighting(float(at), seen.cameras[camera], pixel, covariance)
+            taken.append(1e3 * (time.perf_counter() - start))
+    return np.array(taken)
