@@ -196,7 +196,7 @@ def _frames_with_ball(recording: Recording) -> Iterator[tuple[str, Array]]:
         )
         if shared:
             stamps, views = np.unique(np.round(np.concatenate(times), 6), return_counts=True)
-            yield flight.name, stamps[views >= 2]
+            yield flight.name, np.asarray(stamps[views >= 2], dtype=np.float64)
         else:
             own = times[most]
             others = [

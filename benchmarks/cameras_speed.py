@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -14,7 +15,7 @@ from ballfg.benchmarks.cameras_clocks import sighted
 from ballfg.benchmarks.cameras_scenes import Filmed, Scenario, draw
 from ballfg.dynamics import nominal_model
 from ballfg.estimate import Online, uncertain
-from ballfg.vision import Detections, associate, detect_all
+from ballfg.vision import Camera, Detections, associate, detect_all
 
 Array = NDArray[np.float64]
 
@@ -39,19 +40,22 @@ class StreamTimes:
         return self.frames / (self.searching + self.associating)
 
 
-def stream_times(scenario: Scenario, jobs: int) -> StreamTimes:
-    """Draws the videos, then times what `ballfg track` does before it draws pictures."""
+def stream_times(scenario: Scenario, runs: int) -> list[StreamTimes]:
+    """Draws the videos, then times what `ballfg track` does before it draws pictures: a process for each camera."""
     recording = scenario.recording()
     with TemporaryDirectory() as folder:
         scene = Path(folder) / "scene"
         draw(recording, scene, f"{scenario.name}, timed")
-        start = time.perf_counter()
-        found: dict[str, Detections] = detect_all(
-            {camera.name: scene / f"{camera.name}.mp4" for camera in recording.cameras}, jobs=jobs
-        )
-        searched = time.perf_counter()
-        associate(list(found.values()), recording.cameras)
-        end = time.perf_counter()
+        videos = {camera.name: scene / f"{camera.name}.mp4" for camera in recording.cameras}
+        return [_timed(videos, recording.cameras) for _ in range(runs)]
+
+
+def _timed(videos: dict[str, Path], cameras: Sequence[Camera]) -> StreamTimes:
+    start = time.perf_counter()
+    found: dict[str, Detections] = detect_all(videos, jobs=len(videos))
+    searched = time.perf_counter()
+    associate(list(found.values()), cameras)
+    end = time.perf_counter()
     return StreamTimes(min(len(d.frames) for d in found.values()), searched - start, end - searched)
 
 

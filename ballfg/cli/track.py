@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from ballfg.cli.inputs import default_jobs
 from ballfg.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -54,7 +53,7 @@ def track(
     name: Annotated[str | None, typer.Option(help="Name of the dataset.", show_default="the folder's")] = None,
     overlay: Annotated[bool, typer.Option(help="Write the overlay video.")] = True,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier result.")] = False,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes.", show_default="one per core")] = default_jobs(),
+    jobs: Annotated[int | None, typer.Option(min=1, help="Processes.", show_default="one per camera")] = None,
 ) -> None:
     """From the videos of calibrated cameras to a dataset of tracks, with pictures to check them by.
 
@@ -118,7 +117,7 @@ def _from_videos(
     stamps: Sequence[str],
     colour: Colour | None,
     detector: str | None,
-    jobs: int,
+    jobs: int | None,
 ) -> tuple[Tracking, Streams]:
     """What was found, and what gives each video's frames once more."""
     from ballfg.vision.detect import learn_detector
@@ -138,7 +137,7 @@ def _from_videos(
         rig,
         make,
         stamps=files,
-        jobs=jobs,
+        jobs=jobs or len(rig),
         watch=lambda frames, total: progress(frames, total, "frames searched"),
     )
     return tracking, [open_video(path, files.get(name)).frames for name, path in videos.items()]
