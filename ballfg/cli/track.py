@@ -16,6 +16,7 @@ import typer
 from ballfg.cli.progress import progress
 
 if TYPE_CHECKING:
+    from ballfg.dynamics import AnalyticModel, Surfaces
     from ballfg.vision import Camera
     from ballfg.vision.detector import Colour as BallColour
     from ballfg.vision.tracking import Tracking
@@ -44,6 +45,9 @@ def track(
         typer.Option(help="NAME=FILE.csv, a camera's stamps (column t), instead of its video's; may be repeated."),
     ] = None,
     without: Annotated[list[str] | None, typer.Option(help="Leave a camera out; may be repeated.")] = None,
+    time_offsets: Annotated[
+        bool, typer.Option("--time-offsets", help="Find by how much cameras' stamps are late against the first one's.")
+    ] = False,
     colour: Annotated[Colour | None, typer.Option(help="Of the ball; any without it.")] = None,
     detector: Annotated[str | None, typer.Option(help="FILE.py:NAME, a detector of your own, to run.")] = None,
     ball: Annotated[str, typer.Option(help="table-tennis, tennis or a ball file (YAML).")] = "table-tennis",
@@ -82,6 +86,8 @@ def track(
         tracking = _from_table(Path(recordings[0]), rig, without or ())
     else:
         tracking, streams = _from_videos(recordings, rig, stamps or (), colour, detector, jobs)
+    if time_offsets and tracking.balls:
+        tracking = _on_one_clock(tracking, kind.model, replace(kind.surfaces, table_height=height))
     if (doubt := disagreement(tracking)) is not None:
         print(f"note: {doubt}", file=sys.stderr)
     info = replace(info, rate=tracking.rate)
@@ -141,6 +147,21 @@ def _from_videos(
         watch=lambda frames, total: progress(frames, total, "frames searched"),
     )
     return tracking, [open_video(path, files.get(name)).frames for name, path in videos.items()]
+
+
+def _on_one_clock(tracking: Tracking, model: AnalyticModel, surfaces: Surfaces) -> Tracking:
+    """The same candidates once more, each camera with the time offset that the balls tell."""
+    from ballfg.estimate import estimate_time_offsets, sighted_track, uncertain
+    from ballfg.vision.tracking import track_detections
+
+    pairs = zip(tracking.names, tracking.balls, strict=True)
+    tracks = [sighted_track(name, ball.sightings, tracking.cameras) for name, ball in pairs]
+    found = estimate_time_offsets(tracks, model, surfaces, uncertain(model))
+    for camera, sigma in zip(found.cameras, found.sigmas.tolist(), strict=True):
+        print(f"  {camera.name}: stamps late by {1e3 * camera.time_offset:.3f} ± {1e3 * sigma:.3f} ms")
+    if not found.settled:
+        print("note: the time offsets did not settle; record more balls, or check the cameras' poses", file=sys.stderr)
+    return track_detections(tracking.detections, found.cameras)
 
 
 def _from_table(path: Path, rig: Sequence[Camera], without: Sequence[str]) -> Tracking:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from ballfg.simulate.cameras import table_rig
 from ballfg.simulate.scene import SceneConfig, record, write_scene
 from ballfg.tracks import read_dataset
 from ballfg.vision import Camera
-from ballfg.vision.camera_file import write_cameras
+from ballfg.vision.camera_file import read_cameras, write_cameras
 
 RATE = 100.0
 SIZE = (320, 180)
@@ -54,8 +55,8 @@ def rig(tmp_path: Path) -> Path:
     return path
 
 
-def table(path: Path, ball: bool = True) -> Path:
-    """Detections of the throw, or of nothing that moves like a ball."""
+def table(path: Path, ball: bool = True, late: Mapping[str, float] | None = None) -> Path:
+    """Detections of the throw, or of nothing that moves like a ball; stamps of some cameras late by some seconds."""
     noise = np.random.default_rng(0)
     with path.open("w", newline="") as file:
         writer = csv.writer(file)
@@ -64,7 +65,8 @@ def table(path: Path, ball: bool = True) -> Path:
             for t in np.arange(0.0, SPAN, 1.0 / RATE):
                 pixel = model.project(centre(np.array([t])))[0] if ball else noise.uniform((0, 0), SIZE)
                 u, v = pixel + 0.1 * noise.normal(size=2)
-                writer.writerow((t, model.name, u, v, 0.1, 0.1, 0.8 if ball else 0.4))
+                stamp = t + (late or {}).get(model.name, 0.0)
+                writer.writerow((stamp, model.name, u, v, 0.1, 0.1, 0.8 if ball else 0.4))
     return path
 
 
@@ -93,6 +95,20 @@ def test_what_describes_the_dataset_can_be_given(rig: Path, tmp_path: Path) -> N
     assert (info.name, info.table_height, info.ball.radius) == ("throws", 0.1, 0.0335)
     assert info.source == "ballfg track detections.csv"
     assert "middle" not in (out / "cameras.yaml").read_text()
+
+
+def test_late_stamps_are_found_and_written_with_the_cameras(
+    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, given = tmp_path / "shots", table(tmp_path / "detections.csv", late={"middle": 0.004})
+    assert status("track", given, "--cameras", rig, "--out", out, "--time-offsets") == 0
+    assert "  middle: stamps late by " in capsys.readouterr().out
+    by_name = {camera.name: camera for camera in read_cameras(out / "cameras.yaml")}
+    assert by_name["left"].time_offset == 0.0
+    assert by_name["middle"].time_offset == pytest.approx(0.004, abs=5e-4)
+    assert by_name["right"].time_offset == pytest.approx(0.0, abs=5e-4)
+    (track,) = read_dataset(out)
+    assert np.sqrt(((track.positions - centre(track.times)) ** 2).sum(axis=1).mean()) < 0.004
 
 
 def test_no_ball_says_how_good_the_best_were_and_leaves_an_empty_dataset(
