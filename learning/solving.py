@@ -15,7 +15,8 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate import Smoother
 from ballfg.estimate.problem import effective_sigmas
 from ballfg.estimate.segmentation import Contact
-from ballfg.estimate.smoother import Earlier, Solution
+from ballfg.estimate.smoother import Earlier
+from ballfg.estimate.solution import Solution
 from ballfg.factors.graph import Convergence, LevenbergMarquardt
 from ballfg.factors.kind import Values
 from ballfg.factors.search import Search, run_together

@@ -56,10 +56,10 @@ def render(
     from ballfg.simulate import parse_effects, parse_settings
     from ballfg.simulate.cameras import table_rig
     from ballfg.simulate.scene import SceneConfig, record, write_scene
-    from ballfg.simulate.scene.writing import check_folder
+    from ballfg.simulate.scene.writing import check_scene_folder
 
     know_effects(effects)
-    check_folder(out, force=force)
+    check_scene_folder(out, force=force)
     cameras = table_rig(_size(size), distance)
     names = [camera.name for camera in cameras]
     look: dict[str, Any] = {"colour": colour, "noise": noise, "flicker": flicker, "distractors": distractors}

@@ -25,7 +25,7 @@ from ballfg.dynamics.learned import LearnedModel, build
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.spin_embedding import SpinEmbedding
 from ballfg.dynamics.trained import Trained
-from ballfg.dynamics.yaml_file import read_yaml
+from ballfg.tracks.yaml_file import read_yaml
 
 CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
 _MODEL, _LAUNCHER, _BASE = "model.", "launcher.", "base."

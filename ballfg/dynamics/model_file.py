@@ -17,7 +17,7 @@ from ballfg.dynamics.effects.registry import effect_class
 from ballfg.dynamics.learned import LearnedModel
 from ballfg.dynamics.learned_file import has_learned_part, read_learned, remove_others, write_learned
 from ballfg.dynamics.model import THIN_SHELL, BallModel
-from ballfg.dynamics.yaml_file import read_yaml
+from ballfg.tracks.yaml_file import read_yaml
 
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
 SECTIONS = (*KINDS, "learned")

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from ballfg.dynamics.augmented import AugmentedModel
@@ -14,30 +13,29 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimate.estimator import Estimator
 from ballfg.estimate.initial import initial_states, move_contacts
-from ballfg.estimate.motion import contacts_by_interval
 from ballfg.estimate.near_contact import widen_near_contacts
 from ballfg.estimate.problem import (
     PASSENGER,
     Events,
     build_graph,
     coefficient_sigmas,
-    contact_kinds,
     effective_sigmas,
     initial_values,
     trackwise_model,
 )
 from ballfg.estimate.result import Estimate, Status, leave_one_out, leave_sighting_out
 from ballfg.estimate.second_start import search_twice
-from ballfg.estimate.segmentation import Contact, Segmentation, physics_of, segment
+from ballfg.estimate.segmentation import Segmentation, physics_of, segment
 from ballfg.estimate.settings import Settings, sample_sigmas
 from ballfg.estimate.sighted import SightedTrack, retimed
+from ballfg.estimate.solution import Solution, contacts_at_ends, places_of, refined_contacts, timed_contacts
 from ballfg.factors.covariance import Covariances, marginal_covariances
 from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum
 from ballfg.factors.kind import FactorKind, Values
 from ballfg.factors.prior import PriorFactors
 from ballfg.factors.search import Search, run
-from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 
 Array = NDArray[np.float64]
@@ -60,15 +58,6 @@ FIRST_STEPS = 15
 """Linear solutions of the first round, after which stamps move anyhow."""
 OFFSET_SETTLED = 1e-5
 """s. An offset that moves by less is settled: the path bends by a nanometre meanwhile."""
-
-
-@dataclass(frozen=True)
-class Solution:
-    """A minimised graph and the events it was built on."""
-
-    events: Events
-    graph: BallGraph
-    minimum: Minimum
 
 
 @dataclass(frozen=True)
@@ -202,18 +191,18 @@ class Smoother(Estimator):
             graph = graph if earlier is None else earlier.join(graph)
             minimum = yield from search_twice(self.optimizer, graph, values)
             solution = Solution(events, graph, minimum)
-            seen[_places(events.contacts)] = solution
-            refined = _refined(track.times, solution)
-            if _places(refined) == _places(events.contacts):
-                unseen = () if settled else _contacts_at_ends(track.times, solution, ball, self.surfaces)
+            seen[places_of(events.contacts)] = solution
+            refined = refined_contacts(track.times, solution)
+            if places_of(refined) == places_of(events.contacts):
+                unseen = () if settled else contacts_at_ends(track.times, solution, ball, self.surfaces)
                 if not unseen:  # a contact that only the end of the track suggests must also explain it better
                     return min((*settled, solution), key=lambda s: s.minimum.error)
                 settled = (solution,)
                 refined = tuple(sorted((*refined, *unseen), key=lambda c: c.time))
-            if _places(refined) in seen:
+            if places_of(refined) in seen:
                 break
             values = move_contacts(
-                solution.minimum.values, track.times, _places(events.contacts), _places(refined), ball
+                solution.minimum.values, track.times, places_of(events.contacts), places_of(refined), ball
             )
             events = Events(refined, segmentation)
         return min(seen.values(), key=lambda s: s.minimum.error)
@@ -222,7 +211,7 @@ class Smoother(Estimator):
         """What a solution says about the track."""
         minimum, segmentation = solution.minimum, solution.events.segmentation
         n, p = len(track), len(minimum.values.coefficients)
-        states, contacts = minimum.values.states, _timed(track.times, solution)
+        states, contacts = minimum.values.states, timed_contacts(track.times, solution)
         ball = self._ball(track)
         if minimum.step is None:
             covariances = _prior_covariances(n, sigma, self.settings, coefficient_sigmas(ball, self.settings))
@@ -291,61 +280,6 @@ def _worst_break(solution: Solution) -> int | None:
             if not norm.max() <= worst:
                 worst, where = norm.max(), int(kind.variables[norm.argmax(), 0])
     return where
-
-
-def _contacts_at_ends(times: Array, solution: Solution, model: BallModel, surfaces: Surfaces) -> tuple[Contact, ...]:
-    """Contacts that a single sample at either end could show, too little for the segmentation.
-
-    The last state has fallen through a surface; or the first, where later samples lead back to, rises from below one.
-    """
-    values, events, last = solution.minimum.values, solution.events, len(times) - 1
-    taken = {c.interval for c in events.contacts} | set(events.segmentation.hits.tolist())
-    for rest in events.segmentation.rests:
-        taken |= set(range(rest.first, rest.last + 1))
-    found = []
-    for inside, beyond in ((1, 0), (last - 1, last)) if last > 0 else ():
-        interval = min(inside, beyond)
-        states = np.concatenate((values.states[[inside, beyond]], np.tile(values.coefficients, (2, 1))), axis=1)
-        pair = torch.from_numpy(states)
-        height = surfaces.level_below(pair)[0]
-        with torch.no_grad():
-            above, below = model.gap(pair, height).tolist()
-        outwards = (beyond - inside) * float(pair[1, VZ]) < 0.0
-        if interval not in taken and above >= 0.0 > below and outwards and bool(surfaces.over_table(pair)[1]):
-            time = times[beyond] - below / float(pair[1, VZ])
-            found.append(Contact(interval, float(np.clip(time, times[interval], times[interval + 1])), float(height)))
-            taken.add(interval)
-    return tuple(found)
-
-
-def _places(contacts: tuple[Contact, ...]) -> tuple[tuple[int, float], ...]:
-    return tuple((c.interval, c.height) for c in contacts)
-
-
-def _timed(times: Array, solution: Solution) -> tuple[Contact, ...]:
-    """The contacts with the times that the estimate gives them; unchanged where it gives none."""
-    grouped = contacts_by_interval(solution.events.contacts)
-    timed: list[Contact] = []
-    for kind in contact_kinds(solution.graph):
-        for interval, elapsed in zip(
-            kind.variables[:, 0].tolist(), kind.contact_times(solution.minimum.values), strict=True
-        ):
-            for contact, tau in zip(grouped[interval], elapsed.tolist(), strict=True):
-                time = float(times[interval] + tau) if np.isfinite(tau) else contact.time
-                timed.append(Contact(interval, time, contact.height))
-    return tuple(sorted(timed, key=lambda c: c.time))
-
-
-def _refined(times: Array, solution: Solution) -> tuple[Contact, ...]:
-    """The contacts, each in the interval that its estimated time lies in; those outside the track are dropped."""
-    refined = []
-    for contact in _timed(times, solution):
-        if not times[0] <= contact.time <= times[-1]:
-            continue
-        interval = int(np.clip(np.searchsorted(times, contact.time, side="right") - 1, 0, len(times) - 2))
-        step = np.clip(interval - contact.interval, -1, 1)  # one interval at a time: the estimate moves along
-        refined.append(Contact(contact.interval + int(step), contact.time, contact.height))
-    return tuple(refined)
 
 
 def _status(minimum: Minimum, samples: int) -> Status:

@@ -82,10 +82,11 @@ def check_format(name: str) -> FileFormat:
     return cast(FileFormat, name)
 
 
-def check_folder(folder: Path, *, force: bool) -> None:
+def check_folder(folder: Path, *, force: bool, mark: str = TRUTH_FILE, what: str = "simulated dataset") -> None:
     """Refuses a folder that holds something that must not be lost.
 
-    Raises: ValueError: a file, or a folder with other content than a simulated dataset, or with one and no `force`.
+    Args: folder: to write to.  force: an earlier result may be replaced.  mark: file that tells one.  what: one is.
+    Raises: ValueError: a file, or a folder with other content than such a result, or with one and no `force`.
     """
     if not folder.exists():
         return
@@ -93,10 +94,10 @@ def check_folder(folder: Path, *, force: bool) -> None:
         raise ValueError(f"out must be a folder; {folder} is a file. Choose another name.")
     if not any(folder.iterdir()):
         return
-    if not (folder / TRUTH_FILE).is_file():
-        raise ValueError(f"out must be new, empty or a simulated dataset; {folder} holds other files. Choose another.")
+    if not (folder / mark).is_file():
+        raise ValueError(f"out must be new, empty or a {what}; {folder} holds other files. Choose another.")
     if not force:
-        raise ValueError(f"out must be new or empty; {folder} holds a simulated dataset. Replace it with --force.")
+        raise ValueError(f"out must be new or empty; {folder} holds a {what}. Replace it with --force.")
 
 
 def truth_content(config: SimulationConfig) -> dict[str, Any]:

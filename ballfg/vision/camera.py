@@ -17,6 +17,10 @@ DISTORTIONS: Final = (0, 4, 5, 8, 12, 14)
 _PRECISELY: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-12)
 """OpenCV undoes distortion by five steps of a fixed point unless it is told to go on: 0.1 pixel off in a wide lens."""
 
+WIDEST_ASKED: Final = 6.0
+"""Tangent of the widest angle from the axis at which it is asked whether a lens turns back: 80 degrees."""
+WIDEST_STEPS: Final = 6001
+
 
 @dataclass(frozen=True, eq=False)
 class Camera:
@@ -108,15 +112,30 @@ class Camera:
         """(3,) m, where the camera stands."""
         return np.asarray(-self.rotation.T @ self.tvec)
 
+    @cached_property
+    def widest(self) -> float:
+        """Distance from the axis, in the plane at z = 1, up to which the lens shows further out what is further out.
+
+        The polynomial of a distortion that was fitted within the image turns back somewhere outside of it; what lies
+        beyond would land in the picture once more. Infinite for a lens that never turns back.
+        """
+        k1, k2, _, _, k3, k4, k5, k6 = np.pad(self.distortion, (0, 14 - len(self.distortion)))[:8]
+        r = np.linspace(0.0, WIDEST_ASKED, WIDEST_STEPS)
+        q = r * r
+        bent = r * (1 + q * (k1 + q * (k2 + q * k3))) / (1 + q * (k4 + q * (k5 + q * k6)))
+        back = np.flatnonzero(np.diff(bent) <= 0.0)
+        return float(r[back[0]]) if len(back) else np.inf
+
     def project(self, points: ArrayLike) -> Array:
-        """(..., 2) pixels of points (..., 3) m; NaN for those that are not in front of the camera."""
+        """(..., 2) pixels of points (..., 3) m; NaN for those that are behind the camera or beyond its lens."""
         points = np.asarray(points, dtype=np.float64)
         flat = np.ascontiguousarray(points.reshape(-1, 3))
         if len(flat) == 0:
             return np.zeros((*points.shape[:-1], 2))
         pixels, _ = cv2.projectPoints(flat, self.rvec, self.tvec, self.matrix, self.distortion)
         pixels = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
-        pixels[~(self.depth(flat) > 0.0)] = np.nan
+        x, y, depth = (flat @ self.rotation.T + self.tvec).T
+        pixels[~((depth > 0.0) & (np.hypot(x, y) <= self.widest * depth))] = np.nan
         return pixels.reshape(*points.shape[:-1], 2)
 
     def depth(self, points: ArrayLike) -> Array:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from types import ModuleType
 
 from ballfg.tracks.hints import did_you_mean
+from ballfg.tracks.python_file import run_file
 from ballfg.vision.detections import Detector
 from ballfg.vision.video import Video
 
@@ -32,7 +31,7 @@ def load_detector(text: str) -> Maker:
     path = Path(file).resolve()
     if not path.is_file():
         raise FileNotFoundError(f"detector: {path} does not exist. A detector of one's own is one Python file.")
-    found = vars(_run(path))
+    found = vars(run_file(path, "detector"))
     if not callable(found.get(name)):
         own = [word for word, item in found.items() if callable(item) and not word.startswith("_")]
         problem = "is not callable" if name in found else "is not defined there"
@@ -45,28 +44,3 @@ def load_detector(text: str) -> Maker:
 def _made(found: Detector | type[Detector], video: Video) -> Detector:
     """The detector of a camera, which serves no other; `video` is what makers are called with."""
     return found() if isinstance(found, type) else found
-
-
-def _run(path: Path) -> ModuleType:
-    """The module of a file, under a name that no import finds: other processes then get its functions as a whole."""
-    module = ModuleType(f"ballfg detector {path}")
-    sys.modules[module.__name__] = module  # dataclasses look their module up
-    try:
-        exec(compile(path.read_bytes(), path, "exec"), module.__dict__)
-    except Exception as error:  # whatever the user's code raises is the user's to mend
-        raise ValueError(f"{path} must run as Python; {_where(error, path)}. Mend it there.") from error
-    finally:
-        del sys.modules[module.__name__]
-    return module
-
-
-def _where(error: Exception, path: Path) -> str:
-    """What happened, and in which line of the file."""
-    if isinstance(error, SyntaxError) and error.filename == str(path):
-        return f"line {error.lineno}: SyntaxError: {error.msg}"
-    line, trace = "", error.__traceback__
-    while trace is not None:
-        if trace.tb_frame.f_code.co_filename == str(path):
-            line = f"line {trace.tb_lineno}: "
-        trace = trace.tb_next
-    return f"{line}{type(error).__name__}: {error}"

@@ -1,4 +1,4 @@
-"""Reading YAML that people write: safe loader only, no key twice, every key known."""
+"""Reading YAML that people write: a mapping, every key known."""
 
 from __future__ import annotations
 
@@ -6,22 +6,9 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from ballfg.tracks.fields import kind
 from ballfg.tracks.hints import did_you_mean
-
-
-class _UniqueKeyLoader(yaml.SafeLoader):
-    """The safe loader, which takes the last of two equal keys in silence; this one refuses them."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """The mapping. Raises: ConstructorError: if a key comes twice."""
-        keys = [key.value for key, _ in node.value]
-        for key, _ in node.value:
-            if keys.count(key.value) > 1:
-                raise yaml.constructor.ConstructorError(None, None, f"'{key.value}' stands twice", key.start_mark)
-        return super().construct_mapping(node, deep)
+from ballfg.tracks.yaml_file import read_yaml
 
 
 def read_mapping(path: Path) -> dict[Any, Any]:
@@ -31,11 +18,7 @@ def read_mapping(path: Path) -> dict[Any, Any]:
     """
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a file that exists. Correct the path.")
-    try:
-        content = yaml.load(path.read_text(encoding="utf-8-sig"), Loader=_UniqueKeyLoader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: must be YAML; {' '.join(str(error).split())}. Correct it.") from None
-    return mapping(f"{path}: the content", content)
+    return mapping(f"{path}: the content", read_yaml(path))
 
 
 def mapping(what: str, content: Any) -> dict[Any, Any]:

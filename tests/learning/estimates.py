@@ -15,7 +15,8 @@ from ballfg.estimate.launcher import Launcher
 from ballfg.estimate.problem import effective_sigmas
 from ballfg.estimate.segmentation import Segmentation
 from ballfg.estimate.settings import Settings
-from ballfg.estimate.smoother import Earlier, Smoother, Solution
+from ballfg.estimate.smoother import Earlier, Smoother
+from ballfg.estimate.solution import Solution
 from ballfg.factors.graph import Convergence, LevenbergMarquardt
 from ballfg.factors.kind import Values
 from ballfg.factors.loss import Loss

@@ -98,3 +98,13 @@ def test_view_ends_at_the_image() -> None:
 def test_refuses(changes: dict[str, object], message: str) -> None:
     with pytest.raises(ValueError, match=message.replace("(", r"\(")):
         camera(**changes)
+
+
+def test_what_lies_beyond_where_the_lens_turns_back_is_not_seen() -> None:
+    barrel = camera(4, distortion=[-0.3, 0.0, 0.0, 0.0])  # r (1 - 0.3 r^2) is highest at r = 1 / sqrt(0.9)
+    assert barrel.widest == pytest.approx(1.0 / np.sqrt(0.9), abs=2e-3)
+    assert camera(0).widest == np.inf
+    rays = np.array([[0.9, 0.0, 1.0], [1.6, 0.0, 1.0], [0.0, -1.9, 1.0]]) @ barrel.rotation
+    seen = barrel.project(barrel.centre + 2.0 * rays)
+    assert np.isfinite(seen).all(axis=1).tolist() == [True, False, False]
+    assert barrel.in_view(barrel.centre + 2.0 * rays).tolist() == [False, False, False]

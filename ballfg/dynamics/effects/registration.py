@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import sys
 from pathlib import Path
-from types import ModuleType
 from typing import TypeVar
 
 from torch import nn
@@ -12,6 +10,7 @@ from torch import nn
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, FlightEffect
 from ballfg.dynamics.effects.registry import EFFECTS, GENERIC
 from ballfg.dynamics.measurement import MeasurementEffect
+from ballfg.tracks.python_file import run_file
 
 E = TypeVar("E", bound=type[Effect])
 
@@ -63,7 +62,7 @@ def load_effects(path: str | Path) -> tuple[type[Effect], ...]:
     path = Path(path).resolve()
     if not path.is_file():
         raise FileNotFoundError(f"effects file {path} does not exist; effects of one's own are one Python file.")
-    module = _run(path)
+    module = run_file(path, "effects")
     own = [
         item
         for name, item in vars(module).items()
@@ -75,31 +74,6 @@ def load_effects(path: str | Path) -> tuple[type[Effect], ...]:
         return tuple(register(effect) for effect in own)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {error}") from error
-
-
-def _run(path: Path) -> ModuleType:
-    """The module of a file, under a name that no import finds: worker processes then get its classes as a whole."""
-    module = ModuleType(f"ballfg effects {path}")
-    sys.modules[module.__name__] = module  # dataclasses look their module up
-    try:
-        exec(compile(path.read_bytes(), path, "exec"), module.__dict__)
-    except Exception as error:  # whatever the user's code raises is the user's to mend
-        raise ValueError(f"{path} must run as Python; {_where(error, path)}. Mend it there.") from error
-    finally:
-        del sys.modules[module.__name__]
-    return module
-
-
-def _where(error: Exception, path: Path) -> str:
-    """What happened, and in which line of the file."""
-    line = error.lineno if isinstance(error, SyntaxError) and error.filename == str(path) else None
-    trace = error.__traceback__
-    while trace is not None:
-        if trace.tb_frame.f_code.co_filename == str(path):
-            line = trace.tb_lineno
-        trace = trace.tb_next
-    message = error.msg if isinstance(error, SyntaxError) else str(error)
-    return f"{'' if line is None else f'line {line}: '}{type(error).__name__}: {message}"
 
 
 def _origin(effect: type[Effect]) -> tuple[str, str]:

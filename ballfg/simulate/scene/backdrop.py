@@ -22,7 +22,6 @@ from ballfg.simulate.scene.room import (
     is_line,
     middle_line,
 )
-from ballfg.simulate.scene.view import pixels_of
 from ballfg.vision.camera import Camera
 
 Image = NDArray[np.float32]
@@ -143,7 +142,7 @@ class _Room:
 def _may_show(camera: Camera, box: Box, pixels: Array) -> NDArray[np.bool_]:
     """(n,) pixels (n, 2) at which a box may be seen; all if the lens cannot show all of its corners."""
     margin = 24 + camera.size[0] // 40  # straight edges bend between their corners
-    corners = pixels_of(camera, box.corners())
+    corners = camera.project(box.corners())
     if not np.isfinite(corners).all():
         return np.ones(len(pixels), dtype=bool)
     (left, top), (right, bottom) = corners.min(axis=0) - margin, corners.max(axis=0) + margin

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.simulate.scene.view import Rect, clipped, pixels_of
+from ballfg.simulate.scene.view import Rect, clipped
 from ballfg.vision.camera import Camera
 
 Array = NDArray[np.float64]
@@ -53,7 +53,7 @@ def ball_image(camera: Camera, path: Array, radius: float) -> BallImage | None:
         radius: m.
     Returns: None if no pixel of the camera sees it.
     """
-    pixels = pixels_of(camera, path)
+    pixels = camera.project(path)
     if not np.isfinite(pixels).all():
         return None
     rect = clipped(camera, pixels, camera.matrix.max() * radius / camera.depth(path).min() + MARGIN)

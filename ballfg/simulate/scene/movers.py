@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.simulate.scene.room import Colour
-from ballfg.simulate.scene.view import Rect, clipped, pixels_of
+from ballfg.simulate.scene.view import Rect, clipped
 from ballfg.vision.camera import Camera
 
 Array = NDArray[np.float64]
@@ -106,7 +106,7 @@ def draw(
         exposure: s, for the blur of its motion.
     Returns: the part of the image that has changed; None if none has.
     """
-    pixels = pixels_of(camera, capsule.ends)
+    pixels = camera.project(capsule.ends)
     if not np.isfinite(pixels).all():
         return None
     away = float(np.linalg.norm(capsule.ends.mean(axis=0) - camera.centre))

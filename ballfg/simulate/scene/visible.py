@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from ballfg.simulate.scene.recording import Recording
 from ballfg.simulate.scene.shutter import PATH_POINTS
-from ballfg.simulate.scene.view import inside, pixels_of
+from ballfg.simulate.scene.view import inside
 from ballfg.vision.camera import Camera
 
 
@@ -24,7 +24,7 @@ def visible_columns(recording: Recording, number: int) -> dict[str, Any]:
     camera, frames = recording.cameras[number], recording.frames[number]
     rows: list[dict[str, Any]] = []
     for passage in recording.passages[number]:
-        pixels = pixels_of(camera, passage.paths)
+        pixels = camera.project(passage.paths)
         seen = inside(camera, pixels[:, PATH_POINTS // 2])
         pixels, frame = pixels[seen], passage.frames[seen]
         radius = outline_radius(camera, passage.centres[seen], recording.config.ball.ball.radius)

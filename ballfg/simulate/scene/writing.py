@@ -18,6 +18,7 @@ from torch import Tensor
 from ballfg.dynamics import Effect
 from ballfg.simulate.scene.recording import Recording
 from ballfg.simulate.scene.visible import visible_columns
+from ballfg.simulate.writing import check_folder
 from ballfg.state import STATE_NAMES
 from ballfg.tracks import TableWriter
 from ballfg.tracks.writing import staging
@@ -63,7 +64,7 @@ def write_scene(
         OSError: OpenCV cannot write a video or an image here.
     """
     path = Path(folder)
-    check_folder(path, force=force)
+    check_scene_folder(path, force=force)
     for camera in recording.cameras:
         if camera.name != Path(camera.name).name or camera.name.startswith("."):
             raise ValueError(f"camera names must be good as file names; got {camera.name!r}. Rename it.")
@@ -83,21 +84,9 @@ def write_scene(
         _publish(stage, path, scene_content(recording))
 
 
-def check_folder(folder: Path, *, force: bool) -> None:
-    """Refuses a folder that holds something that must not be lost.
-
-    Raises: ValueError: a file, or a folder with other content than a scene, or with one and no `force`.
-    """
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise ValueError(f"out must be a folder; {folder} is a file. Choose another name.")
-    if not any(folder.iterdir()):
-        return
-    if not (folder / SCENE_FILE).is_file():
-        raise ValueError(f"out must be new, empty or a rendered scene; {folder} holds other files. Choose another.")
-    if not force:
-        raise ValueError(f"out must be new or empty; {folder} holds a rendered scene. Replace it with --force.")
+def check_scene_folder(folder: Path, *, force: bool) -> None:
+    """Refuses a folder as `ballfg.simulate.writing.check_folder` does; what may be replaced is a rendered scene."""
+    check_folder(folder, force=force, mark=SCENE_FILE, what="rendered scene")
 
 
 def scene_content(recording: Recording) -> dict[str, Any]:
