@@ -1,4 +1,4 @@
-"""Minimising from a rough start: what a robust loss has set aside on the way is asked once more.
+"""Minimising from a rough start: a spin label that was set aside on the way is asked once more.
 
 Cauchy's loss lets go. On the way from a rough start a spin may leave its label so far behind that it hardly pulls
 any more; the search then ends in another minimum, or on a slope. Where a label ends like that, convex losses lead to
@@ -11,7 +11,13 @@ import numpy as np
 
 from ballfg.factors.graph import BallGraph, LevenbergMarquardt, Minimum
 from ballfg.factors.kind import Values
+from ballfg.factors.launcher import LauncherSpinFactors
+from ballfg.factors.prior import SpinLabelFactors
 from ballfg.factors.search import Search
+
+LABELS = (LauncherSpinFactors, SpinLabelFactors)
+"""Kinds that say what a spin is before the flight is looked at. Of many sightings a few wrong ones are far off as a matter
+of course; of the one label that a track has, that is news."""
 
 
 def search_twice(optimizer: LevenbergMarquardt, graph: BallGraph, values: Values) -> Search[Minimum]:
@@ -25,11 +31,12 @@ def search_twice(optimizer: LevenbergMarquardt, graph: BallGraph, values: Values
 
 
 def _lets_go(graph: BallGraph, values: Values) -> bool:
-    """Whether a loss that pulls less the further away a value is does so with a residual."""
-    able = [kind for kind in graph.kinds if kind.loss.convex != kind.loss]
+    """Whether the loss of a label pulls less the further away the spin is, and the spin is far away."""
+    able = [kind for kind in graph.kinds if isinstance(kind, LABELS) and kind.loss.convex != kind.loss]
     return any((np.linalg.norm(kind.linearize(values).residual, axis=-1) > kind.loss.scale).any() for kind in able)
 
 
 def _convex(graph: BallGraph) -> BallGraph:
-    """The graph with losses that never let go."""
-    return BallGraph(tuple(kind.with_loss(kind.loss.convex) for kind in graph.kinds))
+    """The graph with labels that never let go."""
+    kinds = (kind.with_loss(kind.loss.convex) if isinstance(kind, LABELS) else kind for kind in graph.kinds)
+    return BallGraph(tuple(kinds))
