@@ -16,8 +16,8 @@ from ballfg.factors.prior import SpinLabelFactors
 from ballfg.factors.search import Search
 
 LABELS = (LauncherSpinFactors, SpinLabelFactors)
-"""Kinds that say what a spin is before the flight is looked at. Of many sightings a few wrong ones are far off as a matter
-of course; of the one label that a track has, that is news."""
+"""Kinds that say what a spin is before the flight is looked at. That a few of many sightings are far off is a matter of
+course; of the one label that a track has it is news."""
 
 
 def search_twice(optimizer: LevenbergMarquardt, graph: BallGraph, values: Values) -> Search[Minimum]:
