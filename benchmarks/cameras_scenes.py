@@ -15,10 +15,10 @@ from ballfg.benchmarks.metrics import nees
 from ballfg.cli.progress import progress
 from ballfg.simulate.cameras import table_rig
 from ballfg.simulate.scene import Flight, Recording, SceneConfig, free_running, record, write_scene
-from ballfg.vision.detect import detect_all
-from ballfg.vision.detections import Detections
-from ballfg.vision.seen_ball import SeenBall
-from ballfg.vision.tracking import Tracking, track_detections
+from ballfg.vision.association.seen_ball import SeenBall
+from ballfg.vision.detection.detect import detect_all
+from ballfg.vision.detection.detections import Detections
+from ballfg.vision.tracking.pipeline import Tracking, track_detections
 
 Array = NDArray[np.float64]
 

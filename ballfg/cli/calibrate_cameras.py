@@ -15,11 +15,11 @@ import typer
 from ballfg.cli.progress import progress
 
 if TYPE_CHECKING:
-    from ballfg.vision.boards import Board, Image
-    from ballfg.vision.calibration_report import Calibration
+    from ballfg.vision.calibration.boards import Board, Image
+    from ballfg.vision.calibration.intrinsics import Intrinsics
+    from ballfg.vision.calibration.report import Calibration
+    from ballfg.vision.calibration.table_points import TableFile
     from ballfg.vision.camera import Camera
-    from ballfg.vision.intrinsics import Intrinsics
-    from ballfg.vision.table_points import TableFile
 
 OURS: Final = (".yaml", ".yml")
 THEIRS: Final = (".xml", ".json")
@@ -66,8 +66,8 @@ def calibrate_cameras(
     Beside the file two others say how well the cameras are known: OUT_calibration.json and .png. Without --table only
     the lenses are written, for a later --intrinsics.
     """
-    from ballfg.vision.boards import read_grey
-    from ballfg.vision.table_points import read_table
+    from ballfg.vision.calibration.boards import read_grey
+    from ballfg.vision.calibration.table_points import read_table
     from ballfg.vision.whole_file import check_writable
 
     if out.suffix.lower() not in (*OURS, *THEIRS):
@@ -128,7 +128,7 @@ def _listed(names: Iterable[str]) -> str:
 
 
 def _board(kind: BoardKind, squares: str, square: float, marker: float, dictionary: str, legacy: bool) -> Board:
-    from ballfg.vision.boards import Charuco, Chessboard
+    from ballfg.vision.calibration.boards import Charuco, Chessboard
 
     match = re.fullmatch(r"(\d+)x(\d+)", squares)
     if match is None:
@@ -140,8 +140,8 @@ def _board(kind: BoardKind, squares: str, square: float, marker: float, dictiona
 
 
 def _lens(name: str, places: Iterable[str], board: Board, distortion: int) -> Intrinsics:
-    from ballfg.vision.boards import find_views, image_files, suggested
-    from ballfg.vision.intrinsics import calibrate_intrinsics
+    from ballfg.vision.calibration.boards import find_views, image_files, suggested
+    from ballfg.vision.calibration.intrinsics import calibrate_intrinsics
 
     files = image_files(places)
     views = list(progress(find_views(files, board), len(files), f"images of {name} searched"))
@@ -153,8 +153,8 @@ def _lens(name: str, places: Iterable[str], board: Board, distortion: int) -> In
 
 
 def _placed(camera: Camera, lens: Intrinsics | None, marked: TableFile | None) -> Calibration:
-    from ballfg.vision.calibration_report import Calibration
-    from ballfg.vision.extrinsics import calibrate_extrinsics
+    from ballfg.vision.calibration.extrinsics import calibrate_extrinsics
+    from ballfg.vision.calibration.report import Calibration
 
     if marked is None:
         return Calibration(camera, lens, None)
@@ -163,11 +163,11 @@ def _placed(camera: Camera, lens: Intrinsics | None, marked: TableFile | None) -
 
 
 def _write(out: Path, found: list[Calibration], shown: Mapping[str, Image], marked: TableFile | None) -> None:
-    from ballfg.vision.calibration_picture import calibration_picture
-    from ballfg.vision.calibration_report import content, summary
+    from ballfg.vision.calibration.picture import calibration_picture
+    from ballfg.vision.calibration.report import content, summary
+    from ballfg.vision.calibration.table_points import TABLE_HEIGHT
     from ballfg.vision.camera_file import write_cameras
     from ballfg.vision.camera_storage import write_opencv
-    from ballfg.vision.table_points import TABLE_HEIGHT
     from ballfg.vision.whole_file import whole_file
 
     figure = calibration_picture(found, shown, TABLE_HEIGHT if marked is None else marked.table_height)

@@ -18,9 +18,9 @@ from ballfg.cli.progress import progress
 if TYPE_CHECKING:
     from ballfg.dynamics import AnalyticModel, Surfaces
     from ballfg.vision import Camera
-    from ballfg.vision.detector import Colour as BallColour
-    from ballfg.vision.tracking import Tracking
-    from ballfg.vision.tracking_dataset import Streams
+    from ballfg.vision.detection.detector import Colour as BallColour
+    from ballfg.vision.tracking.dataset import Streams
+    from ballfg.vision.tracking.pipeline import Tracking
 
 
 class Colour(enum.StrEnum):
@@ -70,9 +70,9 @@ def track(
     from ballfg.simulate.balls import ball_kind
     from ballfg.tracks import DatasetInfo
     from ballfg.vision.camera_file import read_cameras
-    from ballfg.vision.recordings import without as others
-    from ballfg.vision.tracking_dataset import check_folder, write_tracking
-    from ballfg.vision.tracking_report import disagreement, no_ball, summary
+    from ballfg.vision.tracking.dataset import check_folder, write_tracking
+    from ballfg.vision.tracking.recordings import without as others
+    from ballfg.vision.tracking.report import disagreement, no_ball, summary
 
     kind = ball_kind(ball)
     height = kind.surfaces.table_height if table_height is None else table_height
@@ -126,12 +126,12 @@ def _from_videos(
     jobs: int | None,
 ) -> tuple[Tracking, Streams]:
     """What was found, and what gives each video's frames once more."""
-    from ballfg.vision.detect import learn_detector
-    from ballfg.vision.detector import DetectorSettings
-    from ballfg.vision.detector_file import load_detector
-    from ballfg.vision.recordings import match_videos, stamp_files
-    from ballfg.vision.tracking import track_videos
-    from ballfg.vision.video import open_video
+    from ballfg.vision.detection.detect import learn_detector
+    from ballfg.vision.detection.detector import DetectorSettings
+    from ballfg.vision.detection.detector_file import load_detector
+    from ballfg.vision.detection.video import open_video
+    from ballfg.vision.tracking.pipeline import track_videos
+    from ballfg.vision.tracking.recordings import match_videos, stamp_files
 
     videos, files = match_videos(recordings, rig), stamp_files(stamps, rig)
     if detector is not None and colour is not None:
@@ -152,7 +152,7 @@ def _from_videos(
 def _on_one_clock(tracking: Tracking, model: AnalyticModel, surfaces: Surfaces) -> Tracking:
     """The same candidates once more, each camera with the time offset that the balls tell."""
     from ballfg.estimate import estimate_time_offsets, sighted_track, uncertain
-    from ballfg.vision.tracking import track_detections
+    from ballfg.vision.tracking.pipeline import track_detections
 
     pairs = zip(tracking.names, tracking.balls, strict=True)
     tracks = [sighted_track(name, ball.sightings, tracking.cameras) for name, ball in pairs]
@@ -165,8 +165,8 @@ def _on_one_clock(tracking: Tracking, model: AnalyticModel, surfaces: Surfaces) 
 
 
 def _from_table(path: Path, rig: Sequence[Camera], without: Sequence[str]) -> Tracking:
-    from ballfg.vision.detections_table import read_detections
-    from ballfg.vision.tracking import track_detections
+    from ballfg.vision.detection.detections_table import read_detections
+    from ballfg.vision.tracking.pipeline import track_detections
 
     detections, notes = read_detections(path, rig, without)
     for note in notes:

@@ -1,20 +1,20 @@
 """From cameras to tracks: camera models, calibration, detection, association, triangulation."""
 
-from ballfg.vision.agreement import Agreement, check_agreement
-from ballfg.vision.associate import AssociationSettings, associate
+from ballfg.vision.association.agreement import Agreement, check_agreement
+from ballfg.vision.association.associate import AssociationSettings, associate
+from ballfg.vision.association.seen_ball import SeenBall
+from ballfg.vision.association.triangulate import Triangulated, triangulate
+from ballfg.vision.calibration.extrinsics import calibrate_extrinsics
+from ballfg.vision.calibration.intrinsics import calibrate_intrinsics
 from ballfg.vision.camera import Camera
 from ballfg.vision.camera_file import read_cameras, write_cameras
 from ballfg.vision.camera_storage import write_opencv
-from ballfg.vision.detect import detect, detect_all, learn_detector
-from ballfg.vision.detections import Candidates, Detections, Detector
-from ballfg.vision.detector import BallDetector, DetectorSettings
-from ballfg.vision.extrinsics import calibrate_extrinsics
-from ballfg.vision.intrinsics import calibrate_intrinsics
+from ballfg.vision.detection.detect import detect, detect_all, learn_detector
+from ballfg.vision.detection.detections import Candidates, Detections, Detector
+from ballfg.vision.detection.detector import BallDetector, DetectorSettings
+from ballfg.vision.detection.video import Video, open_video
 from ballfg.vision.projection import CameraBank
-from ballfg.vision.seen_ball import SeenBall
-from ballfg.vision.tracking import Tracking, track_detections, track_videos
-from ballfg.vision.triangulate import Triangulated, triangulate
-from ballfg.vision.video import Video, open_video
+from ballfg.vision.tracking.pipeline import Tracking, track_detections, track_videos
 
 __all__ = [
     "Agreement",

@@ -14,7 +14,7 @@ from ballfg.benchmarks.cameras_scenes import Filmed, Scenario, judge, scenarios,
 from ballfg.benchmarks.results import Results
 from ballfg.simulate.scene import Clock, Recording
 from ballfg.vision import Detections
-from ballfg.vision.tracking import track_detections
+from ballfg.vision.tracking.pipeline import track_detections
 
 NOISE = 0.1
 """px"""

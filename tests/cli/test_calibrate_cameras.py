@@ -14,8 +14,8 @@ import yaml
 
 from ballfg.cli.main import run
 from ballfg.vision import Camera
+from ballfg.vision.calibration.table_points import table_points
 from ballfg.vision.camera_file import read_cameras
-from ballfg.vision.table_points import table_points
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "vision"))
 

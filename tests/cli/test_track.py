@@ -287,7 +287,7 @@ def test_a_detector_of_ones_own_finds_what_it_looks_for(
     rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "mine.py").write_text(
-        "from ballfg.vision.detections import Candidates\n"
+        "from ballfg.vision.detection.detections import Candidates\n"
         "def corner(image):\n"
         "    return Candidates.at([[5.0, 7.0]], sigma=0.3, scores=[0.25])\n"
     )

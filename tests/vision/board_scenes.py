@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 
 from ballfg.vision import Camera
-from ballfg.vision.boards import Charuco, Chessboard, View
+from ballfg.vision.calibration.boards import Charuco, Chessboard, View
 
 TRUE = Camera(
     name="left",

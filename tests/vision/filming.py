@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from ballfg.vision.camera import Camera
-from ballfg.vision.detections import Detections
+from ballfg.vision.detection.detections import Detections
 
 TARGET = (1.37, 0.0, 0.9)
 HEIGHT = 0.78

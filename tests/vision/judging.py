@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ballfg.vision.associate import SeenBall
+from ballfg.vision.association.associate import SeenBall
+from ballfg.vision.association.paths import MAX_GAP
 from ballfg.vision.camera import Camera
-from ballfg.vision.detections import Detections
-from ballfg.vision.paths import MAX_GAP
+from ballfg.vision.detection.detections import Detections
 
 from .filming import World
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ballfg.vision.agreement import check_agreement
-from ballfg.vision.associate import associate
+from ballfg.vision.association.agreement import check_agreement
+from ballfg.vision.association.associate import associate
 from ballfg.vision.camera import Camera
 
 from .filming import World, film, rig, shots, turned

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballfg.vision.associate import AssociationSettings, SeenBall, associate
-from ballfg.vision.detections import Detections
+from ballfg.vision.association.associate import AssociationSettings, SeenBall, associate
+from ballfg.vision.detection.detections import Detections
 
 from .filming import Shot, World, film, rig, shots, turned
 from .judging import judge

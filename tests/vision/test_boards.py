@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ballfg.vision.boards import Charuco, Chessboard, find_views, image_files, read_grey, suggested
+from ballfg.vision.calibration.boards import Charuco, Chessboard, find_views, image_files, read_grey, suggested
 
 sys.path.insert(0, str(Path(__file__).parent))
 from board_scenes import CHARUCO, CHESSBOARD, TRUE, image_of, poses

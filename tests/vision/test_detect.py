@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
-from ballfg.vision.detect import detect, detect_all, learn_detector
-from ballfg.vision.detections import Candidates
-from ballfg.vision.video import Video, open_video
+from ballfg.vision.detection.detect import detect, detect_all, learn_detector
+from ballfg.vision.detection.detections import Candidates
+from ballfg.vision.detection.video import Video, open_video
 
 from .drawn import Film
 

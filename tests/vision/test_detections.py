@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ballfg.vision.detections import Candidates, Detections
+from ballfg.vision.detection.detections import Candidates, Detections
 
 
 def three() -> Detections:

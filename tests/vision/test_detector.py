@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from ballfg.vision.background import Background
-from ballfg.vision.detector import BallDetector, DetectorSettings
+from ballfg.vision.detection.background import Background
+from ballfg.vision.detection.detector import BallDetector, DetectorSettings
 
 from .drawn import Film, Shot
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ballfg.vision import Camera
-from ballfg.vision.extrinsics import Extrinsics, calibrate_extrinsics
-from ballfg.vision.table_points import Marked, read_table, table_outline, table_points
+from ballfg.vision.calibration.extrinsics import Extrinsics, calibrate_extrinsics
+from ballfg.vision.calibration.table_points import Marked, read_table, table_outline, table_points
 
 AT = table_points()
 CORNERS = ("near_left", "near_right", "far_left", "far_right")

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ballfg.vision.flights import is_ball, meeting, successions
-from ballfg.vision.paths import Path, path
+from ballfg.vision.association.flights import is_ball, meeting, successions
+from ballfg.vision.association.paths import Path, path
 
 from .filming import Shot, arm
 

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from ballfg.vision import Camera
-from ballfg.vision.boards import Charuco, Chessboard, View
-from ballfg.vision.intrinsics import _FLAGS, RAYS, Intrinsics, _fit, calibrate_intrinsics, coverage, turn
-from ballfg.vision.lens_covariance import covariance_of_lens, pixel_grid, sigma_of_rays
+from ballfg.vision.calibration.boards import Charuco, Chessboard, View
+from ballfg.vision.calibration.intrinsics import _FLAGS, RAYS, Intrinsics, _fit, calibrate_intrinsics, coverage, turn
+from ballfg.vision.calibration.lens_covariance import covariance_of_lens, pixel_grid, sigma_of_rays
 
 sys.path.insert(0, str(Path(__file__).parent))
 from board_scenes import CHARUCO, CHESSBOARD, TRUE, exact_views, image_of, poses

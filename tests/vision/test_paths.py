@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ballfg.vision.paths import MAX_GAP, path, smooth_path
+from ballfg.vision.association.paths import MAX_GAP, path, smooth_path
 
 PERIOD = 1.0 / 60.0
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ballfg.vision.streak import Look, Patch, fit_streak, start, swept
+from ballfg.vision.detection.streak import Look, Patch, fit_streak, start, swept
 
 from .drawn import coverage
 

@@ -17,14 +17,14 @@ from joblib.externals.loky.backend.reduction import dumps
 from ballfg.tracks import TABLE_TENNIS, DatasetInfo, read_dataset
 from ballfg.vision import Camera
 from ballfg.vision.camera_file import read_cameras
-from ballfg.vision.detections import Candidates, Detections
-from ballfg.vision.detections_table import read_detections
-from ballfg.vision.detector_file import load_detector
-from ballfg.vision.playback import Image
-from ballfg.vision.tracking import Tracking, track_detections
-from ballfg.vision.tracking_dataset import FILES, check_folder, write_tracking
-from ballfg.vision.tracking_report import no_ball, summary
-from ballfg.vision.video import Video, open_video
+from ballfg.vision.detection.detections import Candidates, Detections
+from ballfg.vision.detection.detections_table import read_detections
+from ballfg.vision.detection.detector_file import load_detector
+from ballfg.vision.detection.video import Video, open_video
+from ballfg.vision.tracking.dataset import FILES, check_folder, write_tracking
+from ballfg.vision.tracking.pipeline import Tracking, track_detections
+from ballfg.vision.tracking.playback import Image
+from ballfg.vision.tracking.report import no_ball, summary
 
 RATE = 100.0
 FRAMES, START, END = 80, 20, 60
@@ -215,7 +215,7 @@ def test_the_summary_counts(tracking: Tracking) -> None:
 
 DETECTOR = """
 import numpy as np
-from ballfg.vision.detections import Candidates
+from ballfg.vision.detection.detections import Candidates
 
 LEVEL = 200
 

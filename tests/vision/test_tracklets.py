@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ballfg.vision.detections import Detections
-from ballfg.vision.tracklets import find_tracklets
+from ballfg.vision.association.tracklets import find_tracklets
+from ballfg.vision.detection.detections import Detections
 
 from .filming import World, arm, film, rig, shots
 

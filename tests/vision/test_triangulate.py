@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from ballfg.vision.association.triangulate import Triangulated, triangulate
 from ballfg.vision.camera import Camera
-from ballfg.vision.triangulate import Triangulated, triangulate
 
 from .filming import looking, rig
 

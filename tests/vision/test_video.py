@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from ballfg.vision.video import open_video
+from ballfg.vision.detection.video import open_video
 
 SIZE = (64, 48)
 

@@ -9,10 +9,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.vision.palette import bgr
-from ballfg.vision.playback import Image
-from ballfg.vision.tracking import Tracking
-from ballfg.vision.view_painter import by_score, polyline, ring, uncover, write
+from ballfg.vision.tracking.palette import bgr
+from ballfg.vision.tracking.pipeline import Tracking
+from ballfg.vision.tracking.playback import Image
+from ballfg.vision.tracking.view_painter import by_score, polyline, ring, uncover, write
 
 Array = NDArray[np.float64]
 

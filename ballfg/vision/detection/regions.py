@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.vision.background import SHRINK, Background, Image, shrunk
+from ballfg.vision.detection.background import SHRINK, Background, Image, shrunk
 
 MARGIN: Final = 6
 """px of background kept around a region: the mask misses up to a small pixel of the rim, and the fit needs some."""

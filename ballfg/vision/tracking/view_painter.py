@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.vision.palette import bgr
-from ballfg.vision.playback import Image
-from ballfg.vision.tracking import Tracking
+from ballfg.vision.tracking.palette import bgr
+from ballfg.vision.tracking.pipeline import Tracking
+from ballfg.vision.tracking.playback import Image
 
 Array = NDArray[np.float64]
 Colour = tuple[int, int, int]

@@ -14,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.tracks.sightings import Sightings
+from ballfg.vision.association.clock import shared_stamps
+from ballfg.vision.association.completing import complete
+from ballfg.vision.association.flights import is_ball, successions
+from ballfg.vision.association.gathering import SAME_SHUTTER, Footage, Gathered, Rows, gather
+from ballfg.vision.association.matching import Piece, match
+from ballfg.vision.association.seen_ball import SeenBall
+from ballfg.vision.association.tracklets import find_tracklets
 from ballfg.vision.camera import Camera
-from ballfg.vision.clock import shared_stamps
-from ballfg.vision.completing import complete
-from ballfg.vision.detections import Detections
-from ballfg.vision.flights import is_ball, successions
-from ballfg.vision.gathering import SAME_SHUTTER, Footage, Gathered, Rows, gather
-from ballfg.vision.matching import Piece, match
-from ballfg.vision.seen_ball import SeenBall
-from ballfg.vision.tracklets import find_tracklets
+from ballfg.vision.detection.detections import Detections
 
 Array = NDArray[np.float64]
 

@@ -8,9 +8,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from ballfg.vision.calibration.extrinsics import Extrinsics
+from ballfg.vision.calibration.intrinsics import RAYS, FittedView, Intrinsics
 from ballfg.vision.camera import Camera
-from ballfg.vision.extrinsics import Extrinsics
-from ballfg.vision.intrinsics import RAYS, FittedView, Intrinsics
 
 COEFFICIENTS: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 """Names of OpenCV's distortion coefficients, in their order."""

@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.vision.paths import Path
+from ballfg.vision.association.paths import Path
 
 Array = NDArray[np.float64]
 

@@ -15,9 +15,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.vision.association.epipolar import epipolar_miss
+from ballfg.vision.association.paths import Path
 from ballfg.vision.camera import Camera
-from ballfg.vision.epipolar import epipolar_miss
-from ballfg.vision.paths import Path
 
 Array = NDArray[np.float64]
 

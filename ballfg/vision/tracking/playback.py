@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.vision.camera import Camera
-from ballfg.vision.detections import Detections
+from ballfg.vision.detection.detections import Detections
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]

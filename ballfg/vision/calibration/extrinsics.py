@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.vision.calibration.table_points import Marked
 from ballfg.vision.camera import Camera
-from ballfg.vision.table_points import Marked
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from ballfg.tracks.detections_file import CAMERA, NOISE, SCORE, UNSTATED
 from ballfg.tracks.hints import did_you_mean
 from ballfg.tracks.rows import KEY
 from ballfg.vision.camera import Camera
-from ballfg.vision.detections import Detections
+from ballfg.vision.detection.detections import Detections
 
 Array = NDArray[np.float64]
 

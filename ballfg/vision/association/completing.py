@@ -8,8 +8,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.vision.association.gathering import Footage, Gathered, Rows, gather
 from ballfg.vision.camera import Camera
-from ballfg.vision.gathering import Footage, Gathered, Rows, gather
 
 Array = NDArray[np.float64]
 

@@ -9,11 +9,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.vision.association.clock import nearest
+from ballfg.vision.association.paths import Path, path
+from ballfg.vision.association.triangulate import triangulate
 from ballfg.vision.camera import Camera
-from ballfg.vision.clock import nearest
-from ballfg.vision.detections import Detections
-from ballfg.vision.paths import Path, path
-from ballfg.vision.triangulate import triangulate
+from ballfg.vision.detection.detections import Detections
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.int64]

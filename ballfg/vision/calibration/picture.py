@@ -11,12 +11,12 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from ballfg.vision.boards import Image
-from ballfg.vision.calibration_report import Calibration
+from ballfg.vision.calibration.boards import Image
+from ballfg.vision.calibration.extrinsics import Extrinsics
+from ballfg.vision.calibration.intrinsics import CELLS, Intrinsics
+from ballfg.vision.calibration.report import Calibration
+from ballfg.vision.calibration.table_points import TABLE_HEIGHT, table_outline
 from ballfg.vision.camera import Camera
-from ballfg.vision.extrinsics import Extrinsics
-from ballfg.vision.intrinsics import CELLS, Intrinsics
-from ballfg.vision.table_points import TABLE_HEIGHT, table_outline
 
 Array = NDArray[np.float64]
 

@@ -11,9 +11,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.vision.boards import View
+from ballfg.vision.calibration.boards import View
+from ballfg.vision.calibration.lens_covariance import covariance_of_lens, pixel_grid, sigma_of_rays
 from ballfg.vision.camera import DISTORTIONS, Camera
-from ballfg.vision.lens_covariance import covariance_of_lens, pixel_grid, sigma_of_rays
 
 Array = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.vision.stamps import Array, read_stamps
+from ballfg.vision.detection.stamps import Array, read_stamps
 
 Image = NDArray[np.uint8]
 

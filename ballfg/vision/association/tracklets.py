@@ -15,8 +15,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.vision.detections import Detections
-from ballfg.vision.paths import RATE_OF_CHANGE
+from ballfg.vision.association.paths import RATE_OF_CHANGE
+from ballfg.vision.detection.detections import Detections
 
 Rows = NDArray[np.int64]
 

@@ -16,11 +16,11 @@ from ballfg.tracks.info import INFO_FILE, write_info
 from ballfg.tracks.rows import KEY, SIGMAS, VALUES
 from ballfg.tracks.writing import staging
 from ballfg.vision.camera_file import write_cameras
-from ballfg.vision.contact_sheet import ContactSheet, Extent
-from ballfg.vision.overlay import Watch, write_overlay
-from ballfg.vision.playback import Image
-from ballfg.vision.strobe import tapped
-from ballfg.vision.tracking import Tracking
+from ballfg.vision.tracking.contact_sheet import ContactSheet, Extent
+from ballfg.vision.tracking.overlay import Watch, write_overlay
+from ballfg.vision.tracking.pipeline import Tracking
+from ballfg.vision.tracking.playback import Image
+from ballfg.vision.tracking.strobe import tapped
 
 Streams = Sequence[Callable[[], Iterator[tuple[float, Image]]]]
 """For each camera what opens its video and gives stamps (s) and images."""

@@ -8,11 +8,11 @@ from typing import Final, Literal
 
 import numpy as np
 
-from ballfg.vision.background import Array, Background, Image
-from ballfg.vision.detections import Candidates
-from ballfg.vision.regions import Region, find_regions
-from ballfg.vision.scoring import score
-from ballfg.vision.streak import LOOK, Look, Patch, StreakFit, fit_streak, start
+from ballfg.vision.detection.background import Array, Background, Image
+from ballfg.vision.detection.detections import Candidates
+from ballfg.vision.detection.regions import Region, find_regions
+from ballfg.vision.detection.scoring import score
+from ballfg.vision.detection.streak import LOOK, Look, Patch, StreakFit, fit_streak, start
 
 Colour = Literal["white", "orange"]
 

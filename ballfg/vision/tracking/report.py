@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from ballfg.vision.agreement import LEAST_MISFIT
-from ballfg.vision.tracking import Tracking
+from ballfg.vision.association.agreement import LEAST_MISFIT
+from ballfg.vision.tracking.pipeline import Tracking
 
 
 def summary(tracking: Tracking) -> Iterator[str]:

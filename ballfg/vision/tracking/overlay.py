@@ -10,10 +10,10 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
-from ballfg.vision.palette import bgr
-from ballfg.vision.playback import Image, Schedule, play, schedule
-from ballfg.vision.tracking import Tracking
-from ballfg.vision.view_painter import ViewPainter, write
+from ballfg.vision.tracking.palette import bgr
+from ballfg.vision.tracking.pipeline import Tracking
+from ballfg.vision.tracking.playback import Image, Schedule, play, schedule
+from ballfg.vision.tracking.view_painter import ViewPainter, write
 
 Watch = Callable[[Iterable[Any], int, str], Iterable[Any]]
 """Hands items through and shows how far it is: (items, how many, what they are)."""

@@ -11,9 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from ballfg.vision.palette import hexadecimal
-from ballfg.vision.strobe import EXPOSURES, HEIGHT, WIDTH, ZOOM, AllCandidates, Picture, Strobe
-from ballfg.vision.tracking import Tracking
+from ballfg.vision.tracking.palette import hexadecimal
+from ballfg.vision.tracking.pipeline import Tracking
+from ballfg.vision.tracking.strobe import EXPOSURES, HEIGHT, WIDTH, ZOOM, AllCandidates, Picture, Strobe
 
 Array = NDArray[np.float64]
 Extent = tuple[float, float, float, float]

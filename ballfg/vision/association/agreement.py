@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from ballfg.vision.association.paths import path
+from ballfg.vision.association.seen_ball import SeenBall
+from ballfg.vision.association.triangulate import triangulate
 from ballfg.vision.camera import Camera
-from ballfg.vision.paths import path
-from ballfg.vision.seen_ball import SeenBall
-from ballfg.vision.triangulate import triangulate
 
 Array = NDArray[np.float64]
 

@@ -8,8 +8,8 @@ from pathlib import Path
 
 from ballfg.tracks.hints import did_you_mean
 from ballfg.tracks.python_file import run_file
-from ballfg.vision.detections import Detector
-from ballfg.vision.video import Video
+from ballfg.vision.detection.detections import Detector
+from ballfg.vision.detection.video import Video
 
 Maker = Callable[[Video], Detector]
 """Makes the detector of a camera from its video."""

@@ -12,9 +12,9 @@ from typing import Final
 import cv2
 import joblib
 
-from ballfg.vision.detections import Candidates, Detections, Detector
-from ballfg.vision.detector import BallDetector, DetectorSettings
-from ballfg.vision.video import Video, open_video
+from ballfg.vision.detection.detections import Candidates, Detections, Detector
+from ballfg.vision.detection.detector import BallDetector, DetectorSettings
+from ballfg.vision.detection.video import Video, open_video
 
 SAMPLE: Final = 15
 """Frames from which a background is learned: what stands in the same place in eight of them is background."""

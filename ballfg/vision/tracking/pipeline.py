@@ -11,14 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.tracks import Track
-from ballfg.vision.agreement import Agreement, check_agreement
-from ballfg.vision.associate import associate
+from ballfg.vision.association.agreement import Agreement, check_agreement
+from ballfg.vision.association.associate import associate
+from ballfg.vision.association.seen_ball import SeenBall
 from ballfg.vision.camera import Camera
-from ballfg.vision.detect import Watch, detect_all, learn_detector
-from ballfg.vision.detections import Detections, Detector
-from ballfg.vision.recordings import check_sizes
-from ballfg.vision.seen_ball import SeenBall
-from ballfg.vision.video import Video, open_video
+from ballfg.vision.detection.detect import Watch, detect_all, learn_detector
+from ballfg.vision.detection.detections import Detections, Detector
+from ballfg.vision.detection.video import Video, open_video
+from ballfg.vision.tracking.recordings import check_sizes
 
 Array = NDArray[np.float64]
 
@@ -111,7 +111,7 @@ def track_videos(
         make: the detector of a camera, from its opened video.
         stamps: camera -> CSV file, for those whose stamps are not the container's.
         jobs: processes.
-        watch: shows how far the search is, see `ballfg.vision.detect.Watch`.
+        watch: shows how far the search is, see `ballfg.vision.detection.detect.Watch`.
     Raises: FileNotFoundError: a file is missing. ValueError: as `open_video`, `check_sizes` and `track_detections`.
     """
     check_count(cameras)

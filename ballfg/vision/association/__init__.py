@@ -1,0 +1,1 @@
+"""From candidates of several cameras to balls in space."""

@@ -1,0 +1,1 @@
+"""From videos to what may be a ball, frame by frame."""
