@@ -227,6 +227,36 @@ def test_videos_become_the_tracks_that_were_flown(
     assert (overlay.get(cv2.CAP_PROP_FRAME_WIDTH), overlay.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (1920, 390)
 
 
+def test_states_and_predictions_of_what_was_filmed_agree_with_the_truth(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The whole way: video, dataset, states straight from pixels, prediction from the first 0.3 s."""
+    out, states, ahead = tmp_path / "shots", tmp_path / "states.csv", tmp_path / "ahead.csv"
+    assert status("track", *videos(scene), "--out", out, "--no-overlay", "--jobs", 1) == 0
+    assert status("estimate", out, "--from", "detections", "--out", states, "--jobs", 1) == 0
+    assert status("predict", out, "--observe", 0.3, "--out", ahead, "--jobs", 1) == 0
+    capsys.readouterr()
+    truth = numbers(scene / "truth.csv", "t", "x", "y", "z", "vx", "vy", "vz")
+    found = numbers(states, "t", "x", "y", "z", "vx", "vy", "vz", "sigma_vx", "sigma_vy", "sigma_vz")
+    predicted = numbers(ahead, "t", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
+    for flown, seen, coming in zip(truth.values(), found.values(), predicted.values(), strict=True):
+        velocity = at(flown, seen[:, 0])[:, 3:]
+        steady = np.abs(velocity - at(flown, seen[:, 0] + 0.017)[:, 3:]).max(axis=1) < 0.5  # no bounce next to it
+        steady &= np.abs(velocity - at(flown, seen[:, 0] - 0.017)[:, 3:]).max(axis=1) < 0.5
+        error = (seen[:, 4:7] - velocity)[steady]
+        assert np.sqrt((error**2).mean()) < 0.05
+        assert np.median(np.abs(error / seen[steady, 7:])) < 1.5
+        off = coming[:, 1:4] - at(flown, coming[:, 0])[:, :3]
+        soon = coming[:, 0] < coming[0, 0] + 0.1
+        assert np.linalg.norm(off[soon], axis=1).max() < 0.03
+        assert np.median(np.abs(off / coming[:, 4:])) < 1.5
+
+
+def at(flown: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Truth, sampled every millisecond, at other times."""
+    return np.column_stack([np.interp(times, flown[:, 0], column) for column in flown[:, 1:].T])
+
+
 def film(path: Path, size: tuple[int, int] = SIZE, frames: int = 20) -> Path:
     """A video of noise on grey."""
     noise = np.random.default_rng(1)
