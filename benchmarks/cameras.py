@@ -66,7 +66,7 @@ def run_cameras(results: Results, out: Path, size: Size, jobs: int) -> list[Path
     _add_velocities(results, compare(shown[1]), results.seed)
     _add_clocks(results, off)
     turned = list(progress(nudges(shown[0]), 9, "cameras turned"))
-    _add_nudges(results, turned)
+    _add_nudges(results, turned, shown[0])
     _add_speed(results, ways[0], shown[1])
     names = [f.scenario.name for f in shown]
     return [
@@ -106,6 +106,7 @@ def _add_points(results: Results, name: str, found: Judged) -> None:
     add("complete", "1", share([True] * found.found + [False] * (found.seen - found.found)), found.seen)
     add("false_points", "1", share([True] * found.false + [False] * len(found.errors)), points)
     add("tracks_per_ball", "1", found.tracks / found.balls, found.balls)
+    add("mixed_tracks", "1", found.mixed, found.tracks)
 
 
 def _add_velocities(results: Results, found: dict[str, Velocities], seed: int) -> None:
@@ -117,7 +118,7 @@ def _add_velocities(results: Results, found: dict[str, Velocities], seed: int) -
         results.add("unsynchronised", name, "velocity_rmse", "m/s", bootstrap(kept, int(flown.sum()), rng), flown.sum())
         place = 1e3 * np.sqrt(velocities.positions[flown].sum() / velocities.counts[flown].sum())
         results.add("unsynchronised", name, "position_rmse", "mm", place, flown.sum())
-        results.add("unsynchronised", name, "flights_found", "1", int((velocities.counts > 0).sum()), len(flown))
+        results.add("unsynchronised", name, "states", "1", int(velocities.counts.sum()), len(flown))
     above, below = (pooled_rms(found[name].squares[flown], found[name].counts[flown]) for name in (FACTORS, NAIVE))
     figure = bootstrap(ratio(above, below), int(flown.sum()), rng)
     results.add("unsynchronised", f"{FACTORS} / {NAIVE}", "velocity_rmse", "1", figure, flown.sum())
@@ -141,8 +142,11 @@ def _add_clocks(results: Results, filmed: Sequence[Filmed]) -> None:
     )
 
 
-def _add_nudges(results: Results, found: Sequence[Nudge]) -> None:
-    """How often the turned camera is the one that is named."""
+def _add_nudges(results: Results, found: Sequence[Nudge], filmed: Filmed) -> None:
+    """How often the turned camera is the one that is named; as a control, whether one is where none was turned."""
+    said = filmed.tracking.agreement
+    innocent = said is not None and said.culprit is not None
+    results.add("no camera turned", "agreement", "named", "1", float(innocent), 1)
     right = [nudge.named == nudge.camera for nudge in found]
     results.add("a camera turned by 0.5 degrees", "agreement", "named", "1", share(right), len(right))
     turns = [abs(nudge.turn - 0.5) for nudge in found if np.isfinite(nudge.turn)]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
@@ -15,6 +15,7 @@ from ballfg.benchmarks.metrics import nees
 from ballfg.cli.progress import progress
 from ballfg.simulate.cameras import table_rig
 from ballfg.simulate.scene import Flight, Recording, SceneConfig, free_running, record, write_scene
+from ballfg.vision.association.clock import nearest
 from ballfg.vision.association.seen_ball import SeenBall
 from ballfg.vision.detection.detect import detect_all
 from ballfg.vision.detection.detections import Detections
@@ -24,6 +25,8 @@ Array = NDArray[np.float64]
 
 FALSE: Final = 0.05
 """m. A point further from every ball than that is not of a ball."""
+MIXED: Final = 3
+"""Points of a second ball that make a track one of two balls; where two nearly touch, a point or two may seem to be."""
 SAME_FRAME: Final = 0.5
 """Of a frame interval: a point that near in time to a frame is that frame's."""
 
@@ -115,7 +118,7 @@ class Judged:
         squares: (n,) NEES of these.
         false: points that are of no ball.
         seen: frames in which two cameras or more see a ball.  found: those that have a point.
-        tracks: found.  balls: launched.
+        tracks: found.  mixed: those with points of more than one ball.  balls: launched.
     """
 
     errors: Array
@@ -124,7 +127,8 @@ class Judged:
     seen: int
     found: int
     tracks: int
-    balls: int = field(kw_only=True)
+    mixed: int
+    balls: int
 
     @property
     def rmse(self) -> float:
@@ -135,14 +139,17 @@ class Judged:
 def judge(filmed: Filmed) -> Judged:
     """Each point against the nearest ball in the air at its time; each frame with a ball against the points."""
     recording = filmed.recording
-    errors, squares, false, at = [], [], 0, {flight.name: [np.empty(0)] for flight in recording.flights}
+    errors, squares = [np.zeros((0, 3))], [np.zeros(0)]
+    false, mixed, at = 0, 0, {flight.name: [np.empty(0)] for flight in recording.flights}
     for ball in filmed.tracking.balls:
         flight, error = _nearest(recording.flights, ball)
         of_ball = np.linalg.norm(error, axis=1) <= FALSE
         false += int((~of_ball).sum())
         errors.append(error[of_ball])
         squares.append(nees(error[of_ball], ball.covariances[of_ball]))
-        for name in {flight[k] for k in np.flatnonzero(of_ball)}:
+        names, counts = np.unique(flight[of_ball], return_counts=True)
+        mixed += int((counts >= MIXED).sum() > 1)
+        for name in names:
             at[name].append(ball.times[of_ball & (flight == name)])
     seen = found = 0
     for name, times in _frames_with_ball(recording):
@@ -156,7 +163,8 @@ def judge(filmed: Filmed) -> Judged:
         seen,
         found,
         len(filmed.tracking.balls),
-        balls=len(recording.flights),
+        mixed,
+        len(recording.flights),
     )
 
 
@@ -178,7 +186,7 @@ def _nearest(flights: tuple[Flight, ...], ball: SeenBall) -> tuple[NDArray[np.st
 
 
 def _frames_with_ball(recording: Recording) -> Iterator[tuple[str, Array]]:
-    """For each ball the true times of the frames that see it while another camera does.
+    """For each ball the true times of the frames that have its centre in the image while another camera has.
 
     Cameras that share a shutter have one frame together. Of cameras that do not, a frame of the one that sees most of
     the ball counts if another one sees the ball within a frame interval before and after.
@@ -186,8 +194,8 @@ def _frames_with_ball(recording: Recording) -> Iterator[tuple[str, Array]]:
     step = 1.0 / recording.config.rate
     for number, flight in enumerate(recording.flights):
         times = [
-            frames.times[passages[number].frames]
-            for frames, passages in zip(recording.frames, recording.passages, strict=True)
+            frames.times[passages[number].frames[camera.in_view(passages[number].centres)]]
+            for camera, frames, passages in zip(recording.cameras, recording.frames, recording.passages, strict=True)
         ]
         most = int(np.argmax([len(t) for t in times]))
         shared = all(
@@ -211,6 +219,4 @@ def _distance(times: Array, others: Array) -> Array:
     """(n,) s from each time to the nearest of the others, which ascend."""
     if not len(others):
         return np.full(len(times), np.inf)
-    after = np.clip(np.searchsorted(others, times), 1, max(len(others) - 1, 1))
-    left, right = others[np.clip(after - 1, 0, len(others) - 1)], others[np.clip(after, 0, len(others) - 1)]
-    return np.minimum(np.abs(times - left), np.abs(times - right))
+    return np.asarray(np.abs(times - others[nearest(others, times)]))

@@ -9,13 +9,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from joblib.externals.loky import get_reusable_executor
 from numpy.typing import NDArray
 
 from ballfg.benchmarks.cameras_clocks import sighted
 from ballfg.benchmarks.cameras_scenes import Filmed, Scenario, draw
 from ballfg.dynamics import nominal_model
 from ballfg.estimate import Online, uncertain
-from ballfg.vision import Camera, Detections, associate, detect_all
+from ballfg.vision import Camera, Detections, detect_all, track_detections
 
 Array = NDArray[np.float64]
 
@@ -27,7 +28,7 @@ class StreamTimes:
     Attributes:
         frames: of each camera.
         searching: s, videos to candidates, with the start of the processes.
-        associating: s, candidates to balls.
+        associating: s, candidates to balls, and whether the cameras agree.
     """
 
     frames: int
@@ -51,10 +52,11 @@ def stream_times(scenario: Scenario, runs: int) -> list[StreamTimes]:
 
 
 def _timed(videos: dict[str, Path], cameras: Sequence[Camera]) -> StreamTimes:
+    get_reusable_executor().shutdown(wait=True)  # each run starts its processes, as the command does
     start = time.perf_counter()
     found: dict[str, Detections] = detect_all(videos, jobs=len(videos))
     searched = time.perf_counter()
-    associate(list(found.values()), cameras)
+    track_detections(list(found.values()), cameras)
     end = time.perf_counter()
     return StreamTimes(min(len(d.frames) for d in found.values()), searched - start, end - searched)
 

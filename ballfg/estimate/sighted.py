@@ -30,6 +30,10 @@ LOOSE_GROWTH: Final = 2.0
 """m/s, growth of that with the time to the next moment that rays fix: what a window's velocity is worth."""
 
 
+class NeverSeenByTwoError(ValueError):
+    """No two cameras saw the ball within a few frames: there is no telling where it was."""
+
+
 @dataclass(frozen=True, eq=False)
 class SightedTrack(Track):
     """A track whose stamps are the true times of sightings.
@@ -173,11 +177,11 @@ def filled(moments: Array, path: Path, name: str) -> Path:
     """The path with what rays leave open interpolated in time, extrapolated at its ends.
 
     Args: moments: (n,) s, of the path.  path: from `rough_path`.  name: of the track, for the message.
-    Raises: ValueError: if rays fix no position at all.
+    Raises: NeverSeenByTwoError: if rays fix no position at all.
     """
     firm = path.sigmas.max(axis=1) <= LOOSE
     if not firm.any():
-        raise ValueError(
+        raise NeverSeenByTwoError(
             f"track {name!r}: the ball must be seen by two cameras within a few frames; it never is. "
             "Leave the track out, or look at the time offsets of the cameras."
         )

@@ -7,7 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Final
 
-from ballfg.estimate.sighted import SightedTrack, sighted_track
+from ballfg.estimate.sighted import NeverSeenByTwoError, SightedTrack, sighted_track
 from ballfg.tracks.detections_file import DETECTIONS_FILE, read_sightings
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
@@ -45,7 +45,7 @@ class SightedDataset:
         for name, sightings in balls.items():
             try:
                 self._tracks[name] = sighted_track(name, sightings, cameras, labels.of(name))
-            except ValueError as error:
+            except NeverSeenByTwoError as error:
                 notes.append(str(error))
 
     def __len__(self) -> int:

@@ -29,13 +29,14 @@ class CameraBank:
         self._focal = _stacked([camera.matrix[[0, 1], [0, 1]] for camera in cameras])
         self._principal = _stacked([camera.matrix[:2, 2] for camera in cameras])
         self._distortion = _stacked([np.pad(c.distortion, (0, 14 - len(c.distortion))) for c in cameras])
+        self._widest = _stacked([np.array(camera.widest) for camera in cameras])
         tilts = [_tilt(*camera.distortion[12:]) for camera in cameras if len(camera.distortion) == 14]
         self._tilt = None
         if tilts:
             self._tilt = torch.stack([_tilt(*np.pad(c.distortion, (0, 14 - len(c.distortion)))[12:]) for c in cameras])
 
     def project(self, points: Tensor, camera: Tensor) -> Tensor:
-        """Pixels of points, each in the camera of its row; NaN for those that are not in front of it.
+        """Pixels of points, each in the camera of its row; NaN for those that are behind it or beyond its lens.
 
         Args:
             points: (n, 3) m.
@@ -44,7 +45,8 @@ class CameraBank:
         """
         local = (self._rotation[camera] @ points.unsqueeze(-1)).squeeze(-1) + self._tvec[camera]
         depth = local[:, 2:]
-        plane = local[:, :2] / torch.where(depth > 0.0, depth, torch.nan)
+        seen = (depth > 0.0) & (local[:, :2].detach().norm(dim=-1, keepdim=True) <= self._widest[camera, None] * depth)
+        plane = local[:, :2] / torch.where(seen, depth, torch.nan)
         bent = _distorted(plane, self._distortion[camera])
         if self._tilt is not None:
             tilted = (self._tilt[camera] @ torch.cat((bent, torch.ones_like(depth)), dim=-1).unsqueeze(-1)).squeeze(-1)

@@ -75,6 +75,23 @@ def test_a_point_beside_every_ball_is_false_and_a_frame_without_a_point_is_missi
     assert found.seen == before.seen
 
 
+def test_tracks_of_two_balls_and_no_track_at_all_are_told(together) -> None:
+    first, second = together.tracking.balls
+    half = len(first) // 2
+    grafted = replace(
+        first,
+        times=np.concatenate((first.times[:half], second.times[half:])),
+        points=np.concatenate((first.points[:half], second.points[half:])),
+        covariances=np.concatenate((first.covariances[:half], second.covariances[half:])),
+        views=np.concatenate((first.views[:half], second.views[half:])),
+    )
+    assert judge(together).mixed == 0
+    assert judge(replace(together, tracking=replace(together.tracking, balls=(grafted, second)))).mixed == 1
+    nothing = judge(replace(together, tracking=replace(together.tracking, balls=())))
+    assert (nothing.found, nothing.tracks, len(nothing.errors)) == (0, 0, 0)
+    assert nothing.seen == judge(together).seen
+
+
 def test_truth_ends_with_the_flight(together) -> None:
     flight = together.recording.flights[0]
     states = truth_at(flight, np.array([flight.start - 0.01, flight.start, flight.end + 0.01]))

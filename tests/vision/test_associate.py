@@ -55,15 +55,6 @@ def test_time_offsets_are_taken_off_the_stamps() -> None:
     assert sightings.times[sightings.camera == 2].max() < 0.0  # as the camera wrote them
 
 
-def test_treated_as_synchronised_it_is_as_wrong_as_the_ball_is_fast() -> None:
-    world = World(shots(2, np.random.default_rng(3)), 2.2, arm=False)
-    films = film(CAMERAS, world)
-    right = judge(associate(films, CAMERAS), world, CAMERAS, films)
-    naive = judge(associate(films, CAMERAS, AssociationSettings(interpolate=False)), world, CAMERAS, films)
-    assert right.rmse < 0.001
-    assert naive.rmse > 10 * right.rmse
-
-
 def test_survives_a_camera_turned_by_half_a_degree() -> None:
     world = World(two_at_once(2, 8), 2.4, seed=8)
     films = film(CAMERAS, world)

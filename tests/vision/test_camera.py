@@ -108,3 +108,7 @@ def test_what_lies_beyond_where_the_lens_turns_back_is_not_seen() -> None:
     seen = barrel.project(barrel.centre + 2.0 * rays)
     assert np.isfinite(seen).all(axis=1).tolist() == [True, False, False]
     assert barrel.in_view(barrel.centre + 2.0 * rays).tolist() == [False, False, False]
+    torch_seen = CameraBank([barrel]).project(
+        torch.from_numpy(barrel.centre + 2.0 * rays), torch.zeros(3, dtype=torch.int64)
+    )
+    np.testing.assert_allclose(torch_seen.numpy(), seen, atol=1e-9)

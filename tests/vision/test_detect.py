@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import signal
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -106,3 +108,11 @@ def test_example_in_the_docs_runs(
     for example in examples:
         exec(compile(example, "docs/detect.md", "exec"), {"__name__": "docs"})
     assert f"{COUNT} frames" in capsys.readouterr().out
+
+
+def test_a_process_that_dies_ends_the_search(films: dict[str, Path]) -> None:
+    def die(video: Video) -> None:
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    with pytest.raises(RuntimeError, match="terminated"):
+        detect_all(films, die, jobs=2)

@@ -38,6 +38,8 @@ MOST_POINTS: Final = 600
 """That are used, evenly spread over those there are: more do not change the answer."""
 _LOOSE: Final = 20.0
 """px, noise with which points are made of views that may be wrong."""
+_UNSEEN: Final = 1e4
+"""px, error of a sighting whose point lies behind the camera or beyond its lens: further than any image is wide."""
 _FAR: Final = 9.0
 """Median squared errors at which a point counts half."""
 _STEPS: Final = 8
@@ -162,9 +164,9 @@ def _scene(cameras: list[Camera], pixels: Array, covariances: Array) -> _Scene:
 
 
 def _errors(scene: _Scene, cameras: list[Camera], points: Array) -> Array:
-    """(n, c, 2) px, seen minus projected; zero where not seen."""
+    """(n, c, 2) px, seen minus projected; zero where not seen, `_UNSEEN` where it was seen and cannot be."""
     projected = np.stack([camera.project(points) for camera in cameras], axis=1)
-    return np.nan_to_num(scene.pixels - projected, nan=0.0)
+    return np.where(np.isnan(scene.pixels), 0.0, np.nan_to_num(scene.pixels - projected, nan=_UNSEEN))
 
 
 def _squares(scene: _Scene, errors: Array) -> Array:

@@ -43,13 +43,9 @@ class AssociationSettings:
     least_points: int = 6
     """Points of the shortest track that is kept; at least 3."""
 
-    interpolate: bool = True
-    """Whether cameras that do not share a shutter are brought to one time. False triangulates nearest frames as if they
-    were synchronised: up to half a frame wrong, which is what a comparison wants to show, and nothing else should."""
-
     def __post_init__(self) -> None:
         if not 0.0 <= self.least_score <= 1.0:
-            raise ValueError(f"least_score must lie in [0, 1]; got {self.least_score}. Scores are probabilities.")
+            raise ValueError(f"least_score must lie in [0, 1]; got {self.least_score}. A score is a mark, 1 is a ball.")
         if self.least_points < 3:
             raise ValueError(f"least_points must be at least 3; got {self.least_points}. Raise it.")
 
@@ -96,7 +92,7 @@ def _footage(detections: Sequence[Detections], cameras: Sequence[Camera], settin
     ordered = [by_name[name] for name in names]
     chosen = [seen.select(seen.scores >= settings.least_score) for seen in ordered]
     frames = [seen.frames - camera.time_offset for seen, camera in zip(chosen, cameras, strict=True)]
-    return Footage(list(cameras), chosen, shared_stamps(frames, SAME_SHUTTER), settings.interpolate)
+    return Footage(list(cameras), chosen, shared_stamps(frames, SAME_SHUTTER))
 
 
 def _pieces(footage: Footage) -> list[Piece]:

@@ -9,7 +9,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.vision.association.clock import nearest
 from ballfg.vision.association.paths import Path, path
 from ballfg.vision.association.triangulate import triangulate
 from ballfg.vision.camera import Camera
@@ -31,8 +30,6 @@ class Footage:
     """One for each camera, in the cameras' order."""
     shared: Array | None
     """(k,) s, true time of the stamps if the cameras share a shutter."""
-    interpolate: bool
-    """Whether a camera is asked where the ball was at another's stamp; else its nearest frame is taken."""
     offset: float = 0.0
     """px, error of the calibration, added to every pixel's noise."""
 
@@ -70,7 +67,7 @@ def gather(footage: Footage, rows: Sequence[Rows]) -> Gathered:
     covariances = np.full((len(times), len(rows), 2, 2), np.nan)
     for camera, mine in enumerate(rows):
         if len(mine) and len(times):
-            pixels[:, camera], covariances[:, camera] = _seen_at(footage, camera, mine, times)
+            pixels[:, camera], covariances[:, camera] = footage.path(camera, mine).at(times)
     made = triangulate(footage.cameras, pixels, covariances + footage.offset**2 * np.eye(2))
     found = np.isfinite(made.points).all(axis=1)
     used = made.used[found]
@@ -89,14 +86,3 @@ def _stamps(footage: Footage, rows: Sequence[Rows]) -> Array:
         return np.zeros(0)
     first, last = np.min(seen), np.max(seen)
     return np.asarray(stamps[(stamps >= first - SAME_SHUTTER) & (stamps <= last + SAME_SHUTTER)])
-
-
-def _seen_at(footage: Footage, camera: int, rows: Rows, times: Array) -> tuple[Array, Array]:
-    """Where a camera saw the ball at some times: pixels (k, 2) and covariances (k, 2, 2); NaN where it did not."""
-    line = footage.path(camera, rows)
-    if footage.interpolate:
-        return line.at(times)
-    near = nearest(line.times, times)
-    taken = np.abs(line.times[near] - times) <= 0.5 * float(np.median(np.diff(footage.frames(camera))))
-    pixels = np.where(taken[:, None], line.values[near], np.nan)
-    return pixels, np.where(taken[:, None, None], line.covariances[near], np.nan)

@@ -143,8 +143,9 @@ def _poses(lens: Camera, marked: Marked, flat: bool) -> list[Camera]:
 
 
 def _squares(camera: Camera, marked: Marked) -> float:
-    """Sum of squared whitened residuals."""
-    return float(((camera.project(marked.points) - marked.pixels) ** 2).sum() / marked.sigma**2)
+    """Sum of squared whitened residuals; infinite where a point cannot be seen."""
+    total = float(((camera.project(marked.points) - marked.pixels) ** 2).sum() / marked.sigma**2)
+    return total if np.isfinite(total) else np.inf
 
 
 def _is_above(camera: Camera, points: Array) -> bool:
@@ -201,7 +202,9 @@ def _covariance(found: Extrinsics) -> Array:
     turns = np.stack([_axis(rotation.T @ by_r) for by_r in slopes], axis=1)
     centres = np.stack([-by_r.T @ camera.tvec for by_r in slopes], axis=1)
     moved = np.block([[turns, np.zeros((3, 3))], [centres, -rotation.T]])
-    sigma = max(marked.sigma, found.rms / np.sqrt(2.0))
+    freedom = 2 * len(marked.points) - 6
+    shown = found.rms * np.sqrt(len(marked.points) / freedom)  # rms is of distances: two numbers a point
+    sigma = max(marked.sigma, shown)
     return np.asarray(sigma**2 * moved @ np.linalg.inv(by_pose.T @ by_pose) @ moved.T)
 
 

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import multiprocessing
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
-from queue import Queue
+from queue import Empty, Queue
 from typing import Final
 
 import cv2
-import joblib
+from joblib.externals.loky import get_reusable_executor
 
 from ballfg.vision.detection.detections import Candidates, Detections, Detector
 from ballfg.vision.detection.detector import BallDetector, DetectorSettings
@@ -18,6 +19,8 @@ from ballfg.vision.detection.video import Video, open_video
 
 SAMPLE: Final = 15
 """Frames from which a background is learned: what stands in the same place in eight of them is background."""
+LOOKS: Final = 1.0
+"""s. When nothing was told for so long, it is looked whether a process has died."""
 TELLS: Final = 20
 """Frames after which a process says how far it is."""
 
@@ -82,11 +85,11 @@ def _in_processes(
 ) -> dict[str, Detections]:
     with multiprocessing.Manager() as manager:
         told = manager.Queue()
-        pool = joblib.Parallel(n_jobs=min(jobs, len(videos)), return_as="generator")
-        found = pool(joblib.delayed(_job)(video, name, make, told) for name, video in videos.items())
-        for _ in watch(_told(told, len(videos)), sum(video.count for video in videos.values())):
+        pool = get_reusable_executor(max_workers=min(jobs, len(videos)))
+        running = [pool.submit(_job, video, name, make, told) for name, video in videos.items()]
+        for _ in watch(_told(told, running), sum(video.count for video in videos.values())):
             pass
-        return dict(zip(videos, found, strict=True))
+        return {name: job.result() for name, job in zip(videos, running, strict=True)}
 
 
 def _job(video: Video, camera: str, make: Callable[[Video], Detector], told: Queue[int | None]) -> Detections:
@@ -107,13 +110,18 @@ def _telling(told: Queue[int | None], frames: Iterable[int], total: int) -> Iter
     told.put((number + 1) % TELLS)
 
 
-def _told(told: Queue[int | None], running: int) -> Iterator[int]:
-    """Counts the frames that the processes say are done, until each has ended."""
-    number = 0
-    while running:
-        done = told.get()
+def _told(told: Queue[int | None], running: Sequence[Future[Detections]]) -> Iterator[int]:
+    """Counts the frames that the processes say are done, until each has ended; a process that died says nothing."""
+    number, left = 0, len(running)
+    while left:
+        try:
+            done = told.get(timeout=LOOKS)
+        except Empty:
+            if any(job.done() and job.exception() is not None for job in running):
+                return
+            continue
         if done is None:
-            running -= 1
+            left -= 1
             continue
         yield from range(number, number + done)
         number += done

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ballfg.tracks import Track
 from ballfg.vision.association.agreement import Agreement, check_agreement
-from ballfg.vision.association.associate import associate
+from ballfg.vision.association.associate import AssociationSettings, associate
 from ballfg.vision.association.seen_ball import SeenBall
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detect import Watch, detect_all, learn_detector
@@ -100,6 +100,7 @@ def track_videos(
     make: Callable[[Video], Detector] = learn_detector,
     *,
     stamps: Mapping[str, Path] | None = None,
+    settings: AssociationSettings | None = None,
     jobs: int = 1,
     watch: Watch | None = None,
 ) -> Tracking:
@@ -110,6 +111,7 @@ def track_videos(
         cameras: at least two, calibrated at the videos' sizes.
         make: the detector of a camera, from its opened video.
         stamps: camera -> CSV file, for those whose stamps are not the container's.
+        settings: of the association.
         jobs: processes.
         watch: shows how far the search is, see `ballfg.vision.detection.detect.Watch`.
     Raises: FileNotFoundError: a file is missing. ValueError: as `open_video`, `check_sizes` and `track_detections`.
@@ -117,15 +119,18 @@ def track_videos(
     check_count(cameras)
     check_sizes({name: open_video(path, (stamps or {}).get(name)).size for name, path in videos.items()}, cameras)
     found = detect_all(videos, make, stamps=stamps, jobs=jobs, watch=watch)
-    return track_detections(list(found.values()), cameras)
+    return track_detections(list(found.values()), cameras, settings)
 
 
-def track_detections(detections: Sequence[Detections], cameras: Sequence[Camera]) -> Tracking:
+def track_detections(
+    detections: Sequence[Detections], cameras: Sequence[Camera], settings: AssociationSettings | None = None
+) -> Tracking:
     """Balls from the candidates of a rig.
 
     Args:
         detections: one for each of the cameras, in any order.
         cameras: at least two, with names of their own.
+        settings: of the association.
     Raises: ValueError: a camera without detections or detections without a camera, too few cameras, or recordings
         that do not overlap in time.
     """
@@ -136,7 +141,7 @@ def track_detections(detections: Sequence[Detections], cameras: Sequence[Camera]
         raise ValueError(f"detections must be one for each camera; got {given} for {wanted}. Match their names.")
     ordered = tuple(by_name[camera.name] for camera in cameras)
     check_overlap(ordered, cameras)
-    balls = tuple(associate(ordered, cameras))
+    balls = tuple(associate(ordered, cameras, settings))
     return Tracking(tuple(cameras), ordered, balls, check_agreement(balls, cameras) if balls else None)
 
 
