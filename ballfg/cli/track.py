@@ -69,14 +69,17 @@ def track(
     _quiet_codecs()
     from ballfg.simulate.balls import ball_kind
     from ballfg.tracks import DatasetInfo
+    from ballfg.tracks.writing import staging
     from ballfg.vision.camera_file import read_cameras
     from ballfg.vision.tracking.dataset import check_folder, write_tracking
     from ballfg.vision.tracking.recordings import without as others
-    from ballfg.vision.tracking.report import disagreement, no_ball, summary
+    from ballfg.vision.tracking.report import blind_cameras, disagreement, no_ball, summary
 
     kind = ball_kind(ball)
     height = kind.surfaces.table_height if table_height is None else table_height
     check_folder(out, [cameras, *(Path(text) for text in recordings)], force=force)
+    with staging(out):  # what cannot be written to is better known before the search
+        pass
     files = " ".join(Path(text).name for text in recordings)
     info = DatasetInfo(name or out.resolve().name, height, kind.ball, source=f"ballfg track {files}")
     rig = others(read_cameras(cameras), without or ())
@@ -85,9 +88,11 @@ def track(
         _refuse(stamps=stamps, colour=colour, detector=detector)
         tracking = _from_table(Path(recordings[0]), rig, without or ())
     else:
-        tracking, streams = _from_videos(recordings, rig, stamps or (), colour, detector, jobs)
+        tracking, streams = _from_videos(recordings, rig, stamps or (), colour, detector, jobs, without or ())
     if time_offsets and tracking.balls:
         tracking = _on_one_clock(tracking, kind.model, replace(kind.surfaces, table_height=height))
+    for line in blind_cameras(tracking):
+        print(f"note: {line}", file=sys.stderr)
     if (doubt := disagreement(tracking)) is not None:
         print(f"note: {doubt}", file=sys.stderr)
     info = replace(info, rate=tracking.rate)
@@ -124,6 +129,7 @@ def _from_videos(
     colour: Colour | None,
     detector: str | None,
     jobs: int | None,
+    without: Sequence[str],
 ) -> tuple[Tracking, Streams]:
     """What was found, and what gives each video's frames once more."""
     from ballfg.vision.detection.detect import learn_detector
@@ -133,7 +139,7 @@ def _from_videos(
     from ballfg.vision.tracking.pipeline import track_videos
     from ballfg.vision.tracking.recordings import match_videos, stamp_files
 
-    videos, files = match_videos(recordings, rig), stamp_files(stamps, rig)
+    videos, files = match_videos(recordings, rig, without), stamp_files(stamps, rig)
     if detector is not None and colour is not None:
         raise ValueError("--colour must not be given with --detector: it is about ballfg's own. Leave one of them out.")
     settings = DetectorSettings(colour=cast("BallColour | None", colour))
@@ -153,15 +159,22 @@ def _on_one_clock(tracking: Tracking, model: AnalyticModel, surfaces: Surfaces) 
     """The same candidates once more, each camera with the time offset that the balls tell."""
     from ballfg.estimate import estimate_time_offsets, sighted_track, uncertain
     from ballfg.vision.tracking.pipeline import track_detections
+    from ballfg.vision.tracking.report import disagreement
 
     pairs = zip(tracking.names, tracking.balls, strict=True)
     tracks = [sighted_track(name, ball.sightings, tracking.cameras) for name, ball in pairs]
     found = estimate_time_offsets(tracks, model, surfaces, uncertain(model))
-    for camera, sigma in zip(found.cameras, found.sigmas.tolist(), strict=True):
-        print(f"  {camera.name}: stamps late by {1e3 * camera.time_offset:.3f} ± {1e3 * sigma:.3f} ms")
     if not found.settled:
-        print("note: the time offsets did not settle; record more balls, or check the cameras' poses", file=sys.stderr)
-    return track_detections(tracking.detections, found.cameras)
+        print("note: the time offsets did not settle and are left as they were", file=sys.stderr)
+        return tracking
+    corrected = track_detections(tracking.detections, found.cameras)
+    if disagreement(corrected) is not None:
+        print("note: with time offsets the cameras still disagree; they are left as they were", file=sys.stderr)
+        return tracking
+    for camera, sigma in list(zip(found.cameras, found.sigmas.tolist(), strict=True))[1:]:
+        late = f"{1e3 * camera.time_offset:.3f} ± {1e3 * sigma:.3f} ms"
+        print(f"  {camera.name}: stamps late by {late} against {found.cameras[0].name}")
+    return corrected
 
 
 def _from_table(path: Path, rig: Sequence[Camera], without: Sequence[str]) -> Tracking:

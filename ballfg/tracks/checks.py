@@ -67,6 +67,20 @@ class Findings:
         return notes
 
 
+def check_step(label: str, stamps: FloatArray) -> None:
+    """Refuses stamps that cannot be seconds of a camera.
+
+    Args: label: names the stamps in an error.  stamps: (n,) s, increasing; fewer than three tell nothing.
+    Raises: ValueError: a median step out of `MIN_STEP` to `MAX_STEP`.
+    """
+    step = float(np.median(np.diff(stamps))) if len(stamps) > 2 else MIN_STEP
+    if not MIN_STEP <= step <= MAX_STEP:
+        raise ValueError(
+            f"{label}: t must be in s, with a median step of {MIN_STEP:g} to {MAX_STEP:g} s; got {step:.4g} s. "
+            "The unit is probably ms or us: convert it."
+        )
+
+
 def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> FloatArray:
     """The samples of one trajectory, one for each stamp, in time order.
 

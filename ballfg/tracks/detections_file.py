@@ -14,6 +14,7 @@ import pyarrow.csv as pa_csv
 from numpy.typing import NDArray
 
 from . import csv_errors
+from .checks import check_step
 from .hints import did_you_mean
 from .rows import KEY
 from .sightings import Sightings
@@ -28,9 +29,12 @@ NOISE: Final = ("sigma_u", "sigma_v", "rho_uv")
 SCORE: Final = "score"
 UNSTATED: Final = {"sigma_u": 0.5, "sigma_v": 0.5, "rho_uv": 0.0}
 """px. Half a pixel: what a detector reaches that looks for the middle of a patch."""
+LEAST_SIGMA: Final = 1e-4
+"""px. No camera tells a ball's centre better; a graph with far surer pixels cannot be solved in double precision."""
+SIGMA_RULE: Final = (f"{LEAST_SIGMA:g} px or more", lambda x: x >= LEAST_SIGMA)
 _RULES: Final = {
-    "sigma_u": ("positive", lambda x: x > 0.0),
-    "sigma_v": ("positive", lambda x: x > 0.0),
+    "sigma_u": SIGMA_RULE,
+    "sigma_v": SIGMA_RULE,
     "rho_uv": ("between -1 and 1", lambda x: np.abs(x) < 1.0),
 }
 
@@ -84,6 +88,8 @@ def read_sightings(
     rows, doubles = _chosen(table)
     if doubles:
         notes.append(f"{path.name}: {doubles} candidates with a lower score than another of the same ball left out")
+    for number, camera in enumerate(time_offsets):
+        check_step(f"{path}, camera {camera!r}", np.unique(table.values["t"][rows][table.camera[rows] == number]))
     offsets = np.array(list(time_offsets.values()))
     rows = rows[np.argsort((table.values["t"] - offsets[table.camera])[rows], kind="stable")]
     found = {str(name): rows[table.names[rows] == name] for name in dict.fromkeys(table.names.tolist())}

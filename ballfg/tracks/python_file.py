@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
 
@@ -18,15 +20,28 @@ def run_file(path: Path, what: str) -> ModuleType:
     module = ModuleType(f"ballfg {what} {path}")
     sys.modules[module.__name__] = module  # dataclasses look their module up
     try:
-        exec(compile(path.read_bytes(), path, "exec"), module.__dict__)
-    except Exception as error:  # whatever the user's code raises is the user's to mend
-        raise ValueError(f"{path} must run as Python; {_where(error, path)}. Mend it there.") from error
+        with blamed(path, ""):
+            exec(compile(path.read_bytes(), path, "exec"), module.__dict__)
     finally:
         del sys.modules[module.__name__]
     return module
 
 
-def _where(error: Exception, path: Path) -> str:
+@contextmanager
+def blamed(path: Path, doing: str) -> Iterator[None]:
+    """Turns whatever the user's code raises, which is the user's to mend, into one line.
+
+    Args: path: of the file.  doing: what its code was asked for; empty while the file runs.
+    Raises: ValueError: with the line.
+    """
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        during = f" ({doing})" if doing else ""
+        raise ValueError(f"{path} must run as Python{during}; {_where(error, path)}. Mend it there.") from error
+
+
+def _where(error: BaseException, path: Path) -> str:
     """What happened, and in which line of the file."""
     line = error.lineno if isinstance(error, SyntaxError) and error.filename == str(path) else None
     trace = error.__traceback__

@@ -111,6 +111,40 @@ def test_late_stamps_are_found_and_written_with_the_cameras(
     assert np.sqrt(((track.positions - centre(track.times)) ** 2).sum(axis=1).mean()) < 0.004
 
 
+def test_time_offsets_do_not_stand_in_for_a_turned_camera(
+    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    turn, _ = cv2.Rodrigues(np.radians([0.0, 0.0, 2.0]))
+    rotation = turn @ RIG[1].rotation
+    moved = replace(RIG[1], rvec=cv2.Rodrigues(rotation)[0].ravel(), tvec=-rotation @ RIG[1].centre)
+    write_cameras(rig, [RIG[0], moved, RIG[2]])
+    out = tmp_path / "shots"
+    given = table(tmp_path / "detections.csv")
+    assert status("track", given, "--cameras", rig, "--out", out, "--time-offsets") == 0
+    said = capsys.readouterr()
+    assert "left as they were" in said.err
+    assert "stamps late by" not in said.out
+    assert all(camera.time_offset == 0.0 for camera in read_cameras(out / "cameras.yaml"))
+
+
+def test_rows_that_stand_twice_count_once(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = table(tmp_path / "detections.csv")
+    lines = given.read_text().splitlines()
+    given.write_text("\n".join([lines[0], *(line for line in lines[1:] for _ in range(2))]) + "\n")
+    assert status("track", given, "--cameras", rig, "--out", tmp_path / "shots") == 0
+    said = capsys.readouterr()
+    assert "1 tracks of 50 points" in said.out
+    assert "150 exact repeats of rows dropped" in said.err
+
+
+def test_stamps_in_milliseconds_are_refused(rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    given = table(tmp_path / "detections.csv")
+    rows = [line.split(",", 1) for line in given.read_text().splitlines()]
+    given.write_text("\n".join([",".join(rows[0]), *(f"{1000 * float(t)},{rest}" for t, rest in rows[1:])]) + "\n")
+    assert status("track", given, "--cameras", rig, "--out", tmp_path / "shots") == 2
+    assert "camera 'left': t must be in s, with a median step of 1e-06 to 1 s; got 10 s" in capsys.readouterr().err
+
+
 def test_no_ball_says_how_good_the_best_were_and_leaves_an_empty_dataset(
     rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -311,6 +345,16 @@ def test_videos_without_a_ball_leave_pictures_to_look_at(
     assert "look at overlay.mp4, contact_sheet.png there" in said
     assert (out / "tracks.csv").read_text().count("\n") == 1
     assert {path.name for path in out.iterdir()} >= {"dataset.yaml", "detections.csv", "overlay.mp4"}
+
+
+def test_a_detector_that_fails_is_told_with_line_and_frame(
+    rig: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "mine.py").write_text("def find(image):\n    return 1 / 0\n")
+    given = [film(tmp_path / f"{model.name}.mp4") for model in RIG]
+    words = (*given, "--cameras", rig, "--out", tmp_path / "shots", "--detector", f"{tmp_path}/mine.py:find")
+    said = refused(capsys, *words, "--jobs", 1)
+    assert "mine.py must run as Python (frame 0 of left); line 2: ZeroDivisionError: division by zero" in said
 
 
 def test_a_detector_of_ones_own_finds_what_it_looks_for(

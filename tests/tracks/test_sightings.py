@@ -114,7 +114,10 @@ def test_best_candidate_counts_and_the_rest_is_told(tmp_path: Path) -> None:
             "trajectory,t,camera,u,v\na,0,lefd,1,2\n",
             "line 2, column 'camera': must be a camera: left, right; got 'lefd'",
         ),
-        ("trajectory,t,camera,u,v,sigma_u\na,0,left,1,2,0\n", "line 2, column 'sigma_u': must be positive; got 0"),
+        (
+            "trajectory,t,camera,u,v,sigma_u\na,0,left,1,2,0\n",
+            "line 2, column 'sigma_u': must be 0.0001 px or more; got 0",
+        ),
         ("trajectory,t,camera,u,v,rho_uv\na,0,left,1,2,1\n", "column 'rho_uv': must be between -1 and 1"),
         (
             "trajectory,t,camera,u,v\na,0,left,1,2\nb,0,left,1,2\na,0,left,3,4\n",

@@ -105,7 +105,7 @@ def test_a_point_with_a_wrong_pixel_is_named() -> None:
     seen = marked(camera, tuple(AT))
     pixels = seen.pixels.copy()
     pixels[seen.names.index("far_left")] += (60, -20)
-    with pytest.raises(ValueError, match=r"explained within 5 px; got .*\. Without 'far_left' the others agree\."):
+    with pytest.raises(ValueError, match=r"explained within 2 px; got .*\. Without 'far_left' the others agree\."):
         calibrate_extrinsics(camera, replace(seen, pixels=pixels))
 
 

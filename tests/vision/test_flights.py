@@ -33,8 +33,15 @@ def test_other_things_are_not() -> None:
     assert not is_ball(track(times, straight))
     assert not is_ball(track(times, 0.01 * np.sin(straight)))
     assert not is_ball(
-        track(times[:30], np.outer(times[:30], [70.0, 0.0, 0.0]) - np.outer(times[:30] ** 2, [0, 0, 4.9]))
+        track(times[:30], np.outer(times[:30], [90.0, 0.0, 0.0]) - np.outer(times[:30] ** 2, [0, 0, 4.9]))
     )
+
+
+def test_what_hovers_is_no_ball_however_badly_it_is_seen() -> None:
+    times = np.arange(0.0, 0.6, 1.0 / 120.0)
+    hovering = np.array([1.0, -0.4, 1.55]) + 0.05 * np.sin(np.outer(times, [5.0, 7.0, 4.0]))
+    assert not is_ball(track(times, hovering, sigma=0.012))
+    assert is_ball(track(times, Shot(0.0, 0.6, (0.1, 0.0, 1.6, 2.0, 0.2, 2.5)).at(times), sigma=0.012))
 
 
 def test_what_is_too_short_to_be_seen_falling_is_no_ball() -> None:

@@ -315,7 +315,7 @@ def test_a_table_of_four_columns_in_any_order_is_enough(tmp_path: Path) -> None:
         ("t,camera,u,v\n0,left,1,2\n0,right,one,2\n", "line 3, column 'u': must be a number"),
         ("t,camera,u,v\n0,left,1,2\n0,right,1,inf\n", "line 3, column 'v': must be finite; got inf"),
         ("t,camera,u,v,score\n0,left,1,2,1\n\n0,right,1,2,1.5\n", "line 4, column 'score': must be 0 to 1; got 1.5"),
-        ("t,camera,u,v,sigma_u\n0,left,1,2,0\n", "column 'sigma_u': must be positive; got 0"),
+        ("t,camera,u,v,sigma_u\n0,left,1,2,0\n", "column 'sigma_u': must be 0.0001 px or more; got 0"),
         ("t,camera,u,v\n0,left,1,2\n", "every camera must have rows; got none of 'right'.*--without right"),
         ("t,camera,u,v\n", "every camera must have rows; got none of 'left' and 'right'"),
     ],

@@ -21,8 +21,8 @@ LONGEST_GAP: Final = 0.3
 """s, after which a ball that was not seen is a new one."""
 LONGEST_HIT_GAP: Final = 0.1
 """s, up to which a ball that comes back with any velocity is the same one, hit meanwhile; later it may have bounced."""
-FASTEST: Final = 60.0
-"""m/s, no ball on or near a table is faster; nor is any served tennis ball."""
+FASTEST: Final = 80.0
+"""m/s, no ball that is struck by hand is faster: the fastest served tennis balls have 73."""
 LEAST_WAY: Final = 0.05
 """m, extent of the track of something that moves."""
 GRAVITY: Final = np.array([0.0, 0.0, -9.81])
@@ -31,12 +31,13 @@ _SLACK: Final = 3.0
 """m/s^2, by which a slow ball's acceleration may differ from gravity: calibration, lift of a fast spin."""
 _AIR: Final = 0.25
 """1/m, by how much more with the square of the speed: drag of 0.13 and as much lift."""
-_WINDOW: Final = 0.15
-"""s, over which an acceleration is measured: long against the noise, short against a flight."""
+_WINDOWS: Final = (0.15, 0.3, 0.6)
+"""s, over which an acceleration is measured: short against a flight, and longer where the noise asks for it."""
 _LEAST_IN_WINDOW: Final = 5
 """Points of such a window: three make the parabola."""
-_TELLING: Final = 4.0
-"""m/s^2, standard deviation of a measured acceleration beyond which a window says nothing about gravity."""
+_TELLING: Final = 2.0
+"""m/s^2, standard deviation of a measured acceleration beyond which a window says nothing about gravity: something
+that hovers must not pass with all that is granted."""
 _SIGMAS: Final = 3.0
 """Of a measured acceleration, that are granted."""
 _FALLING: Final = 0.5
@@ -63,15 +64,24 @@ def is_ball(track: Path) -> bool:
     """Whether what moved along a track in space (d = 3) moved as a ball does: far enough, not too fast, and falling."""
     if np.ptp(track.values, axis=0).max() < LEAST_WAY:
         return False
-    falling = []
+    for length in _WINDOWS:
+        falling = _falling(track, length)
+        if falling:
+            return float(np.mean(falling)) >= _FALLING
+    return False
+
+
+def _falling(track: Path, length: float) -> list[bool]:
+    """For each window of a length (s) that tells, whether the motion in it is a free ball's."""
+    found = []
     for number in range(int(track.parts[-1]) + 1):
         rows = np.flatnonzero(track.parts == number)
-        for start in np.arange(track.times[rows[0]], track.times[rows[-1]] + 0.5 * _WINDOW, 0.5 * _WINDOW):
-            window = rows[(track.times[rows] >= start) & (track.times[rows] <= start + _WINDOW)]
+        for start in np.arange(track.times[rows[0]], track.times[rows[-1]] + 0.5 * length, 0.5 * length):
+            window = rows[(track.times[rows] >= start) & (track.times[rows] <= start + length)]
             if len(window) >= _LEAST_IN_WINDOW:
                 falls = _falls(track, window)
-                falling += [falls] if falls is not None else []
-    return len(falling) > 0 and float(np.mean(falling)) >= _FALLING
+                found += [falls] if falls is not None else []
+    return found
 
 
 def _falls(track: Path, window: NDArray[np.intp]) -> bool | None:

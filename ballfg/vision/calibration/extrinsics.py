@@ -18,7 +18,7 @@ MIN_POINTS: Final = 4
 """Three points have up to four poses."""
 FLAT: Final = 0.01
 """Of the points' extent: less out of line or out of plane than that is none at all."""
-MAX_RMS: Final = 10.0
+MAX_RMS: Final = 4.0
 """Times the sigma of a pixel: beyond it a point has a wrong name or stands elsewhere."""
 CLEARLY: Final = 9.0
 """By which the second best pose must be worse, in sums of squared whitened residuals: three sigmas."""

@@ -12,7 +12,8 @@ import pyarrow.csv as pa_csv
 from numpy.typing import NDArray
 
 from ballfg.tracks import csv_errors
-from ballfg.tracks.detections_file import CAMERA, NOISE, SCORE, UNSTATED
+from ballfg.tracks.checks import check_step
+from ballfg.tracks.detections_file import CAMERA, NOISE, SCORE, SIGMA_RULE, UNSTATED
 from ballfg.tracks.hints import did_you_mean
 from ballfg.tracks.rows import KEY
 from ballfg.vision.camera import Camera
@@ -27,8 +28,8 @@ UNUSED: Final = (KEY,)
 SURE: Final = 1.0
 """Score of all rows of a table without one: somebody has chosen them."""
 _RULES: Final = {
-    "sigma_u": ("positive", lambda x: x > 0.0),
-    "sigma_v": ("positive", lambda x: x > 0.0),
+    "sigma_u": SIGMA_RULE,
+    "sigma_v": SIGMA_RULE,
     "rho_uv": ("between -1 and 1", lambda x: np.abs(x) < 1.0),
     "score": ("0 to 1", lambda x: (x >= 0.0) & (x <= 1.0)),
 }
@@ -62,7 +63,13 @@ def read_detections(
     _check_cameras(path, names, cameras, ignored)
     known = (*REQUIRED, *OPTIONAL, *UNUSED)
     notes = [f"{path.name}: column {name!r} ignored" for name in header if name not in known]
-    return [_of_camera(camera.name, names == camera.name, values) for camera in cameras], notes
+    names, values, repeats = _once(names, values)
+    if repeats:
+        notes.append(f"{path.name}: {repeats} exact repeats of rows dropped")
+    found = [_of_camera(camera.name, names == camera.name, values) for camera in cameras]
+    for seen in found:
+        check_step(f"{path}, camera {seen.camera!r}", seen.frames)
+    return found, notes
 
 
 def _check_header(path: Path, header: Sequence[str]) -> None:
@@ -106,6 +113,14 @@ def _check_values(path: Path, values: dict[str, Array]) -> None:
                 f"{path}, line {line}, column {name!r}: must be {rule}; got {column[row]:g}. "
                 "Correct it or delete the line."
             )
+
+
+def _once(names: NDArray[np.str_], values: dict[str, Array]) -> tuple[NDArray[np.str_], dict[str, Array], int]:
+    """The table without rows that stand in it before, and how many those were."""
+    _, number = np.unique(names, return_inverse=True)
+    _, first = np.unique(np.column_stack((number, *values.values())), axis=0, return_index=True)
+    kept = np.sort(first)
+    return names[kept], {name: column[kept] for name, column in values.items()}, len(names) - len(kept)
 
 
 def _check_cameras(path: Path, names: NDArray[np.str_], cameras: Sequence[Camera], ignored: Sequence[str]) -> None:

@@ -6,9 +6,12 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from ballfg.tracks.hints import did_you_mean
-from ballfg.tracks.python_file import run_file
-from ballfg.vision.detection.detections import Detector
+from ballfg.tracks.python_file import blamed, run_file
+from ballfg.vision.detection.detections import Candidates, Detector
 from ballfg.vision.detection.video import Video
 
 Maker = Callable[[Video], Detector]
@@ -38,9 +41,25 @@ def load_detector(text: str) -> Maker:
         raise ValueError(
             f"{path} must define the callable {name!r}; it {problem}. Correct the name.{did_you_mean(name, own)}"
         )
-    return partial(_made, found[name])
+    return partial(_made, found[name], path)
 
 
-def _made(found: Detector | type[Detector], video: Video) -> Detector:
-    """The detector of a camera, which serves no other; `video` is what makers are called with."""
-    return found() if isinstance(found, type) else found
+def _made(found: Detector | type[Detector], path: Path, video: Video) -> Detector:
+    """The detector of a camera, which serves no other."""
+    with blamed(path, f"making the detector of {video.name}"):
+        return _Watched(found() if isinstance(found, type) else found, path, video.name)
+
+
+class _Watched:
+    """A user's detector; what it raises is told with the file, the line, the video and the frame."""
+
+    def __init__(self, detector: Detector, path: Path, video: str) -> None:
+        self.detector, self.path, self.video = detector, path, video
+        self.frame = 0
+
+    def __call__(self, image: NDArray[np.uint8]) -> Candidates:
+        """The candidates of the next frame."""
+        with blamed(self.path, f"frame {self.frame} of {self.video}"):
+            found = self.detector(image)
+        self.frame += 1
+        return found

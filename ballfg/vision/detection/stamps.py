@@ -8,6 +8,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.tracks.checks import check_step
+
 Array = NDArray[np.float64]
 
 
@@ -41,6 +43,7 @@ def read_stamps(path: Path) -> Array:
                 )
     if not stamps:
         raise ValueError(f"{path} must have one row a frame; got none.")
+    check_step(str(path), np.array(stamps))
     return np.array(stamps)
 
 

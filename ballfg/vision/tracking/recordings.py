@@ -13,19 +13,22 @@ SAME_SHAPE: Final = 0.01
 """Share by which a video's proportions may differ from the camera's where it is taken for the same picture, scaled."""
 
 
-def match_videos(given: Sequence[str], cameras: Sequence[Camera]) -> dict[str, Path]:
+def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Sequence[str] = ()) -> dict[str, Path]:
     """The video of each camera.
 
     Args:
         given: paths, each with a camera's name as its stem, or `name=path`.
         cameras: of the rig.
+        ignored: names of cameras whose videos are passed over.
     Returns: camera -> path, in the order of the cameras.
     Raises: ValueError: a video of no camera, two of one, or a camera without one.
     """
     names = [camera.name for camera in cameras]
     found: dict[str, Path] = {}
     for text in given:
-        name, path = named_path(text, names)
+        name, path = named_path(text, [*names, *ignored])
+        if name in ignored:
+            continue
         if name not in names:
             raise ValueError(
                 f"video {text!r} must be of a camera: {', '.join(names)}; got {name!r}. Rename it, or write "

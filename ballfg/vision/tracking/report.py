@@ -15,6 +15,13 @@ def summary(tracking: Tracking) -> Iterator[str]:
         yield f"  {camera.name}: {len(seen.frames)} frames, {len(seen)} candidates, {used} of them a ball"
 
 
+def blind_cameras(tracking: Tracking) -> Iterator[str]:
+    """A sentence for each camera that had no part in any ball, where there are balls."""
+    for number, camera in enumerate(tracking.cameras):
+        if tracking.balls and not any((ball.sightings.camera == number).any() for ball in tracking.balls):
+            yield f"camera {camera.name!r} saw none of the balls. Check its stamps, its pose and its candidates."
+
+
 def disagreement(tracking: Tracking) -> str | None:
     """What is to be said about the calibration; None where the cameras agree or too little was seen to tell."""
     found = tracking.agreement

@@ -109,7 +109,9 @@ def by_score(score: float) -> Colour:
 
 
 def ring(view: Image, centre: Array, radius: float, colour: Colour, thickness: int = 1) -> None:
-    """A circle at a place (2,) px between pixels."""
+    """A circle at a place (2,) px between pixels; none far outside the view."""
+    if not (np.abs(centre) < 4 * max(view.shape)).all():
+        return
     u, v = (round(float(x) * 2**_SHIFT) for x in centre)
     cv2.circle(view, (u, v), round(radius * 2**_SHIFT), colour, thickness, cv2.LINE_AA, _SHIFT)
 
