@@ -138,7 +138,7 @@ def _add_clocks(results: Results, filmed: Sequence[Filmed]) -> None:
         what = "late by 4 ms" if name in LATE else "on time"
         results.add("time offset", f"{name}, {what}", "largest_error", "ms", 1e3 * worst, len(error))
     results.add(
-        "time offset", "both", "rms_error_over_sigma", "1", float(np.sqrt(np.square(scores).mean())), error.size
+        "time offset", "both", "rms_error_over_sigma", "1", float(np.sqrt(np.square(scores).mean())), np.size(scores)
     )
 
 

@@ -3,9 +3,14 @@
 import numpy as np
 import pytest
 
-from ballfg.vision.association.paths import MAX_GAP, path, smooth_path
+from ballfg.vision.association.paths import MAX_GAP, Path, path
 
 PERIOD = 1.0 / 60.0
+
+
+def smooth_path(times: np.ndarray, values: np.ndarray, covariances: np.ndarray) -> Path:
+    """A path that is known to have no kink."""
+    return Path(times, values, covariances, np.zeros(len(times), dtype=np.int64))
 
 
 def covariances(count: int, sigma: float, d: int = 2) -> np.ndarray:

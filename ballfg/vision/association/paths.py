@@ -143,11 +143,6 @@ def path(times: Array, values: Array, covariances: Array) -> Path:
     return Path(times, values, covariances, np.concatenate(([0], np.cumsum(cut))).astype(np.int64)[: len(times)])
 
 
-def smooth_path(times: Array, values: Array, covariances: Array) -> Path:
-    """A path that is known to have no kink."""
-    return Path(times, values, covariances, np.zeros(len(times), dtype=np.int64))
-
-
 def _least_squares(design: Array) -> Array:
     """(..., p, w) matrices that turn w values into p coefficients; `design` (..., w, p) has columns of size one."""
     transposed = np.swapaxes(design, -1, -2)
