@@ -89,7 +89,15 @@ def _in_processes(
         running = [pool.submit(_job, video, name, make, told) for name, video in videos.items()]
         for _ in watch(_told(told, running), sum(video.count for video in videos.values())):
             pass
+        failed = next((job for job in running if _failed(job)), None)
+        if failed is not None:
+            pool.shutdown(wait=True, kill_workers=True)  # what the other cameras see is of no use any more
+            failed.result()
         return {name: job.result() for name, job in zip(videos, running, strict=True)}
+
+
+def _failed(job: Future[Detections]) -> bool:
+    return job.done() and job.exception() is not None
 
 
 def _job(video: Video, camera: str, make: Callable[[Video], Detector], told: Queue[int | None]) -> Detections:
@@ -111,14 +119,12 @@ def _telling(told: Queue[int | None], frames: Iterable[int], total: int) -> Iter
 
 
 def _told(told: Queue[int | None], running: Sequence[Future[Detections]]) -> Iterator[int]:
-    """Counts the frames that the processes say are done, until each has ended; a process that died says nothing."""
+    """Counts the frames that the processes say are done, until each has ended or one has failed."""
     number, left = 0, len(running)
-    while left:
+    while left and not any(_failed(job) for job in running):
         try:
             done = told.get(timeout=LOOKS)
         except Empty:
-            if any(job.done() and job.exception() is not None for job in running):
-                return
             continue
         if done is None:
             left -= 1
