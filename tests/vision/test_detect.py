@@ -116,3 +116,13 @@ def test_a_process_that_dies_ends_the_search(films: dict[str, Path]) -> None:
 
     with pytest.raises(RuntimeError, match="terminated"):
         detect_all(films, die, jobs=2)
+
+
+def test_a_video_too_short_for_a_background_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "left.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 120, (64, 48))
+    for _ in range(2):
+        writer.write(np.zeros((48, 64, 3), np.uint8))
+    writer.release()
+    with pytest.raises(ValueError, match="video 'left' must have at least 3 frames"):
+        learn_detector(open_video(path))

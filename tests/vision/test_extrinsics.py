@@ -176,6 +176,7 @@ def test_table_file(tmp_path: Path) -> None:
         ("cameras: {left: {a: [1, 2]}}\npoints: {a: [1, 2]}", r"point 'a' must be 3 numbers, its x, y, z in m"),
         ("cameras: {left: {}}", "camera 'left' must be a mapping; got an empty one"),
         ("sigma: 0\ncameras: {left: {near_left: [1, 2]}}", "sigma must be above 0 px; got 0"),
+        ("table_height: 760\ncameras: {left: {near_left: [1, 2]}}", "table_height must be in m, at most 50; got 760"),
         ("cameras: {left: {net_left: [1, 2], net_left: [3, 4]}}", "'net_left' stands twice"),
     ],
 )

@@ -98,19 +98,19 @@ def _check_points(lens: Camera, marked: Marked) -> bool:
             f"camera {lens.name!r}: at least {MIN_POINTS} points must be marked; got {len(marked.points)} "
             f"({', '.join(marked.names)}). Mark more."
         )
-    extent = np.linalg.svd(marked.points - marked.points.mean(axis=0), compute_uv=False)
-    seen = np.linalg.svd(marked.pixels - marked.pixels.mean(axis=0), compute_uv=False)
-    if extent[1] < FLAT * extent[0] or seen[1] < FLAT * seen[0]:
-        raise ValueError(
-            f"camera {lens.name!r}: points must not lie in one line; {', '.join(marked.names)} do. "
-            "Mark points on both sides of the table."
-        )
     inside = ((marked.pixels >= -0.5) & (marked.pixels <= np.array(lens.size) - 0.5)).all(axis=1)
     if not inside.all():
         first = int(np.argmin(inside))
         raise ValueError(
             f"camera {lens.name!r}: pixels must lie in the image of {lens.size[0]}x{lens.size[1]}; "
             f"{marked.names[first]} is at {marked.pixels[first].tolist()}. Correct it, or the camera's size."
+        )
+    extent = np.linalg.svd(marked.points - marked.points.mean(axis=0), compute_uv=False)
+    seen = np.linalg.svd(marked.pixels - marked.pixels.mean(axis=0), compute_uv=False)
+    if extent[1] < FLAT * extent[0] or seen[1] < FLAT * seen[0]:
+        raise ValueError(
+            f"camera {lens.name!r}: points must not lie in one line; {', '.join(marked.names)} do. "
+            "Mark points on both sides of the table."
         )
     return bool(extent[2] < FLAT * extent[1])
 

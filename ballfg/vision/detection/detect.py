@@ -19,6 +19,8 @@ from ballfg.vision.detection.video import Video, open_video
 
 SAMPLE: Final = 15
 """Frames from which a background is learned: what stands in the same place in eight of them is background."""
+FEWEST: Final = 3
+"""Frames that a background is learned from at least."""
 LOOKS: Final = 1.0
 """s. When nothing was told for so long, it is looked whether a process has died."""
 TELLS: Final = 20
@@ -30,7 +32,13 @@ Watch = Callable[[Iterable[int], int], Iterable[int]]
 
 def learn_detector(video: Video, settings: DetectorSettings | None = None) -> BallDetector:
     """The detector of a video's camera: its background learned from frames spread over the recording."""
-    return BallDetector.learn(video.sample(SAMPLE), settings)
+    images = video.sample(SAMPLE)
+    if len(images) < FEWEST:
+        raise ValueError(
+            f"video {video.name!r} must have at least {FEWEST} frames to learn a background; got {len(images)}. "
+            "Record longer, or leave the camera out."
+        )
+    return BallDetector.learn(images, settings)
 
 
 def detect(video: Video, camera: str, detector: Detector, watch: Watch | None = None) -> Detections:
