@@ -86,7 +86,7 @@ def _late(scenario: Scenario, number: int) -> Scenario:
 def _film_all(wanted: Sequence[Scenario], jobs: int) -> list[Filmed]:
     """All recordings, side by side."""
     if jobs == 1:
-        return [film(scenario, 1) for scenario in wanted]
+        return [film(scenario) for scenario in wanted]
     pool = joblib.Parallel(n_jobs=min(jobs, len(wanted)), return_as="generator")
     made = pool(joblib.delayed(_filmed)(scenario) for scenario in wanted)
     return list(progress(made, len(wanted), "recordings drawn and tracked"))
@@ -94,7 +94,7 @@ def _film_all(wanted: Sequence[Scenario], jobs: int) -> list[Filmed]:
 
 def _filmed(scenario: Scenario) -> Filmed:
     torch.set_num_threads(1)  # the processes share the cores already
-    return film(scenario, 1, quiet=True)
+    return film(scenario, quiet=True)
 
 
 def _add_points(results: Results, name: str, found: Judged) -> None:

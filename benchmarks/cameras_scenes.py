@@ -86,7 +86,7 @@ class Filmed:
     tracking: Tracking
 
 
-def film(scenario: Scenario, jobs: int, *, quiet: bool = False) -> Filmed:
+def film(scenario: Scenario, *, quiet: bool = False) -> Filmed:
     """Draws a scenario into videos, with progress if not quiet, and tracks the balls in them; the videos go again."""
     recording = scenario.recording()
     with TemporaryDirectory() as folder:
@@ -95,7 +95,6 @@ def film(scenario: Scenario, jobs: int, *, quiet: bool = False) -> Filmed:
         found = detect_all(
             {camera.name: scene / f"{camera.name}.mp4" for camera in recording.cameras},
             stamps={camera.name: scene / f"{camera.name}_stamps.csv" for camera in recording.cameras},
-            jobs=jobs,
         )
     detections = tuple(found.values())
     return Filmed(scenario, recording, detections, track_detections(detections, recording.cameras))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
-from typing import Final
 
 from ballfg.estimate.sighted import NeverSeenByTwoError, SightedTrack, sighted_track
 from ballfg.tracks.detections_file import DETECTIONS_FILE, read_sightings
@@ -13,9 +12,7 @@ from ballfg.tracks.info import INFO_FILE, DatasetInfo, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.camera import Camera
-from ballfg.vision.camera_file import read_cameras
-
-CAMERAS_FILE: Final = "cameras.yaml"
+from ballfg.vision.camera_file import CAMERAS_FILE, read_cameras
 
 
 class SightedDataset:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -21,6 +21,8 @@ from .sightings import Sightings
 from .table import TableWriter
 
 Array = NDArray[np.float64]
+Rule = tuple[str, Callable[[Array], NDArray[np.bool_]]]
+"""What the numbers of a column must be, in words and as a test."""
 
 DETECTIONS_FILE: Final = "detections.csv"
 CAMERA: Final = "camera"
@@ -31,10 +33,10 @@ UNSTATED: Final = {"sigma_u": 0.5, "sigma_v": 0.5, "rho_uv": 0.0}
 """px. Half a pixel: what a detector reaches that looks for the middle of a patch."""
 LEAST_SIGMA: Final = 1e-4
 """px. No camera tells a ball's centre better; a graph with far surer pixels cannot be solved in double precision."""
-SIGMA_RULE: Final = (f"{LEAST_SIGMA:g} px or more", lambda x: x >= LEAST_SIGMA)
-_RULES: Final = {
-    "sigma_u": SIGMA_RULE,
-    "sigma_v": SIGMA_RULE,
+_SIGMA: Final[Rule] = (f"{LEAST_SIGMA:g} px or more", lambda x: x >= LEAST_SIGMA)
+RULES: Final[Mapping[str, Rule]] = {
+    "sigma_u": _SIGMA,
+    "sigma_v": _SIGMA,
     "rho_uv": ("between -1 and 1", lambda x: np.abs(x) < 1.0),
 }
 
@@ -80,7 +82,7 @@ def read_sightings(
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a table of detections; there is none. Correct the path.")
     header = csv_errors.read_header(path)
-    _check_header(path, header)
+    check_header(path, header, _REQUIRED, _KNOWN)
     table, nameless = _read(path, header, list(time_offsets))
     notes = [f"{path.name}: column {name!r} ignored" for name in header if name not in _KNOWN]
     if nameless:
@@ -123,14 +125,19 @@ _REQUIRED: Final = (KEY, "t", CAMERA, "u", "v")
 _KNOWN: Final = (*_REQUIRED, *NOISE, SCORE)
 
 
-def _check_header(path: Path, header: list[str]) -> None:
-    for name in _REQUIRED:
+def check_header(path: Path, header: Sequence[str], required: Sequence[str], known: Sequence[str]) -> None:
+    """Refuses a header without a needed column or with a known one twice.
+
+    Args: path: of the table.  header: its columns.  required: those needed.  known: those that mean something.
+    Raises: ValueError: naming the column.
+    """
+    for name in required:
         if name not in header:
             raise ValueError(
-                f"{path}: column {name!r} is missing; expected {','.join(_REQUIRED)}, got {','.join(header)}. "
-                f"Add or rename it.{did_you_mean(name, [other for other in header if other not in _KNOWN])}"
+                f"{path}: column {name!r} is missing; expected {','.join(required)}, got {','.join(header)}. "
+                f"Add or rename it.{did_you_mean(name, [other for other in header if other not in known])}"
             )
-    twice = [name for name in _KNOWN if header.count(name) > 1]
+    twice = [name for name in known if list(header).count(name) > 1]
     if twice:
         raise ValueError(f"{path}: column {twice[0]!r} must appear once; got {','.join(header)}. Rename one of them.")
 
@@ -151,12 +158,12 @@ def _read(path: Path, header: list[str], cameras: list[str]) -> tuple[_Table, in
     seen_by = np.array(read.column(CAMERA).to_pylist(), dtype=np.str_)
     (lines,) = np.nonzero(np.char.strip(names) != "")
     values = {name: np.asarray(read.column(name).to_numpy(), dtype=np.float64)[lines] for name in numeric}
-    _check_values(path, values, lines)
+    check_values(path, values, lines)
     strange = ~np.isin(seen_by[lines], cameras)
     if strange.any():
         got = str(seen_by[lines][int(np.argmax(strange))])
         raise ValueError(
-            f"{_place(path, lines[strange], CAMERA)} must be a camera: {', '.join(cameras)}; got {got!r}. "
+            f"{place(path, lines[strange], CAMERA)} must be a camera: {', '.join(cameras)}; got {got!r}. "
             f"Rename it, or add it to the cameras' file.{did_you_mean(got, cameras)}"
         )
     values |= {name: np.full(len(lines), value) for name, value in UNSTATED.items() if name not in values}
@@ -165,18 +172,27 @@ def _read(path: Path, header: list[str], cameras: list[str]) -> tuple[_Table, in
     return _Table(path, lines, names[lines], camera, values), len(names) - len(lines)
 
 
-def _check_values(path: Path, values: dict[str, Array], lines: NDArray[np.int64]) -> None:
+def check_values(
+    path: Path, values: Mapping[str, Array], lines: NDArray[np.int64], rules: Mapping[str, Rule] = RULES
+) -> None:
+    """Refuses cells out of their range.
+
+    Args:
+        path: of the table.  values: (n,) of each column.  lines: (n,) numbers of their rows in the file.
+        rules: by column; others must be finite.
+    Raises: ValueError: naming line and column.
+    """
     for name, column in values.items():
-        rule, holds = _RULES.get(name, ("finite", np.isfinite))
+        rule, holds = rules.get(name, ("finite", np.isfinite))
         wrong = ~(np.isfinite(column) & holds(column))
         if wrong.any():
             raise ValueError(
-                f"{_place(path, lines[wrong], name)} must be {rule}; got {column[wrong][0]:g}. "
+                f"{place(path, lines[wrong], name)} must be {rule}; got {column[wrong][0]:g}. "
                 "Correct it or delete the line."
             )
 
 
-def _place(path: Path, lines: NDArray[np.int64], column: str) -> str:
+def place(path: Path, lines: NDArray[np.int64], column: str) -> str:
     """The first of some rows of the file, and the column, for a message."""
     (line,) = csv_errors.lines_of_rows(path, [int(lines[0])])
     return f"{path}, line {line}, column {column!r}:"

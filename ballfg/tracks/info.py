@@ -18,7 +18,7 @@ _KNOWN = (*_REQUIRED, *_OPTIONAL, "labels")
 # The largest values that can be meant in SI units; above them the unit is almost surely another one.
 _MAX_RADIUS = 0.5  # m
 _MAX_MASS = 2.0  # kg
-_MAX_HEIGHT = 50.0  # m
+MAX_HEIGHT = 50.0  # m
 _MAX_POSITION_NOISE = 1.0  # m
 
 
@@ -83,7 +83,7 @@ class DatasetInfo:
             check_text(key, getattr(self, key), optional=key != "name")
         if not isinstance(self.ball, Ball):
             raise TypeError(f"ball must be a Ball; got {type(self.ball).__name__}. Pass Ball(radius, mass).")
-        set_number(self, "table_height", "frame.table_height", "m", limit=_MAX_HEIGHT, instead="mm")
+        set_number(self, "table_height", "frame.table_height", "m", limit=MAX_HEIGHT, instead="mm")
         if self.rate is not None:
             set_number(self, "rate", "rate", "Hz", above=0.0)
         if self.position_noise is not None:

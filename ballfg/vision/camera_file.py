@@ -16,6 +16,8 @@ from ballfg.vision.camera_storage import check_names, is_storage, read_storage
 from ballfg.vision.strict_yaml import check_keys, mapping, read_mapping
 from ballfg.vision.whole_file import whole_file
 
+CAMERAS_FILE: Final = "cameras.yaml"
+"""Its name in the folder of a dataset or a scene."""
 LENS: Final = ("size", "matrix", "distortion")
 POSE: Final = ("rvec", "tvec")
 FIELDS: Final = (*LENS, *POSE, "time_offset")

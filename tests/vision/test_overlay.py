@@ -19,7 +19,7 @@ from ballfg.vision.tracking.contact_sheet import MOST_TRACKS, ContactSheet
 from ballfg.vision.tracking.overlay import STRIP, VIEW_WIDTH, OverlayPainter, write_overlay
 from ballfg.vision.tracking.palette import bgr
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.playback import HELD, Image, nearest, play, schedule
+from ballfg.vision.tracking.playback import HELD, Image, play, schedule, shown
 from ballfg.vision.tracking.strobe import HEIGHT, WIDTH, ZOOM, Strobe, tapped
 from ballfg.vision.tracking.view_painter import RING
 
@@ -101,9 +101,9 @@ def test_the_frame_on_show_is_the_nearest_in_true_time() -> None:
 def test_a_frame_is_held_for_a_while_and_then_gone() -> None:
     clock = np.array([0.0, 0.01, 0.5])
     times = np.array([0.01 + 0.9 * HELD, 0.01 + 1.1 * HELD, 0.5 - 0.9 * HELD])
-    assert nearest(clock, times).tolist() == [1, -1, 2]
-    assert nearest(np.array([1.0]), np.array([0.0, 1.0])).tolist() == [-1, 0]
-    assert nearest(np.zeros(0), times).tolist() == [-1, -1, -1]
+    assert shown(clock, times).tolist() == [1, -1, 2]
+    assert shown(np.array([1.0]), np.array([0.0, 1.0])).tolist() == [-1, 0]
+    assert shown(np.zeros(0), times).tolist() == [-1, -1, -1]
 
 
 def test_what_other_cameras_film_before_and_after_is_shown_too() -> None:

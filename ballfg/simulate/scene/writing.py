@@ -23,7 +23,7 @@ from ballfg.state import STATE_NAMES
 from ballfg.tracks import TableWriter
 from ballfg.tracks.writing import staging
 from ballfg.vision.camera import Camera
-from ballfg.vision.camera_file import write_cameras
+from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
 
 Pixels = NDArray[np.uint8]
 Watch = Callable[[Iterable[Pixels]], Iterator[Pixels]]
@@ -76,7 +76,7 @@ def write_scene(
             )
             with TableWriter(stage / f"{camera.name}_stamps.csv") as table:
                 table.write({"t": recording.frames[number].stamps})
-        write_cameras(stage / "cameras.yaml", recording.cameras)
+        write_cameras(stage / CAMERAS_FILE, recording.cameras)
         _write_truth(stage / "truth.csv", recording)
         with TableWriter(stage / "visible.csv") as table:
             for number in range(len(recording.cameras)):

@@ -13,6 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.state import STANDARD_GRAVITY
 from ballfg.vision.association.paths import Path
 
 Array = NDArray[np.float64]
@@ -25,7 +26,7 @@ FASTEST: Final = 80.0
 """m/s, no ball that is struck by hand is faster: the fastest served tennis balls have 73."""
 LEAST_WAY: Final = 0.05
 """m, extent of the track of something that moves."""
-GRAVITY: Final = np.array([0.0, 0.0, -9.81])
+GRAVITY: Final = np.array([0.0, 0.0, -STANDARD_GRAVITY])
 """m/s^2"""
 _SLACK: Final = 3.0
 """m/s^2, by which a slow ball's acceleration may differ from gravity: calibration, lift of a fast spin."""

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.tracks.hints import did_you_mean
+from ballfg.tracks.info import MAX_HEIGHT
 from ballfg.vision.strict_yaml import check_keys, mapping, read_mapping
 
 Array = NDArray[np.float64]
@@ -23,8 +24,6 @@ TABLE_HEIGHT: Final = 0.76
 """m, ITTF Laws of Table Tennis 2.1.1 and 2.1.2."""
 CLICK_SIGMA: Final = 0.5
 """px, standard deviation of a coordinate that somebody read off an image with care."""
-HIGHEST: Final = 50.0
-"""m, as for the table of a dataset."""
 _FIELDS: Final = ("table_height", "sigma", "points", "cameras")
 
 
@@ -86,8 +85,8 @@ def read_table(path: str | PathLike[str]) -> TableFile:
     content = read_mapping(path)
     check_keys(str(path), content, _FIELDS, ("cameras",))
     height = _number(f"{path}: table_height", content.get("table_height", TABLE_HEIGHT))
-    if not abs(height) <= HIGHEST:
-        raise ValueError(f"{path}: table_height must be in m, at most {HIGHEST:g}; got {height:g}. Is it mm?")
+    if not abs(height) <= MAX_HEIGHT:
+        raise ValueError(f"{path}: table_height must be in m, at most {MAX_HEIGHT:g}; got {height:g}. Is it mm?")
     sigma = _number(f"{path}: sigma", content.get("sigma", CLICK_SIGMA))
     if not sigma > 0.0:
         raise ValueError(f"{path}: sigma must be above 0 px; got {sigma:g}. Say how well pixels were read off.")

@@ -32,6 +32,8 @@ LEAST_CHANGE: Final = 5.0
 """Grey levels that it must exceed besides: compression and rounding make errors that the frames learned from lack."""
 ROUNDING: Final = 1.0 / 12.0
 """Grey levels^2, variance of rounding to whole ones. It keeps a noise-free video's covariance regular."""
+FEWEST: Final = 3
+"""Images that a background is learned from at least."""
 
 
 class Background:
@@ -53,7 +55,7 @@ class Background:
     """
 
     def __init__(self, images: Sequence[Image]) -> None:
-        if len(images) < 3:
+        if len(images) < FEWEST:
             raise ValueError(
                 f"images must be at least three to learn a background; got {len(images)}. Pass more frames."
             )

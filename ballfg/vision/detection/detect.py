@@ -13,14 +13,13 @@ from typing import Final
 import cv2
 from joblib.externals.loky import get_reusable_executor
 
+from ballfg.vision.detection.background import FEWEST
 from ballfg.vision.detection.detections import Candidates, Detections, Detector
 from ballfg.vision.detection.detector import BallDetector, DetectorSettings
 from ballfg.vision.detection.video import Video, open_video
 
 SAMPLE: Final = 15
 """Frames from which a background is learned: what stands in the same place in eight of them is background."""
-FEWEST: Final = 3
-"""Frames that a background is learned from at least."""
 LOOKS: Final = 1.0
 """s. When nothing was told for so long, it is looked whether a process has died."""
 TELLS: Final = 20

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from ballfg.tracks.sightings import ROUNDING
 
-_ROUNDING: Final = 1e-6
-"""Relative to the trace: a covariance that was computed in single precision is symmetric up to this."""
+Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +193,7 @@ def _check_fields(owner: Candidates | Detections, what: str) -> None:
         _refuse(~finite.all(axis=tuple(range(1, finite.ndim))), what, field, "be finite")
     c = owner.covariances
     definite = (c[:, 0, 0] > 0.0) & (c[:, 0, 0] * c[:, 1, 1] > c[:, 0, 1] * c[:, 1, 0])
-    skew = np.abs(c[:, 0, 1] - c[:, 1, 0]) > _ROUNDING * (c[:, 0, 0] + c[:, 1, 1])
+    skew = np.abs(c[:, 0, 1] - c[:, 1, 0]) > ROUNDING * (c[:, 0, 0] + c[:, 1, 1])
     _refuse(~definite | skew, what, "covariances", "be symmetric and positive definite")
     _refuse((owner.scores < 0.0) | (owner.scores > 1.0), what, "scores", "lie in [0, 1]")
 

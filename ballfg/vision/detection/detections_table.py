@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ballfg.tracks import csv_errors
 from ballfg.tracks.checks import check_step
-from ballfg.tracks.detections_file import CAMERA, NOISE, SCORE, SIGMA_RULE, UNSTATED
+from ballfg.tracks.detections_file import CAMERA, NOISE, RULES, SCORE, UNSTATED, check_header, check_values, place
 from ballfg.tracks.hints import did_you_mean
 from ballfg.tracks.rows import KEY
 from ballfg.vision.camera import Camera
@@ -27,12 +27,7 @@ UNUSED: Final = (KEY,)
 """Columns that may be there and are not needed: which ball a row belongs to is found anew."""
 SURE: Final = 1.0
 """Score of all rows of a table without one: somebody has chosen them."""
-_RULES: Final = {
-    "sigma_u": SIGMA_RULE,
-    "sigma_v": SIGMA_RULE,
-    "rho_uv": ("between -1 and 1", lambda x: np.abs(x) < 1.0),
-    "score": ("0 to 1", lambda x: (x >= 0.0) & (x <= 1.0)),
-}
+_RULES: Final = {**RULES, SCORE: ("0 to 1", lambda x: (x >= 0.0) & (x <= 1.0))}
 
 
 def read_detections(
@@ -57,9 +52,9 @@ def read_detections(
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a table of detections; there is none. Correct the path.")
     header = csv_errors.read_header(path)
-    _check_header(path, header)
+    check_header(path, header, REQUIRED, (*REQUIRED, *OPTIONAL))
     names, values = _read(path, [name for name in header if name in (*REQUIRED, *OPTIONAL)])
-    _check_values(path, values)
+    check_values(path, values, np.arange(len(names)), _RULES)
     _check_cameras(path, names, cameras, ignored)
     known = (*REQUIRED, *OPTIONAL, *UNUSED)
     notes = [f"{path.name}: column {name!r} ignored" for name in header if name not in known]
@@ -70,18 +65,6 @@ def read_detections(
     for seen in found:
         check_step(f"{path}, camera {seen.camera!r}", seen.frames)
     return found, notes
-
-
-def _check_header(path: Path, header: Sequence[str]) -> None:
-    for name in REQUIRED:
-        if name not in header:
-            raise ValueError(
-                f"{path}: column {name!r} is missing; expected {','.join(REQUIRED)}, got {','.join(header)}. "
-                f"Add or rename it.{did_you_mean(name, [other for other in header if other not in REQUIRED])}"
-            )
-    twice = [name for name in (*REQUIRED, *OPTIONAL) if list(header).count(name) > 1]
-    if twice:
-        raise ValueError(f"{path}: column {twice[0]!r} must appear once; got {','.join(header)}. Rename one of them.")
 
 
 def _read(path: Path, columns: Sequence[str]) -> tuple[NDArray[np.str_], dict[str, Array]]:
@@ -102,19 +85,6 @@ def _read(path: Path, columns: Sequence[str]) -> tuple[NDArray[np.str_], dict[st
     return np.array(table.column(CAMERA).to_pylist(), dtype=np.str_), values
 
 
-def _check_values(path: Path, values: dict[str, Array]) -> None:
-    for name, column in values.items():
-        rule, holds = _RULES.get(name, ("finite", np.isfinite))
-        wrong = ~(np.isfinite(column) & holds(column))
-        if wrong.any():
-            row = int(np.argmax(wrong))
-            (line,) = csv_errors.lines_of_rows(path, [row])
-            raise ValueError(
-                f"{path}, line {line}, column {name!r}: must be {rule}; got {column[row]:g}. "
-                "Correct it or delete the line."
-            )
-
-
 def _once(names: NDArray[np.str_], values: dict[str, Array]) -> tuple[NDArray[np.str_], dict[str, Array], int]:
     """The table without rows that stand in it before, and how many those were."""
     _, number = np.unique(names, return_inverse=True)
@@ -128,9 +98,8 @@ def _check_cameras(path: Path, names: NDArray[np.str_], cameras: Sequence[Camera
     strange = ~np.isin(names, [*known, *ignored])
     if strange.any():
         row = int(np.argmax(strange))
-        (line,) = csv_errors.lines_of_rows(path, [row])
         raise ValueError(
-            f"{path}, line {line}, column 'camera': must be a camera: {', '.join(known)}; got {str(names[row])!r}. "
+            f"{place(path, np.array([row]), CAMERA)} must be a camera: {', '.join(known)}; got {str(names[row])!r}. "
             f"Rename it, add it to the cameras' file, or delete its rows.{did_you_mean(str(names[row]), known)}"
         )
     blind = [name for name in known if not (names == name).any()]

@@ -15,7 +15,7 @@ from ballfg.tracks.detections_file import DETECTIONS_FILE
 from ballfg.tracks.info import INFO_FILE, write_info
 from ballfg.tracks.rows import KEY, SIGMAS, VALUES
 from ballfg.tracks.writing import staging
-from ballfg.vision.camera_file import write_cameras
+from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
 from ballfg.vision.tracking.contact_sheet import ContactSheet, Extent
 from ballfg.vision.tracking.overlay import Watch, write_overlay
 from ballfg.vision.tracking.pipeline import Tracking
@@ -26,10 +26,9 @@ Streams = Sequence[Callable[[], Iterator[tuple[float, Image]]]]
 """For each camera what opens its video and gives stamps (s) and images."""
 
 TRACKS: Final = "tracks.csv"
-CAMERAS: Final = "cameras.yaml"
 OVERLAY: Final = "overlay.mp4"
 SHEET: Final = "contact_sheet.png"
-FILES: Final = (INFO_FILE, TRACKS, DETECTIONS_FILE, CAMERAS, OVERLAY, SHEET)
+FILES: Final = (INFO_FILE, TRACKS, DETECTIONS_FILE, CAMERAS_FILE, OVERLAY, SHEET)
 """All that is written."""
 
 
@@ -120,7 +119,7 @@ def _write_tables(stage: Path, tracking: Tracking, info: DatasetInfo) -> None:
         write_info(stage / INFO_FILE, info)
         with TableWriter(stage / TRACKS) as empty:
             empty.write({KEY: np.zeros(0, dtype=object)} | {name: np.zeros(0) for name in (*VALUES, *SIGMAS)})
-    write_cameras(stage / CAMERAS, tracking.cameras)
+    write_cameras(stage / CAMERAS_FILE, tracking.cameras)
     with TableWriter(stage / DETECTIONS_FILE) as detections:
         for camera in range(len(tracking.cameras)):
             detections.write(_detection_columns(tracking, camera))

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.vision.association.clock import nearest
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 
@@ -45,17 +46,14 @@ def schedule(detections: Sequence[Detections], cameras: Sequence[Camera]) -> Sch
             times = clock
         elif len(clock):
             times = np.concatenate((clock[clock < times[0]], times, clock[clock > times[-1]]))
-    return Schedule(times, np.column_stack([nearest(clock, times) for clock in clocks]))
+    return Schedule(times, np.column_stack([shown(clock, times) for clock in clocks]))
 
 
-def nearest(clock: Array, times: Array) -> NDArray[np.int64]:
+def shown(clock: Array, times: Array) -> NDArray[np.int64]:
     """(k,) index into `clock` (f,), increasing, of the stamp nearest to each of `times` (k,); -1 beyond `HELD`."""
     if len(clock) == 0:
         return np.full(len(times), -1, dtype=np.int64)
-    after = np.searchsorted(clock, times).clip(1, max(1, len(clock) - 1))
-    before = after - 1
-    after = after.clip(max=len(clock) - 1)
-    index = np.where(clock[after] - times < times - clock[before], after, before)
+    index = nearest(clock, times)
     return np.where(np.abs(clock[index] - times) <= HELD, index, -1).astype(np.int64)
 
 
