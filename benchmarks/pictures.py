@@ -14,9 +14,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from ballfg.benchmarks.measured import HORIZON, OBSERVE, Measured
+from ballfg.benchmarks.estimators.measured import HORIZON, OBSERVE, Measured
 from ballfg.benchmarks.results import CURVE_MARK, Row
-from ballfg.predict import TrackPrediction
+from ballfg.prediction import TrackPrediction
 
 matplotlib.use("Agg")
 
@@ -153,7 +153,7 @@ def calibration_picture(rows: list[Row], measured: Measured, path: Path) -> Path
 
 def tracks_picture(measured: Measured, path: Path) -> Path:
     """Some tracks, from good to bad, with the smoother's predictions and their 90 % intervals."""
-    from ballfg.benchmarks.measured import prediction_rmse
+    from ballfg.benchmarks.estimators.measured import prediction_rmse
 
     ordered = sorted(measured.predictions["smoother"], key=prediction_rmse)
     shares = np.linspace(0.1, 0.9, EXAMPLES)

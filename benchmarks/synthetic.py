@@ -9,13 +9,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ballfg.benchmarks.step_noise import StepNoise
-from ballfg.dynamics import BallModel, Surfaces, contact_time, nominal_model, rollout
-from ballfg.estimate import Settings
+from ballfg.benchmarks.estimators.step_noise import StepNoise
+from ballfg.dynamics import BallModel, Surfaces, contact_time, nominal_model
+from ballfg.dynamics.motion import rollout
+from ballfg.estimation import Settings
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
-from ballfg.simulate import MeasurementNoise, SimulationConfig, simulate, table_tennis
-from ballfg.simulate import ProcessNoise as TrueProcessNoise
+from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate, table_tennis
+from ballfg.simulation import ProcessNoise as TrueProcessNoise
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ
 from ballfg.tracks import SPIN_LABELS, Track
 

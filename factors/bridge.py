@@ -13,8 +13,8 @@ from typing import Literal
 import gtsam
 import numpy as np
 
+from ballfg.factors.batch import COEFFICIENTS, Array, FactorBatch, Index, Values
 from ballfg.factors.graph import BallGraph
-from ballfg.factors.kind import COEFFICIENTS, Array, FactorKind, Index, Values
 
 OnMiss = Literal["changed", "row"]
 
@@ -46,7 +46,7 @@ class Bridge:
         misses: how often a callback found nothing prepared.
     """
 
-    def __init__(self, kind: FactorKind, on_miss: OnMiss = "changed") -> None:
+    def __init__(self, kind: FactorBatch, on_miss: OnMiss = "changed") -> None:
         if on_miss not in ("changed", "row"):
             raise ValueError(f"on_miss must be 'changed' or 'row'; got '{on_miss}'")
         self.kind = kind
@@ -143,7 +143,7 @@ def _callback(bridge: Bridge, row: int, keys: Sequence[int]) -> Callback:
 
 
 def checked(
-    kind: FactorKind, rows: Index | slice, inputs: tuple[Array, ...], residual: Array, jacobians: tuple[Array, ...]
+    kind: FactorBatch, rows: Index | slice, inputs: tuple[Array, ...], residual: Array, jacobians: tuple[Array, ...]
 ) -> tuple[Array, tuple[Array, ...]]:
     """What a kind returned, contiguous, after checks; GTSAM would end the interpreter, or compute with it silently.
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.factors.kind import COEFFICIENTS, Array, FactorKind, Index
+from ballfg.factors.batch import COEFFICIENTS, Array, FactorBatch, Index
 from ballfg.factors.loss import Loss
 from ballfg.state import POSITION, STATE_DIM, VELOCITY
 from ballfg.vision.projection import CameraBank
@@ -18,7 +18,7 @@ FIXED = -1
 """The column of a camera whose time offset is not estimated."""
 
 
-class CameraFactors(FactorKind):
+class CameraFactors(FactorBatch):
     """r = W (project(p_i + tau v_i) - z), tau = delay - d: how much later than the state the camera saw the ball.
 
     W whitens the pixel noise, W^T W = R^-1. The delay is known; d is what the camera's stamps are later than they were

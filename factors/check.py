@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ballfg.factors.kind import COEFFICIENTS, Array, FactorKind, Values
+from ballfg.factors.batch import COEFFICIENTS, Array, FactorBatch, Values
 
 STEP = 1e-4
 """Step of the differences, relative to a number's size, absolute below 1. The five-point rule's own error is of order
@@ -40,7 +40,7 @@ class BlockError:
         )
 
 
-def jacobian_errors(kind: FactorKind, values: Values, step: float = STEP) -> list[BlockError]:
+def jacobian_errors(kind: FactorBatch, values: Values, step: float = STEP) -> list[BlockError]:
     """One entry per row and block: `compute`'s Jacobians against five-point central differences of its residuals.
 
     Args: kind: any.  values: the point, best one at which residuals are not zero.  step: see `STEP`.
@@ -69,7 +69,7 @@ def jacobian_errors(kind: FactorKind, values: Values, step: float = STEP) -> lis
     return errors
 
 
-def check_factor(kind: FactorKind, values: Values, tolerance: float = 1e-6, step: float = STEP) -> float:
+def check_factor(kind: FactorBatch, values: Values, tolerance: float = 1e-6, step: float = STEP) -> float:
     """The worst relative error of a kind's Jacobians.
 
     Args: kind: any.  values: the point.  tolerance: relative to a block's largest element.  step: see `STEP`.
@@ -81,7 +81,7 @@ def check_factor(kind: FactorKind, values: Values, tolerance: float = 1e-6, step
     return worst.relative
 
 
-def _differences(kind: FactorKind, inputs: tuple[Array, ...], column: int, step: float) -> Array:
+def _differences(kind: FactorBatch, inputs: tuple[Array, ...], column: int, step: float) -> Array:
     """(m, r, d) derivative of the residuals by one variable, (8 (f1 - f-1) - (f2 - f-2)) / 12h."""
     block = inputs[column]
     result = np.empty((len(block), kind.dim, block.shape[-1]))

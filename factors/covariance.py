@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from ballfg.factors.kind import Array
+from ballfg.factors.batch import Array
 from ballfg.state import STATE_DIM
 
 

@@ -16,17 +16,17 @@ import torch
 from torch import Tensor
 
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.contact import fly_through, fly_through_jacobian
-from ballfg.dynamics.flight_step import flight_step
-from ballfg.dynamics.integrate import batch_jacobian, fly_jacobian, step_count, steps_over
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.rollout import roll
-from ballfg.factors.kind import COEFFICIENTS, Array, FactorKind, Index, Noise, Values
+from ballfg.dynamics.motion.contact import fly_through, fly_through_jacobian
+from ballfg.dynamics.motion.flight_step import flight_step
+from ballfg.dynamics.motion.integrate import batch_jacobian, fly_jacobian, step_count, steps_over
+from ballfg.dynamics.motion.rollout import roll
+from ballfg.factors.batch import COEFFICIENTS, Array, FactorBatch, Index, Noise, Values
 from ballfg.factors.noise import Kicks, whitening, whitening_tensor
 from ballfg.state import STATE_DIM
 
 
-class DynamicsFactors(FactorKind):
+class DynamicsFactors(FactorBatch):
     """r = W (x_{i+1} - F(x_i, dt_i; coefficients)), W the whitening of the process noise.
 
     Args:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ballfg.factors.kind import FactorKind, Rows, Values
+from ballfg.factors.batch import FactorBatch, Rows, Values
 from ballfg.factors.linear import Step, solve
 from ballfg.factors.search import Search, run
 
@@ -21,7 +21,7 @@ class BallGraph:
         kinds: the factors, one object a kind.
     """
 
-    kinds: tuple[FactorKind, ...]
+    kinds: tuple[FactorBatch, ...]
 
     def linearize(self, values: Values) -> list[Rows]:
         """All kinds at a point, each in one batch."""

@@ -10,14 +10,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.integrate import batch_jacobian
-from ballfg.dynamics.spin_embedding import SpinEmbedding
-from ballfg.factors.kind import Array, FactorKind, Index, Noise
+from ballfg.dynamics.motion.integrate import batch_jacobian
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.factors.batch import Array, FactorBatch, Index, Noise
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, VELOCITY
 
 
-class LauncherSpinFactors(FactorKind):
+class LauncherSpinFactors(FactorBatch):
     """r = (w_i - spin(settings, v_i)) / sigma: the spin turns with the estimated velocity, not with a measured one.
 
     Args:

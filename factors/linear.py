@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from ballfg.factors.kind import COEFFICIENTS, Array, Index, Rows, Values
+from ballfg.factors.batch import COEFFICIENTS, Array, Index, Rows, Values
 from ballfg.state import STATE_DIM
 
 Piece = tuple[Index, Array, tuple[Array, ...]]

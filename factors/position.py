@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.factors.kind import Array, FactorKind, Index, Noise
+from ballfg.factors.batch import Array, FactorBatch, Index, Noise
 from ballfg.factors.loss import Loss
 from ballfg.state import POSITION, STATE_DIM
 
 
-class PositionFactors(FactorKind):
+class PositionFactors(FactorBatch):
     """r = (p_i - z_i) / sigma_i.
 
     Args:

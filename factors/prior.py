@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.factors.kind import COEFFICIENTS, Array, FactorKind, Index, Noise
+from ballfg.factors.batch import COEFFICIENTS, Array, FactorBatch, Index, Noise
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, STATE_DIM
 
 
-class PriorFactors(FactorKind):
+class PriorFactors(FactorBatch):
     """r = W (x_i - mean_i), W (r, d): rows of W may look at a part of the variable only.
 
     Args:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from ballfg.factors.kind import FactorKind, Rows, Values, merge
+from ballfg.factors.batch import FactorBatch, Rows, Values, merge
 
 if TYPE_CHECKING:
     from ballfg.factors.graph import BallGraph
@@ -58,7 +58,7 @@ def run_together(searches: Sequence[Search[R]]) -> list[R]:
 def linearize_together(questions: Sequence[Question]) -> list[list[Rows]]:
     """Each graph linearised at its point, with one evaluation for all costly kinds of the same group."""
     answers: list[list[Rows]] = [[] for _ in questions]
-    groups: defaultdict[Hashable, list[tuple[int, int, FactorKind]]] = defaultdict(list)
+    groups: defaultdict[Hashable, list[tuple[int, int, FactorBatch]]] = defaultdict(list)
     for number, (graph, values) in enumerate(questions):
         for kind in graph.kinds:
             if not len(kind):
@@ -75,7 +75,7 @@ def linearize_together(questions: Sequence[Question]) -> list[list[Rows]]:
     return answers
 
 
-def _evaluate(kinds: Sequence[FactorKind], points: Sequence[Values]) -> list[Rows]:
+def _evaluate(kinds: Sequence[FactorBatch], points: Sequence[Values]) -> list[Rows]:
     """Kinds of one group, each linearised at its own point."""
     if len(kinds) == 1:
         return [kinds[0].linearize(points[0])]

@@ -17,7 +17,7 @@ from ballfg.cli.inputs import default_jobs
 from ballfg.cli.progress import progress
 
 if TYPE_CHECKING:
-    from ballfg.learning.train_config import TrainConfig
+    from ballfg.learning.config.training import TrainConfig
 
 app = typer.Typer(name="ballfg-train", add_completion=False, pretty_exceptions_enable=False)
 
@@ -43,8 +43,8 @@ def train(
 
     Example: ballfg-train train.yaml --data data/ballgun --out ballgun-model kind=mnn+gs optimizer.epochs=30
     """
-    from ballfg.learning.config import CalibrationConfig
-    from ballfg.learning.config_file import read_config
+    from ballfg.learning.config.calibration import CalibrationConfig
+    from ballfg.learning.config.config_file import read_config
 
     if resume is not None and out not in (None, resume):
         raise ValueError(f"--out and --resume must name one folder; got {out} and {resume}. Leave --out away.")
@@ -54,7 +54,7 @@ def train(
         raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
     folder = Path(settings.out)
     if isinstance(settings, CalibrationConfig):
-        from ballfg.learning.calibration import run_calibration
+        from ballfg.learning.calibration.run import run_calibration
 
         run_calibration(settings, folder, resume=resume is not None, jobs=default_jobs(), watch=progress)
     else:
@@ -63,9 +63,9 @@ def train(
 
 def _train(config: TrainConfig, folder: Path, resume: bool) -> None:
     """In this process where a launcher has started it, or one is enough; else in processes of its own."""
-    from ballfg.learning.distributed import started_by_launcher
-    from ballfg.learning.folder import check
-    from ballfg.learning.launch import launch
+    from ballfg.learning.run.launch import launch
+    from ballfg.learning.run.ranks import started_by_launcher
+    from ballfg.learning.run.run_folder import check
 
     workers = config.workers or default_jobs()
     if workers == 1 or started_by_launcher():
@@ -78,8 +78,8 @@ def _train(config: TrainConfig, folder: Path, resume: bool) -> None:
 
 
 def _train_here(config: TrainConfig, folder: Path, resume: bool) -> None:
-    from ballfg.learning.build import build, export
-    from ballfg.learning.training import run_training
+    from ballfg.learning.config.build import build, export
+    from ballfg.learning.run.training import run_training
 
     run_training(config, folder, resume, build, export, progress)
 

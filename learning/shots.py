@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimate import Settings, Smoother
-from ballfg.estimate.segmentation import Segmentation
+from ballfg.estimation import Settings, Smoother
+from ballfg.estimation.segmentation import Segmentation
 from ballfg.tracks import Track
 
 LEAST_OBSERVED = 5

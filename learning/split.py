@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from ballfg.learning.train_config import SplitConfig
+from ballfg.learning.config.training import SplitConfig
 from ballfg.tracks import Dataset, Track
 
 LABEL = "split"

@@ -9,15 +9,15 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LEVELS = (
-    ("state",),
+    ("state", "files"),
     ("tracks",),
     ("vision",),
     ("dynamics",),
-    ("simulate", "factors"),
-    ("estimate",),
-    ("predict",),
+    ("simulation", "factors"),
+    ("estimation",),
+    ("prediction",),
     ("learning",),
-    ("diagnose",),
+    ("diagnosis",),
     ("benchmarks", "cli"),
 )
 """Rooms from the first to the last; a module imports from its own room and from earlier levels only."""

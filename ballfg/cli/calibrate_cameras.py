@@ -66,9 +66,9 @@ def calibrate_cameras(
     Beside the file two others say how well the cameras are known: OUT_calibration.json and .png. Without --table only
     the lenses are written, for a later --intrinsics.
     """
+    from ballfg.files.whole_file import check_writable
     from ballfg.vision.calibration.boards import read_grey
     from ballfg.vision.calibration.table_points import read_table
-    from ballfg.vision.whole_file import check_writable
 
     if out.suffix.lower() not in (*OURS, *THEIRS):
         raise ValueError(f"out must end in {', '.join((*OURS, *THEIRS))}; got {out}. Choose the format by the ending.")
@@ -163,12 +163,12 @@ def _placed(camera: Camera, lens: Intrinsics | None, marked: TableFile | None) -
 
 
 def _write(out: Path, found: list[Calibration], shown: Mapping[str, Image], marked: TableFile | None) -> None:
+    from ballfg.files.whole_file import whole_file
     from ballfg.vision.calibration.picture import calibration_picture
     from ballfg.vision.calibration.report import content, summary
     from ballfg.vision.calibration.table_points import TABLE_HEIGHT
     from ballfg.vision.camera_file import write_cameras
     from ballfg.vision.camera_storage import write_opencv
-    from ballfg.vision.whole_file import whole_file
 
     figure = calibration_picture(found, shown, TABLE_HEIGHT if marked is None else marked.table_height)
     report, picture = (out.with_name(f"{out.stem}_calibration{ending}") for ending in (".json", ".png"))

@@ -12,7 +12,7 @@ import typer
 from ballfg.cli.inputs import OwnEffects, default_jobs, open_inputs
 
 if TYPE_CHECKING:
-    from ballfg.diagnose.result import Diagnosis
+    from ballfg.diagnosis.result import Diagnosis
 
 
 def diagnose(
@@ -30,8 +30,8 @@ def diagnose(
     report.html to read, report.json for programs, and model.yaml, the corrected
     model, for the --model of other commands.
     """
-    from ballfg.diagnose import diagnose as find
-    from ballfg.diagnose.report import MODEL, PAGE, REPORT, check_report_folder, write_report
+    from ballfg.diagnosis import diagnose as find
+    from ballfg.diagnosis.report.report import MODEL, PAGE, REPORT, check_report_folder, write_report
     from ballfg.dynamics import AnalyticModel
 
     if out.resolve() == dataset.resolve():
@@ -57,7 +57,7 @@ def diagnose(
 
 def _summary(diagnosis: Diagnosis) -> Iterator[str]:
     """The diagnosis in lines: the sentence, effects, errors on the judging half, what is left."""
-    from ballfg.diagnose.wording import listed, probability
+    from ballfg.diagnosis.report.wording import listed, probability
 
     yield f"{diagnosis.verdict.value}: {diagnosis.sentence}"
     rows = [("effect", "kind", "by chance", "BIC", "cannot be told from", "coefficients")]
@@ -78,7 +78,7 @@ def _summary(diagnosis: Diagnosis) -> Iterator[str]:
 
 
 def _errors(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
-    from ballfg.diagnose.wording import fixed
+    from ballfg.diagnosis.report.wording import fixed
 
     before, after = diagnosis.before, diagnosis.after
     rows: list[tuple[str, ...]] = [(f"on {diagnosis.tracks_judged_on} judging tracks", "before", "after")]

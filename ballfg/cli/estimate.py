@@ -24,7 +24,7 @@ from ballfg.cli.progress import progress
 if TYPE_CHECKING:
     import numpy as np
 
-    from ballfg.estimate import Estimate
+    from ballfg.estimation import Estimate
 
 
 class Method(enum.StrEnum):
@@ -61,7 +61,7 @@ def estimate(
 
     Example: ballfg estimate data/aimy --method smoother --out states.csv
     """
-    from ballfg.estimate import estimate_tracks
+    from ballfg.estimation import estimate_tracks
     from ballfg.tracks import TableWriter
 
     statuses: Counter[str] = Counter()

@@ -16,8 +16,8 @@ import typer
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel
     from ballfg.dynamics.surfaces import Surfaces
-    from ballfg.estimate import Estimator, Settings
-    from ballfg.estimate.sighted_dataset import SightedDataset
+    from ballfg.estimation import Estimator, Settings
+    from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.tracks import Dataset
 
 OwnEffects = Annotated[
@@ -51,7 +51,7 @@ class Inputs(Generic[D]):
 
     def estimator(self, method: str) -> Estimator:
         """The estimator of a name. Raises: ValueError: if there is none of that name."""
-        from ballfg.estimate import make_estimator
+        from ballfg.estimation import make_estimator
 
         return make_estimator(method, self.model, self.surfaces, self.settings)
 
@@ -83,7 +83,7 @@ def open_inputs(dataset: Path, model: Path | None, effects: Iterable[Path] | Non
 
 def open_sighted(dataset: Path, model: Path | None, effects: Iterable[Path] | None = None) -> Inputs[SightedDataset]:
     """`open_inputs` for what cameras saw."""
-    from ballfg.estimate.sighted_dataset import read_sighted
+    from ballfg.estimation.observations.sighted_dataset import read_sighted
 
     know_effects(effects)
     return _inputs(read_sighted(dataset), model)
@@ -93,7 +93,7 @@ def _inputs(data: Opened, model: Path | None) -> Inputs[Opened]:
     import torch
 
     from ballfg.dynamics import load_model, nominal_model
-    from ballfg.estimate import dataset_settings, dataset_surfaces
+    from ballfg.estimation import dataset_settings, dataset_surfaces
 
     torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
     for note in data.notes:

@@ -12,7 +12,7 @@ from ballfg.cli.inputs import OwnEffects, know_effects
 from ballfg.cli.progress import progress
 
 if TYPE_CHECKING:
-    from ballfg.simulate.scene import Clock
+    from ballfg.simulation.scene import Clock
 
 _cameras, _picture, _balls, _files = (
     partial(typer.Option, rich_help_panel=panel) for panel in ("Cameras", "Picture", "Balls", "Files")
@@ -53,10 +53,10 @@ def render(
     The cameras are in cameras.yaml, the frames' stamps in NAME_stamps.csv. truth.csv has the true states over time,
     visible.csv where each ball truly is in each frame, scene.yaml everything that was asked for.
     """
-    from ballfg.simulate import parse_effects, parse_settings
-    from ballfg.simulate.cameras import table_rig
-    from ballfg.simulate.scene import SceneConfig, record, write_scene
-    from ballfg.simulate.scene.writing import check_scene_folder
+    from ballfg.simulation import parse_effects, parse_settings
+    from ballfg.simulation.cameras import table_rig
+    from ballfg.simulation.scene import SceneConfig, record, write_scene
+    from ballfg.simulation.scene.writing import check_scene_folder
 
     know_effects(effects)
     check_scene_folder(out, force=force)
@@ -90,7 +90,7 @@ def _clocks(
     """Clocks by camera, from the command line's words."""
     from dataclasses import replace
 
-    from ballfg.simulate.scene import Clock, free_running
+    from ballfg.simulation.scene import Clock, free_running
 
     clocks = {name: Clock() for name in names}
     if unsynchronised:

@@ -12,7 +12,7 @@ from ballfg.cli.inputs import OwnEffects, know_effects
 from ballfg.cli.progress import progress
 
 if TYPE_CHECKING:
-    from ballfg.simulate import BallKind
+    from ballfg.simulation import BallKind
 
 _noise, _ball_option, _files = (
     partial(typer.Option, rich_help_panel=panel) for panel in ("Noise", "Ball and launcher", "Files")
@@ -53,7 +53,7 @@ def simulate(
     The dataset says what is declared. truth.yaml and truth.csv say what was really done: undeclared effects, and the
     true state at every stamp. model.yaml is the declared model, for the --model of other commands.
     """
-    from ballfg.simulate import (
+    from ballfg.simulation import (
         MeasurementNoise,
         ProcessNoise,
         SimulationConfig,
@@ -61,7 +61,7 @@ def simulate(
         parse_settings,
         write_simulation,
     )
-    from ballfg.simulate.writing import check_format
+    from ballfg.simulation.writing import check_format
 
     file_format = check_format(format)
     know_effects(effects)
@@ -87,7 +87,7 @@ def simulate(
 def _ball(name: str, model: Path | None) -> BallKind:
     """The ball, with the model of a file in place of its own if there is one."""
     from ballfg.dynamics import AnalyticModel, load_model
-    from ballfg.simulate import ball_kind, with_model
+    from ballfg.simulation import ball_kind, with_model
 
     kind = ball_kind(name)
     if model is None:

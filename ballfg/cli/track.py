@@ -67,7 +67,7 @@ def track(
     overlay.mp4 shows the views with what was found, contact_sheet.png each track.
     """
     _quiet_codecs()
-    from ballfg.simulate.balls import ball_kind
+    from ballfg.simulation.balls import ball_kind
     from ballfg.tracks import DatasetInfo
     from ballfg.tracks.writing import staging
     from ballfg.vision.camera_file import read_cameras
@@ -157,7 +157,7 @@ def _from_videos(
 
 def _on_one_clock(tracking: Tracking, model: AnalyticModel, surfaces: Surfaces) -> Tracking:
     """The same candidates once more, each camera with the time offset that the balls tell."""
-    from ballfg.estimate import estimate_time_offsets, sighted_track, uncertain
+    from ballfg.estimation import estimate_time_offsets, sighted_track, uncertain
     from ballfg.vision.tracking.pipeline import track_detections
     from ballfg.vision.tracking.report import disagreement
 

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact, per_row
-from ballfg.dynamics.impact import apply_impulse
 from ballfg.dynamics.measurement import Later, MeasurementEffect
 from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
-from ballfg.dynamics.tilted import from_plane, to_plane
+from ballfg.dynamics.motion.impact import apply_impulse
+from ballfg.dynamics.motion.tilted import from_plane, to_plane
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 _ONE, _ZERO = torch.tensor(1.0, dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64)

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.dynamics.effect import Coefficient
-from ballfg.dynamics.impact import slip_velocity
 from ballfg.dynamics.measurement import Later
+from ballfg.dynamics.motion.impact import slip_velocity
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, VELOCITY, VZ, Z
 
 if TYPE_CHECKING:

@@ -14,10 +14,10 @@ import yaml
 from ballfg.dynamics.analytic import AnalyticModel, after_needs
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import effect_class
-from ballfg.dynamics.learned import LearnedModel
-from ballfg.dynamics.learned_file import has_learned_part, read_learned, remove_others, write_learned
 from ballfg.dynamics.model import THIN_SHELL, BallModel
-from ballfg.tracks.yaml_file import read_yaml
+from ballfg.dynamics.networks.learned import LearnedModel
+from ballfg.dynamics.networks.learned_file import has_learned_part, read_learned, remove_others, write_learned
+from ballfg.files.strict_yaml import read_yaml
 
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
 SECTIONS = (*KINDS, "learned")

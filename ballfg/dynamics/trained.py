@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from ballfg.dynamics.spin_embedding import SpinEmbedding
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 
 
 @dataclass(frozen=True)

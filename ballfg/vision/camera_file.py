@@ -11,10 +11,10 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
+from ballfg.files.whole_file import whole_file
 from ballfg.vision.camera import Camera
 from ballfg.vision.camera_storage import check_names, is_storage, read_storage
 from ballfg.vision.strict_yaml import check_keys, mapping, read_mapping
-from ballfg.vision.whole_file import whole_file
 
 CAMERAS_FILE: Final = "cameras.yaml"
 """Its name in the folder of a dataset or a scene."""

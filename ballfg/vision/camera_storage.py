@@ -11,9 +11,9 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
+from ballfg.files.whole_file import whole_file
 from ballfg.tracks.hints import did_you_mean
 from ballfg.vision.camera import Camera
-from ballfg.vision.whole_file import whole_file
 
 MATRIX: Final = "camera_matrix"
 NODES: Final = {

@@ -6,9 +6,9 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
+from ballfg.files.strict_yaml import read_yaml
 from ballfg.tracks.fields import kind
 from ballfg.tracks.hints import did_you_mean
-from ballfg.tracks.yaml_file import read_yaml
 
 
 def read_mapping(path: Path) -> dict[Any, Any]:

@@ -11,9 +11,9 @@ import torch
 
 from ballfg.dynamics import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimate import Smoother, uncertain
-from ballfg.predict import predict_tracks
-from ballfg.simulate import MeasurementNoise, SimulationConfig, simulate
+from ballfg.estimation import Smoother, uncertain
+from ballfg.prediction import predict_tracks
+from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
 
 OBSERVED = 0.25  # s
 NINETY = 1.645  # standard deviations on either side that hold 90 %

@@ -7,12 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import cast
 
+from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.sequence.architecture import SequenceArchitecture, SequenceKind
 from ballfg.learning.sequence.launcher import LauncherSettings
 from ballfg.learning.sequence.predictor import SequencePredictor
 from ballfg.learning.sequence.trainee import SequenceTrainee
 from ballfg.learning.shots import Shot
-from ballfg.learning.train_config import TrainConfig
 from ballfg.tracks import Track
 
 FOLDER = "model"

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from ballfg.learning.augment import apply
+from ballfg.learning.end_to_end.augment import apply
 from ballfg.tracks import Track
 
 LEAST_OBSERVED = 2

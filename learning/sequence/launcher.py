@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.spin_embedding import SpinEmbedding
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.tracks import Track
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from ballfg.learning.augment import augmentation
+from ballfg.learning.end_to_end.augment import augmentation
 from ballfg.learning.sequence.architecture import SequenceArchitecture
 from ballfg.learning.sequence.data import Batch, Example, collate, example
 from ballfg.learning.sequence.launcher import LauncherSettings

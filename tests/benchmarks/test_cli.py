@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 
 from ballfg.benchmarks.cli import run
-from ballfg.simulate import SimulationConfig, write_simulation
+from ballfg.simulation import SimulationConfig, write_simulation
 
 
 def invoke(*words: str) -> int:

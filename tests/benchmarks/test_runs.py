@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.benchmarks import speed
-from ballfg.benchmarks.estimators import Size, describe, run_synthetic
-from ballfg.benchmarks.measured import WHOLE, Measured, _add_smoothing, prediction_rmse
-from ballfg.benchmarks.network import GRAVITY, fitted_network, parameter_count
+from ballfg.benchmarks.estimators.measured import WHOLE, Measured, _add_smoothing, prediction_rmse
+from ballfg.benchmarks.estimators.run import Size, describe, run_synthetic
 from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.speed import problem_model, run_speed
+from ballfg.benchmarks.speed import run as speed
+from ballfg.benchmarks.speed.network import GRAVITY, fitted_network, parameter_count
+from ballfg.benchmarks.speed.run import problem_model, run_speed
 from ballfg.benchmarks.synthetic import fair_protocol
-from ballfg.estimate import Estimate, Status
-from ballfg.predict import TrackPrediction
+from ballfg.estimation import Estimate, Status
+from ballfg.prediction import TrackPrediction
 
 SMALL = Size(compared=3, consistency=4, measured=None, counts=(5, 20))
 

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.step_noise import StepNoise
+from ballfg.benchmarks.estimators.step_noise import StepNoise
 from ballfg.benchmarks.synthetic import AT_BOUNCE, FAIR_NOISE, PAPER_NOISE, fair_protocol, paper_protocol
 from ballfg.state import POSITION, VZ
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,10 +15,7 @@ from ballfg.cli.main import run
 from ballfg.vision import Camera
 from ballfg.vision.calibration.table_points import table_points
 from ballfg.vision.camera_file import read_cameras
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "vision"))
-
-from board_scenes import CHARUCO, TRUE, image_of, poses
+from tests.vision.calibration.board_scenes import CHARUCO, TRUE, image_of, poses
 
 BOARD = ("--board", "charuco", "--squares", "8x6", "--square", 0.04, "--marker", 0.03)
 CENTRES = {"left": (-1.2, 2.6, 2.2), "right": (-1.0, -2.8, 2.3)}

@@ -3,22 +3,18 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "diagnose"))
-
-from made_diagnosis import found, silent, unexplained
-
-import ballfg.diagnose
+import ballfg.diagnosis
 from ballfg.cli.main import run
-from ballfg.diagnose.result import Diagnosis
+from ballfg.diagnosis.result import Diagnosis
 from ballfg.dynamics import AnalyticModel, Architecture, build, load_model, nominal_model, save_model
-from ballfg.simulate import SimulationConfig, write_simulation
+from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import Dataset
+from tests.diagnosis.made_diagnosis import found, silent, unexplained
 
 Asked = list[tuple[str, tuple[str, ...], int]]
 """Dataset, flight effects of the model and jobs."""
@@ -54,8 +50,8 @@ def answer(monkeypatch: pytest.MonkeyPatch) -> Answer:
             asked.append((dataset.info.name, tuple(model.flight), jobs))
             return diagnosis
 
-        monkeypatch.setattr(ballfg.diagnose, "diagnose", diagnose)
-        monkeypatch.setattr("ballfg.diagnose.report.page", lambda diagnosis: "<html></html>")
+        monkeypatch.setattr(ballfg.diagnosis, "diagnose", diagnose)
+        monkeypatch.setattr("ballfg.diagnosis.report.report.page", lambda diagnosis: "<html></html>")
         return asked
 
     return answer

@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 import yaml
 
-import ballfg.diagnose
+import ballfg.diagnosis
 from ballfg.cli.main import run
 from ballfg.dynamics import EFFECTS
+from tests.places import DOCS
 
-GUIDE = Path(__file__).parents[2] / "docs" / "add_an_effect.md"
+GUIDE = DOCS / "add_an_effect.md"
 
 
 def status(*arguments: object) -> int:
@@ -43,7 +44,7 @@ def test_the_guides_commands(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
         asked.append(list(EFFECTS))
         raise ValueError("enough")
 
-    monkeypatch.setattr(ballfg.diagnose, "diagnose", diagnose)
+    monkeypatch.setattr(ballfg.diagnosis, "diagnose", diagnose)
     commands = re.findall(r"^ballfg (.*--effects.*)$", GUIDE.read_text(encoding="utf-8"), re.MULTILINE)
     simulate, search, predict = (command.replace("--tracks 50", "--tracks 2").split() for command in commands)
     assert status(*simulate) == 0

@@ -16,8 +16,8 @@ from ballfg.cli import progress as progress_module
 from ballfg.cli.estimate import Method
 from ballfg.cli.main import run
 from ballfg.cli.progress import progress
-from ballfg.estimate import ESTIMATORS
-from ballfg.simulate import SimulationConfig, write_simulation
+from ballfg.estimation import ESTIMATORS
+from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset
 
 METHODS = ("smoother", "online", "ekf", "sliding-window")

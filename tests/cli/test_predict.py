@@ -10,7 +10,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from ballfg.cli.main import run
-from ballfg.simulate import SimulationConfig, write_simulation
+from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import Dataset, read_dataset
 
 METHODS = ("smoother", "online", "ekf", "sliding-window")

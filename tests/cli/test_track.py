@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from ballfg.cli.main import run
-from ballfg.simulate.cameras import table_rig
-from ballfg.simulate.scene import SceneConfig, record, write_scene
+from ballfg.simulation.cameras import table_rig
+from ballfg.simulation.scene import SceneConfig, record, write_scene
 from ballfg.tracks import read_dataset
 from ballfg.vision import Camera
 from ballfg.vision.camera_file import read_cameras, write_cameras

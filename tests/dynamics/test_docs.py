@@ -11,9 +11,8 @@ import yaml
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, advance, model_from_dict, model_to_dict, nominal_model
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.simulate import parse_effects
-
-DOCS = Path(__file__).parents[2] / "docs"
+from ballfg.simulation import parse_effects
+from tests.places import DOCS
 
 
 def blocks(page, language):

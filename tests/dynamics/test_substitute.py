@@ -7,8 +7,8 @@ import torch
 
 from ballfg.dynamics import Surfaces, advance, fly, fly_jacobian, fly_through, fly_through_jacobian, substitute
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.integrate import batch_jacobian
 from ballfg.dynamics.model import take_rows
+from ballfg.dynamics.motion.integrate import batch_jacobian
 
 NAMES = (
     "flight.drag.k",

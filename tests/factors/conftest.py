@@ -7,7 +7,7 @@ import pytest
 
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.factors.kind import COEFFICIENTS, FactorKind, Rows, Values
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Rows, Values
 
 NAMES = (
     "flight.drag.k",
@@ -87,10 +87,10 @@ def differences() -> Callable[[Callable[[np.ndarray], np.ndarray], np.ndarray, n
 
 
 @pytest.fixture
-def check_jacobian(differences) -> Callable[[FactorKind, Values], float]:
+def check_jacobian(differences) -> Callable[[FactorBatch, Values], float]:
     """Worst error of a kind's Jacobians: each row relative to its largest element, or 1e-4 of its block's."""
 
-    def check(kind: FactorKind, values: Values) -> float:
+    def check(kind: FactorBatch, values: Values) -> float:
         rows = kind.linearize(values)
         assert (np.linalg.norm(rows.residual, axis=-1) > 0.1).all(), "a zero residual hides errors"
         inputs = [np.array(values.gather(column)) for column in kind.variables.T]

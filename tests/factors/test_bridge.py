@@ -3,25 +3,26 @@
 import gc
 import re
 import weakref
-from pathlib import Path
 
 import gtsam
 import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import nominal_model, rollout
+from ballfg.dynamics import nominal_model
 from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.motion import rollout
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge, from_gtsam, key_of, nonlinear_graph, to_gtsam
 from ballfg.factors.check import check_factor, jacobian_errors
 from ballfg.factors.dynamics import ContactFactors, FlightFactors, RestFactors
 from ballfg.factors.graph import BallGraph, LevenbergMarquardt
-from ballfg.factors.kind import COEFFICIENTS, FactorKind, Values
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.factors.position import PositionFactors
 from ballfg.factors.prior import coefficient_prior, spin_prior, state_prior
+from tests.places import DOCS
 
 N = 12
 NAMES = ("flight.drag.k", "flight.magnus.k")
@@ -48,7 +49,7 @@ def problem(rng, *, loss=None, coefficients=False, outlier=False):
         means = np.array([float(parameters[name].detach()) for name in NAMES])
         model = AugmentedModel(model, NAMES)
     dt = np.full(N - 1, 0.02)
-    kinds: list[FactorKind] = [
+    kinds: list[FactorBatch] = [
         PositionFactors(np.arange(N), measured, np.full((N, 3), 0.003), loss),
         FlightFactors(model, np.arange(N - 1), dt, ProcessNoise().flight(dt)),
         state_prior(0, np.zeros(9), np.repeat([5.0, 20.0, 60.0], 3)),
@@ -155,7 +156,7 @@ def test_an_unknown_policy_is_refused(rng):
         Bridge(graph.kinds[0], "all")
 
 
-class Bad(FactorKind):
+class Bad(FactorBatch):
     """Two factors on one state each, spoiled by `spoil`."""
 
     def __init__(self, spoil):
@@ -286,6 +287,6 @@ def test_the_checker_passes_every_kind(rng):
 
 
 def test_the_example_in_the_docs_runs():
-    text = (Path(__file__).parents[2] / "docs" / "custom_factors.md").read_text(encoding="utf-8")
+    text = (DOCS / "custom_factors.md").read_text(encoding="utf-8")
     (block,) = re.findall(r"```python\n(.*?)```", text, re.DOTALL)
     exec(compile(block, "docs/custom_factors.md", "exec"), {"__name__": "example"})

@@ -8,10 +8,10 @@ import pytest
 import torch
 from scipy.optimize import least_squares
 
+from ballfg.factors.batch import COEFFICIENTS, Values, merge
 from ballfg.factors.camera import FIXED, CameraFactors
 from ballfg.factors.check import check_factor
 from ballfg.factors.graph import BallGraph, LevenbergMarquardt
-from ballfg.factors.kind import COEFFICIENTS, Values, merge
 from ballfg.factors.loss import Loss
 from ballfg.factors.prior import coefficient_prior, state_prior
 from ballfg.state import POSITION, VELOCITY

@@ -12,8 +12,8 @@ import pytest
 import torch
 
 from ballfg.dynamics import fly_through
+from ballfg.factors.batch import COEFFICIENTS, Values
 from ballfg.factors.dynamics import ContactFactors, FlightFactors, RestFactors
-from ballfg.factors.kind import COEFFICIENTS, Values
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.factors.position import PositionFactors

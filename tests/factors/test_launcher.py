@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics.spin_embedding import SpinEmbedding
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.factors.batch import Values
 from ballfg.factors.bridge import from_gtsam, nonlinear_graph, to_gtsam
 from ballfg.factors.check import check_factor
 from ballfg.factors.graph import BallGraph, LevenbergMarquardt
-from ballfg.factors.kind import Values
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.loss import Loss
 from ballfg.factors.prior import state_prior

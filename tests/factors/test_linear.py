@@ -6,10 +6,10 @@ import gtsam
 import numpy as np
 import pytest
 
+from ballfg.factors.batch import COEFFICIENTS, Values
 from ballfg.factors.covariance import marginal_covariances
 from ballfg.factors.dynamics import ContactFactors, FlightFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt
-from ballfg.factors.kind import COEFFICIENTS, Values
 from ballfg.factors.linear import solve, weighted
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise

@@ -6,8 +6,8 @@ import gtsam
 import numpy as np
 import pytest
 
+from ballfg.factors.batch import Rows, Values
 from ballfg.factors.graph import objective
-from ballfg.factors.kind import Rows, Values
 from ballfg.factors.linear import weighted
 from ballfg.factors.loss import LEAST_STRETCH, Loss
 from ballfg.factors.position import PositionFactors

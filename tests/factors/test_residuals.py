@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from ballfg.dynamics import fly_through
-from ballfg.dynamics.spin_embedding import SpinEmbedding
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.factors.batch import FactorBatch, Noise, Values
 from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors
-from ballfg.factors.kind import FactorKind, Noise, Values
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import PROCESS_NOISE, Kicks, ProcessNoise, whitening, whitening_tensor
@@ -80,11 +80,11 @@ def near(kind: str, model, coefficients: np.ndarray) -> Values:
     return Values(np.stack((start.numpy(), moved), axis=1).reshape(-1, 9), coefficients)
 
 
-def inputs_of(kind: FactorKind, values: Values) -> tuple[Tensor, ...]:
+def inputs_of(kind: FactorBatch, values: Values) -> tuple[Tensor, ...]:
     return tuple(torch.from_numpy(np.array(values.gather(column))) for column in kind.variables.T)
 
 
-def agreement(kind: FactorKind, values: Values) -> tuple[float, float]:
+def agreement(kind: FactorBatch, values: Values) -> tuple[float, float]:
     """Differences of torch to `compute`: of residuals, and of Jacobians relative to each row's largest element."""
     rows = kind.linearize(values)
     inputs = inputs_of(kind, values)
@@ -112,7 +112,7 @@ def test_dynamics(kind, case) -> None:
     assert worst < (1e-10 if kind in ("flight", "rest") else 2e-6)
 
 
-def others(augmented) -> list[tuple[FactorKind, Values]]:
+def others(augmented) -> list[tuple[FactorBatch, Values]]:
     rng = np.random.default_rng(0)
     states, about = Values(rng.standard_normal((4, 9)), np.zeros(0)), rng.uniform(1.0, 9.0, (2, 3))
     who = np.array([0, 2])
@@ -146,7 +146,7 @@ def test_priors_of_coefficients_follow_the_model(augmented) -> None:
 
 
 def test_a_kind_without_a_torch_residual_says_so() -> None:
-    class Silent(FactorKind):
+    class Silent(FactorBatch):
         def compute(self, rows, inputs) -> tuple:
             return (), ()
 

@@ -9,10 +9,10 @@ import pytest
 import torch
 
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.spin_embedding import SpinEmbedding
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.factors.batch import Values
 from ballfg.factors.dynamics import FlightFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt
-from ballfg.factors.kind import Values
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise

@@ -1,14 +1,11 @@
 from __future__ import annotations
 
-import sys
 from pathlib import Path
 
 import pytest
 
 from ballfg.dynamics import model_from_dict
-from ballfg.simulate import MeasurementNoise, SimulationConfig, table_tennis, with_model, write_simulation
-
-sys.path.insert(0, str(Path(__file__).parent))  # `falling_ball` is imported here and in processes that a test starts
+from ballfg.simulation import MeasurementNoise, SimulationConfig, table_tennis, with_model, write_simulation
 
 PLANTED = {"flight.drag.k": 0.155, "contact.restitution.e": 0.88, "contact.table_height.offset": 0.006}
 

@@ -9,26 +9,27 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Surfaces, rollout
-from ballfg.dynamics.spin_embedding import SpinEmbedding
-from ballfg.estimate.launcher import Launcher
-from ballfg.estimate.problem import effective_sigmas
-from ballfg.estimate.segmentation import Segmentation
-from ballfg.estimate.settings import Settings
-from ballfg.estimate.smoother import Earlier, Smoother
-from ballfg.estimate.solution import Solution
+from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Surfaces
+from ballfg.dynamics.motion import rollout
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.estimation.launcher import Launcher
+from ballfg.estimation.segmentation import Segmentation
+from ballfg.estimation.settings import Settings
+from ballfg.estimation.smoother.problem import effective_sigmas
+from ballfg.estimation.smoother.smoother import Earlier, Smoother
+from ballfg.estimation.smoother.solution import Solution
+from ballfg.factors.batch import Values
 from ballfg.factors.graph import Convergence, LevenbergMarquardt
-from ballfg.factors.kind import Values
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.factors.search import run_together
-from ballfg.learning.end_to_end import EndToEnd
-from ballfg.learning.implicit import GradientMethod
-from ballfg.learning.learnables import Learnables, NoiseScales
-from ballfg.learning.linear import ConjugateGradients, GaussNewtonFactors
-from ballfg.learning.objective import BatchObjective
+from ballfg.learning.config.training import LossConfig
+from ballfg.learning.end_to_end.end_to_end import EndToEnd
+from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
+from ballfg.learning.gradient.conjugate_gradients import ConjugateGradients, GaussNewtonFactors
+from ballfg.learning.gradient.implicit import GradientMethod
+from ballfg.learning.gradient.objective import BatchObjective
 from ballfg.learning.shots import Shot, shots_of
-from ballfg.learning.train_config import LossConfig
 from ballfg.tracks import Track
 
 TABLE = Surfaces(0.0)

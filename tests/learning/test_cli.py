@@ -12,10 +12,10 @@ import yaml
 
 from ballfg.cli.main import run as ballfg
 from ballfg.dynamics import load_model
-from ballfg.learning import calibration_checkpoint as checkpoints
-from ballfg.learning import folder as files
+from ballfg.learning.calibration import checkpoint as checkpoints
+from ballfg.learning.calibration.coefficients import values_of
 from ballfg.learning.cli import run
-from ballfg.learning.coefficients import values_of
+from ballfg.learning.run import run_folder as files
 
 SHORT = ("max_iterations=2", "tolerance=1e-12", "jobs=1")
 

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
 
 import pytest
 import torch
-from estimates import directional
 
-from ballfg.learning.config_file import read_config
+from ballfg.learning.config.config_file import read_config
+from tests.learning.estimates import directional
+from tests.places import DOCS
 
-GUIDE = Path(__file__).parents[2] / "docs" / "learn.md"
+GUIDE = DOCS / "learn.md"
 STEP = 1e-3
 """m, and of a logarithm: the solver finds its point to 1e-13."""
 SAME = 1e-6

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import Surfaces, nominal_model, rollout
-from ballfg.estimate import Settings, Smoother
-from ballfg.estimate.problem import QUALITY_SIGMA, effective_sigmas
-from ballfg.estimate.segmentation import Quality
+from ballfg.dynamics import Surfaces, nominal_model
+from ballfg.dynamics.motion import rollout
+from ballfg.estimation import Settings, Smoother
+from ballfg.estimation.segmentation import Quality
+from ballfg.estimation.smoother.problem import QUALITY_SIGMA, effective_sigmas
 from ballfg.learning.shots import Shot, part, shots_of
 from ballfg.tracks import Track
 

@@ -1,11 +1,11 @@
 """The guide's example is run as it stands."""
 
 import re
-from pathlib import Path
 
 from ballfg.tracks import read_dataset
+from tests.places import DOCS
 
-GUIDE = Path(__file__).parents[2] / "docs" / "tracks.md"
+GUIDE = DOCS / "tracks.md"
 
 
 def test_the_guide_runs(tmp_path, monkeypatch, capsys):

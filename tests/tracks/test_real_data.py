@@ -1,14 +1,11 @@
 """The measured tracks, where they are at hand: at ../shared/data from the project's root, or in $BALLFG_DATA."""
 
-import os
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from ballfg.tracks import TABLE_TENNIS, read_dataset, write_dataset
+from tests.places import DATA
 
-DATA = Path(os.environ.get("BALLFG_DATA", Path(__file__).parents[2].parent / "shared" / "data"))
 pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason=f"no measured tracks at {DATA}; set BALLFG_DATA")
 
 

@@ -11,8 +11,7 @@ from ballfg.vision.association.associate import SeenBall
 from ballfg.vision.association.paths import MAX_GAP
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
-
-from .filming import World
+from tests.vision.filming import World
 
 FALSE = 0.05
 """m, distance from every ball at which a point is a false one."""

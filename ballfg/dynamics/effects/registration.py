@@ -10,7 +10,7 @@ from torch import nn
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, FlightEffect
 from ballfg.dynamics.effects.registry import EFFECTS, GENERIC
 from ballfg.dynamics.measurement import MeasurementEffect
-from ballfg.tracks.python_file import run_file
+from ballfg.files.python_file import run_file
 
 E = TypeVar("E", bound=type[Effect])
 

@@ -5,35 +5,35 @@ from __future__ import annotations
 from typing import Final
 
 from ballfg.dynamics.effect import BounceEffect, Effect, FlightEffect, Kind
-from ballfg.dynamics.effects.buoyancy import Buoyancy
-from ballfg.dynamics.effects.drag import Drag
-from ballfg.dynamics.effects.drag_speed import DragSpeed
-from ballfg.dynamics.effects.drag_spin import DragSpin
-from ballfg.dynamics.effects.frame_tilt import FrameTilt
-from ballfg.dynamics.effects.friction import Friction
-from ballfg.dynamics.effects.generic_contact import GenericContact
-from ballfg.dynamics.effects.generic_flight import GenericFlight
-from ballfg.dynamics.effects.generic_measurement import GenericMeasurement
-from ballfg.dynamics.effects.gravity import Gravity
-from ballfg.dynamics.effects.gust_region import GustRegion
-from ballfg.dynamics.effects.magnus import Magnus
-from ballfg.dynamics.effects.magnus_saturation import MagnusSaturation
-from ballfg.dynamics.effects.radial_bias import RadialBias
-from ballfg.dynamics.effects.restitution import Restitution
-from ballfg.dynamics.effects.restitution_speed import RestitutionSpeed
-from ballfg.dynamics.effects.scale import Scale
-from ballfg.dynamics.effects.spin_decay import SpinDecay
-from ballfg.dynamics.effects.spin_label_frame import SpinLabelFrame
-from ballfg.dynamics.effects.spin_label_offset import SpinLabelOffset
-from ballfg.dynamics.effects.spin_label_scale import SpinLabelScale
-from ballfg.dynamics.effects.table_height import TableHeight
-from ballfg.dynamics.effects.table_tilt import TableTilt
-from ballfg.dynamics.effects.tangential_restitution import TangentialRestitution
-from ballfg.dynamics.effects.time_offset import TimeOffset
-from ballfg.dynamics.effects.time_scale import TimeScale
-from ballfg.dynamics.effects.velocity_lag import VelocityLag
-from ballfg.dynamics.effects.wind import Wind
-from ballfg.dynamics.effects.wind_shear import WindShear
+from ballfg.dynamics.effects.bounce.friction import Friction
+from ballfg.dynamics.effects.bounce.generic import GenericContact
+from ballfg.dynamics.effects.bounce.restitution import Restitution
+from ballfg.dynamics.effects.bounce.restitution_speed import RestitutionSpeed
+from ballfg.dynamics.effects.bounce.table_height import TableHeight
+from ballfg.dynamics.effects.bounce.table_tilt import TableTilt
+from ballfg.dynamics.effects.bounce.tangential_restitution import TangentialRestitution
+from ballfg.dynamics.effects.flight.buoyancy import Buoyancy
+from ballfg.dynamics.effects.flight.drag import Drag
+from ballfg.dynamics.effects.flight.drag_speed import DragSpeed
+from ballfg.dynamics.effects.flight.drag_spin import DragSpin
+from ballfg.dynamics.effects.flight.generic import GenericFlight
+from ballfg.dynamics.effects.flight.gravity import Gravity
+from ballfg.dynamics.effects.flight.gust_region import GustRegion
+from ballfg.dynamics.effects.flight.magnus import Magnus
+from ballfg.dynamics.effects.flight.magnus_saturation import MagnusSaturation
+from ballfg.dynamics.effects.flight.spin_decay import SpinDecay
+from ballfg.dynamics.effects.flight.wind import Wind
+from ballfg.dynamics.effects.flight.wind_shear import WindShear
+from ballfg.dynamics.effects.measurement.frame_tilt import FrameTilt
+from ballfg.dynamics.effects.measurement.generic import GenericMeasurement
+from ballfg.dynamics.effects.measurement.radial_bias import RadialBias
+from ballfg.dynamics.effects.measurement.scale import Scale
+from ballfg.dynamics.effects.measurement.spin_label_frame import SpinLabelFrame
+from ballfg.dynamics.effects.measurement.spin_label_offset import SpinLabelOffset
+from ballfg.dynamics.effects.measurement.spin_label_scale import SpinLabelScale
+from ballfg.dynamics.effects.measurement.time_offset import TimeOffset
+from ballfg.dynamics.effects.measurement.time_scale import TimeScale
+from ballfg.dynamics.effects.measurement.velocity_lag import VelocityLag
 
 EFFECTS: Final[dict[str, type[Effect]]] = {
     effect.name: effect

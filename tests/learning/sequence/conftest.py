@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from ballfg.simulate import MeasurementNoise, SimulationConfig, simulate, table_tennis
+from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate, table_tennis
 from ballfg.tracks import Track
 
 

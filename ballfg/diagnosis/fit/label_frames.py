@@ -1,0 +1,64 @@
+"""Spin labels in other axes or with other signs: not a small change that a score could measure, but one of 48.
+
+Spins are estimated from the flights alone, without labels and with the declared coefficients (those fitted to wrong
+labels would be wrong too); the frames in which the labels agree with them best are then fitted in full.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ballfg.diagnosis.fit.fit import fit
+from ballfg.diagnosis.fit.problem import LABEL_CAUCHY, Fit, linearise
+from ballfg.diagnosis.search.hypothesis import Hypothesis
+from ballfg.dynamics.effects.measurement.spin_label_frame import signed_permutations
+from ballfg.state import SPIN
+
+Array = NDArray[np.float64]
+
+UNLABELLED_SPIN = 200.0
+"""rad/s, prior of a spin about zero while labels are set aside."""
+FRAMES = 48
+"""Ways in which axes can be exchanged and reversed, the identity among them."""
+FRAMES_FITTED = 2
+"""Frames that are fitted in full."""
+
+
+def frame_hypotheses(before: Fit, general: Hypothesis) -> list[Hypothesis]:
+    """The frames that suit the flights best.
+
+    Args: before: the fit so far.  general: the hypothesis of another frame, whichever.
+    """
+    spins, covariances, labels = _spins_without_labels(before)
+    frames = signed_permutations().numpy()[1:]
+    costs = [_disagreement(labels, spins, covariances, frame, before.noise.label) for frame in frames]
+    best = np.argsort(costs)[:FRAMES_FITTED]
+    names = [c.name for c in general.effect.coefficients]
+    return [Hypothesis(general.effect, dict(zip(names, frames[i].ravel().tolist(), strict=True))) for i in best]
+
+
+def _spins_without_labels(before: Fit) -> tuple[Array, Array, Array]:
+    """(n, 3) spins from the flights alone, their covariances (n, 3, 3) and labels (n, 3), of labelled stretches."""
+    problem = before.problem
+    labelled = problem.stretches.take(problem.stretches.labelled)
+    bare = replace(labelled, labels=torch.full_like(labelled.labels, torch.nan), settings=0.0 * labelled.settings)
+    declared = dict(zip(problem.free, problem.centres.tolist(), strict=True))
+    unknowns = replace(before.unknowns, starts=before.unknowns.starts[problem.stretches.labelled], values=declared)
+    alone = replace(problem, stretches=bare, shared=False)
+    result = fit(alone, unknowns, replace(before.noise, spin=UNLABELLED_SPIN), settle_noise=False)
+    by_start = linearise(result.problem, result.unknowns, result.noise, result.predicted).by_start
+    covariances = np.linalg.inv(by_start.swapaxes(-1, -2) @ by_start)[:, SPIN, SPIN]
+    return result.unknowns.starts[:, SPIN], np.asarray(covariances), labelled.labels.numpy()
+
+
+def _disagreement(labels: Array, spins: Array, covariances: Array, frame: Array, noise: float) -> float:
+    """Robust squared distance between labels and spins in a frame (3, 3)."""
+    covariance = frame @ covariances @ frame.T + noise**2 * np.eye(3)
+    apart = labels - spins @ frame.T
+    square = (apart * np.linalg.solve(covariance, apart[..., None])[..., 0]).sum(axis=-1)
+    robust = LABEL_CAUCHY**2 * np.log1p(square / LABEL_CAUCHY**2) + np.linalg.slogdet(covariance)[1]
+    return float(robust.sum())

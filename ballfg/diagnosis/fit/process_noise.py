@@ -1,0 +1,61 @@
+"""How far real balls stray from a model from one moment to the next: the process noise that predictions call for.
+
+The fit is deterministic: what balls do beside their model goes to the residual. A prediction needs it as process noise,
+else it is too sure of itself, or gives away what the observed part tells. The usual process noise of measured tracks is
+scaled as a whole, to the scale at which the finding half is predicted with the largest likelihood.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import cast
+
+import numpy as np
+
+from ballfg.diagnosis.result import Errors
+from ballfg.diagnosis.search.evaluation import JudgedTrack, prediction_errors
+from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.dynamics.trained import Trained
+from ballfg.estimation.configure import dataset_settings, dataset_surfaces
+from ballfg.estimation.settings import MEASURED
+from ballfg.tracks import Dataset
+
+SCALES = (0.03, 0.1, 0.3, 1.0)
+"""Of the usual process noise; the likelihood is flat between neighbours."""
+MOST_PREDICTED = 15
+"""Tracks that are predicted for it, evenly over those given."""
+SCALED = ("acceleration", "spin", "contact_velocity", "contact_tangential", "contact_spin")
+"""What is scaled; a hit remains a hit."""
+
+
+@dataclass(frozen=True)
+class Predicting:
+    """A model with the process noise that predicts best, and its errors on tracks that it was fitted to."""
+
+    model: AnalyticModel
+    errors: Errors
+
+
+def with_process_noise(model: AnalyticModel, tracks: Sequence[JudgedTrack], dataset: Dataset, jobs: int) -> Predicting:
+    """The model with the process noise that predicts tracks best.
+
+    Args: model: with `trained`, which is replaced.  tracks: those that it was fitted to.
+    """
+    tried: list[Errors] = []
+    some = tracks[:: math.ceil(len(tracks) / MOST_PREDICTED)]
+    trained = cast(Trained, model.trained)
+    for scale in SCALES:
+        model.trained = _scaled(trained, scale)
+        settings = dataset_settings(dataset, model)
+        tried.append(prediction_errors(model, some, dataset_surfaces(dataset), settings, jobs))
+        if len(tried) > 1 and tried[-1].log_likelihood < tried[-2].log_likelihood:
+            break  # it has one maximum
+    best = int(np.argmax([errors.log_likelihood for errors in tried]))
+    model.trained = _scaled(trained, SCALES[best])
+    return Predicting(model, tried[best])
+
+
+def _scaled(trained: Trained, scale: float) -> Trained:
+    return replace(trained, process_noise={name: scale * getattr(MEASURED, name) for name in SCALED})

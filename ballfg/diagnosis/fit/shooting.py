@@ -1,0 +1,127 @@
+"""Motion from a first state, through contacts whose number and order are known: smooth in everything.
+
+A rollout decides by itself where the ball bounces, so that a small change can add or lose a bounce. Here the contacts
+are given, each with a guess of its time; the contact times are solved for. Each row flies in equal steps of its
+own from contact to contact, and a Hermite polynomial gives the states in between.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ballfg.dynamics.model import BallModel, take_rows
+from ballfg.dynamics.motion.contact import contact_time
+from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, fly, rk4_from
+from ballfg.dynamics.motion.paths import hermite
+from ballfg.state import VELOCITY
+
+LONGEST_STEP, LONGEST_WAY = 0.04, 0.4
+"""s and m of one integration step: twice those of a rollout, and the rollout's own from 20 m/s on. A flight of a second
+then ends within a micrometre of the rollout's, far below what any camera sees. However wild a state that a fit tries,
+steps become no shorter."""
+LEAST_ARC = 1e-3
+"""s. An arc between two contacts is taken to last at least so long when its steps are laid out."""
+
+
+@dataclass(frozen=True)
+class Arc:
+    """Flight of some rows from one contact to the next.
+
+    Attributes:
+        rows: (m,) which ones.
+        begun: (m,) s, when each began.
+        step: (m, 1) s.
+        nodes: (j + 1, m, 9) states.
+        slopes: (j + 1, m, 9) their derivatives by time.
+    """
+
+    rows: Tensor
+    begun: Tensor
+    step: Tensor
+    nodes: Tensor
+    slopes: Tensor
+
+    def states(self, times: Tensor) -> Tensor:
+        """(k, m, 9) states at times (k, m) s; beyond the last node the last polynomial goes on."""
+        place = (times - self.begun) / self.step[:, 0]
+        index = place.detach().floor().clamp(0, len(self.nodes) - 2).long()
+        theta = (place - index).unsqueeze(-1)
+        where = index.unsqueeze(-1).expand(-1, -1, self.nodes.shape[-1])
+        ends = (a.gather(0, where + j) for j in (0, 1) for a in (self.nodes, self.slopes))
+        return hermite(theta, self.step, *ends)
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """The motion of r rows.
+
+    Attributes:
+        arcs: in order of time.
+        contacts: (r, c) s, when each contact happened; NaN where there is none, or the ball never got there.
+    """
+
+    arcs: tuple[Arc, ...]
+    contacts: Tensor
+
+    def states(self, times: Tensor) -> Tensor:
+        """(k, r, 9) states at times (k, r) s since the start."""
+        result = self.arcs[0].states(times)
+        for arc in self.arcs[1:]:
+            asked = times[:, arc.rows]
+            inside = (asked.detach() >= arc.begun.detach()).unsqueeze(-1)
+            within = torch.where(inside, arc.states(asked), result[:, arc.rows])
+            result = result.index_copy(1, arc.rows, within)
+        return result
+
+
+def shoot(model: BallModel, start: Tensor, heights: Tensor, guesses: Tensor, ends: Tensor) -> Trajectories:
+    """The motion of rows of balls.
+
+    Args:
+        model: coefficients may have one value a row, shape (r, 1).
+        start: (r, 9) at time 0.
+        heights: (r, c) m, declared heights of the surfaces met, in order; NaN where there is no further one.
+        guesses: (r, c) s, about when.
+        ends: (r,) s, how long to fly.
+    Returns: differentiable, backward and forward, in start and coefficients. A row that misses a contact is NaN from
+        there on.
+    """
+    rows, begun, own = torch.arange(len(start)), torch.zeros_like(start[:, 0]), model
+    arcs: list[Arc] = []
+    contacts = torch.full_like(heights, torch.nan)
+    for number in range(heights.shape[1] + 1):
+        meets = (
+            ~heights[rows, number].isnan() if number < heights.shape[1] else torch.zeros_like(rows, dtype=torch.bool)
+        )
+        until = torch.where(meets, guesses[rows, number], ends[rows]) if number < heights.shape[1] else ends[rows]
+        arc = _fly_arc(own, rows, start, begun, until - begun.detach())
+        arcs.append(arc)
+        if not bool(meets.any()):
+            break
+        own, count = take_rows(own, meets, len(rows)), len(arc.nodes) - 1
+        rows, near = rows[meets], arc.nodes[-1][meets]
+        tau = contact_time(own, near, heights[rows, number])
+        lost = tau.isnan()
+        start = own.bounce(fly(own, near, tau.masked_fill(lost, 0.0)))
+        start = torch.where(lost.unsqueeze(-1), torch.nan, start)
+        begun = begun[meets] + count * arc.step[meets, 0] + tau.masked_fill(lost, 0.0)
+        contacts[rows, number] = begun.detach().masked_fill(lost, torch.nan)
+    return Trajectories(tuple(arcs), contacts)
+
+
+def _fly_arc(model: BallModel, rows: Tensor, state: Tensor, begun: Tensor, duration: Tensor) -> Arc:
+    duration = duration.clamp_min(LEAST_ARC)
+    fastest = float(state[:, VELOCITY].detach().square().sum(-1).nan_to_num(nan=0.0).max().sqrt())
+    longest = min(LONGEST_STEP, max(MAX_STEP, LONGEST_WAY / max(fastest, 1.0)))
+    count = max(1, math.ceil(float(duration.max()) / longest))
+    step = (duration / count).unsqueeze(-1)
+    nodes, slopes = [state], [derivative(model.rates, state)]
+    for _ in range(count):
+        state = rk4_from(model.rates, state, slopes[-1], step)
+        nodes.append(state)
+        slopes.append(derivative(model.rates, state))
+    return Arc(rows, begun, step, torch.stack(nodes), torch.stack(slopes))

@@ -1,0 +1,1 @@
+"""What is left after the search: patterns, drift, and fallbacks without a name."""

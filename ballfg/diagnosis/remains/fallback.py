@@ -1,0 +1,148 @@
+"""When no named effect explains what is left: a description that predicts better, without a name.
+
+First a few generic terms, which a person can read; only if those do not help, a network that corrects the model.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from typing import cast
+
+import numpy as np
+
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.process_noise import with_process_noise
+from ballfg.diagnosis.remains.sparse import SparseTerms, fit_with_terms, sparse_terms
+from ballfg.diagnosis.result import Errors, Fallback
+from ballfg.diagnosis.search.calibrated import calibrated_model
+from ballfg.diagnosis.search.evaluation import JudgedTrack
+from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.networks.architecture import Architecture
+from ballfg.dynamics.networks.learned import LearnedModel, build
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.estimation.configure import dataset_settings, dataset_surfaces
+from ballfg.estimation.measurement.as_measured import plainly_measured
+from ballfg.estimation.measurement.invert_measurement import ThroughMeasurement
+from ballfg.estimation.settings import Settings
+from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.learning.config.training import LossConfig, OptimizerConfig, TrainConfig
+from ballfg.learning.end_to_end.end_to_end import EndToEnd
+from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
+from ballfg.learning.run.loop import Task, Training, TrainingStoppedError
+from ballfg.learning.run.ranks import Ranks
+from ballfg.learning.shots import Shot, shots_of
+from ballfg.tracks import Dataset, Track
+
+HELPS = 0.9
+"""A fallback must reduce the prediction error on the judging half to this share of what it is without."""
+OBSERVED = 0.4
+"""Share of a typical track that the network's estimates see; it learns to predict the rest."""
+VALIDATES = 5
+"""One track of so many decides at which epoch the network is best."""
+LEAST_LEARNED = 10
+"""Fewer shots than this make no network that predicts others."""
+EPOCHS = 30
+"""About a minute for 25 tracks."""
+POSITION_SCALE = 0.03
+"""m, prediction error beyond which a track's part in the loss grows only linearly: a few must not rule the network."""
+
+Judge = Callable[[BallModel], Errors]
+"""Errors of a model's predictions on the judging half."""
+
+
+def fallback(
+    before: Fit, embedding: SpinEmbedding, dataset: Dataset, tracks: Sequence[Track], now: Errors, judge: Judge
+) -> Fallback | None:
+    """What explains the rest without naming it; None if nothing predicts better.
+
+    Args:
+        before: of an `AnalyticModel`, on the finding half.
+        embedding: names its launcher settings.
+        dataset: where the tracks come from.  tracks: of the finding half.
+        now: errors of the model as it is, on the judging half.
+    """
+    most = HELPS * now.prediction_rmse_mm
+    parts = [JudgedTrack(track, np.zeros(0)) for track in tracks]
+    terms = sparse_terms(before)
+    if terms is not None:
+        after = fit_with_terms(before, terms)
+        model = with_process_noise(calibrated_model(after, embedding), parts, dataset, 1).model
+        errors = judge(model)
+        if errors.prediction_rmse_mm < most:
+            return Fallback("sparse terms", describe(terms, after), now, errors, model)
+    base = with_process_noise(calibrated_model(before, embedding), parts, dataset, 1).model
+    network = learned_residual(base, dataset, tracks)
+    if network is None:
+        return None
+    errors = judge(network)
+    if errors.prediction_rmse_mm >= most:
+        return None
+    words = f"{network.architecture.kind}, {_size(network)} parameters"
+    return Fallback("learned residual", words, now, errors, network)
+
+
+def describe(terms: SparseTerms, after: Fit) -> str:
+    """The terms with their fitted coefficients, those that explain most first."""
+    units = after.problem.model.declared_coefficients()
+    values = {name: after.unknowns.values[name] for name in terms.estimates}
+    return ", ".join(f"{name.split('.', 1)[1]} = {value:.3g} {units[name].unit}" for name, value in values.items())
+
+
+def learned_residual(base: AnalyticModel, dataset: Dataset, tracks: Sequence[Track]) -> LearnedModel | None:
+    """A network that corrects a model, trained end to end on tracks; None if they are too few or the training fails.
+
+    Args: base: calibrated; its noise and launcher stay.
+    """
+    tracks, settings = _as_happened(base, dataset, tracks)
+    if len(tracks) < LEAST_LEARNED:
+        return None
+    seconds = OBSERVED * float(np.median([track.duration for track in tracks]))
+    plain = cast(AnalyticModel, plainly_measured(base))
+    made = shots_of(tracks, plain, dataset_surfaces(dataset), settings, samples=None, seconds=seconds)
+    shots = [shot for _, shot in made if isinstance(shot, Shot)]
+    if len(shots) < LEAST_LEARNED:
+        return None
+    model = build(Architecture.of("mnn+gs", residual=True), radius=base.radius, base=plain, seed=0)
+    launcher = None if settings.launcher is None else settings.launcher.embedding
+    noise = NoiseScales(settings.process, position=settings.position_scale, learned=False)
+    loss = LossConfig(position_scale=POSITION_SCALE)
+    trainee = EndToEnd(shots, Learnables(model, launcher, noise), loss)
+    if not _trained(trainee, len(shots), TrainConfig(optimizer=OptimizerConfig(epochs=EPOCHS), loss=loss)):
+        return None
+    model.base, model.trained = base, base.trained
+    return model.requires_grad_(False)
+
+
+def _as_happened(base: AnalyticModel, dataset: Dataset, tracks: Sequence[Track]) -> tuple[list[Track], Settings]:
+    """Tracks without what the model's measurement did to them, those of which it can be undone, and their settings."""
+    settings = dataset_settings(dataset, base)
+    if base.measures_plainly:
+        return list(tracks), settings
+    through = ThroughMeasurement(Smoother, base, dataset_surfaces(dataset), settings)
+    undone = [through.undo(track) for track in tracks]
+    return [u.track for u in undone if u.settled], through.smoother.settings
+
+
+def _trained(trainee: EndToEnd, count: int, config: TrainConfig) -> bool:
+    """Whether the training came to its end."""
+    numbers = range(count)
+    validation = tuple(numbers[VALIDATES - 1 :: VALIDATES])
+    train = tuple(n for n in numbers if n not in validation)
+    training = Training(Task(trainee, train, validation, config, Ranks(), _unwatched))
+    try:
+        for _ in training.epochs():
+            pass
+    except TrainingStoppedError:
+        return False
+    training.take_best()
+    return True
+
+
+def _unwatched(items: Iterable[list[int]], count: int, what: str) -> Iterator[list[int]]:
+    return iter(items)
+
+
+def _size(model: LearnedModel) -> int:
+    own = (*model.flight.parameters(), *model.contact.parameters())
+    return sum(p.numel() for p in own)

@@ -1,0 +1,152 @@
+"""What a fit leaves, in three kinds: accelerations in flight, kicks at contacts, errors of the measured positions.
+
+The first two are what a smoother would invent: free accelerations in short bins and free kicks after contacts, all
+at once with the first state of their stretch, under the priors of a white process noise.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.diagnosis.fit.problem import Fit, linearise
+from ballfg.diagnosis.fit.response import Along, ArcResponse, along, responses, weighted
+from ballfg.diagnosis.result import ContactResiduals, FlightResiduals, MeasurementResiduals, Residuals
+from ballfg.state import STATE_DIM
+
+BIN = 0.04
+"""s, about how long an acceleration stays the same: a bin never reaches across a contact."""
+ACCELERATION = 0.6
+"""m/s^2/sqrt(Hz), density of the white acceleration that a bin may hold: 3 m/s^2 over 40 ms. A steady force is then
+seen damped by a sixth to a third on arcs of 0.3 s; a wider prior damps less, and shows more noise."""
+CONTACT_VELOCITY, CONTACT_SPIN = 0.2, 20.0
+"""m/s and rad/s, priors of the kicks after a contact, per axis."""
+
+Array = NDArray[np.float64]
+_Row = tuple[Any, ...]
+"""A row of residuals: the stretch's number and what its kind has beside it."""
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Free kicks of one arc of one stretch: three columns for each of b bins, then six for a contact before the arc.
+
+    Attributes:
+        columns: (m, d) whitened answers.  sigma: (d,) priors.
+        times: (b,) s.  states: (b, 9).
+        contact: None for a first arc; else number of the contact, its time, the state before it.
+    """
+
+    columns: Array
+    sigma: Array
+    times: Array
+    states: Array
+    contact: tuple[int, float, Array] | None
+
+    def flights(self, row: int, value: Array, covariance: Array) -> Iterator[_Row]:
+        """Rows of `FlightResiduals` from the piece's part (d,) and (d, d) of what was invented."""
+        for b, (time, state) in enumerate(zip(self.times, self.states, strict=True)):
+            own = slice(3 * b, 3 * b + 3)
+            yield row, time, state, value[own], covariance[own, own]
+
+    def contacts(self, row: int, value: Array, covariance: Array) -> Iterator[_Row]:
+        """Rows of `ContactResiduals`, one or none."""
+        if self.contact is not None:
+            yield row, *self.contact, value[-6:], covariance[-6:, -6:]
+
+
+def residuals_of(fit: Fit) -> Residuals:
+    """The residuals of a fit."""
+    path, system = along(fit), linearise(fit.problem, fit.unknowns, fit.noise, fit.predicted)
+    pieces: dict[int, list[_Piece]] = defaultdict(list)
+    for arc in responses(fit, path):
+        for row, piece in zip(arc.rows.tolist(), _pieces(fit, arc), strict=True):
+            pieces[row].append(piece)
+    flights: list[_Row] = []
+    contacts: list[_Row] = []
+    for row, own in pieces.items():
+        value, covariance = _invented(system.residual[row], system.by_start[row], own)
+        end = 0
+        for piece in own:
+            part = slice(end, end := end + len(piece.sigma))
+            flights += piece.flights(row, value[part], covariance[part, part])
+            contacts += piece.contacts(row, value[part], covariance[part, part])
+    return Residuals(fit.problem.stretches.names, _flight(flights), _contact(contacts), _measurement(fit, path))
+
+
+def _pieces(fit: Fit, arc: ArcResponse) -> list[_Piece]:
+    """One piece for each stretch of an arc."""
+    m, q = arc.times.shape
+    counts = np.maximum(1, np.rint(arc.step * q / BIN).astype(np.int64))
+    number = (np.arange(q) * counts[:, None]) // q
+    width = int(counts.max())
+    indicator = (number[..., None] == np.arange(width)).astype(np.float64)
+    acceleration = np.einsum("mqb,ac->mqabc", indicator, np.eye(3)).reshape(m, q, 3, 3 * width)
+    columns = weighted(fit, arc.answer(acceleration), arc.rows)
+    kicks = weighted(fit, arc.kicks, arc.rows)
+    pieces = []
+    for i, count in enumerate(counts.tolist()):
+        first = np.searchsorted(number[i], np.arange(count + 1))
+        middle = (first[:-1] + first[1:] - 1) // 2
+        length = arc.step[i] * q / count
+        own, sigma = columns[i, :, : 3 * count], np.full(3 * count, ACCELERATION / np.sqrt(length))
+        contact = None
+        if arc.number:
+            own = np.concatenate((own, kicks[i]), axis=1)
+            sigma = np.concatenate((sigma, np.repeat((CONTACT_VELOCITY, CONTACT_SPIN), 3)))
+            contact = (arc.number - 1, float(arc.begun[i]), arc.incoming[i])
+        pieces.append(
+            _Piece(own, sigma, arc.begun[i] + (np.arange(count) + 0.5) * length, arc.nodes[i, middle], contact)
+        )
+    return pieces
+
+
+def _invented(residual: Array, by_start: Array, pieces: list[_Piece]) -> tuple[Array, Array]:
+    """Posterior mean (d,) and covariance (d, d) of all kicks of a stretch, its first state adapting."""
+    columns = np.concatenate([by_start, *(piece.columns for piece in pieces)], axis=1)
+    sigma = np.concatenate([piece.sigma for piece in pieces])
+    precision = columns.T @ columns + np.diag(np.concatenate((np.zeros(STATE_DIM), sigma**-2)))
+    covariance = np.linalg.inv(precision)
+    return (covariance @ (columns.T @ residual))[STATE_DIM:], covariance[STATE_DIM:, STATE_DIM:]
+
+
+def _flight(found: list[_Row]) -> FlightResiduals:
+    stretch, times, states, acceleration, covariance = (np.array(c) for c in zip(*found, strict=True))
+    return FlightResiduals(stretch, times, states, acceleration, covariance)
+
+
+def _contact(found: list[_Row]) -> ContactResiduals:
+    if not found:
+        none = np.zeros(0, dtype=np.int64)
+        empty = np.zeros((0, 3))
+        return ContactResiduals(none, none, np.zeros(0), np.zeros((0, STATE_DIM)), empty, empty, np.zeros((0, 6, 6)))
+    stretch, number, times, incoming, kick, covariance = (np.array(c) for c in zip(*found, strict=True))
+    return ContactResiduals(stretch, number, times, incoming, kick[:, :3], kick[:, 3:], covariance)
+
+
+def _measurement(fit: Fit, path: Along) -> MeasurementResiduals:
+    stretches = fit.problem.stretches
+    used = stretches.used.numpy()
+    times = path.times.T.numpy()
+    since = since_contact(times, path.contacts)
+    return MeasurementResiduals(
+        stretch=np.nonzero(used)[0],
+        times=times[used],
+        states=path.states[used],
+        since_contact=since[used],
+        position=(stretches.positions.numpy() - fit.predicted.positions)[used],
+        sigma=fit.sigmas[used],
+    )
+
+
+def since_contact(times: Array, contacts: Array) -> Array:
+    """(n, k) s since the last contact (n, c) before times (n, k), NaN before the first one."""
+    after = times[..., None] - contacts[:, None, :]
+    after = np.where(after >= 0.0, after, np.inf)
+    least = after.min(axis=-1, initial=np.inf)
+    return np.where(np.isfinite(least), least, np.nan)

@@ -1,0 +1,140 @@
+"""A sparse regression over generic terms: few of them, chosen one by one, that explain what no named effect does.
+
+Forward selection on projected Gram matrices: each step takes the term that explains most beside those chosen, until
+none is worth its penalty; then terms that later ones made superfluous are dropped. Source: J. Chen and Z. Chen 2008,
+"Extended Bayesian information criteria for model selection with large model spaces", with gamma = 1.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.diagnosis.fit.columns import signatures
+from ballfg.diagnosis.fit.fit import fit
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.search.candidates import with_hypothesis
+from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect
+from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.dynamics.effect import Effect
+from ballfg.dynamics.effects.registry import GENERIC
+
+MOST_TERMS = 12
+"""More describe noise, and no person reads them."""
+LEAST_LEFT = 1e-6
+"""Share of a term's information that must be its own beside the terms chosen before."""
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SparseTerms:
+    """Terms that were chosen.
+
+    Attributes:
+        hypotheses: the generic effects that hold them, their strengths the chosen terms only.
+        estimates: one-step coefficients by parameter name.
+        explained: squared whitened residual that they would explain together.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    estimates: Mapping[str, float]
+    explained: float
+
+
+def sparse_terms(before: Fit) -> SparseTerms | None:
+    """The terms that a fit lacks; None where none is worth its penalty.
+
+    Args: before: of an `AnalyticModel`.
+    """
+    library = _library(before)
+    found, _ = signatures(before, library)
+    efficient = found.efficient()
+    loose = np.concatenate([[c.sigma for c in h.free().values()] for h in library])
+    information = efficient.total + np.diag(loose**-2.0)
+    score = efficient.score.sum(axis=0)
+    samples = 3 * int(before.problem.stretches.used.sum())
+    chosen = select(information, score, np.log(samples) + 2.0 * np.log(len(score)))
+    if not chosen:
+        return None
+    estimate = np.linalg.solve(information[np.ix_(chosen, chosen)], score[chosen])
+    names = [name for h in library for name in h.columns]
+    taken = {names[i] for i in chosen}
+    kept = [replace(h, strengths=tuple(s for s in h.strengths if h.parameter(s) in taken)) for h in library]
+    return SparseTerms(
+        tuple(h for h in kept if h.strengths),
+        {names[i]: float(e) for i, e in zip(chosen, estimate, strict=True)},
+        float(estimate @ score[chosen]),
+    )
+
+
+def fit_with_terms(before: Fit, terms: SparseTerms) -> Fit:
+    """The joint fit with the terms in the model, noise settled again."""
+    problem = before.problem
+    for hypothesis in terms.hypotheses:
+        problem = with_hypothesis(problem, hypothesis)
+    listed = problem.free
+    start = {n: float(np.clip(v, listed[n].low, listed[n].high)) for n, v in terms.estimates.items()}
+    unknowns = replace(before.unknowns, values={**before.unknowns.values, **start})
+    return fit(problem, unknowns, before.noise)
+
+
+def select(information: Array, score: Array, penalty: float) -> list[int]:
+    """Indices of the terms worth their penalty, in the order chosen.
+
+    Args:
+        information: (p, p).  score: (p,).
+        penalty: what a term must explain, as twice a log likelihood.
+    """
+    chosen: list[int] = []
+    while len(chosen) < MOST_TERMS:
+        gain = _gains(information, score, chosen)
+        best = int(np.argmax(gain))
+        if gain[best] < penalty:
+            break
+        chosen.append(best)
+    return _pruned(information, score, penalty, chosen)
+
+
+def _gains(information: Array, score: Array, chosen: list[int]) -> Array:
+    """(p,) what each further term would explain beside those chosen; zero for those."""
+    across = information[:, chosen]
+    solved = np.linalg.solve(information[np.ix_(chosen, chosen)], across.T) if chosen else np.zeros((0, len(score)))
+    left = score - solved.T @ score[chosen]
+    own = np.diagonal(information) - (across * solved.T).sum(axis=1)
+    seen = own > LEAST_LEFT * np.diagonal(information)
+    return np.where(seen, left**2 / np.where(seen, own, 1.0), 0.0)
+
+
+def _pruned(information: Array, score: Array, penalty: float, chosen: list[int]) -> list[int]:
+    """The chosen terms less those without which the others explain nearly as much."""
+    while chosen:
+        inverse = np.linalg.inv(information[np.ix_(chosen, chosen)])
+        loss = (inverse @ score[chosen]) ** 2 / np.diagonal(inverse)
+        least = int(np.argmin(loss))
+        if loss[least] >= penalty:
+            break
+        chosen = [term for k, term in enumerate(chosen) if k != least]
+    return chosen
+
+
+def _library(before: Fit) -> list[Hypothesis]:
+    """All generic terms about the middle of the data; those of contacts only where there are contacts."""
+    stretches, model = before.problem.stretches, before.problem.model
+    assert isinstance(model, AnalyticModel)
+    positions = stretches.positions.numpy()[stretches.used.numpy()]
+    middle = dict(zip(("center_x", "center_y", "center_z"), np.median(positions, axis=0).tolist(), strict=True))
+    bounces = bool(stretches.heights.isfinite().any())
+    effects = [e for e in GENERIC.values() if (e.kind != "bounce" or bounces) and not has_effect(model, e.name)]
+    return [Hypothesis(effect, _shape(effect, middle), _strengths(effect)) for effect in effects]
+
+
+def _shape(effect: type[Effect], middle: Mapping[str, float]) -> dict[str, float]:
+    return {c.name: middle[c.name] for c in effect.coefficients if c.name in middle}
+
+
+def _strengths(effect: type[Effect]) -> tuple[str, ...]:
+    return tuple(c.name for c in effect.coefficients if c.absent is not None)

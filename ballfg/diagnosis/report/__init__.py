@@ -1,0 +1,1 @@
+"""A diagnosis as files and pictures."""

@@ -1,0 +1,262 @@
+"""Pictures of a diagnosis: what the fit leaves in flight, at contacts and in the measurements, and what it brings.
+
+Each function draws one figure; none touches the state of pyplot. Where a model was changed, `before` and `after` stand
+side by side or in one panel, always with the same axes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter
+from numpy.typing import NDArray
+
+from ballfg.diagnosis.remains.binned import at_contact, binned, in_flight, slip_speed
+from ballfg.diagnosis.result import (
+    Candidate,
+    ContactResiduals,
+    Errors,
+    FlightResiduals,
+    MeasurementResiduals,
+    Residuals,
+    Standing,
+)
+from ballfg.state import SPIN, VELOCITY
+
+Array = NDArray[np.float64]
+Series = Mapping[str, Residuals]
+"""Residuals by what the legend calls them: `before` and `after`, or one alone."""
+
+BEFORE, AFTER, GREY = "#d55e00", "#0072b2", "#8c8c8c"
+"""Okabe and Ito's vermilion and blue: they differ for every kind of colour vision."""
+AXIS_COLOURS = ("#0072b2", "#e69f00", "#009e73")
+IN_FLIGHT = ("along the flight", "across, to the left", "across, upwards")
+AT_CONTACT = ("along the ground", "to the left", "up")
+LARGEST_WHITENED = 4.0
+"""Whitened residuals beyond it count as it in means: one outlier must not hide a pattern of all the others."""
+SHOWN_SHARE = 0.98
+"""Of the single points that the axes hold; the others lie outside."""
+LEAST_EXPLAINED = 0.3
+"""Below it what a candidate explains is all the same: chance alone brings about 1."""
+NAMED = 6
+"""Candidates of the first round that the picture of the rounds names, beside those added later."""
+LINES_OF_TEXT = 18
+"""That fit above each other beside the picture of the rounds."""
+MARKED = {Standing.ADDED: ("added", AFTER), Standing.ALIKE: ("alike", BEFORE)}
+"""Word and colour of the candidates that stand out there."""
+
+
+def flight_in_time(series: Series) -> Figure:
+    """Acceleration that the model lacks against the time since launch, one column for each of the series."""
+    figure, panels = _grid(3, len(series), (max(7.4, 5.0 * len(series)), 6.0))
+    for column, (label, residuals) in zip(panels.T, series.items(), strict=True):
+        flight = residuals.flight
+        _means(column, flight.times, *in_flight(flight), flight.stretch, label)
+        column[0].set_title(label, size=11)
+        column[-1].set_xlabel("time since launch or hit, s")
+    _name_rows(panels, IN_FLIGHT, "m/s²")
+    figure.suptitle("Acceleration that the model lacks: mean over stretches ± standard error", size=11)
+    return figure
+
+
+def flight_against(series: Series) -> Figure:
+    """The same against speed, height and spin."""
+    figure, panels = _grid(3, 3, (10.5, 6.2))
+    for label, residuals in series.items():
+        flight = residuals.flight
+        for column, (name, against) in zip(panels.T, _conditions(flight).items(), strict=True):
+            _means(column, against, *in_flight(flight), flight.stretch, label)
+            column[-1].set_xlabel(name)
+    _name_rows(panels, IN_FLIGHT, "m/s²")
+    _legend(panels[0, 0], series)
+    figure.suptitle("Acceleration that the model lacks, against the state: mean ± standard error", size=11)
+    return figure
+
+
+def _conditions(flight: FlightResiduals) -> dict[str, Array]:
+    states = flight.states
+    return {
+        "speed, m/s": np.linalg.norm(states[:, VELOCITY], axis=-1),
+        "height, m": states[:, 2],
+        "spin, rad/s": np.linalg.norm(states[:, SPIN], axis=-1),
+    }
+
+
+def contacts(series: Series, radius: float) -> Figure:
+    """Outgoing minus predicted velocity at contacts against the normal speed and the slip of the ball.
+
+    Args: radius: m, of the ball.
+    """
+    count = len(series)
+    figure, panels = _grid(3, 2 * count, (max(8.2, 5.9 * count), 6.2))
+    points = []
+    for i, (label, residuals) in enumerate(series.items()):
+        contact = residuals.contact
+        values, sigmas = at_contact(contact)
+        points.append(values)
+        for j, (name, against) in enumerate(_impacts(contact, radius).items()):
+            column = panels[:, j * count + i]
+            for axes, component in zip(column, values.T, strict=True):
+                axes.plot(against, component, ".", color=GREY, markersize=3, alpha=0.45, zorder=1)
+            _means(column, against, values, sigmas, contact.stretch, label)
+            column[0].set_title(label, size=11)
+            column[-1].set_xlabel(name)
+            if i:
+                column[0].sharex(panels[0, j * count])
+    reach = 1.15 * float(np.quantile(np.abs(np.concatenate(points)), SHOWN_SHARE))
+    if reach > 0.0:
+        panels[0, 0].set_ylim(-reach, reach)
+    _name_rows(panels, AT_CONTACT, "m/s")
+    title = "Kick to the velocity at a contact that the model lacks: each contact, mean ± standard error"
+    figure.suptitle(title, size=11)
+    return figure
+
+
+def _impacts(contact: ContactResiduals, radius: float) -> dict[str, Array]:
+    return {
+        "incoming normal speed, m/s": -contact.incoming[:, 5],
+        "incoming slip, m/s": slip_speed(contact.incoming, radius),
+    }
+
+
+def measurements(series: Series) -> Figure:
+    """Whitened position residuals against time, place and speed."""
+    figure, panels = _grid(3, 5, (13.0, 6.0))
+    for label, residuals in series.items():
+        measured = residuals.measurement
+        values = np.clip(measured.position / measured.sigma, -LARGEST_WHITENED, LARGEST_WHITENED)
+        for column, (name, against) in zip(panels.T, _places(measured).items(), strict=True):
+            _means(column, against, values, np.ones_like(values), measured.stretch, label)
+            column[-1].set_xlabel(name)
+    _name_rows(panels, tuple(f"residual {a}" for a in "xyz"), "sigma")
+    _legend(panels[0, 0], series)
+    figure.suptitle("Measured minus fitted position over its noise: mean ± standard error", size=11)
+    return figure
+
+
+def _places(measured: MeasurementResiduals) -> dict[str, Array]:
+    places = {f"{name}, m": measured.states[:, i] for i, name in zip(range(3), "xyz", strict=True)}
+    speed = np.linalg.norm(measured.states[:, VELOCITY], axis=-1)
+    return {"time since launch or hit, s": measured.times, **places, "speed, m/s": speed}
+
+
+def histogram(series: Series) -> Figure:
+    """Whitened position residuals of each axis before the normal distribution, on a logarithmic scale."""
+    figure, panels = _grid(1, len(series), (max(7.4, 5.0 * len(series)), 3.2))
+    edges = np.linspace(-6.0, 6.0, 49)
+    middle = 0.5 * (edges[1:] + edges[:-1])
+    for axes, (label, residuals) in zip(panels[0], series.items(), strict=True):
+        measured = residuals.measurement
+        whitened = measured.position / measured.sigma
+        for i, (name, colour) in enumerate(zip("xyz", AXIS_COLOURS, strict=True)):
+            share = np.histogram(whitened[:, i], edges)[0] / max(len(whitened), 1) / (edges[1] - edges[0])
+            axes.step(middle, np.where(share > 0.0, share, np.nan), where="mid", color=colour, label=name)
+        axes.plot(middle, np.exp(-0.5 * middle**2) / np.sqrt(2.0 * np.pi), "k--", linewidth=1.0, label="normal")
+        axes.set(yscale="log", ylim=(2e-4, 1.0), xlabel="(measured − fitted) / noise", title=label)
+        axes.legend(fontsize="small")
+    panels[0, 0].set_ylabel("density")
+    return figure
+
+
+def errors_by_track(before: Errors, after: Errors) -> Figure:
+    """Each judging track's prediction error before and after, joined by a line; the diamonds pool all tracks."""
+    figure, panels = _grid(1, 1, (4.6, 4.2))
+    axes = panels[0, 0]
+    pairs = np.stack((before.by_track, after.by_track), axis=-1)
+    pairs = pairs[np.isfinite(pairs).all(axis=-1)]
+    fell = int((pairs[:, 1] < pairs[:, 0]).sum())
+    for pair in pairs:
+        colour = AFTER if pair[1] < pair[0] else BEFORE
+        axes.plot((0, 1), pair, "o-", color=colour, alpha=0.4, markersize=4, linewidth=0.9)
+    pooled = (before.prediction_rmse_mm, after.prediction_rmse_mm)
+    axes.plot((0, 1), pooled, "D-", color="black", markersize=8, linewidth=2.2, label="all tracks")
+    for x, value, side in ((0, pooled[0], "right"), (1, pooled[1], "left")):
+        axes.annotate(f"{value:.1f}", (x, value), (-14 + 28 * x, 0), textcoords="offset points", ha=side, va="center")
+    axes.set(xlim=(-0.35, 1.35), xticks=(0, 1), yscale="log", ylabel="prediction error, mm")
+    axes.set_xticklabels(("before", "after"))
+    axes.set_title(f"smaller on {fell} of {len(pairs)} tracks", size=11)
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter("{x:g}")
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    return figure
+
+
+def ranking(rounds: Sequence[Sequence[Candidate]]) -> Figure:
+    """What each candidate explains, round after round: an added effect takes along what only resembled it."""
+    figure, panels = _grid(1, 1, (7.6, 4.2))
+    axes = panels[0, 0]
+    standing = {c.name: c.standing for row in reversed(rounds) for c in row}
+    standing |= {c.name: c.standing for row in rounds for c in row if c.standing is Standing.ADDED}
+    lines: dict[str, list[tuple[int, float]]] = {}
+    for i, row in enumerate(rounds):
+        for c in row:
+            if c.standing is not Standing.INVISIBLE:
+                lines.setdefault(c.name, []).append((i + 1, max(c.explained, LEAST_EXPLAINED)))
+    for name, line in lines.items():
+        _, colour = MARKED.get(standing[name], ("", GREY))
+        front = 2 + (standing[name] in MARKED) + (standing[name] is Standing.ADDED)
+        axes.plot(*zip(*line, strict=True), "o-", color=colour, markersize=5, linewidth=1.2, zorder=front)
+    first = [c.name for c in rounds[0] if c.name in lines]
+    named = first[:NAMED] + [name for name in first[NAMED:] if standing[name] is Standing.ADDED]
+    for name, height in _apart({name: lines[name][0][1] for name in named}).items():
+        word, colour = MARKED.get(standing[name], ("", "black"))
+        axes.plot((0.95, 1.0), (height, lines[name][0][1]), color=GREY, linewidth=0.6, zorder=1)
+        axes.text(0.93, height, f"{name}, {word}" if word else name, ha="right", va="center", size=9, color=colour)
+    axes.set(yscale="log", xlim=(0.2, len(rounds) + 0.3), xlabel="round", ylabel="squared whitened residual explained")
+    axes.margins(y=0.12)
+    axes.set_xticks(range(1, len(rounds) + 1))
+    return figure
+
+
+def _apart(places: Mapping[str, float]) -> dict[str, float]:
+    """Heights of labels on a logarithmic axis: in order, and a line of text apart."""
+    if not places:
+        return {}
+    line = max(1.0, np.log(max(places.values()) / LEAST_EXPLAINED)) / LINES_OF_TEXT
+    placed: dict[str, float] = {}
+    last = -np.inf
+    for name, value in sorted(places.items(), key=lambda item: item[1]):
+        last = max(float(np.log(value)), last + line)
+        placed[name] = float(np.exp(last))
+    return placed
+
+
+def _grid(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, NDArray[np.object_]]:
+    """A figure of panels: those in a column have the same horizontal axis, all of them the same vertical one."""
+    figure = Figure(figsize=size, layout="constrained")
+    panels = figure.subplots(rows, columns, squeeze=False, sharex="col", sharey=True)
+    for axes in panels.flat:
+        axes.grid(visible=True, which="major", alpha=0.25)
+    return figure, panels
+
+
+def _means(
+    column: Iterable[Axes], against: Array, values: Array, sigmas: Array, stretch: NDArray[np.int64], label: str
+) -> None:
+    """Three components of a residual, one in each panel of a column, as means over bins."""
+    colour = BEFORE if label == "before" else AFTER
+    for axes, component, sigma in zip(column, values.T, sigmas.T, strict=True):
+        bins = binned(against, component, sigma, stretch)
+        axes.axhline(0.0, color="black", linewidth=0.8, zorder=0)
+        axes.errorbar(
+            *(bins.centres, bins.means, bins.errors),
+            fmt="o-",
+            color=colour,
+            markersize=4,
+            linewidth=1.2,
+            capsize=2,
+            label=label,
+        )
+
+
+def _name_rows(panels: NDArray[np.object_], names: Sequence[str], unit: str) -> None:
+    for axes, name in zip(panels[:, 0], names, strict=True):
+        axes.set_ylabel(f"{name}, {unit}")
+
+
+def _legend(axes: Axes, series: Series) -> None:
+    if len(series) > 1:
+        axes.legend(fontsize="small")

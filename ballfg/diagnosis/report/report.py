@@ -1,0 +1,182 @@
+"""A diagnosis as files: `report.json` for programs, `report.html` for people, `model.yaml` for other commands."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+from ballfg.diagnosis.report.page import page
+from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Fallback, Finding, GenericTest, Value
+from ballfg.dynamics import save_model
+
+REPORT: Final = "report.json"
+"""Written last: where it is, the others are whole."""
+PAGE: Final = "report.html"
+MODEL: Final = "model.yaml"
+
+
+def write_report(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> None:
+    """Write `report.json`, `report.html` and `model.yaml` into a folder.
+
+    Everything is made in a folder beside it and moved at the end: a new folder appears at once, an earlier report is
+    replaced file by file. Other files of the folder stay.
+
+    Args: out: new, empty or with an earlier report; its parent must exist.
+    Raises:
+        ValueError: if `out` is a file or holds other things than a report.
+        FileNotFoundError: if its parent does not exist.
+    """
+    check_report_folder(Path(out))
+    folder = Path(out).resolve()
+    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent) as temporary:
+        made = Path(temporary) / "report"
+        made.mkdir()
+        _write_all(diagnosis, made)
+        _move(made, folder)
+
+
+def check_report_folder(folder: Path) -> None:
+    """Refuse a folder that holds something that must not be lost.
+
+    Raises:
+        ValueError: if it is a file or a folder with other content than an earlier report.
+        FileNotFoundError: if its parent does not exist.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"out must be a folder; {folder} is a file. Choose another name.")
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / REPORT).is_file():
+        raise ValueError(
+            f"out must be new, empty or hold an earlier report; {folder} holds other files. Choose another name."
+        )
+    if not folder.absolute().parent.is_dir():
+        raise FileNotFoundError(f"out must be in an existing folder; {folder.parent} is none. Create it first.")
+
+
+def _write_all(diagnosis: Diagnosis, folder: Path) -> None:
+    save_model(diagnosis.model, folder / MODEL)
+    (folder / PAGE).write_text(page(diagnosis), encoding="utf-8")
+    text = json.dumps(content(diagnosis), indent=2, allow_nan=False, ensure_ascii=False)
+    (folder / REPORT).write_text(text + "\n", encoding="utf-8")
+
+
+def _move(made: Path, folder: Path) -> None:
+    """Give a folder its final name; where it is there already, replace its files, `report.json` last."""
+    if not folder.exists():
+        os.rename(made, folder)
+        return
+    new = {path.name: path for path in made.iterdir()}
+    for name in sorted(new, key=lambda name: (name == REPORT, new[name].is_file())):
+        if not (folder / name).is_dir():  # a folder's name holds a digest of its content: the same one may stay
+            os.replace(new[name], folder / name)
+    for path in folder.glob(f"{Path(MODEL).stem}.learned-*"):
+        if path.name not in new:
+            shutil.rmtree(path)
+
+
+def content(diagnosis: Diagnosis) -> dict[str, Any]:
+    """What `report.json` holds, with null for numbers that there are not.
+
+    It has no times and no paths: the same diagnosis gives the same bytes.
+    """
+    left = diagnosis.unexplained
+    plain: dict[str, Any] = _plain(
+        {
+            "verdict": diagnosis.verdict.value,
+            "sentence": diagnosis.sentence,
+            "dataset": diagnosis.dataset,
+            "effects": [_finding(finding) for finding in diagnosis.findings],
+            "error": {
+                "before": _errors(diagnosis.before),
+                "after": _errors(diagnosis.after),
+                "tracks_found_on": diagnosis.tracks_found_on,
+                "tracks_judged_on": diagnosis.tracks_judged_on,
+            },
+            "unexplained": {
+                "where": left.where,
+                "share_of_residual": left.share_of_residual,
+                "tests": [_test(test) for test in left.tests],
+                "fallback": None if left.fallback is None else _fallback(left.fallback),
+            },
+            "calibrated": _values(diagnosis.calibrated),
+            "noise": _values(diagnosis.noise),
+            "rounds": [[_candidate(candidate) for candidate in row] for row in diagnosis.rounds],
+            "excluded": diagnosis.excluded,
+        }
+    )
+    return plain
+
+
+def _finding(finding: Finding) -> dict[str, Any]:
+    return {
+        "name": finding.name,
+        "kind": finding.kind,
+        "parameters": _values(finding.parameters),
+        "p_value": finding.p_value,
+        "delta_bic": finding.delta_bic,
+        "indistinguishable_from": finding.indistinguishable_from,
+        "held_out_gain": finding.held_out_gain,
+        "held_out_p": finding.held_out_p,
+        "sentence": finding.sentence,
+        "decide": finding.decide,
+    }
+
+
+def _candidate(candidate: Candidate) -> dict[str, Any]:
+    return {
+        "name": candidate.name,
+        "kind": candidate.kind,
+        "standing": candidate.standing.value,
+        "explained": candidate.explained,
+        "p_value": candidate.p_value,
+        "delta_bic": candidate.delta_bic,
+        "estimate": _values(candidate.estimate),
+    }
+
+
+def _errors(errors: Errors) -> dict[str, Any]:
+    return {
+        "prediction_rmse_mm": errors.prediction_rmse_mm,
+        "apex_rmse_mm": errors.apex_rmse_mm,
+        "nis": errors.nis,
+        "log_likelihood": errors.log_likelihood,
+        "by_track_mm": errors.by_track.tolist(),
+    }
+
+
+def _test(test: GenericTest) -> dict[str, Any]:
+    return {"name": test.name, "where": test.where, "p_value": test.p_value, "share": test.share}
+
+
+def _fallback(fallback: Fallback) -> dict[str, Any]:
+    return {
+        "kind": fallback.kind,
+        "description": fallback.description,
+        "error": {"before": _errors(fallback.before), "after": _errors(fallback.after)},
+    }
+
+
+def _values(values: Mapping[str, Value]) -> dict[str, Any]:
+    """Each with value, sigma and unit, and with what was declared where something was."""
+    return {
+        name: {"value": v.value, "sigma": v.sigma, "unit": v.unit}
+        | ({} if v.declared is None else {"declared": v.declared})
+        for name, v in values.items()
+    }
+
+
+def _plain(value: Any) -> Any:
+    """The same for strict JSON: no NaN, no infinity, no numpy."""
+    if isinstance(value, Mapping):
+        return {str(name): _plain(item) for name, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    if value is None or isinstance(value, str | int):
+        return value
+    number = float(value)
+    return number if math.isfinite(number) else None

@@ -1,0 +1,80 @@
+"""Numbers as a person reads them: as many digits as are known, with their unit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+
+from ballfg.diagnosis.result import Finding, Unexplained, Value, Verdict
+
+NONE = "–"
+"""What stands for a number that there is not."""
+MOST_DECIMALS = 6
+"""A number that needs more is written with a power of ten."""
+LEAST_PROBABILITY = 1e-99
+"""Below it the distribution that a probability was read from is a mere convention."""
+
+
+def number(value: float, digits: int = 3) -> str:
+    """A number to some significant digits; a dash for NaN."""
+    return NONE if math.isnan(value) else f"{value:.{digits}g}"
+
+
+def fixed(value: float, decimals: int) -> str:
+    """A number to some decimals; a dash for NaN."""
+    return NONE if math.isnan(value) else f"{value:.{decimals}f}"
+
+
+def plus_minus(value: Value) -> str:
+    """For instance `0.203 ± 0.012 m/s`: two digits of the standard deviation and the value's to the same decimal."""
+    unit = "" if value.unit == "1" else f" {value.unit}"
+    if not (math.isfinite(value.sigma) and value.sigma > 0):
+        return f"{number(value.value, 4)}{unit}"
+    decimals = max(0, 1 - math.floor(math.log10(value.sigma)))
+    if decimals > MOST_DECIMALS:
+        return f"{value.value:.3g} ± {value.sigma:.2g}{unit}"
+    return f"{value.value:.{decimals}f} ± {value.sigma:.{decimals}f}{unit}"
+
+
+def listed(values: Mapping[str, Value]) -> str:
+    """For instance `x 0.203 ± 0.012 m/s, y 0.001 ± 0.010 m/s`."""
+    return ", ".join(f"{name} {plus_minus(value)}" for name, value in values.items())
+
+
+def probability(p: float) -> str:
+    """For instance `0.34`, `3e-12`, `less than 1e-99`; a dash for NaN."""
+    if math.isnan(p):
+        return NONE
+    if p < LEAST_PROBABILITY:
+        return f"less than {LEAST_PROBABILITY:.0e}"
+    return f"{p:.2g}" if p >= 0.01 else f"{p:.0e}".replace("e-0", "e-")
+
+
+def change(before: float, after: float) -> str:
+    """For instance `-34 %`; empty where there is nothing to compare with."""
+    if not (math.isfinite(before) and math.isfinite(after)) or before == 0.0:
+        return ""
+    return f"{100 * (after / before - 1):+.0f} %"
+
+
+def joined(names: tuple[str, ...]) -> str:
+    """For instance `wind, gust_region and drag_speed`."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}" if names else ""
+
+
+def sentence(verdict: Verdict, findings: Sequence[Finding], left: Unexplained) -> str:
+    """The answer of a diagnosis in one sentence."""
+    if verdict is Verdict.NOTHING:
+        return "Nothing is lacking that these tracks could show: what the model leaves is noise."
+    named = joined(tuple(f"{_or_others(f)} ({listed(f.parameters)})" for f in findings))
+    if verdict is Verdict.FOUND:
+        return f"The model lacks {named}; with {'it' if len(findings) == 1 else 'them'} what is left is noise."
+    if not findings:
+        return f"Something is lacking that no effect of the catalogue explains: {left.where}."
+    share = f"{100 * left.share_of_residual:.0f} %"
+    return f"Something is lacking: {named} would explain a part; {share} of a pattern stays unexplained: {left.where}."
+
+
+def _or_others(finding: Finding) -> str:
+    """The finding's name, with those that could stand in its place."""
+    return " or ".join((finding.name, *finding.indistinguishable_from))

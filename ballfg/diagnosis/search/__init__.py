@@ -1,0 +1,1 @@
+"""The search: candidate effects scored, refitted and judged, one after the other."""

@@ -1,0 +1,1 @@
+"""Effects on the flight, one a file."""

@@ -1,0 +1,196 @@
+"""Contacts with a surface: when the ball touches it, and the flow through one or more contacts.
+
+The contact time is a function of the state. A search finds it without a graph; two Newton steps then run with one. A
+Newton step from the solution has the solution's exact first derivative, two steps have its derivatives up
+to the third, so that both the saltation term of a Jacobian and the Hessian of a loss come out of autograd right
+(docs/derivations/contact.md).
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.integrate import MAX_STEP, batch_jacobian, derivative, fly, fly_jacobian, rk4_step
+from ballfg.state import Z
+
+SEARCH_STEPS = 12
+"""Upper bound on the search from a guess; one or two are enough for a contact within 20 ms."""
+TIME_TOLERANCE = 1e-13
+"""s. The search stops when the bound on every contact time's error is below."""
+GAP_TOLERANCE = 1e-10
+"""m. A grazing ball whose search stalled this close to the surface has touched it."""
+TYPICAL_JERK = 60.0
+"""m/s^3, in the bound on the search's error."""
+LEAST_FALL = 1.0
+"""m/s^2. The search takes a ball to fall at least as fast as this."""
+LONGEST_FALL = 20.0
+"""s. A contact further away counts as none."""
+BEYOND = 0.3
+"""s. A contact that lies further away than its interval's length and this is no continuation of it any more: NaN."""
+MIN_SPEED = 1e-6
+"""m/s. Least normal speed that a Newton step divides by; a ball that grazes more gently is at its apex."""
+
+
+def contact_time(
+    model: BallModel, state: Tensor, height: Tensor | float, longest: Tensor | float = LONGEST_FALL
+) -> Tensor:
+    """Time until the falling ball touches a surface, on the branch on which it moves down.
+
+    Args: model: the ball.  state: (..., 9).  height: m, scalar or (...).  longest: s, scalar or (...), how far to look.
+    Returns: (...) s; negative when the ball is already below the surface on its way down. NaN where the ball,
+        in free flight, does not come down to that height within `longest`. Differentiable in the state and the
+        parameters.
+    """
+    with torch.no_grad():
+        tau = _search(model, state, height, torch.zeros_like(state[..., Z]), longest)
+        if bool(tau.isnan().any()):  # rare: lift above the weight, near misses, or no contact at all
+            start = _scan(model, state, height, tau.isnan(), longest)
+            scanned = _search(model, state, height, start, longest)
+            tau = torch.where(tau.isnan(), scanned, tau)
+    if torch.is_grad_enabled():
+        for _ in range(2):
+            tau = tau + _newton_step(model, state, height, tau)
+    return tau
+
+
+def _search(model: BallModel, state: Tensor, height: Tensor | float, start: Tensor, longest: Tensor | float) -> Tensor:
+    """Contact times (...) s near the times `start`, each step solving the parabola through the ball's motion there.
+
+    NaN where the search does not arrive, or starts at NaN.
+    """
+    tau, lost = torch.nan_to_num(start), start.isnan()
+    at = state if not bool(tau.any()) else fly(model, state, tau)
+    for _ in range(SEARCH_STEPS):
+        h, vz = model.gap(at, height), model.gap_rate(at)
+        fall = -model.gap_acceleration(at)
+        used = fall.clamp_min(LEAST_FALL)
+        square = vz.square() + 2 * used * h
+        root = square.clamp_min(0.0).sqrt()
+        falling = vz < 0  # each form of the root where it does not cancel; the apex where the parabola stays below
+        move = torch.where(falling & (square > 0), 2 * h / (root - vz).clamp_min(1e-300), (vz + root) / used)
+        error = (TYPICAL_JERK / 6 * move.abs() + (used - fall).abs() / 2) * move.square()
+        arrived = (falling & (square > 0) & (error < TIME_TOLERANCE * vz.abs())) | (h.abs() < GAP_TOLERANCE) & (
+            move.abs() < MIN_SPEED
+        )
+        tau = tau + move
+        lost |= ~(tau.abs() <= longest)
+        if bool((arrived | lost).all()):
+            break
+        tau = tau.masked_fill(lost, 0.0)
+        at = fly(model, state, tau)
+    return tau.masked_fill(lost | ~arrived, torch.nan)
+
+
+def _scan(model: BallModel, state: Tensor, height: Tensor | float, wanted: Tensor, longest: Tensor | float) -> Tensor:
+    """Times (...) s within one step of the contact: small steps, back in time for a ball that falls below the surface.
+
+    NaN where the ball is not `wanted` or turns before it gets there.
+    """
+    found = torch.full_like(state[..., Z], torch.nan)
+    h = model.gap(state, height)
+    step = torch.where((h < 0) & (model.gap_rate(state) < 0), -MAX_STEP, MAX_STEP).to(state.dtype)
+    open_ = wanted.clone()
+    furthest = float(longest.max()) if isinstance(longest, Tensor) else longest
+    for i in range(math.ceil(furthest / MAX_STEP)):
+        after = rk4_step(model.rates, state, step.unsqueeze(-1))
+        h_after, falling = model.gap(after, height), model.gap_rate(after) < 0
+        forward = step > 0
+        crossed = torch.where(forward, (h >= 0) & (h_after < 0), h_after >= 0)
+        missed = (h_after < 0) & torch.where(forward, falling, ~falling) | ~h_after.isfinite()
+        found = torch.where(open_ & crossed, (i + ~forward) * step, found)
+        open_ &= ~(crossed | missed)
+        if not bool(open_.any()):
+            break
+        state = torch.where(open_.unsqueeze(-1), after, state)
+        h = model.gap(state, height)
+    return found
+
+
+def _newton_step(model: BallModel, state: Tensor, height: Tensor | float, tau: Tensor) -> Tensor:
+    at = fly(model, state, torch.nan_to_num(tau))
+    speed = model.gap_rate(at).clamp_max(-MIN_SPEED)
+    return -model.gap(at, height) / speed + 0.0 * tau  # keeps NaN
+
+
+def fly_through(
+    model: BallModel, state: Tensor, dt: Tensor, heights: tuple[Tensor | float, ...]
+) -> tuple[Tensor, Tensor]:
+    """The state after `dt`, with one contact after another on the way, at surfaces that the caller names.
+
+    The contacts happen whether or not their times lie inside [0, dt]: a contact a little before or after the
+    interval is a smooth continuation, so that an estimator can move through it. Whether it lies inside is for the
+    caller to see in the returned times.
+
+    Args:
+        model: the ball.
+        state: (n, 9).
+        dt: (n,) s.
+        heights: for each contact, in order, the surface's height in m, scalar or (n,).
+    Returns: state after dt (n, 9), contact times since the start (n, len(heights)) s. NaN in rows in which a contact
+        never comes; they have no part in any gradient.
+    """
+    elapsed = torch.zeros_like(dt)
+    lost = torch.zeros_like(dt, dtype=torch.bool)
+    times = []
+    for height in heights:
+        tau = contact_time(model, state, height, dt.abs() + BEYOND)
+        lost = lost | tau.isnan()
+        tau = tau.masked_fill(lost, 0.0)
+        state = model.bounce(fly(model, state, tau))
+        elapsed = elapsed + tau
+        times.append(elapsed.masked_fill(lost, torch.nan))
+    after = fly(model, state, dt - elapsed)
+    if bool(lost.any()):
+        after = after.masked_fill(lost.unsqueeze(-1), torch.nan)
+    return after, torch.stack(times, dim=-1) if times else dt.new_zeros((*dt.shape, 0))
+
+
+def fly_through_jacobian(
+    model: BallModel, state: Tensor, dt: Tensor, heights: tuple[Tensor | float, ...]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`fly_through` and its derivative by the state, composed of flight, saltation and impact.
+
+    Args: as for `fly_through`.
+    Returns: state after dt (n, 9), contact times (n, k) s, Jacobian (n, 9, 9); detached from any graph.
+    """
+    state = state.detach()
+    jacobian = torch.eye(state.shape[-1], dtype=state.dtype).expand(*state.shape, -1)
+    elapsed = torch.zeros_like(dt)
+    elapsed_by_state = torch.zeros_like(state).unsqueeze(-2)  # (n, 1, 9)
+    times = []
+    for height in heights:
+        with torch.no_grad():
+            tau = contact_time(model, state, height, dt.abs() + BEYOND)
+        before, flight = fly_jacobian(model, state, tau)
+        jacobian = flight @ jacobian
+        with torch.no_grad():
+            rate, speed = derivative(model.rates, before), model.gap_rate(before).clamp_max(-MIN_SPEED)
+        # at the contact the gap is zero: d gap + gap_rate d tau = 0
+        tau_by_state = -(_gap_gradient(model, before, height).unsqueeze(-2) @ jacobian)
+        tau_by_state = tau_by_state / speed[..., None, None]
+        jacobian = jacobian + rate.unsqueeze(-1) * tau_by_state
+        state, impact = batch_jacobian(model.bounce, before, outputs=state.shape[-1])
+        jacobian = impact @ jacobian
+        elapsed = elapsed + tau
+        elapsed_by_state = elapsed_by_state + tau_by_state
+        times.append(elapsed)
+    after, flight = fly_jacobian(model, state, dt - elapsed)
+    if not times:
+        return after, dt.new_zeros((*dt.shape, 0)), flight
+    with torch.no_grad():
+        rate = derivative(model.rates, after)
+    jacobian = flight @ jacobian - rate.unsqueeze(-1) * elapsed_by_state
+    return after, torch.stack(times, dim=-1), jacobian
+
+
+def _gap_gradient(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
+    """Derivative of the gap by the state, of the state's shape."""
+    leaf = state.detach().requires_grad_(True)
+    with torch.enable_grad():
+        total = model.gap(leaf, height).sum()
+    (gradient,) = torch.autograd.grad(total, leaf)
+    return gradient

@@ -1,0 +1,168 @@
+"""Rollouts of many balls at many times, arc by arc: the same motion as `rollout`, in far fewer steps.
+
+`rollout` steps from stamp to stamp. Here the balls fly in common steps of `MAX_STEP`, each from its own last contact
+on; the states at the stamps come from a Hermite polynomial through the ends of the step in which they lie, with the
+position's second derivatives, so that nothing of the integration's accuracy is lost (docs/derivations/integration.md).
+A contact is solved once an arc, for all balls together. What does not simply fly and bounce (rest, rolling, a ball lost
+below a surface) is handed to `rollout`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ballfg.dynamics.model import BallModel, take_rows
+from ballfg.dynamics.motion.contact import contact_time
+from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, fly, rk4_from
+from ballfg.dynamics.motion.rollout import LONGEST_MOTION, REST_SPEED, next_surface, rollout, stays
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.state import POSITION, VELOCITY, VZ
+
+MOST_ARCS = 40
+"""A ball that bounces more often is about to come to rest."""
+
+
+def paths(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) -> Tensor:
+    """The states at a sequence of times.
+
+    Args:
+        model: the ball.
+        state: (n, 9) at time 0.
+        times: (k,) or (n, k) s since then, not decreasing, not negative.
+        surfaces: table and floor.
+    Returns: (n, k, 9), differentiable in the states and the parameters, through the contact times too.
+    Raises: ValueError: if the times are negative or decrease.
+    """
+    times = times.expand(state.shape[0], -1) if times.dim() == 1 else times
+    if times.shape[1] == 0 or not bool((torch.diff(times, dim=-1, prepend=torch.zeros_like(times[:, :1])) >= 0).all()):
+        return rollout(model, state, times, surfaces)  # it says what is wrong
+    result = state.unsqueeze(1).expand(-1, times.shape[1], -1)
+    strange = times[:, -1] > LONGEST_MOTION
+    active, begun, at = torch.arange(len(state)), torch.zeros_like(times[:, 0]), state
+    for _ in range(MOST_ARCS):
+        own, asked = take_rows(model, active, len(times)), times[active]
+        arc = _fly_arc(own, at, asked[:, -1] - begun.detach(), surfaces)
+        bounced, tau, ends_here = _land(own, arc, at)
+        end = torch.where(arc.landed, (begun + tau).detach(), torch.inf)
+        inside = (asked >= begun.detach().unsqueeze(1)) & (asked <= end.unsqueeze(1))
+        sampled = arc.sample((asked - begun.unsqueeze(1)).clamp_min(0.0))
+        result = result.index_put((active,), torch.where(inside.unsqueeze(-1), sampled, result[active]))
+        strange = strange.index_put((active,), strange[active] | ends_here | arc.resting)
+        onward = arc.landed & ~ends_here & (end < asked[:, -1])
+        at, begun, active = bounced[onward], (begun + tau)[onward], active[onward]
+        if len(active) == 0:
+            break
+    strange = strange.index_put((active,), torch.ones_like(active, dtype=torch.bool))
+    if bool(strange.any()):
+        rows = strange.nonzero()[:, 0]
+        part = rollout(take_rows(model, rows, len(times)), state[rows], times[rows], surfaces)
+        result = result.index_put((rows,), part)
+    return result
+
+
+@dataclass(frozen=True)
+class _Arc:
+    """Free flight of m balls from a common moment on.
+
+    Attributes:
+        nodes: (j + 1, m, 9) states, `MAX_STEP` apart; a ball that is done stays where it was.
+        slopes: (j + 1, m, 9) their derivatives by time.
+        landed: (m,) bool, the ball came down on a surface.
+        step: (m,) the step in which it did.
+        height: (m,) m, of that surface.
+        resting: (m,) bool, the ball lay on a surface from the start.
+    """
+
+    nodes: Tensor
+    slopes: Tensor
+    landed: Tensor
+    step: Tensor
+    height: Tensor
+    resting: Tensor
+
+    def sample(self, times: Tensor) -> Tensor:
+        """(m, k, 9) states at times (m, k) s since the start of the arc."""
+        place = times / MAX_STEP
+        step = place.detach().floor().clamp(0, len(self.nodes) - 2).long()
+        theta = (place - step).unsqueeze(-1)
+        index = step.unsqueeze(-1).expand(-1, -1, self.nodes.shape[-1])
+        nodes, slopes = self.nodes.transpose(0, 1), self.slopes.transpose(0, 1)
+        ends = (
+            nodes.gather(1, index),
+            slopes.gather(1, index),
+            nodes.gather(1, index + 1),
+            slopes.gather(1, index + 1),
+        )
+        return hermite(theta, MAX_STEP, *ends)
+
+
+def hermite(theta: Tensor, h: Tensor | float, x0: Tensor, d0: Tensor, x1: Tensor, d1: Tensor) -> Tensor:
+    """(..., 9) states within a step: position of degree five, velocity its derivative, everything else of degree three.
+
+    Args:
+        theta: (..., 1) in [0, 1].  h: s, the step, scalar or (..., 1).
+        x0, d0: (..., 9) state and derivative at the step's start.  x1, d1: at its end.
+    """
+    t2, t3 = theta * theta, theta * theta * theta
+    t4, t5 = t3 * theta, t3 * t2
+    p0, v0, a0 = x0[..., POSITION], d0[..., POSITION], d0[..., VELOCITY]
+    p1, v1, a1 = x1[..., POSITION], d1[..., POSITION], d1[..., VELOCITY]
+    rise = 10 * t3 - 15 * t4 + 6 * t5
+    position = (
+        p0 + rise * (p1 - p0) + h * (theta - 6 * t3 + 8 * t4 - 3 * t5) * v0 + h * (-4 * t3 + 7 * t4 - 3 * t5) * v1
+    )
+    position = position + h * h * (0.5 * (t2 - 3 * t3 + 3 * t4 - t5) * a0 + 0.5 * (t3 - 2 * t4 + t5) * a1)
+    velocity = (30 * t2 - 60 * t3 + 30 * t4) * (p1 - p0) / h
+    velocity = velocity + (1 - 18 * t2 + 32 * t3 - 15 * t4) * v0 + (-12 * t2 + 28 * t3 - 15 * t4) * v1
+    velocity = velocity + h * (
+        0.5 * (2 * theta - 9 * t2 + 12 * t3 - 5 * t4) * a0 + 0.5 * (3 * t2 - 8 * t3 + 5 * t4) * a1
+    )
+    r0, r1, s0, s1 = (x[..., VELOCITY.stop :] for x in (x0, x1, d0, d1))
+    rest = r0 + (3 * t2 - 2 * t3) * (r1 - r0) + h * ((theta - 2 * t2 + t3) * s0 + (t3 - t2) * s1)
+    return torch.cat((position, velocity, rest), dim=-1)
+
+
+def _fly_arc(model: BallModel, state: Tensor, left: Tensor, surfaces: Surfaces) -> _Arc:
+    """Flight of balls (m, 9) until each has landed or flown for `left` (m,) s."""
+    resting = stays(model, state.detach(), surfaces.level_below(state.detach()), surfaces)
+    done = resting.clone()
+    landed, step, level = torch.zeros_like(done), torch.zeros_like(done, dtype=torch.long), torch.zeros_like(left)
+    nodes, h = [state], torch.full_like(state[:, :1], MAX_STEP)
+    slopes: list[Tensor] = []
+    while not slopes or not bool(done.all()):
+        slope = derivative(model.rates, state)
+        after = rk4_from(model.rates, state, slope, h)
+        height = surfaces.level_below(state.detach())
+        height, landing = next_surface(model, state.detach(), after.detach(), height, ~done, surfaces)
+        step = torch.where(landing, len(slopes), step)
+        level, landed = torch.where(landing, height, level), landed | landing
+        state = torch.where(done.unsqueeze(-1), state, after)
+        slopes.append(slope)
+        nodes.append(state)
+        done = done | landing | (len(slopes) * MAX_STEP >= left)
+    slopes.append(derivative(model.rates, state))
+    return _Arc(torch.stack(nodes), torch.stack(slopes), landed, step, level, resting)
+
+
+def _land(model: BallModel, arc: _Arc, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """States (m, 9) just after the contacts, times (m,) s since the arc's start, whether (m,) the ball stays there."""
+    tau, bounced = arc.nodes.new_zeros(len(start)), start
+    ends_here = torch.zeros_like(arc.landed)
+    if not bool(arc.landed.any()):
+        return bounced, tau, ends_here
+    rows = arc.landed.nonzero()[:, 0]
+    own = take_rows(model, rows, len(start))
+    before = arc.nodes[arc.step[rows], rows]
+    within = contact_time(own, before, arc.height[rows])
+    lost = within.isnan()
+    within = within.masked_fill(lost, 0.0)
+    after = own.bounce(fly(own, before, within))
+    stops = lost | (after[:, VZ].detach() < REST_SPEED)
+    return (
+        bounced.index_put((rows,), after),
+        tau.index_put((rows,), arc.step[rows].to(within.dtype) * MAX_STEP + within),
+        ends_here.index_put((rows,), stops),
+    )

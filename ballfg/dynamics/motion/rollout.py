@@ -1,0 +1,169 @@
+"""Motion with events: free flight, contacts at their exact times, several in one step, rest and rolling.
+
+What is defined where nature is not asked:
+- A bounce that would rise for less than `REST_SPEED` ends in rest: the ball stays on the surface and rolls. So does one
+  that meets a surface more than `MAX_CONTACTS` times within one step. A resting ball whose lift exceeds its weight
+  takes off again.
+- A ball that starts a little below a surface (its centre above it) and moves down bounces at the moment at which it
+  went through; one that moves up leaves. One that can no longer come up is put on the surface, at rest.
+- Over more than `LONGEST_MOTION` the ball stays where it was by then.
+- A ball whose centre starts below the table's surface is beside the table; the floor is what it falls on.
+- Whether a ball meets the table is decided by its centre's place over it at the moment of contact; edges are not hit. A
+  ball that rolls over the edge falls from the end of the integration step in which it does.
+"""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor
+
+from ballfg.dynamics.model import BallModel, take_rows
+from ballfg.dynamics.motion.contact import contact_time
+from ballfg.dynamics.motion.integrate import RateFunction, fly, rk4_step, step_count
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.state import VZ, Z
+
+REST_SPEED = 0.05
+"""m/s. A ball that leaves a surface more slowly would be back within 10 ms, 0.13 mm high: it rests."""
+REST_GAP = 1e-5
+"""m. A ball this close to a surface and slower than half of `REST_SPEED` rests on it. A ball that left at `REST_SPEED`
+or faster is never both, so that a hop is the same motion however its time is cut."""
+LONGEST_MOTION = 20.0
+"""s. A ball that nobody touches lies still by then; over a longer interval it is taken to stay where it is."""
+MAX_CONTACTS = 32
+"""In one step of 20 ms a ball that leaves at `REST_SPEED` under its weight alone bounces at most twice."""
+
+
+def is_resting(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
+    """(...) bool: the ball lies on the surface at `height`."""
+    return (model.gap(state, height).abs() <= REST_GAP) & (state[..., VZ].abs() <= REST_SPEED / 2)
+
+
+def place_on(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
+    """The state moved onto a surface, its vertical velocity zero."""
+    z = state[..., Z] - model.gap(state, height)
+    parts = (
+        state[..., :Z],
+        z[..., None],
+        state[..., Z + 1 : VZ],
+        torch.zeros_like(z)[..., None],
+        state[..., VZ + 1 :],
+    )
+    return torch.cat(parts, dim=-1)
+
+
+def roll(model: BallModel, state: Tensor, dt: Tensor, height: Tensor | float) -> Tensor:
+    """The state after `dt` (...) s of resting on the surface at `height` m: sliding until it rolls, then rolling."""
+    state = place_on(model, state, height)
+    steps = step_count(dt)
+    h = (dt / steps).unsqueeze(-1)
+    rates: RateFunction = model.roll
+    for _ in range(steps):
+        state = rk4_step(rates, state, h)
+    return state
+
+
+def advance(model: BallModel, state: Tensor, dt: Tensor, surfaces: Surfaces) -> Tensor:
+    """The state after `dt`, through whatever contacts happen on the way.
+
+    Args:
+        model: the ball.
+        state: (n, 9).
+        dt: (n,) s, not negative.
+        surfaces: table and floor.
+    Returns: (n, 9), differentiable in the state and the parameters, through the contact times too.
+    Raises: ValueError: if a dt is negative or not a number.
+    """
+    if not bool(((dt >= 0) & (dt < math.inf)).all()):
+        raise ValueError(
+            f"dt must be finite and not negative; got {float(dt.min()):g} to {float(dt.max()):g} s. Sort the times."
+        )
+    dt = dt.clamp_max(LONGEST_MOTION)
+    steps = step_count(dt)
+    for _ in range(steps):
+        state = _advance_step(model, state, dt / steps, surfaces)
+    return state
+
+
+def _advance_step(model: BallModel, state: Tensor, h: Tensor, surfaces: Surfaces) -> Tensor:
+    """One step of at most `MAX_STEP`."""
+    height = surfaces.level_below(state.detach())
+    remaining = h
+    done = state
+    active = torch.arange(state.shape[0])
+    for contacts in range(MAX_CONTACTS + 1):
+        after = fly(model, state, remaining)
+        resting = stays(model, state.detach(), height, surfaces)
+        height, landing = next_surface(model, state.detach(), after.detach(), height, ~resting, surfaces)
+        if bool(resting.any()):
+            part = take_rows(model, resting, len(state))
+            rolled = roll(part, state[resting], remaining[resting], height[resting])
+            after = after.index_put((resting.nonzero()[:, 0],), rolled)
+        done = done.index_put((active,), after) if len(active) < len(done) else after
+        if not bool(landing.any()):
+            break
+        model, active, height = take_rows(model, landing, len(state)), active[landing], height[landing]
+        state, remaining = _land(model, state[landing], remaining[landing], height, last=contacts == MAX_CONTACTS - 1)
+    return done
+
+
+def stays(model: BallModel, state: Tensor, height: Tensor, surfaces: Surfaces) -> Tensor:
+    """(n,) bool: the ball rests on the surface at `height`, and its weight keeps it there."""
+    resting = is_resting(model, state, height)
+    if bool(resting.any()):
+        with torch.no_grad():
+            resting &= model.rates(state)[0][..., Z] <= 0
+        resting &= (height != surfaces.table_height) | surfaces.over_table(state)
+    return resting
+
+
+def next_surface(
+    model: BallModel, state: Tensor, after: Tensor, height: Tensor, flying: Tensor, surfaces: Surfaces
+) -> tuple[Tensor, Tensor]:
+    """Heights (n,) m of the surfaces that count in this step and whether (n,) the flying balls come down on them."""
+    landing = flying & (model.gap(after, height) < 0) & (after[..., VZ] < 0)
+    to_check = landing & (height == surfaces.table_height)
+    if surfaces.extent is None or not bool(to_check.any()):
+        return height, landing
+    part = take_rows(model, to_check, len(state))
+    with torch.no_grad():
+        tau = contact_time(part, state[to_check], height[to_check])
+        touch = fly(part, state[to_check], torch.nan_to_num(tau))
+    beside = torch.zeros_like(landing)
+    beside[to_check] = ~surfaces.over_table(touch)
+    height = torch.where(beside, surfaces.lowest(), height)
+    return height, landing & (model.gap(after, height) < 0)
+
+
+def _land(model: BallModel, state: Tensor, remaining: Tensor, height: Tensor, *, last: bool) -> tuple[Tensor, Tensor]:
+    """States just after the next contact and the time then left; a bounce too small to rise ends in rest."""
+    tau = contact_time(model, state, height)
+    lost = tau.isnan()  # below the surface and never up again
+    tau = torch.where(lost, torch.zeros_like(tau), tau)
+    bounced = model.bounce(fly(model, state, tau))
+    rest = (lost | (bounced[..., VZ] < REST_SPEED) | last).unsqueeze(-1)
+    return torch.where(rest, place_on(model, bounced, height), bounced), remaining - tau
+
+
+def rollout(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) -> Tensor:
+    """The states at a sequence of times.
+
+    Args:
+        model: the ball.
+        state: (n, 9) at time 0.
+        times: (k,) or (n, k) s since then, not decreasing, not negative.
+        surfaces: table and floor.
+    Returns: (n, k, 9).
+    Raises: ValueError: if the times are negative or decrease.
+    """
+    times = times.expand(state.shape[0], -1) if times.dim() == 1 else times
+    steps = torch.diff(times, dim=-1, prepend=torch.zeros_like(times[:, :1]))
+    if not bool((steps >= 0).all()):
+        raise ValueError("times must start at 0 or later and must not decrease. Sort them.")
+    states = []
+    for dt in steps.unbind(-1):
+        state = advance(model, state, dt, surfaces)
+        states.append(state)
+    return torch.stack(states, dim=1)

@@ -1,0 +1,1 @@
+"""Learned models: networks, Gram-Schmidt features, their files."""

@@ -1,0 +1,158 @@
+"""The learned model: networks say how the ball flies and bounces, alone or as a correction of another model."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import torch
+from torch import Tensor, nn
+
+from ballfg.dynamics.effect import Coefficient, per_row
+from ballfg.dynamics.effects.bounce.table_height import TableHeight
+from ballfg.dynamics.measurement import Later
+from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
+from ballfg.dynamics.networks.architecture import Architecture
+from ballfg.dynamics.networks.layers import NetworkKind
+from ballfg.dynamics.networks.learned_parts import (
+    START_RESTITUTION,
+    GramSchmidtContact,
+    GramSchmidtFlight,
+    RawContact,
+    RawFlight,
+)
+from ballfg.state import POSITION, SPIN, VELOCITY, VZ
+
+START_OFFSET: Final = -0.003
+"""m by which an untrained model takes surfaces to lie above their declared heights: as in the nominal model."""
+
+_BASE = "base."
+
+
+class LearnedModel(BallModel):
+    """A ball whose flight and contact are networks.
+
+    Without a base it starts as a ball that falls in vacuum, with a restitution of `START_RESTITUTION` and no
+    tangential change in a bounce. With a base it starts as the base.
+
+    Attributes:
+        architecture: what it is made of.
+        flight: network of the rates.  contact: network of the bounce.
+        base: the model that is corrected, or None.
+        offset: () m by which surfaces lie above their declared heights; the base's where there is one.
+    """
+
+    def __init__(
+        self,
+        architecture: Architecture,
+        *,
+        radius: float,
+        inertia_factor: float = THIN_SHELL,
+        base: BallModel | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(radius, inertia_factor)
+        if architecture.residual != (base is not None):
+            raise ValueError(
+                f"base must be given if, and only if, the architecture is residual; got residual="
+                f"{architecture.residual} and base={type(base).__name__}. Change one of them."
+            )
+        if base is not None and base.radius != radius:
+            raise ValueError(f"base must be a ball of the same radius; got {base.radius:g} m and {radius:g} m.")
+        raw = architecture.kind == "mlp"
+        kind: NetworkKind = "mlp" if raw else architecture.kind.removesuffix("+gs")  # type: ignore[assignment]
+        generator = torch.Generator().manual_seed(seed)
+        self.architecture = architecture
+        self.flight = (RawFlight if raw else GramSchmidtFlight)(
+            kind,
+            architecture.width_flight,
+            architecture.depth,
+            spin_rate=architecture.spin_rate,
+            falls=base is None,
+            generator=generator,
+        )
+        self.contact = (RawContact if raw else GramSchmidtContact)(
+            kind,
+            architecture.width_contact,
+            architecture.depth,
+            radius=radius,
+            first=START_RESTITUTION if base is None else 1.0,
+            generator=generator,
+        )
+        self.base = base
+        if base is None:
+            self.offset = nn.Parameter(torch.tensor(START_OFFSET, dtype=torch.float64))
+
+    def declared_coefficients(self) -> dict[str, Coefficient]:
+        """The base's coefficients as `base....`, or the surfaces' offset."""
+        if self.base is None:
+            return {"offset": TableHeight.coefficients[0]}
+        return {_BASE + name: c for name, c in self.base.declared_coefficients().items()}
+
+    def rates(self, state: Tensor) -> Rates:
+        """Acceleration and angular acceleration in free flight."""
+        acceleration, spin_rate = self.flight(state)
+        if self.base is None:
+            return acceleration, spin_rate
+        base_acceleration, base_spin_rate = self.base.rates(state)
+        if spin_rate is not None and base_spin_rate is not None:
+            spin_rate = base_spin_rate + spin_rate
+        return base_acceleration + acceleration, base_spin_rate if spin_rate is None else spin_rate
+
+    def bounce(self, state: Tensor) -> Tensor:
+        """(..., 9) state just after an impact on a horizontal plane; the position does not change."""
+        guess = _vertical_bounce(state) if self.base is None else self.base.bounce(state)
+        after: Tensor = self.contact(state, guess)
+        return after
+
+    def surface_offset(self, state: Tensor) -> Tensor | float:
+        """(...) m by which surfaces lie above the heights declared for them."""
+        if self.base is not None:
+            return self.base.surface_offset(state)
+        return per_row(self.offset)
+
+    def surface_slope(self, state: Tensor) -> Tensor | None:
+        """(2,) or (..., 2) slope of the surfaces: the base's."""
+        return None if self.base is None else self.base.surface_slope(state)
+
+    @property
+    def measures_plainly(self) -> bool:
+        """As the base; a model without one does."""
+        return self.base is None or self.base.measures_plainly
+
+    def measured(self, states: Tensor, later: Later) -> Tensor:
+        """(..., 3) m, the positions as the base measures them."""
+        return states[..., POSITION] if self.base is None else self.base.measured(states, later)
+
+    def true_stamps(self, stamps: Tensor) -> Tensor:
+        """(...) s, as the base."""
+        return stamps if self.base is None else self.base.true_stamps(stamps)
+
+    def stamps(self, times: Tensor) -> Tensor:
+        """(...) s, as the base."""
+        return times if self.base is None else self.base.stamps(times)
+
+    def labelled(self, spin: Tensor) -> Tensor:
+        """(..., 3) rad/s, as the base."""
+        return spin if self.base is None else self.base.labelled(spin)
+
+    def extra_repr(self) -> str:
+        """Kind, radius and inertia factor for `print(model)`."""
+        return f"{self.architecture.kind}, radius={self.radius:g} m, inertia_factor={self.inertia_factor:g}"
+
+
+def build(
+    architecture: Architecture,
+    *,
+    radius: float,
+    inertia_factor: float = THIN_SHELL,
+    base: BallModel | None = None,
+    seed: int = 0,
+) -> LearnedModel:
+    """An untrained model; the same seed gives the same weights."""
+    return LearnedModel(architecture, radius=radius, inertia_factor=inertia_factor, base=base, seed=seed)
+
+
+def _vertical_bounce(state: Tensor) -> Tensor:
+    """The state with its vertical velocity reversed and `START_RESTITUTION` of it left."""
+    up = -START_RESTITUTION * state[..., VZ : VZ + 1]
+    return torch.cat((state[..., POSITION], state[..., VELOCITY.start : VZ], up, state[..., SPIN]), dim=-1)

@@ -1,0 +1,193 @@
+"""The learned part of a model file: a folder with `config.yaml` and `weights.safetensors`.
+
+Safe loaders only. The folder's name ends with a digest of its content: a model file always names a whole folder, and
+saving again never changes one that a file names.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+from pathlib import Path
+from typing import Annotated, Any
+
+import safetensors
+import safetensors.torch
+import torch
+import yaml
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from torch import Tensor
+
+from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.networks.architecture import Architecture
+from ballfg.dynamics.networks.learned import LearnedModel, build
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.dynamics.trained import Trained
+from ballfg.files.strict_yaml import read_yaml
+
+CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
+_MODEL, _LAUNCHER, _BASE = "model.", "launcher.", "base."
+"""What the names of tensors start with: those of the networks and of the spin embedding; those of the base, which
+stand in the model file itself."""
+
+
+class _LauncherConfig(BaseModel):
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+    labels: Annotated[tuple[str, ...], Field(strict=False)]
+    categories: dict[str, Annotated[tuple[str, ...], Field(strict=False)]]
+
+
+class _TrainedConfig(BaseModel):
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+
+    process_noise: dict[str, float]
+    position_scale: float
+    spin_noise: float | None
+    launcher: _LauncherConfig | None
+
+
+class _Config(BaseModel):
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+    architecture: Architecture | None
+    trained: _TrainedConfig | None
+
+
+def has_learned_part(model: BallModel) -> bool:
+    """Whether a model file needs a folder to hold this model."""
+    return isinstance(model, LearnedModel) or model.trained is not None
+
+
+def write_learned(model: BallModel, parent: Path, stem: str) -> str:
+    """Write the folder of a model's learned part.
+
+    Args: model: learned, or analytic with `trained`.  parent: folder to write into.  stem: start of the name.
+    Returns: the new folder's name. It appears only once it is whole.
+    """
+    config = yaml.safe_dump(_config(model).model_dump(mode="json"), sort_keys=False, allow_unicode=True).encode()
+    weights = safetensors.torch.save({name: t.detach().contiguous() for name, t in _tensors(model).items()})
+    folder = parent / f"{stem}.learned-{hashlib.sha256(config + weights).hexdigest()[:12]}"
+    if not folder.exists():
+        part = folder.with_name(f".{folder.name}.part")
+        shutil.rmtree(part, ignore_errors=True)
+        part.mkdir()
+        (part / CONFIG).write_bytes(config)
+        (part / WEIGHTS).write_bytes(weights)
+        os.rename(part, folder)
+    return folder.name
+
+
+def remove_others(parent: Path, stem: str, keep: str | None) -> None:
+    """Remove the folders that `write_learned` made earlier under this stem, but for one."""
+    for folder in parent.glob(f"{stem}.learned-{'[0-9a-f]' * 12}"):
+        if folder.name != keep:
+            shutil.rmtree(folder)
+
+
+def read_learned(folder: Path, analytic: AnalyticModel) -> BallModel:
+    """The model of a folder and of the effects that the model file declares.
+
+    Args: folder: written by `write_learned`.  analytic: model of the effects; the base of a residual architecture.
+    Raises:
+        FileNotFoundError: if the folder or one of its files is missing.
+        ValueError: if a file is damaged, the config unknown, or weights have other names, shapes or types.
+    """
+    for path in (folder / CONFIG, folder / WEIGHTS):
+        if not path.is_file():
+            raise FileNotFoundError(f"{path} does not exist; a learned part is a folder with {CONFIG} and {WEIGHTS}.")
+    config = _read_config(folder / CONFIG)
+    model = _empty_model(config, analytic, folder)
+    expected = _tensors(model)
+    tensors = _read_weights(folder / WEIGHTS, expected)
+    with torch.no_grad():
+        for name, tensor in expected.items():
+            tensor.copy_(tensors[name])
+    return model
+
+
+def _config(model: BallModel) -> _Config:
+    architecture = model.architecture if isinstance(model, LearnedModel) else None
+    trained = model.trained
+    if trained is None:
+        return _Config(architecture=architecture, trained=None)
+    launcher = trained.launcher
+    return _Config(
+        architecture=architecture,
+        trained=_TrainedConfig(
+            process_noise=dict(trained.process_noise),
+            position_scale=trained.position_scale,
+            spin_noise=trained.spin_noise,
+            launcher=None
+            if launcher is None
+            else _LauncherConfig(labels=launcher.labels, categories=launcher.categories),
+        ),
+    )
+
+
+def _tensors(model: BallModel) -> dict[str, Tensor]:
+    """The weights of the learned part by name; they share the model's memory."""
+    tensors: dict[str, Tensor] = {}
+    if isinstance(model, LearnedModel):
+        tensors |= {_MODEL + n: t for n, t in model.state_dict().items() if not n.startswith(_BASE)}
+    if model.trained is not None and model.trained.launcher is not None:
+        tensors |= {_LAUNCHER + n: t for n, t in model.trained.launcher.state_dict().items()}
+    return tensors
+
+
+def _read_config(path: Path) -> _Config:
+    content: Any = read_yaml(path)
+    try:
+        return _Config.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "content"
+        raise ValueError(f"{path}: {where}: {first['msg']}; got {first['input']!r}.") from None
+
+
+def _empty_model(config: _Config, analytic: AnalyticModel, folder: Path) -> BallModel:
+    """The model that the config describes, its weights not yet the learned ones."""
+    model: BallModel = analytic
+    architecture = config.architecture
+    if architecture is not None:
+        if not architecture.residual and (analytic.flight or analytic.contact):
+            raise ValueError(
+                f"{folder / CONFIG}: a model that is not residual must stand alone; the model file declares "
+                f"{', '.join((*analytic.flight, *analytic.contact))}. Leave its sections flight and bounce empty."
+            )
+        base = analytic if architecture.residual else None
+        model = build(architecture, radius=analytic.radius, inertia_factor=analytic.inertia_factor, base=base)
+    if config.trained is not None:
+        model.trained = _trained(config.trained, folder)
+    return model
+
+
+def _trained(config: _TrainedConfig, folder: Path) -> Trained:
+    given = config.launcher
+    try:
+        launcher = None if given is None else SpinEmbedding(given.labels, given.categories)
+        return Trained(config.process_noise, config.position_scale, launcher, config.spin_noise)
+    except ValueError as error:
+        raise ValueError(f"{folder / CONFIG}: {error}") from None
+
+
+def _read_weights(path: Path, expected: dict[str, Tensor]) -> dict[str, Tensor]:
+    try:
+        tensors = safetensors.torch.load_file(path)
+    except safetensors.SafetensorError as error:
+        raise ValueError(f"{path}: not readable as safetensors ({error}).") from error
+    for name in sorted(set(expected) | set(tensors)):
+        if name not in tensors or name not in expected:
+            has = "is missing" if name not in tensors else "is not of this model"
+            raise ValueError(f"{path}: tensor '{name}' {has}; {CONFIG} and {WEIGHTS} do not belong together.")
+        tensor, wanted = tensors[name], expected[name]
+        if tensor.shape != wanted.shape or tensor.dtype != wanted.dtype:
+            raise ValueError(
+                f"{path}: tensor '{name}' must be {wanted.dtype} of shape {tuple(wanted.shape)}; got {tensor.dtype} of "
+                f"shape {tuple(tensor.shape)}. {CONFIG} and {WEIGHTS} do not belong together."
+            )
+        if not bool(tensor.isfinite().all()):
+            raise ValueError(f"{path}: tensor '{name}' must be finite; it holds NaN or infinity. Train again.")
+    return tensors

@@ -1,0 +1,154 @@
+"""The flight and the contact of a learned ball, with Gram-Schmidt features or with raw velocity and spin."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import torch
+from torch import Tensor, nn
+
+from ballfg.dynamics.model import Rates
+from ballfg.dynamics.networks.gram_schmidt import (
+    CONTACT_FEATURES,
+    CONTACT_TERMS,
+    FLIGHT_FEATURES,
+    FLIGHT_TERMS,
+    SPEED_SCALE,
+    SPIN_SCALE,
+    acceleration,
+    angular_acceleration,
+    contact_change,
+    contact_frame,
+    flight_frame,
+)
+from ballfg.dynamics.networks.layers import NETWORKS, NetworkKind
+from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, VELOCITY, VZ
+
+HIGHEST_RESTITUTION: Final = 1.2
+"""Most that a network may give: above one, so that a fit can move through what no table does."""
+START_RESTITUTION: Final = 0.85
+"""Restitution of an untrained model."""
+
+_UP = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
+_RAW_SCALES = torch.tensor([1 / SPEED_SCALE] * 3 + [1 / SPIN_SCALE] * 3, dtype=torch.float64)
+_RATE_SCALES = torch.tensor([SPEED_SCALE] * 3 + [SPIN_SCALE] * 3, dtype=torch.float64)
+_CHANGE_SCALES = torch.tensor([SPEED_SCALE] * 2 + [SPIN_SCALE] * 3, dtype=torch.float64)
+
+
+class GramSchmidtFlight(nn.Module):
+    """Rates in free flight: a network's coefficients on Gram-Schmidt vectors, plus a vertical bias.
+
+    Args:
+        kind, width, depth: of the network.
+        spin_rate: give the angular acceleration too.
+        falls: start from free fall; else from no acceleration at all, for a correction.
+        generator: of the first weights.
+
+    Attributes: bias: () m/s^2, upwards.
+    """
+
+    def __init__(
+        self, kind: NetworkKind, width: int, depth: int, *, spin_rate: bool, falls: bool, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.spin_rate = spin_rate
+        outputs = FLIGHT_TERMS * (2 if spin_rate else 1)
+        self.network = NETWORKS[kind](FLIGHT_FEATURES, outputs, width, depth, generator)
+        self.bias = nn.Parameter(torch.tensor(-STANDARD_GRAVITY if falls else 0.0, dtype=torch.float64))
+
+    def forward(self, state: Tensor) -> Rates:
+        """Acceleration and angular acceleration (or None) of states (..., 9)."""
+        frame = flight_frame(state)
+        coefficients = self.network(frame.features)
+        bias = self.bias * _UP
+        if not self.spin_rate:
+            return acceleration(frame, coefficients, bias), None
+        linear, angular = coefficients.split(FLIGHT_TERMS, dim=-1)
+        return acceleration(frame, linear, bias), angular_acceleration(frame, angular)
+
+
+class RawFlight(nn.Module):
+    """Rates in free flight: a network of velocity and spin as they are, in the world frame.
+
+    Args: as for `GramSchmidtFlight`. The bias of the last layer is the gravity.
+    """
+
+    def __init__(
+        self, kind: NetworkKind, width: int, depth: int, *, spin_rate: bool, falls: bool, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.spin_rate = spin_rate
+        self.network = NETWORKS[kind](6, 6 if spin_rate else 3, width, depth, generator)
+        if falls:
+            self.network.last.bias.data[2] = -STANDARD_GRAVITY / SPEED_SCALE
+
+    def forward(self, state: Tensor) -> Rates:
+        """Acceleration and angular acceleration (or None) of states (..., 9)."""
+        outputs = self.network(state[..., VELOCITY.start : SPIN.stop] * _RAW_SCALES)
+        rates = outputs * _RATE_SCALES[: outputs.shape[-1]]
+        return rates[..., :3], rates[..., 3:] if self.spin_rate else None
+
+
+class GramSchmidtContact(nn.Module):
+    """A bounce: a network's coefficients on Gram-Schmidt vectors in the plane change a first guess of it.
+
+    Args:
+        kind, width, depth: of the network.
+        radius: m.
+        first: restitution of the guess; 1 where the guess is another model's bounce.
+        generator: of the first weights.
+    """
+
+    def __init__(
+        self, kind: NetworkKind, width: int, depth: int, *, radius: float, first: float, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.radius, self.first = radius, first
+        self.network = NETWORKS[kind](CONTACT_FEATURES, CONTACT_TERMS + 1, width, depth, generator)
+
+    def forward(self, state: Tensor, guess: Tensor) -> Tensor:
+        """(..., 9) after the contact, from the states before it and a guess of those after it."""
+        frame = contact_frame(state, self.radius)
+        coefficients = self.network(frame.features)
+        tangential, normal = coefficients.split((CONTACT_TERMS, 1), dim=-1)
+        velocity, spin = contact_change(frame, tangential, self.radius)
+        return _changed(guess, velocity, normal, spin, self.first)
+
+
+class RawContact(nn.Module):
+    """A bounce: a network of velocity and spin as they are changes a first guess of it.
+
+    Args:
+        kind, width, depth: of the network.
+        radius: m; not used: raw velocity and spin are all that the network sees.
+        first: restitution of the guess; 1 where the guess is another model's bounce.
+        generator: of the first weights.
+    """
+
+    def __init__(
+        self, kind: NetworkKind, width: int, depth: int, *, radius: float, first: float, generator: torch.Generator
+    ) -> None:
+        super().__init__()
+        self.first = first
+        self.network = NETWORKS[kind](6, 6, width, depth, generator)
+
+    def forward(self, state: Tensor, guess: Tensor) -> Tensor:
+        """(..., 9) after the contact, from the states before it and a guess of those after it."""
+        outputs = self.network(state[..., VELOCITY.start : SPIN.stop] * _RAW_SCALES)
+        change = outputs[..., 1:] * _CHANGE_SCALES
+        return _changed(guess, change[..., :2], outputs[..., :1], change[..., 2:], self.first)
+
+
+def _changed(guess: Tensor, velocity: Tensor, normal: Tensor, spin: Tensor, first: float) -> Tensor:
+    """A guess of the state after a contact, changed; the normal velocity by a factor that keeps its sign.
+
+    Args:
+        guess: (..., 9), with a restitution of `first`.
+        velocity: (..., 2) m/s and spin: (..., 3) rad/s to add.
+        normal: (..., 1); takes the restitution from 0 (very negative) over `first` (0) to `HIGHEST_RESTITUTION`.
+    """
+    t = torch.tanh(normal)
+    room = HIGHEST_RESTITUTION - first
+    factor = 1.0 + 2.0 * room * t / (HIGHEST_RESTITUTION + (2.0 * first - HIGHEST_RESTITUTION) * t)
+    moved = torch.cat((guess[..., VELOCITY.start : VZ] + velocity, guess[..., VZ : VZ + 1] * factor), dim=-1)
+    return torch.cat((guess[..., POSITION], moved, guess[..., SPIN] + spin), dim=-1)

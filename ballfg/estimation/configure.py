@@ -1,0 +1,72 @@
+"""Settings for a dataset: what it says about its noise, and where it says nothing, what its tracks show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import islice
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.dynamics.trained import Trained
+from ballfg.estimation.launcher import Launcher
+from ballfg.estimation.measurement.position_noise import estimate_position_noise
+from ballfg.estimation.observations.sighted_dataset import SightedDataset
+from ballfg.estimation.settings import MEASURED, Settings, uncertain
+from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
+from ballfg.tracks import Dataset, DatasetInfo
+
+TRACKS_FOR_NOISE = 50
+"""How many tracks the measurement noise is estimated from, when a dataset does not state it."""
+
+
+def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Settings:
+    """Settings for measured tracks; those that cameras saw bring the noise of each sighting themselves.
+
+    The position noise is the dataset's; where it states none, it is estimated from the scatter of the first tracks
+    about short polynomials. The coefficients of an analytic model are estimated with each track, within their priors; a
+    trained model is taken as it is, with the noise and the launcher that were learned together with it.
+    """
+    info, trained = dataset.info, model.trained
+    if info.position_noise is not None:
+        noise = (info.position_noise,) * 3
+    elif isinstance(dataset, SightedDataset):
+        noise = Settings().position_noise
+    else:
+        x, y, z = estimate_position_noise(islice(iter(dataset), TRACKS_FOR_NOISE)).tolist()
+        noise = (x, y, z)
+    if trained is None:
+        settings = uncertain(model, position_noise=noise)
+    else:
+        settings = Settings(
+            position_noise=noise,
+            position_scale=trained.position_scale,
+            process=learned_process(trained),
+            launcher=launcher_of(info, model),
+        )
+        if trained.launcher is None and trained.spin_noise is not None:
+            settings = replace(settings, spin_label_noise=trained.spin_noise)
+    return settings if info.spin_noise is None else replace(settings, spin_label_noise=info.spin_noise)
+
+
+def learned_process(trained: Trained) -> ProcessNoise:
+    """The process noise that was learned; what was not is as usual. Raises: ValueError: a number of another name."""
+    unknown = sorted(set(trained.process_noise) - set(PROCESS_NOISE))
+    if unknown:
+        known = ", ".join(PROCESS_NOISE)
+        raise ValueError(
+            f"process_noise must name numbers of the process noise, {known}; got '{unknown[0]}'. Rename it."
+        )
+    return replace(MEASURED, **trained.process_noise)
+
+
+def launcher_of(info: DatasetInfo, model: BallModel) -> Launcher | None:
+    """What a trained model knows of a dataset's launcher; a track without the label `group` is of the dataset's own."""
+    trained = model.trained
+    if trained is None or trained.launcher is None or trained.spin_noise is None:
+        return None
+    return Launcher(trained.launcher, trained.spin_noise, {"group": info.name})
+
+
+def dataset_surfaces(dataset: Dataset | SightedDataset) -> Surfaces:
+    """The dataset's table, of unknown extent, and the floor below it."""
+    return Surfaces.table_tennis(dataset.info.table_height)

@@ -1,0 +1,1 @@
+"""The extended Kalman filter with its backward pass, and the sliding-window mean."""

@@ -1,0 +1,327 @@
+"""The extended Kalman filter on filterpy, with the same dynamics and noise as the smoother, and an RTS pass.
+
+docs/estimators_ekf.md has the equations, what the filter does at contacts, hits and outliers, and what it cannot do.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import torch
+from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.advance_jacobian import Motion, advance_jacobian
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.estimator import Estimator
+from ballfg.estimation.filters.rts import FilterRecord, fly_back, rts_smooth
+from ballfg.estimation.filters.sliding_window import SlidingWindow, first_pair
+from ballfg.estimation.filters.window_velocity import WINDOW
+from ballfg.estimation.result import Array, Estimate, Status, leave_one_out
+from ballfg.estimation.segmentation import Contact, Quality
+from ballfg.estimation.settings import Settings, sample_sigmas, spin_start
+from ballfg.estimation.smoother.near_contact import widen_near_contacts
+from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
+from ballfg.state import POSITION, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
+from ballfg.tracks import Track
+
+GATE = float(chi2.isf(1e-6, 3))
+"""Squared whitened innovation, 30.7, beyond which a sample is not used: one good sample in a million."""
+REJECTED_FOR_HIT = 4
+"""So many samples in a row beyond the gate are no outliers: something hit the ball before the first of them."""
+HIT_POSITION = 1.0
+"""m, standard deviation of the position after a hit: it starts anew at the measurement."""
+WIDE_VELOCITY = 1.0
+"""m/s. While the velocity is less well known, a step is linearised at the velocity that its sample suggests."""
+LEAST_USED = 0.5
+"""Share of samples that must have passed the gate for the filter to have followed the ball."""
+NEAR_SURFACE = 0.05
+"""m. Samples this close to a surface need not lie on one parabola with others: there may be a bounce."""
+
+
+class _BallFilter(FilterpyEKF):
+    """filterpy's filter with the ball's own prediction: x, P, F, Q, R are its attributes, the update is its own.
+
+    Its update uses the Joseph form (I - K H) P (I - K H)^T + K R K^T, positive definite under rounding.
+    """
+
+    def __init__(self, model: BallModel, surfaces: Surfaces, mean: Array, covariance: Array) -> None:
+        super().__init__(dim_x=len(mean), dim_z=3)
+        self.model = model
+        self.surfaces = surfaces
+        self.x = mean
+        self.P = covariance
+        self.H = np.eye(3, len(mean))
+        self.predicted = mean
+
+    def move(self, point: Array, dt: float) -> Motion:
+        """Sets F at the linearisation point, and the mean that `predict_x` will put into x."""
+        motion = advance_jacobian(self.model, torch.from_numpy(point)[None], dt, self.surfaces)
+        self.F = motion.jacobian.numpy()
+        self.predicted = motion.after[0].numpy() + self.F @ (self.x - point)
+        return motion
+
+    def predict_x(self, u: float = 0) -> None:
+        """The mean follows the nonlinear motion, not F x."""
+        self.x = self.predicted
+
+    def linearisation_point(self, measured: Array, dt: float, R: Array) -> Array:
+        """(d,) the mean; while the velocity is wide, the mean given the interval's sample in drag-free flight.
+
+        It is no information, only the place of the tangent: the sample itself still updates the state once.
+        """
+        P = self.P
+        if np.trace(P[VELOCITY, VELOCITY]) < WIDE_VELOCITY**2:
+            return self.x
+        H = self.H.copy()
+        H[:, VELOCITY] = dt * np.eye(3)
+        miss = measured - H @ self.x
+        miss[Z] += 0.5 * STANDARD_GRAVITY * dt**2
+        point = self.x.copy()
+        point[:6] += (P @ H.T @ np.linalg.solve(H @ P @ H.T + R, miss))[:6]
+        return point
+
+    def innovation(self, measured: Array) -> Array:
+        """(3,) whitened: measured minus predicted position over the root of its covariance H P H^T + R."""
+        root = np.linalg.cholesky(self.P[POSITION, POSITION] + self.R)
+        return np.asarray(np.linalg.solve(root, measured - self.x[POSITION]))
+
+    def correct(self, measured: Array) -> None:
+        """The update of filterpy with a measured position."""
+        self.update(measured, lambda _: self.H, lambda x: x[POSITION])
+
+
+class ExtendedKalmanFilter(Estimator):
+    """The extended Kalman filter; with `smooth`, followed by a Rauch-Tung-Striebel pass.
+
+    The state is the 9-vector and, with `settings.coefficients`, the model's uncertain coefficients. Contacts happen
+    where the predicted flight meets a surface. With `settings.find_events`, samples beyond the gate are outliers,
+    and four of them in a row make a hit: the filter goes back to before the first one, widens velocity and spin by
+    `settings.process.hit_velocity` and `hit_spin`, and starts anew at the measurements.
+
+    Args:
+        model: the ball.  surfaces: what it may bounce on.  settings: noise and priors.
+        smooth: adds the backward pass; the name is then "ekf+rts", innovations are leave-one-out.
+        initialise: "prior": the first sample with its own noise as the position, velocity 0 +- `velocity_prior`,
+            spin label or prior, so that each sample is used once. "window": the sliding window's state at its fifth
+            sample with the sliding window's covariance (noise and lag); the filter then starts with the sixth, and
+            the states before are the sliding window's. Each sample is used once there, too.
+
+    Raises: ValueError: for another `initialise`, or coefficients that the model does not have.
+    """
+
+    name = "ekf"
+
+    def __init__(
+        self,
+        model: BallModel,
+        surfaces: Surfaces,
+        settings: Settings,
+        smooth: bool = False,
+        initialise: Literal["prior", "window"] = "prior",
+    ) -> None:
+        super().__init__(model, surfaces, settings)
+        if initialise not in ("prior", "window"):
+            raise ValueError(f"initialise must be 'prior' or 'window'; got {initialise!r}")
+        self.trackwise = trackwise_model(model, settings)
+        self.smooth = smooth
+        self.initialise = initialise
+        if smooth:
+            self.name = "ekf+rts"  # type: ignore[misc]  # the class's name is that of its default
+
+    def estimate(self, track: Track) -> Estimate:
+        """The states of a track, each given the samples so far; with `smooth` given all samples.
+
+        Coefficients are those of the last sample; cross covariances tie each state to the coefficients at that state.
+        """
+        run = _Run(self, track)
+        record = run.record
+        if not run.finite():
+            return self._failed(track, run)
+        mean, covariance = rts_smooth(record) if self.smooth else (record.mean, record.covariance)
+        if record.start > 0 and (self.smooth or self.initialise == "prior"):
+            fly_back(self.trackwise, record.start, track.times, run.flight_noise, mean, covariance)
+        whitened = record.whitened
+        if self.smooth:
+            samples = record.position_rows(mean, track.positions, run.sigma)
+            states = mean[:, :STATE_DIM], covariance[:, :STATE_DIM, :STATE_DIM]
+            whitened = leave_one_out(*states, track.positions, run.sigma, samples)
+        return self._result(track, run, mean, covariance, whitened)
+
+    def _result(self, track: Track, run: _Run, mean: Array, covariance: Array, whitened: Array) -> Estimate:
+        states = mean[:, :STATE_DIM]
+        contacts = tuple(contact for i in sorted(run.record.contacts) for contact in run.record.contacts[i])
+        honest = widen_near_contacts(
+            track.times, states, covariance[:, :STATE_DIM, :STATE_DIM], contacts, self.model, self.surfaces
+        )
+        return Estimate(
+            name=track.name,
+            times=track.times,
+            states=states,
+            covariances=honest,
+            status=_status(run.record.used),
+            whitened=whitened,
+            coefficient_names=tuple(self.settings.coefficients),
+            coefficients=mean[-1, STATE_DIM:],
+            coefficient_covariance=covariance[-1, STATE_DIM:, STATE_DIM:],
+            cross_covariances=covariance[:, :STATE_DIM, STATE_DIM:],
+            contacts=contacts,
+            hits=np.array(run.record.hits, dtype=np.int64),
+            quality=run.record.quality,
+        )
+
+    def _failed(self, track: Track, run: _Run) -> Estimate:
+        """Measured positions and priors."""
+        pairs = [run.prior(i) for i in range(len(track))]
+        mean, covariance = (np.stack(part) for part in zip(*pairs, strict=True))
+        result = self._result(track, run, mean, covariance, np.full((len(track), 3), np.nan))
+        return replace(result, status=Status.FAILED)
+
+
+def _status(used: NDArray[np.bool_]) -> Status:
+    """A filter that set aside most of what it saw has lost the ball, or was told wrong things about it."""
+    if used.sum() < 2:
+        return Status.NO_VELOCITY
+    return Status.OK if used.mean() >= LEAST_USED else Status.NOT_CONVERGED
+
+
+class _Run:
+    """One pass of the filter over one track; `record` is what comes out."""
+
+    def __init__(self, owner: ExtendedKalmanFilter, track: Track) -> None:
+        self.owner = owner
+        self.track = track
+        self.settings = owner.settings
+        self.sigma = sample_sigmas(owner.settings, len(track), track.sigmas)
+        self.flight_noise = owner.settings.process.flight(np.diff(track.times))
+        self.means = coefficient_means(owner.model, owner.settings)
+        self.skipped: set[int] = set()
+        self.record = FilterRecord.empty(len(track), STATE_DIM + len(self.means))
+        with np.errstate(over="ignore", invalid="ignore"):  # ends in Status.FAILED
+            self._filter()
+
+    def finite(self) -> bool:
+        """Whether all of it is a number."""
+        return bool(np.isfinite(self.record.mean).all() and np.isfinite(self.record.covariance).all())
+
+    def prior(self, i: int) -> tuple[Array, Array]:
+        """What is known at sample i from it alone: mean (d,) and covariance (d, d)."""
+        spin, spin_sigma = spin_start(self.settings.spin_label(self.track), self.settings)
+        mean = np.concatenate((self.track.positions[i], np.zeros(3), spin, self.means))
+        sigma = (
+            self.sigma[i],
+            np.full(3, self.settings.velocity_prior),
+            np.full(3, spin_sigma),
+            np.array(list(self.settings.coefficients.values())),
+        )
+        return mean, np.diag(np.concatenate(sigma) ** 2)
+
+    def _filter(self) -> None:
+        """All samples in turn; back to before the first of four that were rejected, with a hit there."""
+        n, record = len(self.track), self.record
+        ball = self._begin()
+        k = record.start + 1
+        rejected: list[int] = []
+        while k < n:
+            self._predict(ball, k)
+            if not (np.isfinite(ball.x).all() and np.isfinite(ball.P).all()):
+                record.mean[k:] = np.nan
+                return
+            if k in self.skipped:
+                self._store(ball, k, used=False)
+            elif self._accept(ball, k):
+                rejected = []
+            else:
+                rejected.append(k)
+            if len(rejected) == REJECTED_FOR_HIT:
+                k, rejected = rejected[0], []
+                self._hit(ball, k)
+            else:
+                k += 1
+
+    def _begin(self) -> _BallFilter:
+        """The filter at its first sample, or at the window's end."""
+        record, owner = self.record, self.owner
+        first, second = self._first_pair(0)
+        mean, covariance = self.prior(first)
+        start = first
+        if owner.initialise == "window":
+            start = min(first + WINDOW - 1, len(self.track) - 1)
+            window = SlidingWindow(owner.model, owner.surfaces, self.settings).estimate(self.track)
+            record.mean[:, :STATE_DIM] = window.states
+            record.mean[:, STATE_DIM:] = mean[STATE_DIM:]
+            record.covariance[:] = covariance
+            record.covariance[:, :STATE_DIM, :STATE_DIM] = window.covariances
+            mean, covariance = record.mean[start].copy(), record.covariance[start].copy()
+        record.start = start
+        record.quality[:first] = Quality.OUTLIER
+        self.skipped.update(range(first + 1, second))
+        ball = _BallFilter(owner.trackwise, owner.surfaces, mean, covariance)
+        self._store(ball, start, used=True)
+        return ball
+
+    def _hit(self, ball: _BallFilter, since: int) -> None:
+        """Back to before sample `since`; the flight begins anew at the first good one from there on."""
+        first, second = self._first_pair(since)
+        self.skipped.update(range(since, first))
+        self.skipped.update(range(first + 1, second))
+        self.record.hits.append(first - 1)
+        ball.x = self.record.mean[since - 1].copy()
+        ball.P = self.record.covariance[since - 1].copy()
+
+    def _first_pair(self, first: int) -> tuple[int, int]:
+        """The first two good samples of a flight from sample `first` on; a filter believes them whatever they are."""
+        if not self.settings.find_events:
+            return first, first + 1
+        z = self.track.positions[:, Z, None] - self.owner.model.radius
+        near = np.abs(z - np.array(self.owner.surfaces.heights())).min(axis=-1) < NEAR_SURFACE
+        return first_pair(self.track.times, self.track.positions, self.sigma, near, first)
+
+    def _predict(self, ball: _BallFilter, k: int) -> None:
+        """To the time of sample k."""
+        times, record = self.track.times, self.record
+        used = next((i for i in range(k, len(times)) if i not in self.skipped), k)
+        R = np.diag(self.sigma[used] ** 2)
+        point = ball.linearisation_point(self.track.positions[used], times[used] - times[k - 1], R)
+        motion = ball.move(point, times[k] - times[k - 1])
+        ball.Q = self._noise(k, motion)
+        ball.R = np.diag(self.sigma[k] ** 2)
+        ball.predict()
+        record.contacts.pop(k - 1, None)
+        if motion.contacts:
+            begin = float(times[k - 1])
+            record.contacts[k - 1] = tuple(Contact(k - 1, begin + time, height) for time, height in motion.contacts)
+        record.prior_mean[k], record.prior_covariance[k] = ball.x, ball.P
+        record.transition[k], record.noise[k] = ball.F, ball.Q
+
+    def _noise(self, k: int, motion: Motion) -> Array:
+        """(d, d) process noise from sample k - 1 to k: flight, contacts, a hit at an unknown time."""
+        process, dt = self.settings.process, np.diff(self.track.times[k - 1 : k + 1])
+        covariance = self.flight_noise[k - 1].copy()
+        for time, _ in motion.contacts:
+            covariance += process.contact(dt, np.array([time]))[0]
+        if k - 1 in self.record.hits:
+            covariance += process.hit(dt)[0]
+            covariance[POSITION, POSITION] += HIT_POSITION**2 * np.eye(3)
+        noise = np.zeros((len(self.record.mean[k]),) * 2)
+        noise[:STATE_DIM, :STATE_DIM] = covariance
+        return noise
+
+    def _accept(self, ball: _BallFilter, k: int) -> bool:
+        """Update with sample k unless it lies beyond the gate; the first sample after a hit always counts."""
+        measured = self.track.positions[k]
+        whitened = self.record.whitened[k] = ball.innovation(measured)
+        used = not self.settings.find_events or k - 1 in self.record.hits or bool(whitened @ whitened <= GATE)
+        if used:
+            ball.correct(measured)
+        self._store(ball, k, used)
+        return used
+
+    def _store(self, ball: _BallFilter, k: int, used: bool) -> None:
+        self.record.mean[k] = ball.x
+        self.record.covariance[k] = ball.P = (ball.P + ball.P.T) / 2
+        self.record.quality[k] = Quality.GOOD if used else Quality.OUTLIER

@@ -1,0 +1,132 @@
+"""The record of a filter's run over a track, and the Rauch-Tung-Striebel pass that smooths it.
+
+Source: H. E. Rauch, F. Tung, C. T. Striebel, "Maximum likelihood estimates of linear dynamic systems", AIAA Journal
+3(8), 1965, equations 3.30 and 3.31; the covariance in the form that stays positive definite under rounding.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.integrate import fly_jacobian
+from ballfg.estimation.segmentation import Contact, Quality
+from ballfg.factors.batch import Rows
+from ballfg.factors.loss import Loss
+from ballfg.state import POSITION, STATE_DIM
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class FilterRecord:
+    """What a filter knew at each of n samples; states of dimension d = 9 + p, coefficients of the model at the end.
+
+    Attributes:
+        start: first sample that the filter knows something of.
+        prior_mean: (n, d) and prior_covariance: (n, d, d), before the sample.
+        mean: (n, d) and covariance: (n, d, d), after it.
+        transition: (n, d, d), Jacobian of the motion from the sample before.
+        noise: (n, d, d), process noise gathered since the sample before.
+        whitened: (n, 3), innovations divided by their standard deviations; NaN where there is none.
+        quality: (n,) `Quality`.
+        contacts: for each interval that has any.
+        hits: intervals.
+    """
+
+    prior_mean: Array
+    prior_covariance: Array
+    mean: Array
+    covariance: Array
+    transition: Array
+    noise: Array
+    whitened: Array
+    quality: NDArray[np.int8]
+    start: int = 0
+    contacts: dict[int, tuple[Contact, ...]] = field(default_factory=dict)
+    hits: list[int] = field(default_factory=list)
+
+    @classmethod
+    def empty(cls, n: int, d: int) -> FilterRecord:
+        """A record of n samples with nothing in it yet."""
+        square = (n, d, d)
+        return cls(
+            prior_mean=np.zeros((n, d)),
+            prior_covariance=np.zeros(square),
+            mean=np.zeros((n, d)),
+            covariance=np.zeros(square),
+            transition=np.zeros(square),
+            noise=np.zeros(square),
+            whitened=np.full((n, 3), np.nan),
+            quality=np.full(n, Quality.GOOD, dtype=np.int8),
+        )
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """(n,) samples that took part."""
+        return self.quality != Quality.OUTLIER
+
+    def position_rows(self, mean: Array, measured: Array, sigma: Array) -> Rows:
+        """The samples that took part, as whitened position residuals at `mean` (n, d).
+
+        Args: mean: (n, d).  measured: (n, 3) m.  sigma: (n, 3) m.
+        """
+        n = len(mean)
+        whitening = (self.used & (np.arange(n) >= self.start))[:, None] / sigma
+        jacobian = np.zeros((n, 3, STATE_DIM))
+        jacobian[:, np.arange(3), np.arange(3)] = whitening
+        return Rows(np.arange(n)[:, None], whitening * (mean[:, POSITION] - measured), (jacobian,), Loss())
+
+
+def rts_smooth(record: FilterRecord) -> tuple[Array, Array]:
+    """Means (n, d) and covariances (n, d, d) given all samples; those before `record.start` are left as they are.
+
+    Filterpy has this pass for linear filters only: it predicts with F x; here the prediction is the motion itself.
+
+    With C = P_k F^T (P-_{k+1})^-1, from the last sample to the first:
+    x^s_k = x_k + C (x^s_{k+1} - x-_{k+1}) and P^s_k = (I - C F) P_k (I - C F)^T + C (P^s_{k+1} + Q) C^T.
+
+    At a hit P- holds the hit's wide jump, so that C is small there and little is carried across.
+    """
+    mean, covariance = record.mean.copy(), record.covariance.copy()
+    identity = np.eye(mean.shape[1])
+    for k in range(len(mean) - 2, record.start - 1, -1):
+        F, P = record.transition[k + 1], record.covariance[k]
+        C = _gain(P @ F.T, record.prior_covariance[k + 1])
+        mean[k] = record.mean[k] + C @ (mean[k + 1] - record.prior_mean[k + 1])
+        rest = identity - C @ F
+        smoothed = rest @ P @ rest.T + C @ (covariance[k + 1] + record.noise[k + 1]) @ C.T
+        covariance[k] = (smoothed + smoothed.T) / 2
+    return mean, covariance
+
+
+def _gain(cross: Array, covariance: Array) -> Array:
+    """The product cross @ covariance^-1, with the covariance scaled to a correlation: entries span eight decades."""
+    scale = 1.0 / np.sqrt(np.diagonal(covariance))
+    correlation = covariance * np.outer(scale, scale)
+    return np.asarray(np.linalg.solve(correlation, (cross * scale).T).T * scale)
+
+
+def fly_back(model: BallModel, start: int, times: Array, noise: Array, mean: Array, covariance: Array) -> None:
+    """Fills the states before sample `start`, in place: free flight back from it.
+
+    Args:
+        model: the ball, with its coefficients in the state.
+        start: the first sample with a state.
+        times: (n,) s.
+        noise: (n - 1, 9, 9), process noise of free flight over each interval.
+        mean: (n, d).
+        covariance: (n, d, d).
+    """
+    for k in range(start - 1, -1, -1):
+        after, jacobian = fly_jacobian(
+            model, torch.from_numpy(mean[k + 1 : k + 2]), torch.from_numpy(times[k : k + 1] - times[k + 1 : k + 2])
+        )
+        F = jacobian[0].numpy()
+        widened = covariance[k + 1].copy()
+        widened[:STATE_DIM, :STATE_DIM] += noise[k]
+        mean[k], covariance[k] = after[0].numpy(), F @ widened @ F.T

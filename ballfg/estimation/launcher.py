@@ -1,0 +1,84 @@
+"""A launcher whose settings tell the spin of a shot: what a trained model knows of it, for the estimators."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.estimation.filters.window_velocity import window_velocities
+from ballfg.tracks import SPIN_LABELS, Track
+
+FIRST_SAMPLES = 10
+"""The launch direction is the mean direction of flight over so many samples."""
+
+
+@dataclass(frozen=True)
+class SpinLabel:
+    """A spin that is known before the flight is looked at: (3,) rad/s, and its standard deviation per axis, rad/s."""
+
+    spin: NDArray[np.float64]
+    sigma: float
+
+
+@dataclass(frozen=True)
+class Launcher:
+    """Spin from the labels of a track.
+
+    Attributes:
+        embedding: what the settings mean.
+        sigma: rad/s, standard deviation per axis of the spin that they tell.
+        defaults: labels that hold where a track has none, for instance `group` for a dataset that is one group.
+    """
+
+    embedding: SpinEmbedding
+    sigma: float
+    defaults: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.sigma) and self.sigma > 0.0):
+            raise ValueError(f"sigma must be positive and finite; got {self.sigma}. Leave the launcher out instead.")
+
+    @classmethod
+    def of_levels(cls, topspin: float, sidespin: float, sigma: float) -> Launcher:
+        """A launcher whose spin per level is known, of the labels `topspin` and `sidespin`.
+
+        Topspin turns about the horizontal axis across the flight (the top of the ball moves forward), sidespin about
+        the vertical.
+
+        Args: topspin, sidespin: rad/s per level.  sigma: as in the class.
+        """
+        rows = torch.tensor([[0.0, topspin, 0.0], [0.0, 0.0, sidespin]], dtype=torch.float64)
+        return cls(SpinEmbedding(("topspin", "sidespin"), {}, rows), sigma)
+
+    def settings(self, track: Track) -> NDArray[np.float64] | None:
+        """(k,) the settings of a shot; None where the track does not tell them, or has a spin label of its own."""
+        if track.spin_label is not None:
+            return None
+        found = self.embedding.settings({**self.defaults, **track.labels})
+        return None if found is None else found.numpy()
+
+    def label(self, track: Track) -> SpinLabel | None:
+        """The spin that the settings and the first samples tell; None where they do not.
+
+        For estimators that need the spin before they know the velocity; the smoother estimates both together.
+        """
+        settings = self.settings(track)
+        if settings is None or len(track) < 2:
+            return None
+        first = slice(0, FIRST_SAMPLES)
+        velocity = window_velocities(track.times[first], track.positions[first]).mean(axis=0)
+        with torch.no_grad():
+            spin = self.embedding.spin(torch.from_numpy(settings), torch.from_numpy(velocity))
+        return SpinLabel(spin.numpy(), self.sigma)
+
+    def labelled(self, track: Track) -> Track:
+        """The track with spin labels made from its settings, for methods that know labels only; else as it is."""
+        label = self.label(track)
+        if label is None:
+            return track
+        return replace(track, labels={**track.labels, **dict(zip(SPIN_LABELS, label.spin.tolist(), strict=True))})

@@ -1,0 +1,1 @@
+"""Measurement effects undone, and the noise of positions."""

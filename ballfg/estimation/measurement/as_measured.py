@@ -1,0 +1,120 @@
+"""Between what happened and what is written down: stamps, positions and spin labels, as a model measures them."""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.rollout import advance
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.state import POSITION, STATE_DIM
+
+Array = NDArray[np.float64]
+
+_MEASUREMENT = "measurement"
+"""Attribute of an `AnalyticModel` that holds its measurement effects."""
+LARGEST_CONDITION = 1e6
+"""Of the map from spins to labels: beyond it a label leaves a component of the spin open."""
+
+
+def plainly_measured(model: BallModel) -> BallModel:
+    """The ball of a model, its positions, stamps and labels written down as they are; all parameters are shared.
+
+    Raises: TypeError: if the model measures by other means than the effects of an analytic model or of its base.
+    """
+    plain = _without_effects(model)
+    if not plain.measures_plainly:
+        raise TypeError(
+            f"model must get its measurement from measurement effects; {type(model).__name__} has one of its own. "
+            "Write it as a MeasurementEffect of an AnalyticModel."
+        )
+    return plain
+
+
+def _without_effects(model: BallModel) -> BallModel:
+    if model.measures_plainly:
+        return model
+    plain = copy.copy(model)
+    plain._modules = {
+        name: _without_effects(child) if isinstance(child, BallModel) else child
+        for name, child in model._modules.items()
+    }
+    if isinstance(plain._modules.get(_MEASUREMENT), torch.nn.ModuleDict):
+        plain._modules[_MEASUREMENT] = torch.nn.ModuleDict()
+    return plain
+
+
+def true_times(model: BallModel, times: Array) -> Array:
+    """(n,) s, when the samples of a track were taken; the first stamp is right. Those of a plain model, to the bit.
+
+    Args: times: (n,) s, all stamps of the track from its first on.
+    """
+    if model.measures_plainly:
+        return times
+    with torch.no_grad():
+        return np.asarray(times[0] + model.true_stamps(torch.from_numpy(times - times[0])).numpy())
+
+
+def written_time(model: BallModel, first: float, time: float) -> float:
+    """What a track whose first stamp is `first` would write at a true time; both s."""
+    with torch.no_grad():
+        return first + float(model.stamps(torch.tensor(time - first, dtype=torch.float64)))
+
+
+@torch.no_grad()
+def measured_positions(model: BallModel, states: Tensor, surfaces: Surfaces) -> Tensor:
+    """(n, 3) m, where balls will be measured, before noise.
+
+    Args:
+        model: may be augmented.
+        states: (n, 9 + p), true.
+        surfaces: what a ball may bounce on between the moments that one sample is made of.
+    """
+    if model.measures_plainly:
+        return states[:, POSITION]
+
+    def later(delay: Tensor) -> Tensor:
+        return advance(model, states, delay.expand(len(states)), surfaces)[:, :STATE_DIM]
+
+    return model.measured(states, later)
+
+
+@dataclass(frozen=True)
+class LabelMap:
+    """How labels come from spins: label = matrix spin + offset.
+
+    Attributes:
+        matrix: (3, 3).
+        offset: (3,) rad/s.
+    """
+
+    matrix: Array
+    offset: Array
+
+    @classmethod
+    def of(cls, model: BallModel) -> LabelMap:
+        """The map of a model. Raises: ValueError: if it gives different spins the same label."""
+        with torch.no_grad():
+            offset = model.labelled(torch.zeros(3, dtype=torch.float64)).numpy()
+            columns = model.labelled(torch.eye(3, dtype=torch.float64)).numpy() - offset
+        if not np.linalg.cond(columns) < LARGEST_CONDITION:
+            raise ValueError(
+                "model must give different spins different labels; its effects on spin labels make "
+                f"{columns.T.round(3).tolist()} of the unit matrix. Change their coefficients or leave them out."
+            )
+        return cls(columns.T, offset)
+
+    def spin(self, label: Array) -> Array:
+        """(3,) rad/s, the spin of a label (3,) rad/s."""
+        return np.asarray(np.linalg.solve(self.matrix, label - self.offset))
+
+    @property
+    def gain(self) -> float:
+        """By which labels are larger than spins, in the mean over all directions."""
+        return float(abs(np.linalg.det(self.matrix)) ** (1.0 / 3.0))

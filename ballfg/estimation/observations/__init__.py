@@ -1,0 +1,1 @@
+"""Observations: what was measured, as objects that every estimator knows."""

@@ -1,0 +1,93 @@
+"""The balls of a dataset as its cameras saw them: `detections.csv` and `cameras.yaml` of its folder."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from os import PathLike
+from pathlib import Path
+
+from ballfg.estimation.observations.sighted import NeverSeenByTwoError, SightedTrack, sighted_track
+from ballfg.tracks.detections_file import DETECTIONS_FILE, read_sightings
+from ballfg.tracks.info import INFO_FILE, DatasetInfo, read_info
+from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
+from ballfg.tracks.sightings import Sightings
+from ballfg.vision.camera import Camera
+from ballfg.vision.camera_file import CAMERAS_FILE, read_cameras
+
+
+class SightedDataset:
+    """The tracks of a folder as cameras saw them; made by `read_sighted`. A table of tracks need not be there.
+
+    Attributes:
+        path: the folder.
+        info: what `dataset.yaml` states.
+        cameras: of the rig.
+        notes: what was ignored or left out, one sentence each.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        info: DatasetInfo,
+        cameras: tuple[Camera, ...],
+        balls: dict[str, Sightings],
+        labels: LabelTable,
+        notes: list[str],
+    ) -> None:
+        self.path = path
+        self.info = info
+        self.cameras = cameras
+        self.notes = notes
+        self._tracks = {}
+        for name, sightings in balls.items():
+            try:
+                self._tracks[name] = sighted_track(name, sightings, cameras, labels.of(name))
+            except NeverSeenByTwoError as error:
+                notes.append(str(error))
+
+    def __len__(self) -> int:
+        return len(self._tracks)
+
+    def __iter__(self) -> Iterator[SightedTrack]:
+        return iter(self._tracks.values())
+
+    def __repr__(self) -> str:
+        return f"SightedDataset({self.info.name!r}, {len(self)} tracks, {len(self.cameras)} cameras)"
+
+    @property
+    def names(self) -> list[str]:
+        """The names of the trajectories, in the order of the tracks."""
+        return list(self._tracks)
+
+
+def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
+    """Opens the detections of a dataset and checks all of them. They are held in memory.
+
+    Args:
+        folder: holds `dataset.yaml`, `cameras.yaml`, `detections.csv` with the trajectory of each row, and optionally
+            `labels.csv`.
+    Returns: the balls that two cameras saw; `notes` tell of others.
+    Raises:
+        FileNotFoundError: one of the files is missing.
+        ValueError: the content breaks a rule, or there is no ball in it; the message names file, line and remedy.
+    """
+    path = Path(folder)
+    for name in (INFO_FILE, CAMERAS_FILE, DETECTIONS_FILE):
+        if not (path / name).is_file():
+            raise FileNotFoundError(
+                f"{path} must hold {INFO_FILE}, {CAMERAS_FILE} and {DETECTIONS_FILE} for an estimate from detections; "
+                f"{name} is missing. Add it, or make the folder with 'ballfg track'."
+            )
+    info, notes = read_info(path / INFO_FILE)
+    cameras = tuple(read_cameras(path / CAMERAS_FILE))
+    balls, more = read_sightings(path / DETECTIONS_FILE, {camera.name: camera.time_offset for camera in cameras})
+    labels = LabelTable({}, {})
+    if (path / LABELS_FILE).is_file():
+        labels = read_labels(path / LABELS_FILE, list(balls))
+    dataset = SightedDataset(path, info, cameras, balls, labels, notes + more)
+    if not len(dataset):
+        raise ValueError(
+            f"{path / DETECTIONS_FILE}: must hold a ball that two cameras saw, its name in the column 'trajectory'; "
+            f"got none ({len(balls)} named). Find balls with 'ballfg track', or look at the calibration."
+        )
+    return dataset

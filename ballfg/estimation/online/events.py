@@ -1,0 +1,161 @@
+"""Events as a stream brings them: what the segmenter believes now, laid over the samples of the window."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.online.isam import Sample
+from ballfg.estimation.segmentation import Event, EventKind, Segmentation, SegmentationPhysics, Segmenter
+from ballfg.estimation.segmentation.assembly import BREAKS, contacts_of, intervals_of, quality_of, rests_of
+from ballfg.estimation.segmentation.result import Quality
+from ballfg.estimation.segmentation.second_look import SIDE, hits_at_contacts
+from ballfg.estimation.segmentation.settings import SegmentationSettings
+from ballfg.estimation.smoother.motion import Motion
+from ballfg.estimation.smoother.problem import QUALITY_SIGMA
+from ballfg.state import STANDARD_GRAVITY, VZ, Z
+
+Array = NDArray[np.float64]
+
+SIGMA_FACTOR = np.array([QUALITY_SIGMA.get(quality, 1.0) for quality in Quality])
+"""Standard deviation of a sample of each quality, in multiples of a good one's."""
+UNUSABLE = QUALITY_SIGMA[Quality.SHIFTED]
+"""Multiple of the standard deviation from which a sample does not shape its state."""
+MOVE_MARGIN = 0.02
+"""Share of an interval by which the estimated contact must lie outside it before it moves: keeps it from flapping."""
+MOST_MOVES = 6
+"""How often one contact may move."""
+
+
+class EventTracker:
+    """Keeps a segmenter's final and pending events and turns them into a segmentation of the window.
+
+    Args:
+        surfaces: table and floor.  physics: of the ball.
+        find_events: False leaves contacts only, as the smoother does.
+    """
+
+    def __init__(self, surfaces: Surfaces, physics: SegmentationPhysics, find_events: bool) -> None:
+        self.settings = SegmentationSettings()
+        self.physics = physics
+        self.find_events = find_events
+        self.segmenter = Segmenter(surfaces, physics, self.settings)
+        self._final: list[Event] = []
+        self._pending: tuple[Event, ...] = ()
+        self._moves: dict[tuple[int, float], list[int]] = {}  # steps of each contact, by the place it was found at
+
+    def push(self, time: float, position: Array, sigma: Array) -> bool:
+        """Takes in a sample; returns whether the explanation of the window may differ from the last one."""
+        decision = self.segmenter.push(time, position, sigma)
+        before = (*self._final, *self._pending)
+        self._final += decision.final
+        self._pending = decision.pending
+        after = (*self._final, *self._pending)
+        changed = len(before) != len(after) or any(a is not b for a, b in zip(before, after, strict=True))
+        return changed or self._resting() or self._second_look_due()
+
+    def _resting(self) -> bool:
+        state = [e.kind for e in (*self._final, *self._pending) if e.kind in _REST_KINDS]
+        return bool(state) and state[-1] is EventKind.REST
+
+    def _second_look_due(self) -> bool:
+        """A contact has just got enough samples after it to be told from a hit."""
+        newest = self.segmenter.count - 1
+        return any(e.kind is EventKind.CONTACT and e.index + SIDE == newest for e in self._pending)
+
+    def segmentation(self, first: int, times: Array, positions: Array) -> Segmentation:
+        """The best explanation of the samples first, first + 1, ... of the stream, numbered from 0.
+
+        Args: first: number of the window's first sample.  times: (n,) s.  positions: (n, 3) m.
+        """
+        self._final = _still_needed(self._final, first)
+        events = [replace(e, index=e.index - first) for e in (*self._final, *self._pending) if _matters(e, first)]
+        n = len(times)
+        contacts, hits = contacts_of(events), intervals_of(events, *BREAKS)
+        quality = quality_of(events, n, self.settings.shift_level)
+        hits += hits_at_contacts(times, positions, quality <= Quality.WIDE, contacts, hits, self.physics, self.settings)
+        found = Segmentation(
+            contacts=tuple(contacts),
+            hits=np.array(sorted(hits), dtype=np.int64),
+            restarts=np.array(intervals_of(events, EventKind.RESTART), dtype=np.int64),
+            rests=tuple(rests_of(events, n)),
+            quality=quality,
+        )
+        return found if self.find_events else found.only_contacts()
+
+    def moved(self, segmentation: Segmentation, first: int) -> Segmentation:
+        """The segmentation with its contacts where the estimate has moved them."""
+        if not self._moves:
+            return segmentation
+        self._moves = {place: steps for place, steps in self._moves.items() if place[0] >= first - 1}
+        contacts = [
+            replace(c, interval=c.interval + sum(self._moves.get((c.interval + first, c.height), ())))
+            for c in segmentation.contacts
+        ]
+        return replace(segmentation, contacts=tuple(contacts))
+
+    def move(self, interval: int, height: float, step: int) -> bool:
+        """Note that the contact in an interval of the stream belongs to a neighbour; False if it moved too often."""
+        for place, steps in self._moves.items():
+            if place[1] == height and place[0] + sum(steps) == interval:
+                if len(steps) >= MOST_MOVES:
+                    return False
+                steps.append(step)
+                return True
+        self._moves[interval, height] = [step]
+        return True
+
+    def rise(self, height: float) -> float:
+        """m, z of the ball's centre when it touches a surface declared at `height`."""
+        return height + self.physics.surface_offset + self.physics.radius
+
+
+_REST_KINDS = (EventKind.REST, EventKind.LEAVE, *BREAKS)
+
+
+def _matters(event: Event, first: int) -> bool:
+    """An event inside the window, or the rest that the window begins in."""
+    inside = event.index >= first - (event.kind is EventKind.REST)
+    return inside or event.kind is EventKind.REST
+
+
+def _still_needed(events: list[Event], first: int) -> list[Event]:
+    """Events in the window, and the last rest, leave or break before it."""
+    old = [e for e in events if e.index < first and e.kind in _REST_KINDS]
+    open_rest = old[-1:] if old and old[-1].kind is EventKind.REST else []
+    return open_rest + [e for e in events if e.index >= first]
+
+
+def contact_step(state: Array, rise: float, dt: float) -> int:
+    """Where a contact belongs, seen from the interval it is in: -1 the one before, 1 the next, 0 it stays.
+
+    The ball's path over one interval is a parabola to some micrometres.
+
+    Args: state: (9,) at the interval's start.  rise: m, z of the centre at the contact.  dt: s.
+    """
+    above, vz = float(state[Z]) - rise, float(state[VZ])
+    root = vz * vz + 2 * STANDARD_GRAVITY * above
+    if root < 0.0:
+        return 0
+    time = (vz + math.sqrt(root)) / STANDARD_GRAVITY
+    if time < -MOVE_MARGIN * dt:
+        return -1
+    return 1 if time > (1 + MOVE_MARGIN) * dt else 0
+
+
+def first_difference(samples: Sequence[Sample], motions: Sequence[Motion], factors: Array) -> int | None:
+    """The first sample that was reached otherwise, or whose usability differs, from what is now believed.
+
+    None if only noise levels differ: those change without going back.
+    """
+    for k, sample in enumerate(samples):
+        if k and not sample.motion.same(motions[k - 1]):
+            return k
+        if (sample.factor >= UNUSABLE) != (factors[k] >= UNUSABLE):
+            return k
+    return None

@@ -1,0 +1,127 @@
+"""The last word on a track: the window minimised to a tight tolerance, and the states that left it before."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.estimation.online.events import SIGMA_FACTOR
+from ballfg.estimation.online.isam import Sample
+from ballfg.estimation.online.window import Window
+from ballfg.estimation.result import Estimate
+from ballfg.estimation.segmentation import Contact, Segmentation
+from ballfg.estimation.settings import Settings
+from ballfg.estimation.smoother.problem import effective_sigmas
+from ballfg.estimation.smoother.smoother import Earlier, Smoother
+from ballfg.factors.batch import COEFFICIENTS, Array, FactorBatch, Index, Values
+from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+from ballfg.tracks import Track
+
+
+@dataclass(frozen=True)
+class Frozen:
+    """A state as it was when it left the window.
+
+    Attributes:
+        sample: its observation.  state: (9,).  joint: (9 + p, 9 + p) covariance with the coefficients.
+    """
+
+    sample: Sample
+    state: Array
+    joint: Array
+
+
+def freeze(window: Window, count: int) -> list[Frozen]:
+    """The window's oldest states with their covariances."""
+    shared, states, frozen = [COEFFICIENT_KEY] * (window.p > 0), window.states, []
+    for k in range(count):
+        joint = window.isam.jointMarginalCovariance([STATE_KEY + window.first + k, *shared]).fullMatrix()
+        frozen.append(Frozen(window.samples[k], states[k], joint))
+    return frozen
+
+
+def unknown(sample: Sample, settings: Settings, p: int) -> Frozen:
+    """A state of which nothing but its observation is known, because its window could not be solved."""
+    state, sigma = np.zeros(STATE_DIM), np.empty(STATE_DIM + p)
+    state[POSITION], sigma[POSITION] = sample.position, sample.sigma
+    sigma[VELOCITY], sigma[SPIN] = settings.velocity_prior, settings.spin_prior
+    sigma[STATE_DIM:] = list(settings.coefficients.values())
+    return Frozen(sample, state, np.diag(sigma**2))
+
+
+class LinearFactors(FactorBatch):
+    """A linear factor that marginalised states left: r = sum A_i (v_i - v_i*) - b.
+
+    Args:
+        factor: of iSAM2.  values: v*, of the window.  first: number of the window's first state.
+    """
+
+    def __init__(self, factor: gtsam.NonlinearFactor, values: Values, first: int) -> None:
+        keys = list(factor.keys())
+        numbers = [COEFFICIENTS if k == COEFFICIENT_KEY else k - STATE_KEY - first for k in keys]
+        at = gtsam.Values()
+        for number, key in zip(numbers, keys, strict=True):
+            at.insert(key, values.coefficients if number == COEFFICIENTS else values.states[number])
+        matrix, self.b = factor.linearize(at).jacobian()
+        super().__init__(np.array([numbers]), len(self.b))
+        widths = [len(values.coefficients) if n == COEFFICIENTS else STATE_DIM for n in numbers]
+        self.blocks = tuple(np.split(matrix, np.cumsum(widths)[:-1], axis=1))
+        self.points = tuple(np.array(values.gather(np.array([n]))) for n in numbers)
+
+    def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+        """Residual (1, r) and Jacobians (1, r, d)."""
+        parts = [block @ (x - at)[0] for block, x, at in zip(self.blocks, inputs, self.points, strict=True)]
+        return (np.sum(parts, axis=0) - self.b)[None], tuple(block[None] for block in self.blocks)
+
+
+def final_estimate(
+    smoother: Smoother, window: Window, track: Track, found: Segmentation, frozen: Sequence[Frozen]
+) -> Estimate:
+    """The result over a whole track.
+
+    Args:
+        smoother: with the window's model, surfaces and settings.
+        window: after the last push.
+        track: all of it.
+        found: the events among the window's samples.
+        frozen: the states that left the window, oldest first.
+    """
+    first = window.first
+    part = track if first == 0 else track.between(float(track.times[first]), float(track.times[-1]))
+    sigma = effective_sigmas(part, found, smoother.settings)
+    values = Values(window.states, window.coefficients)
+    summaries = [LinearFactors(factor, values, first) for factor in (window.shared if first else [])]
+    late = smoother.result(part, sigma, smoother.solve(part, found, sigma, Earlier(values, summaries)))
+    if not frozen:
+        return late
+    joints = np.array([f.joint for f in frozen])
+    contacts, hits, quality = _events_of(frozen)
+    return replace(
+        late,
+        times=track.times,
+        states=np.concatenate((np.array([f.state for f in frozen]), late.states)),
+        covariances=np.concatenate((joints[:, :STATE_DIM, :STATE_DIM], late.covariances)),
+        cross_covariances=np.concatenate((joints[:, :STATE_DIM, STATE_DIM:], late.cross_covariances)),
+        contacts=(*contacts, *(replace(c, interval=c.interval + first) for c in late.contacts)),
+        hits=np.concatenate((hits, late.hits + first)),
+        quality=np.concatenate((quality, late.quality)),
+    )
+
+
+def _events_of(frozen: Sequence[Frozen]) -> tuple[list[Contact], Index, NDArray[np.int8]]:
+    """Contacts, hits and qualities of the samples that left the window."""
+    contacts, hits = [], []
+    for k, state in enumerate(frozen):
+        motion = state.sample.motion
+        if k and motion.linked:
+            start = frozen[k - 1].sample.time
+            contacts += [Contact(k - 1, start + t, h) for t, h in zip(motion.times, motion.heights, strict=True)]
+        if k and (motion.hit or not motion.linked):
+            hits.append(k - 1)
+    quality = np.array([int(np.argmin(np.abs(SIGMA_FACTOR - f.sample.factor))) for f in frozen], dtype=np.int8)
+    return contacts, np.array(hits, dtype=np.int64), quality

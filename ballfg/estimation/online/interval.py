@@ -1,0 +1,152 @@
+"""What happens between two samples, as a dynamics factor of its own that joins others in one batch."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.integrate import steps_over
+from ballfg.estimation.smoother.motion import FLIGHT, Motion
+from ballfg.factors.batch import merge
+from ballfg.factors.bridge import Bridge, checked
+from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors
+from ballfg.factors.noise import ProcessNoise
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+
+Array = NDArray[np.float64]
+
+
+class Interval:
+    """One linked interval: its factor, and the last answer that its torch batch gave.
+
+    Args:
+        kind: one row, between states i and i + 1 of the stream.
+        motion: what happens.
+        covariance: (9, 9) of the process noise.
+
+    Attributes:
+        slot: where iSAM2 keeps the factor; None before it does.
+        group: intervals of one group can be evaluated together.
+    """
+
+    def __init__(self, kind: DynamicsFactors, motion: Motion, covariance: Array) -> None:
+        self.kind = kind
+        self.motion = motion
+        self.covariance = covariance
+        self.index = int(kind.variables[0, 0])
+        self.bridge = Bridge(kind, on_miss="row")
+        self.slot: int | None = None
+        steps = 1 if motion.heights else steps_over(float(kind.dt[0]))
+        self.group = (type(kind), len(motion.heights), steps)
+
+
+class IntervalMaker:
+    """Makes intervals for one model and noise; those of free flight, the usual case, quickly.
+
+    The correlation of the noise in flight does not depend on dt, so its root is computed once and scaled.
+    """
+
+    def __init__(self, model: BallModel, noise: ProcessNoise) -> None:
+        self.model = model
+        self.noise = noise
+        covariance = noise.flight(np.ones(1))
+        scale = np.sqrt(np.diagonal(covariance[0]))
+        self._template = FlightFactors(model, np.zeros(1, dtype=np.int64), np.ones(1), covariance)
+        self._root = self._template.whitening * scale
+        self._correlation = covariance[0] / (scale[:, None] * scale)
+
+    def make(self, index: int, motion: Motion, dt: float) -> Interval:
+        """The interval from state `index` of the stream to the next, dt s later."""
+        if motion == FLIGHT:
+            return self._flight(index, dt)
+        states, duration = np.array([index]), np.array([dt])
+        covariance = motion.covariance(duration, self.noise)
+        kind: DynamicsFactors
+        if motion.heights:
+            kind = ContactFactors(self.model, states, duration, covariance, np.array([motion.heights]))
+        elif motion.rest is not None:
+            kind = RestFactors(self.model, states, duration, covariance, np.array([motion.rest]))
+        else:
+            kind = FlightFactors(self.model, states, duration, covariance)
+        return Interval(kind, motion, covariance[0])
+
+    def _flight(self, index: int, dt: float) -> Interval:
+        scale = np.empty(STATE_DIM)
+        scale[POSITION] = self.noise.acceleration * math.sqrt(dt**3 / 3)
+        scale[VELOCITY] = self.noise.acceleration * math.sqrt(dt)
+        scale[SPIN] = self.noise.spin * math.sqrt(dt)
+        kind = copy.copy(self._template)
+        kind.variables = kind.variables.copy()
+        kind.variables[0, :2] = index, index + 1
+        kind.dt, kind.whitening = np.array([dt]), self._root / scale
+        return Interval(kind, FLIGHT, self._correlation * (scale[:, None] * scale))
+
+
+def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coefficients: Array) -> tuple[list[Array], int]:
+    """Residuals and Jacobians of some intervals, one torch call for all that share a motion, kept in their bridges.
+
+    Args:
+        intervals: k of them.
+        start: (k, 9) states at which they begin.
+        after: (l, 9) states at which the first l of them end; what the others lack is for `store` to put.
+        coefficients: (p,).
+    Returns: for each interval the propagated state and its Jacobian side by side, (9, 1 + 9 + p); number of calls.
+    Raises: ValueError: if the model gives something that is not finite.
+    """
+    groups: dict[tuple[type, int, int], list[int]] = {}
+    for k, interval in enumerate(intervals):
+        groups.setdefault(interval.group, []).append(k)
+    result: list[Array] = [np.empty(0)] * len(intervals)
+    for members in groups.values():
+        batch = merge([intervals[k].kind for k in members])
+        point = np.empty((len(members), STATE_DIM + len(coefficients)))
+        point[:, :STATE_DIM], point[:, STATE_DIM:] = start[members], coefficients
+        moved, jacobian = batch.propagate(torch.from_numpy(point), slice(None))
+        pieces = np.concatenate((moved.numpy()[:, :STATE_DIM, None], jacobian.numpy()[:, :STATE_DIM]), axis=2)
+        for row, k in enumerate(members):
+            result[k] = pieces[row]
+        count = sum(k < len(after) for k in members)  # the first ones: members ascend
+        if count:
+            ended = members[:count]
+            answers = _whitened(batch, pieces[:count], start[ended], after[ended], coefficients)
+            for row, k in enumerate(ended):
+                _keep(intervals[k], answers, row)
+    return result, len(groups)
+
+
+def store(interval: Interval, start: Array, after: Array, coefficients: Array, piece: Array) -> None:
+    """Whiten one interval's propagation and keep it for iSAM2's question; `piece` as from `evaluate`."""
+    _keep(interval, _whitened(interval.kind, piece[None], start[None], after[None], coefficients), 0)
+
+
+Answers = tuple[tuple[Array, ...], Array, tuple[Array, ...]]
+"""Inputs (k, d) of the variables, residuals (k, 9), Jacobians (k, 9, d)."""
+
+
+def _whitened(batch: DynamicsFactors, pieces: Array, start: Array, after: Array, coefficients: Array) -> Answers:
+    root = batch.whitening[: len(pieces)]
+    residual = (root @ (after - pieces[:, :, 0])[..., None])[..., 0]
+    by_start = -(root @ pieces[:, :, 1:])
+    inputs: tuple[Array, ...] = (start, after)
+    blocks: tuple[Array, ...] = (by_start[..., :STATE_DIM], root)
+    if len(coefficients):
+        inputs = (*inputs, np.broadcast_to(coefficients, (len(start), len(coefficients))))
+        blocks = (*blocks, by_start[..., STATE_DIM:])
+    return (inputs, *checked(batch, slice(None), inputs, residual, blocks))
+
+
+def _keep(interval: Interval, answers: Answers, row: int) -> None:
+    inputs, residual, blocks = answers
+    interval.bridge.keep(0, tuple([x[row] for x in inputs]), residual[row], tuple([j[row] for j in blocks]))
+
+
+def coefficient_count(model: BallModel) -> int:
+    """How many coefficients are estimated with the states."""
+    return len(model.names) if isinstance(model, AugmentedModel) else 0

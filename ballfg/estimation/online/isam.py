@@ -1,0 +1,331 @@
+"""iSAM2 over a window of states: one sample more, a few samples back, one state out at the old end.
+
+The window keeps a mirror of what iSAM2 holds: linearisation points and the linear solution about them. So it knows
+before an update which states GTSAM will relinearise, and evaluates their factors, together with the new one, in one
+torch call; the callbacks find their answers ready. docs/derivations/online.md explains the choices.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.dynamics.model import BallModel
+from ballfg.estimation.launcher import SpinLabel
+from ballfg.estimation.online.interval import Interval, IntervalMaker, coefficient_count, evaluate, store
+from ballfg.estimation.online.sighting import Sighting, prepare
+from ballfg.estimation.settings import Settings
+from ballfg.estimation.smoother.motion import FLIGHT, Motion
+from ballfg.estimation.smoother.problem import coefficient_means, start_priors
+from ballfg.factors.batch import FactorBatch
+from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
+from ballfg.factors.position import PositionFactors
+from ballfg.factors.prior import coefficient_prior
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+
+Array = NDArray[np.float64]
+
+VELOCITY_THRESHOLD = 0.3
+"""m/s. Linearised this far off, drag is wrong by k dv^2 = 0.012 m/s^2, and by 0.04 m/s^2 where the spin is off by
+`SPIN_THRESHOLD` as well: a third of the acceleration that the process noise allows over half a second, for as long as
+it takes the next state to be relinearised. Three times less costs twice the evaluations and changes nothing
+(docs/derivations/online.md)."""
+SPIN_THRESHOLD = 40.0
+"""rad/s. The Magnus force is linear in the spin: only its product with an error in velocity matters."""
+POSITION_THRESHOLD = 0.5
+"""Measurement standard deviations. Flight does not depend on the position; a robust loss's weight does."""
+COEFFICIENT_THRESHOLD = 0.5
+"""Prior standard deviations. The coefficients touch every factor: moving them relinearises the whole window."""
+_UNIT3 = gtsam.noiseModel.Unit.Create(3)
+WILDFIRE = 1e-7
+"""m, m/s, rad/s. Back-substitution stops where the solution changes by less."""
+
+
+@dataclass
+class Sample:
+    """One observation, and what is believed of it.
+
+    Attributes:
+        time: s.  position: (3,) m.  stated: (3,) m, its standard deviation as stated.
+        factor: multiple of that with which it takes part.
+        motion: how the ball got here from the sample before.
+        label: what is known of the spin, on the first sample of a track.
+        slots: where iSAM2 keeps the sample's own factors: what was measured first, then priors.
+        sightings: what cameras saw at this moment; where there are some, the position only helps to find events.
+    """
+
+    time: float
+    position: Array
+    stated: Array
+    factor: float = 1.0
+    motion: Motion = FLIGHT
+    label: SpinLabel | None = None
+    slots: tuple[int, ...] = ()
+    sightings: list[Sighting] = field(default_factory=list)
+
+    @property
+    def sigma(self) -> Array:
+        """(3,) m, the standard deviation with which it takes part."""
+        return self.stated * self.factor
+
+
+@dataclass(frozen=True)
+class Update:
+    """What one update did.
+
+    Attributes:
+        innovation: (3,) whitened, (2,) of a sighting; NaN where nothing predicted the sample.
+        evaluated: factors of the motion evaluated, the new one among them.
+        calls: torch calls for them.
+        variables: states that iSAM2 eliminated again.
+    """
+
+    innovation: Array
+    evaluated: int
+    calls: int
+    variables: int
+
+
+class IncrementalWindow:
+    """The last samples of a stream as a factor graph in iSAM2.
+
+    Args:
+        model: the ball, from `problem.trackwise_model`.  settings: noise and priors.
+        position_sigma: m, of a good measurement; scales the threshold of relinearisation in position.
+
+    Attributes:
+        first: number of the window's first state since the stream began.
+        samples: n of them.  intervals: n - 1, None where nothing links two samples.
+        theta: (n, 9) linearisation points.  delta: (n, 9) solution about them.
+        coefficient_theta, coefficient_delta: (p,) the same for the coefficients.
+        shared: factors that belong to no sample: the prior of the coefficients; once the window was cut, the linear
+            factors that took its place and that of all states that left.
+        newest_covariance: (9 + p, 9 + p) of the newest state and the coefficients.
+    """
+
+    def __init__(self, model: BallModel, settings: Settings, position_sigma: float) -> None:
+        self.model = model
+        self.settings = settings
+        self.position_sigma = position_sigma
+        self.maker = IntervalMaker(model, settings.process)
+        self.p = coefficient_count(model)
+        self._own_means = coefficient_means(model.model, settings) if self.p else np.zeros(0)  # type: ignore[arg-type]
+        self._own_sigmas = np.array(list(settings.coefficients.values()))
+        self.first = 0
+        self.samples: list[Sample] = []
+        self.intervals: list[Interval | None] = []
+        self.shared: list[gtsam.NonlinearFactor] = []
+        if self.p:
+            self.shared.append(Bridge(coefficient_prior(self._own_means, self._own_sigmas), "row").factor(0))
+        self.threshold = np.empty(STATE_DIM)
+        self.threshold[POSITION] = POSITION_THRESHOLD * position_sigma
+        self.threshold[VELOCITY], self.threshold[SPIN] = VELOCITY_THRESHOLD, SPIN_THRESHOLD
+        self._clear()
+
+    def _clear(self) -> None:
+        """An empty iSAM2 and no states."""
+        self.isam = self._new_isam()
+        self.theta, self.delta = np.zeros((0, STATE_DIM)), np.zeros((0, STATE_DIM))
+        self.coefficient_theta, self.coefficient_delta = self._own_means.copy(), np.zeros(self.p)
+        self.newest_covariance = np.zeros((0, 0))
+
+    def _new_isam(self) -> gtsam.ISAM2:
+        return gtsam.ISAM2(_parameters(self.threshold, COEFFICIENT_THRESHOLD * self._own_sigmas))
+
+    @property
+    def states(self) -> Array:
+        """(n, 9) the present estimate."""
+        return self.theta + self.delta
+
+    @property
+    def coefficients(self) -> Array:
+        """(p,) the present estimate."""
+        return self.coefficient_theta + self.coefficient_delta
+
+    @property
+    def times(self) -> Array:
+        """(n,) s."""
+        return np.array([sample.time for sample in self.samples])
+
+    def append(self, sample: Sample) -> Update:
+        """Take in a sample.
+
+        Raises: RuntimeError or ValueError: what GTSAM or the model raised; the window must then be built anew.
+        """
+        if not (sample.motion.linked and self.samples):
+            return self._append_start(sample)
+        dt = sample.time - self.samples[-1].time
+        interval = self.maker.make(self.first + len(self.samples) - 1, sample.motion, dt)
+        estimate = self.states[-1], self.coefficients
+        piece, count, calls = self._relinearize(interval)
+        away = np.concatenate((estimate[0] - self.theta[-1], estimate[1] - self.coefficient_theta))
+        predicted = piece[:, 0] + piece[:, 1:] @ away
+        covariance = piece[:, 1:] @ self.newest_covariance @ piece[:, 1:].T + interval.covariance
+        state, innovation = self._corrected(predicted, covariance, sample)
+        store(interval, self.theta[-1], state, self.coefficient_theta, piece)
+        variables = self._insert(sample, state, interval)
+        return Update(innovation, count, calls, variables)
+
+    def _append_start(self, sample: Sample) -> Update:
+        """A sample that nothing predicts: its state has a wide prior of its own."""
+        state = np.zeros(STATE_DIM)
+        state[POSITION] = sample.position
+        if sample.label is not None:
+            state[SPIN] = sample.label.spin
+        priors = start_priors(0, sample.position, sample.label, self.settings)
+        _, count, calls = self._relinearize(None)
+        return Update(np.full(3, np.nan), count, calls, self._insert(sample, state, None, priors))
+
+    def _corrected(self, predicted: Array, covariance: Array, sample: Sample) -> tuple[Array, Array]:
+        """The predicted state moved by the measurement as a Kalman filter would, and the whitened innovation.
+
+        It is the new state's linearisation point only: closer to the final answer than the prediction, it saves
+        relinearisations, and a robust loss gets a weight near the one that it ends with.
+        """
+        if sample.sightings:
+            for sighting in sample.sightings:
+                predicted, covariance = sighting.corrected(predicted, covariance)
+            return predicted, sample.sightings[0].innovation
+        innovation = sample.position - predicted[POSITION]
+        noise = np.diag(sample.sigma**2)
+        inverse = np.linalg.inv(np.linalg.cholesky(covariance[POSITION, POSITION] + noise))
+        whitened = inverse @ innovation
+        pull = whitened @ inverse
+        if self.settings.loss.name != "squared":
+            weight = self.settings.loss.weight(np.array([np.linalg.norm(whitened)]))
+            spread = covariance[POSITION, POSITION] + noise / weight
+            pull = np.asarray(np.linalg.solve(spread, innovation), dtype=np.float64)
+        return predicted + covariance[:, POSITION] @ pull, whitened
+
+    def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
+        """Do ahead what iSAM2 will do: move the states whose solution left the thresholds, evaluate their factors.
+
+        Returns: the new interval's propagation (9, 1 + 9 + p), factors evaluated, torch calls.
+        """
+        moved = np.asarray((np.abs(self.delta) > self.threshold).any(axis=1), dtype=bool)
+        limit = COEFFICIENT_THRESHOLD * self._own_sigmas
+        shared = bool((np.abs(self.coefficient_delta) > limit).any())
+        if moved.any():
+            self.theta = np.where(moved[:, None], self.theta + self.delta, self.theta)
+            self.delta = np.where(moved[:, None], 0.0, self.delta)
+        if shared:
+            self.coefficient_theta = self.coefficient_theta + self.coefficient_delta
+            self.coefficient_delta = np.zeros(self.p)
+        seen = [(sighting, k) for k in np.flatnonzero(moved) for sighting in self.samples[k].sightings]
+        prepare([sighting for sighting, _ in seen], self.theta[[k for _, k in seen]])
+        either = moved[:-1] | moved[1:] | shared
+        touched = [interval for k in np.flatnonzero(either) if (interval := self.intervals[k]) is not None]
+        begins = [interval.index - self.first for interval in touched]
+        ends = [k + 1 for k in begins]
+        if new is not None:
+            touched.append(new)
+            begins.append(len(self.theta) - 1)  # its end comes out of this call: `store` puts it
+        if not touched:
+            return np.empty(0), 0, 0
+        pieces, calls = evaluate(touched, self.theta[begins], self.theta[ends], self.coefficient_theta)
+        return pieces[-1], len(touched), calls
+
+    def _insert(
+        self,
+        sample: Sample,
+        state: Array,
+        interval: Interval | None,
+        priors: Sequence[FactorBatch] = (),
+    ) -> int:
+        """Give iSAM2 a new state with its factors, and read back the solution.
+
+        Returns: how many states were eliminated again.
+        """
+        key = STATE_KEY + self.first + len(self.samples)
+        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+        if interval is not None:
+            graph.push_back(interval.bridge.factor(0))
+        prepare(sample.sightings, np.tile(state, (len(sample.sightings), 1)))
+        for factor in self._measured(sample, key - STATE_KEY):
+            graph.push_back(factor)
+        for prior in priors:
+            graph.push_back(Bridge(prior, "row").factor(0, [key - STATE_KEY]))
+        values.insert(key, state)
+        own = graph.size()
+        if len(self.theta) == 0:
+            for factor in self.shared:
+                graph.push_back(factor)
+            if self.p:
+                values.insert(COEFFICIENT_KEY, self.coefficient_theta)
+        slots = self._update(graph, values, [], {key: 1, COEFFICIENT_KEY: 2} if self.p and len(self.theta) else {})
+        if interval is not None:
+            interval.slot = slots[0]
+        sample.slots = tuple(slots[interval is not None : own])
+        if self.samples:
+            self.intervals.append(interval)
+        self.samples.append(sample)
+        self.theta = np.concatenate((self.theta, state[None]))
+        self._read_back()
+        return int(self._result.getVariablesReeliminated())
+
+    def _measured(self, sample: Sample, state: int) -> list[gtsam.NonlinearFactor]:
+        """The factors of what was measured at a sample."""
+        if sample.sightings:
+            return [sighting.factor(state) for sighting in sample.sightings]
+        return [self._position_factor(sample, state)]
+
+    def _position_factor(self, sample: Sample, state: int) -> gtsam.NonlinearFactor:
+        """The observation's factor; without a robust loss it is linear, and GTSAM never has to ask for it."""
+        if self.settings.loss.name == "squared":
+            root = np.zeros((3, STATE_DIM))
+            root[:, POSITION] = np.diag(1.0 / sample.sigma)
+            factor = gtsam.JacobianFactor(STATE_KEY + state, root, sample.position / sample.sigma, _UNIT3)
+            origin = gtsam.Values()
+            origin.insert(STATE_KEY + state, np.zeros(STATE_DIM))
+            return gtsam.LinearContainerFactor(factor, origin)
+        kind = PositionFactors(np.array([state]), sample.position[None], sample.sigma[None], self.settings.loss)
+        return Bridge(kind, "row").factor(0)
+
+    def _update(
+        self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int], last: dict[int, int]
+    ) -> list[int]:
+        """One iSAM2 update; `last` are keys eliminated after all others, by group; empty leaves it to GTSAM.
+
+        By itself GTSAM eliminates the newest states last, but not the coefficients: every state would then hang
+        on them from below, and no update would be local.
+        """
+        if last:
+            groups = gtsam.KeyGroupMap()
+            for key, group in last.items():
+                groups.insert2(key, group)
+            self._result = self.isam.update(graph, values, remove, groups)
+        else:
+            self._result = self.isam.update(graph, values, remove)
+        return list(self._result.getNewFactorsIndices())
+
+    def _read_back(self) -> None:
+        """The linear solution of all states, and the newest one's covariance."""
+        newest = STATE_KEY + self.first + len(self.theta) - 1
+        solution = self.isam.getDelta()
+        self.delta = solution.vector(range(STATE_KEY + self.first, newest + 1)).reshape(-1, STATE_DIM)
+        if self.p:
+            self.coefficient_delta = solution.at(COEFFICIENT_KEY)
+            self.newest_covariance = self.isam.jointMarginalCovariance([newest, COEFFICIENT_KEY]).fullMatrix()
+        else:
+            self.newest_covariance = self.isam.marginalCovariance(newest)
+
+
+def _parameters(threshold: Array, coefficient_threshold: Array) -> gtsam.ISAM2Params:
+    """QR, because a loose spin prior beside a tight process noise defeats Cholesky."""
+    parameters = gtsam.ISAM2Params()
+    parameters.setFactorization("QR")
+    parameters.relinearizeSkip = 1
+    parameters.findUnusedFactorSlots = True
+    thresholds = gtsam.ISAM2ThresholdMap()
+    thresholds.insert(("x", threshold))
+    if len(coefficient_threshold):
+        thresholds.insert(("c", coefficient_threshold))
+    parameters.setRelinearizeThreshold(thresholds)
+    solver = gtsam.ISAM2GaussNewtonParams()
+    solver.setWildfireThreshold(WILDFIRE)
+    parameters.setOptimizationParams(solver)
+    return parameters

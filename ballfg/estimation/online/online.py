@@ -1,0 +1,331 @@
+"""The online estimator: iSAM2, one observation at a time, within a window of bounded length."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.estimator import Estimator
+from ballfg.estimation.observations.sighted import SightedTrack
+from ballfg.estimation.online.events import SIGMA_FACTOR, EventTracker, contact_step, first_difference
+from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unknown
+from ballfg.estimation.online.isam import Sample, Update
+from ballfg.estimation.online.sighting import Sighting
+from ballfg.estimation.online.stream import SightingStream
+from ballfg.estimation.online.window import Window
+from ballfg.estimation.result import Estimate, Status
+from ballfg.estimation.segmentation import physics_of
+from ballfg.estimation.settings import Settings, sample_sigmas
+from ballfg.estimation.smoother.motion import FLIGHT, Motion, motions_of
+from ballfg.estimation.smoother.problem import trackwise_model
+from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.state import STATE_DIM
+from ballfg.tracks import Track
+from ballfg.vision.camera import Camera
+
+Array = NDArray[np.float64]
+
+LAG = 128
+"""States that stay when the window is cut: 0.7 s at 180 Hz, after which new samples say nothing about an old state."""
+LATEST_CHANGE = 80
+"""Samples. The segmenter's events are final after 64; nothing older is built again."""
+YOUNG = 20
+"""Samples after a contact in which the estimate may still move it to another interval."""
+
+
+@dataclass(frozen=True)
+class OnlineState:
+    """What is known after an observation.
+
+    Attributes:
+        time: s.
+        state: (9,) position m, velocity m/s, spin rad/s, of the ball at that time.
+        covariance: (9, 9).
+        coefficients: (p,) of the model, where they are estimated.
+        innovation: (3,) the observation against its prediction, whitened, (2,) of a sighting; NaN where nothing
+            predicted it.
+        motion: how the ball got here from the last observation.
+        revised: how many of the last samples were taken back and explained anew.
+        evaluated: factors of the motion evaluated.  calls: torch calls for them.
+        rebuilt: iSAM2 failed, and the window was built anew.
+        status: OK, or what to try.
+    """
+
+    time: float
+    state: Array
+    covariance: Array
+    coefficients: Array
+    innovation: Array
+    motion: Motion
+    revised: int
+    evaluated: int
+    calls: int
+    rebuilt: bool
+    status: Status
+
+
+class Online(Estimator):
+    """Incremental smoothing: every observation updates the states of the whole window.
+
+    Use `push` on a live stream of positions, `push_sighting` on one of what cameras saw, or `estimate` on a track,
+    which ends by minimising over the window to a tight tolerance.
+
+    Args:
+        model: the ball.  surfaces: what it may bounce on.
+        settings: noise and priors; time offsets of cameras are not estimated here, see `estimate_time_offsets`.
+        lag: the window is cut to this many states whenever it holds twice as many.
+        cameras: that sightings come from.
+
+    Attributes:
+        window: the samples, states and factors that are held; None before the first observation.
+    """
+
+    name = "online"
+
+    def __init__(
+        self,
+        model: BallModel,
+        surfaces: Surfaces,
+        settings: Settings,
+        lag: int = LAG,
+        cameras: Sequence[Camera] = (),
+    ) -> None:
+        super().__init__(model, surfaces, settings)
+        if lag < 2:
+            raise ValueError(f"lag must be at least 2 states; got {lag}")
+        if settings.time_offsets:
+            raise ValueError(
+                "settings.time_offsets must be empty for the estimator 'online': it cannot move stamps that have "
+                "passed. Find the offsets beforehand with estimate_time_offsets and give the cameras that it returns."
+            )
+        self.cameras = tuple(cameras)
+        self.trackwise = trackwise_model(model, settings)
+        self.physics = physics_of(model)
+        self.lag = lag
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: the next observation begins a new stream."""
+        self.window: Window | None = None
+        self.events = EventTracker(self.surfaces, self.physics, self.settings.find_events)
+        self._samples: list[Sample] = []  # of the window, also while iSAM2 is out of order
+        self._stream = SightingStream(self.cameras, self.settings.sighting_loss) if self.cameras else None
+        self._frozen: list[Frozen] | None = None  # states that left the window, where someone asks for them
+        self._counts = np.zeros(2, dtype=np.int64)
+
+    def push(self, time: float, position: ArrayLike, sigma: ArrayLike | None = None) -> OnlineState:
+        """Take in an observation.
+
+        Args:
+            time: s, later than the last.
+            position: (3,) m.
+            sigma: (3,) m, its standard deviation; the settings' where None.
+        Returns: the newest state. It is valid for good; the window's own arrays move on.
+        Raises: ValueError: if the time does not increase, or a number is not finite.
+        """
+        own = None if sigma is None else np.asarray(sigma, dtype=np.float64)[None]
+        spread = sample_sigmas(self.settings, 1, own)[0]
+        point = np.array(position, dtype=np.float64)
+        if not (np.isfinite(spread) & (spread > 0.0)).all():
+            raise ValueError(f"sigma must be positive and finite, in m; got {sigma!r}. Leave it out if it is unknown.")
+        if self._samples and self._samples[-1].sightings:
+            raise ValueError("push must not follow push_sighting in one stream; call reset in between.")
+        return self._observe(Sample(float(time), point, spread))
+
+    def push_sighting(self, time: float, camera: str, pixel: ArrayLike, covariance: ArrayLike) -> OnlineState | None:
+        """Take in what one camera saw, at its own stamp.
+
+        Args:
+            time: s, the camera's stamp; less the camera's time offset it must not be earlier than the last one's.
+            camera: its name, one of `cameras`.
+            pixel: (2,) px, of the ball's centre.
+            covariance: (2, 2) px^2.
+        Returns: the newest state; None as long as rays do not tell where the ball is: with two cameras or more, for the
+            first two or three frames of a flight.
+        Raises: ValueError: an unknown camera, a time that runs backwards, a number that is not finite.
+        """
+        if self._stream is None:
+            raise ValueError("cameras must be given to use push_sighting; got none. Pass them to Online.")
+        if self._samples and not self._samples[-1].sightings:
+            raise ValueError("push_sighting must not follow push in one stream; call reset in between.")
+        samples, joined = self._stream.take(float(time), camera, pixel, covariance)
+        if joined is not None:
+            return self._join(joined)
+        state = None
+        for sample in samples:
+            state = self._observe(sample)
+        return state
+
+    def _observe(self, sample: Sample) -> OnlineState:
+        """Take in a sample."""
+        changed = self.events.push(sample.time, sample.position, sample.stated)  # also checks the numbers
+        if self.window is None:
+            self.window = Window(self.trackwise, self.settings, float(sample.stated.min()))
+        self._counts[:] = 0
+        self._samples.append(sample)
+        status, rebuilt = Status.OK if len(self._samples) > 1 else Status.NO_VELOCITY, False
+        try:
+            revised, update = self._take_in(self.window, sample, changed)
+        except (RuntimeError, ValueError) as error:  # GTSAM's, the bridge's or the model's
+            rebuilt, revised = True, len(self._samples) - 1
+            status, update = self._repair(error, status)
+        return self._state(self.window, self._samples[-1], update, revised, rebuilt, status)
+
+    def _join(self, sighting: Sighting) -> OnlineState:
+        """Take in one more sighting of the newest sample."""
+        assert self.window is not None
+        self._counts[:] = 0
+        status, rebuilt, sample = Status.OK, False, self._samples[-1]
+        sample.sightings.append(sighting)
+        try:
+            update = self.window.attach(sighting)
+        except (RuntimeError, ValueError) as error:
+            rebuilt = True
+            status, update = self._repair(error, status)
+        return self._state(self.window, sample, update, 0, rebuilt, status)
+
+    def _take_in(self, window: Window, sample: Sample, changed: bool) -> tuple[int, Update]:
+        """Explain, go back to where the explanation changed, append, move contacts, keep the window's length."""
+        again = self._explain(window) if changed else []
+        for old in again:
+            self._append(window, old)
+        update = self._append(window, sample)
+        moved = self._move_contacts(window)
+        if len(window) > 2 * self.lag:
+            if self._frozen is not None:
+                self._frozen += freeze(window, len(window) - self.lag)
+            window.shorten(self.lag)
+            self._samples = list(window.samples)
+        return max(len(again), moved), update
+
+    def _append(self, window: Window, sample: Sample) -> Update:
+        update = window.append(sample)
+        self._counts += update.evaluated, update.calls
+        return update
+
+    def _explain(self, window: Window) -> list[Sample]:
+        """Lay the events over the samples; those from the first difference on are taken back and returned."""
+        samples, held = self._samples, len(window)
+        times, positions = np.array([s.time for s in samples]), np.array([s.position for s in samples])
+        segmentation = self.events.segmentation(window.first, times, positions)
+        motions = motions_of(self.events.moved(segmentation, window.first), times)
+        sighted = np.array([bool(s.sightings) for s in samples])
+        factors = np.where(sighted, 1.0, SIGMA_FACTOR[segmentation.quality])  # the loss sets wrong sightings aside
+        settled = max(held - LATEST_CHANGE, 0)
+        motions[: max(settled - 1, 0)] = [s.motion for s in samples[1:settled]]
+        factors[:settled] = [s.factor for s in samples[:settled]]
+        start = first_difference(samples[:held], motions, factors)
+        reweighed = [k for k in range(held) if samples[k].factor != factors[k]]
+        for k, sample in enumerate(samples):
+            sample.factor = float(factors[k])
+            if k and (k >= held or not sample.motion.same(motions[k - 1])):
+                sample.motion = motions[k - 1]
+        again = [] if start is None else samples[max(start, 1) : held]
+        if again:
+            window.retract(max(start or 0, 1))
+        staying = [k for k in reweighed if k < len(window)]
+        if staying:
+            window.reweigh(staying)
+        return again
+
+    def _move_contacts(self, window: Window) -> int:
+        """Put young contacts where the estimate says they are; the newest one may not have happened yet.
+
+        Returns: how many samples were taken back for it.
+        """
+        samples, n = self._samples, len(window)
+        for k in range(max(n - YOUNG, 1), n):
+            motion = samples[k].motion
+            if len(motion.heights) != 1 or motion.hit:
+                continue
+            (height,) = motion.heights
+            state = window.theta[k - 1] + window.delta[k - 1]
+            step = contact_step(state, self.events.rise(height), samples[k].time - samples[k - 1].time)
+            other = k + step
+            if step == 0 or not 1 <= other < n or samples[other].motion != FLIGHT:
+                continue
+            if self.events.move(window.first + k - 1, height, step):
+                shift = samples[k - 1].time - samples[other - 1].time
+                samples[k].motion, samples[other].motion = FLIGHT, Motion(motion.heights, (motion.times[0] + shift,))
+                window.retract(min(k, other))
+                for sample in samples[min(k, other) :]:
+                    self._append(window, sample)
+                return n - min(k, other)
+        return 0
+
+    def _repair(self, error: Exception, status: Status) -> tuple[Status, Update]:
+        """Build the window anew from its samples; if that fails as well, begin a new one with the newest sample."""
+        assert self.window is not None
+        try:
+            return status, self.window.start_anew(self._samples)
+        except (RuntimeError, ValueError):
+            if self._frozen is not None:
+                self._frozen += [unknown(s, self.settings, self.window.p) for s in self._samples[:-1]]
+            first = self.window.first + len(self._samples) - 1
+            newest = replace(self._samples[-1], motion=FLIGHT, slots=())
+        self.window = Window(self.trackwise, self.settings, float(newest.stated.min()))
+        self.window.first = first
+        self._samples = [newest]
+        try:
+            return Status.FAILED, self.window.append(newest)
+        except (RuntimeError, ValueError):
+            raise error from None
+
+    def _state(
+        self, window: Window, sample: Sample, update: Update, revised: int, rebuilt: bool, status: Status
+    ) -> OnlineState:
+        return OnlineState(
+            time=sample.time,
+            state=window.theta[-1] + window.delta[-1],
+            covariance=window.newest_covariance[:STATE_DIM, :STATE_DIM].copy(),
+            coefficients=window.coefficients,
+            innovation=update.innovation,
+            motion=sample.motion,
+            revised=revised,
+            evaluated=int(self._counts[0]),
+            calls=int(self._counts[1]),
+            rebuilt=rebuilt,
+            status=status,
+        )
+
+    def estimate(self, track: Track) -> Estimate:
+        """The states of a track: all samples pushed, then the window minimised to a tight tolerance.
+
+        States that left the window before the end are as they were when they left it. `whitened` are the
+        innovations of the pushes. In a `SightedTrack` events are found in its positions; all else rests on sightings.
+        """
+        self.reset()
+        self._frozen = []
+        label = self.settings.spin_label(track)
+        sigma = sample_sigmas(self.settings, len(track), track.sigmas)
+        samples = [
+            Sample(float(t), position, spread, label=label if k == 0 else None)
+            for k, (t, position, spread) in enumerate(zip(track.times, track.positions, sigma, strict=True))
+        ]
+        sightings = self._sightings(track) if isinstance(track, SightedTrack) else []
+        for k, sighting in sightings:
+            samples[k].sightings.append(sighting)
+        states = [self._observe(sample) for sample in samples]
+        innovations = [sighting.innovation for _, sighting in sightings] or [state.innovation for state in states]
+        assert self.window is not None
+        smoother = Smoother(self.model, self.surfaces, self.settings)
+        first = self.window.first
+        found = self.events.segmentation(first, track.times[first:], track.positions[first:])
+        found = self.events.moved(found, first)  # the window's states go with contacts where they are now
+        result = final_estimate(smoother, self.window, track, found, self._frozen)
+        self.reset()
+        lost = any(state.status is Status.FAILED for state in states)
+        status = Status.NOT_CONVERGED if lost else result.status
+        return replace(result, whitened=np.array(innovations), status=status)
+
+    def _sightings(self, track: SightedTrack) -> list[tuple[int, Sighting]]:
+        """The sightings of a track, each with the number of its sample."""
+        seen = track.sightings
+        rows = zip(track.state.tolist(), seen.camera.tolist(), seen.pixels, seen.covariances, track.delay, strict=True)
+        loss = self.settings.sighting_loss
+        return [(k, Sighting(track.bank, camera, z, r, float(d), loss)) for k, camera, z, r, d in rows]

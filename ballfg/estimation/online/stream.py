@@ -1,0 +1,121 @@
+"""From a stream of sightings to samples: which state each belongs to, and roughly where the ball was.
+
+Events are found in positions, and one ray is none. So each new moment gets the position of a parabola through the rays
+before it, the newest among them. As long as rays leave it open, at the start of a flight, sightings are held back; a
+single camera later on gets positions carried on from the last that was firm.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ballfg.estimation.observations.sighted import LOOSE, SAME_MOMENT, filled
+from ballfg.estimation.observations.sighted_path import AROUND, BEFORE, Path, Rays, rough_path
+from ballfg.estimation.online.isam import Sample
+from ballfg.estimation.online.sighting import Sighting
+from ballfg.factors.loss import Loss
+from ballfg.tracks.sightings import Sightings
+from ballfg.vision.camera import Camera
+from ballfg.vision.projection import CameraBank
+
+Array = NDArray[np.float64]
+
+MOST_RAYS: Final = 96
+"""Rays that are remembered: more than the windows of four cameras hold."""
+PATIENCE: Final = 0.3
+"""s. A flight that only one camera sees is carried on for so long; then its sightings are held back."""
+FORGET: Final = 0.5
+"""s. Sightings held back for longer are dropped: nothing links them to what comes."""
+STAMPS: Final = 9
+"""Stamps of a camera from which its period is taken."""
+
+
+class SightingStream:
+    """Turns sightings into samples for the window.
+
+    Args:
+        cameras: of the rig.  loss: on a sighting.
+    """
+
+    def __init__(self, cameras: Sequence[Camera], loss: Loss) -> None:
+        self.cameras = {camera.name: camera for camera in cameras}
+        self.bank = CameraBank(cameras)
+        self.loss = loss
+        self._stamps: dict[str, deque[float]] = {name: deque(maxlen=STAMPS) for name in self.cameras}
+        self._rays: Rays | None = None
+        self._held: list[Sample] = []
+        self._newest: Sample | None = None
+        self._firm: tuple[float, Path] | None = None
+        self._last = -np.inf
+
+    def take(
+        self, time: float, camera: str, pixel: ArrayLike, covariance: ArrayLike
+    ) -> tuple[list[Sample], Sighting | None]:
+        """Take in a sighting.
+
+        Args: as those of `Online.push_sighting`.
+        Returns: new samples, oldest first: none while sightings are held back; and the sighting, if it joins the newest
+            sample that was given out.
+        Raises: ValueError: an unknown camera, a wrong shape, a number that is not finite, a time before the last.
+        """
+        if camera not in self.cameras:
+            raise ValueError(f"camera must be one of {', '.join(self.cameras)}; got {camera!r}. Name them to `Online`.")
+        own, number = self.cameras[camera], list(self.cameras).index(camera)
+        row = Sightings(
+            tuple(self.cameras), np.array([number]), np.array([time]), np.array([pixel]), np.array([covariance])
+        )
+        true = float(row.times[0]) - own.time_offset
+        stamps = self._stamps[camera]
+        if true < self._last or (stamps and true <= stamps[-1]):
+            raise ValueError(
+                f"sightings must come in order of true time; got {true} s of camera {camera!r} after {self._last} s. "
+                "Hold them back by a frame and sort them."
+            )
+        stamps.append(true)
+        self._last = true
+        ray = Rays.of(row, np.array([true]), tuple(self.cameras.values()))
+        self._rays = ray if self._rays is None else self._rays.joined(ray, MOST_RAYS, self._period(true))
+        joins = self._newest is not None and true - self._newest.time <= SAME_MOMENT
+        base = self._newest.time if joins and self._newest is not None else true
+        sighting = Sighting(self.bank, number, row.pixels[0], row.covariances[0], true - base, self.loss)
+        if joins and self._newest is not None:
+            if not self._held:
+                return [], sighting
+            self._newest.sightings.append(sighting)
+        else:
+            self._newest = Sample(true, np.zeros(3), np.ones(3), sightings=[sighting])
+            self._held.append(self._newest)
+        return self._placed(), None
+
+    def _period(self, now: float) -> float:
+        """s, of the slowest camera that sees the ball."""
+        seen = [s for s in self._stamps.values() if len(s) > 1 and now - s[-1] < FORGET]
+        return max((float(np.median(np.diff(s))) for s in seen), default=0.0)
+
+    def _placed(self) -> list[Sample]:
+        """The samples that were held back, with positions, once the newest one's is known."""
+        assert self._rays is not None
+        now = self._held[-1].time
+        path = rough_path(self._rays, np.array([now]), BEFORE)
+        if path.sigmas.max() <= LOOSE:
+            self._firm = now, path
+        elif self._firm is None or now - self._firm[0] > PATIENCE:
+            self._held = [sample for sample in self._held if now - sample.time < FORGET]
+            return []
+        moments = np.array([sample.time for sample in self._held])
+        if len(moments) > 1:
+            path = rough_path(self._rays, moments, (*AROUND, *BEFORE))
+        elif self._firm[0] < now:
+            last, known = self._firm
+            moments = np.array([last, now])
+            path = known.joined(path)
+        path = filled(moments, path, "of the stream")
+        for k, sample in enumerate(reversed(self._held)):
+            sample.position, sample.stated = path.positions[-1 - k], path.sigmas[-1 - k]
+        placed, self._held = self._held, []
+        return placed

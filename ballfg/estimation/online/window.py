@@ -1,0 +1,162 @@
+"""A window that can also go back, change its mind, let go of its oldest state, and start anew."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+
+from ballfg.estimation.online.isam import IncrementalWindow, Sample, Update
+from ballfg.estimation.online.sighting import Sighting, prepare
+from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
+from ballfg.state import STATE_DIM
+
+
+class Window(IncrementalWindow):
+    """The window of the online estimator: arguments and attributes as those of `IncrementalWindow`."""
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def retract(self, count: int) -> None:
+        """Take the newest samples back, with their states and factors; iSAM2 forgets them.
+
+        Args: count: how many stay, at least 1.
+        """
+        gone = self.samples[count:]
+        slots = [slot for sample in gone for slot in sample.slots]
+        slots += [i.slot for i in self.intervals[count - 1 :] if i is not None and i.slot is not None]
+        self._relinearize(None)
+        del self.samples[count:], self.intervals[count - 1 :]
+        self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), slots, {})
+        self.theta = self.theta[:count]
+        self._read_back()
+
+    def attach(self, sighting: Sighting) -> Update:
+        """One more sighting of the newest sample, which holds it already.
+
+        Raises: RuntimeError or ValueError: as `append`.
+        """
+        _, count, calls = self._relinearize(None)
+        sighting.corrected(self.states[-1], self.newest_covariance[:STATE_DIM, :STATE_DIM])
+        prepare([sighting], self.theta[-1:])
+        newest = STATE_KEY + self.first + len(self.samples) - 1
+        graph = gtsam.NonlinearFactorGraph()
+        graph.push_back(sighting.factor(newest - STATE_KEY))
+        last = {newest: 1, COEFFICIENT_KEY: 2} if self.p and len(self.theta) > 1 else {}
+        slots = self._update(graph, gtsam.Values(), [], last)
+        sample = self.samples[-1]
+        sample.slots = (*slots, *sample.slots)
+        self._read_back()
+        return Update(sighting.innovation, count, calls, int(self._result.getVariablesReeliminated()))
+
+    def reweigh(self, numbers: list[int]) -> None:
+        """Put in anew the factors of the positions of some samples of the window, whose noise has changed."""
+        self._relinearize(None)
+        graph, old = gtsam.NonlinearFactorGraph(), []
+        for k in numbers:
+            graph.push_back(self._position_factor(self.samples[k], self.first + k))
+            old.append(self.samples[k].slots[0])
+        slots = self._update(graph, gtsam.Values(), old, {})
+        for k, slot in zip(numbers, slots, strict=True):
+            self.samples[k].slots = (slot, *self.samples[k].slots[1:])
+        self._read_back()
+
+    def shorten(self, keep: int) -> None:
+        """Let go of all but the newest states; what the others know becomes a linear factor on the first that stays.
+
+        The factors of the leaving states are eliminated, by QR, at their linearisation points; iSAM2 is then made
+        anew from those that stay, whose linearisations are all at hand: no torch call.
+
+        Raises: RuntimeError: from GTSAM, when the leaving part is singular.
+        """
+        leaving = len(self.samples) - keep
+        self._relinearize(None)
+        before = self.first, self.samples, self.intervals, self.theta, self.delta, self.shared
+        try:
+            self.shared = self._summary(leaving)
+            self.first += leaving
+            self.samples, self.intervals = self.samples[leaving:], self.intervals[leaving:]
+            self.theta, self.delta = self.theta[leaving:], self.delta[leaving:]
+            self._renew()
+        except RuntimeError:
+            self.first, self.samples, self.intervals, self.theta, self.delta, self.shared = before
+            raise
+
+    def _summary(self, leaving: int) -> list[gtsam.NonlinearFactor]:
+        """What the oldest states know, as linear factors on the first state that stays and on the coefficients."""
+        point = self._point(range(leaving + 1))
+        old = gtsam.GaussianFactorGraph()
+        for factor in (*self._factors(range(leaving), range(leaving)), *self.shared):
+            old.push_back(factor.linearize(point))
+        ordering = gtsam.Ordering()
+        present = set(old.keyVector())
+        for key in (*range(STATE_KEY + self.first, STATE_KEY + self.first + leaving + 1), COEFFICIENT_KEY):
+            if key in present:
+                ordering.push_back(key)
+        bayes_net = old.eliminateSequential(ordering, gtsam.EliminateQR)
+        conditionals = [bayes_net.at(i) for i in range(bayes_net.size())]  # by branches of the forest, not in order
+        gone = range(STATE_KEY + self.first, STATE_KEY + self.first + leaving)
+        rest = [_jacobian_factor(c) for c in conditionals if list(c.keys())[0] not in gone]  # noqa: RUF015
+        return [gtsam.LinearContainerFactor(factor, point) for factor in rest]
+
+    def _point(self, numbers: range) -> gtsam.Values:
+        """The linearisation points of some states of the window and of the coefficients."""
+        values = gtsam.Values()
+        for k in numbers:
+            values.insert(STATE_KEY + self.first + k, self.theta[k])
+        if self.p:
+            values.insert(COEFFICIENT_KEY, self.coefficient_theta)
+        return values
+
+    def _factors(self, samples: range, intervals: range) -> list[gtsam.NonlinearFactor]:
+        """The factors of some samples and intervals, out of iSAM2."""
+        held = self.isam.getFactorsUnsafe()
+        slots = [slot for k in samples for slot in self.samples[k].slots]
+        slots += [i.slot for k in intervals if (i := self.intervals[k]) is not None and i.slot is not None]
+        return [held.at(slot) for slot in slots]
+
+    def _renew(self) -> None:
+        """A new iSAM2 out of the window as it is."""
+        n = len(self.samples)
+        graph = gtsam.NonlinearFactorGraph()
+        for factor in (*self._factors(range(n), range(n - 1)), *self.shared):
+            graph.push_back(factor)
+        self.isam = self._new_isam()
+        last = {STATE_KEY + self.first + n - 1: 1, COEFFICIENT_KEY: 2} if self.p else {}
+        slots = iter(self._update(graph, self._point(range(n)), [], last))
+        for sample in self.samples:
+            sample.slots = tuple(next(slots) for _ in sample.slots)
+        for interval in self.intervals:
+            if interval is not None:
+                interval.slot = next(slots)
+        self._read_back()
+
+    def start_anew(self, samples: list[Sample]) -> Update:
+        """Throw iSAM2 away, after an error left it half-updated, and take in all samples again, oldest first.
+
+        Returns: of the last sample's update.
+        Raises: RuntimeError or ValueError: if that fails as well.
+        """
+        start, coefficients = self.states[:1], self.coefficients
+        self._clear()
+        self.samples, self.intervals = [], []
+        for sample in samples:
+            sample.slots = ()
+        update = Update(np.full(3, np.nan), 0, 0, 0)
+        if self.first:
+            self.coefficient_theta = coefficients
+        if any(STATE_KEY + self.first in list(factor.keys()) for factor in self.shared):
+            self._insert(samples[0], start[0], None)
+            samples = samples[1:]
+        for sample in samples:
+            update = self.append(sample)
+        return update
+
+
+def _jacobian_factor(conditional: gtsam.GaussianConditional) -> gtsam.JacobianFactor:
+    """A conditional R x + S y = d as a factor."""
+    keys, unit = list(conditional.keys()), gtsam.noiseModel.Unit.Create(len(conditional.d()))
+    if len(keys) == 1:
+        return gtsam.JacobianFactor(keys[0], conditional.R(), conditional.d(), unit)
+    first, second = keys
+    return gtsam.JacobianFactor(first, conditional.R(), second, conditional.S(), conditional.d(), unit)

@@ -1,0 +1,76 @@
+"""From a chain of events to the parts of a segmentation."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.estimation.segmentation.events import Event, EventKind
+from ballfg.estimation.segmentation.result import Contact, Quality, Rest
+
+BREAKS = (EventKind.HIT, EventKind.RESTART)
+"""After these, nothing of the past is known."""
+
+
+def contacts_of(events: Sequence[Event]) -> list[Contact]:
+    """The contacts, in order."""
+    return [Contact(e.index, e.time, e.height) for e in events if e.kind is EventKind.CONTACT and e.height is not None]
+
+
+def intervals_of(events: Sequence[Event], *kinds: EventKind) -> list[int]:
+    """The intervals that hold an event of some kinds, ascending."""
+    return sorted({e.index for e in events if e.kind in kinds})
+
+
+def rests_of(events: Sequence[Event], samples: int) -> list[Rest]:
+    """The rests: from the first whole interval on a surface to the last.
+
+    A rest begins in the interval of its event and is whole from the next one on; a ball that leaves does so at the
+    end of its interval, one that is hit somewhere inside.
+    """
+    rests = []
+    start: Event | None = None
+    for event in [*events, None]:
+        if event is not None and event.kind not in (*BREAKS, EventKind.REST, EventKind.LEAVE):
+            continue
+        if start is not None and start.height is not None:
+            end = samples - 1 if event is None else event.index + (event.kind is EventKind.LEAVE)
+            if end > start.index + 1:
+                rests.append(Rest(start.index + 1, end - 1, start.height))
+        start = event if event is not None and event.kind is EventKind.REST else None
+    return rests
+
+
+def quality_of(events: Sequence[Event], samples: int, shift_level: float) -> NDArray[np.int8]:
+    """(samples,) quality; being shifted is worse than being wide, and better than being an outlier."""
+    quality = np.full(samples, Quality.GOOD, dtype=np.int8)
+    quality[intervals_of(events, EventKind.WIDE)] = Quality.WIDE
+    quality[shifted(events, samples, shift_level)] = Quality.SHIFTED
+    quality[intervals_of(events, EventKind.OUTLIER)] = Quality.OUTLIER
+    return quality
+
+
+def shifted(events: Sequence[Event], samples: int, level: float) -> NDArray[np.bool_]:
+    """(samples,) whether a sample's offset differs by more than `level` m from the most common one of its segment.
+
+    Which of two offsets is the true one cannot be seen within a segment; the tracker is taken to be right for most of
+    the time. A lone shift in the interval of a contact is left out: its jump is the contact's own as well.
+    """
+    jumps = np.zeros((samples, 3))
+    shifts = [event for event in events if event.kind is EventKind.SHIFT]
+    contacts = intervals_of(events, EventKind.CONTACT) if shifts else []
+    for event in shifts:
+        jumps[event.index + 1] += event.offset
+    marked = np.zeros(samples, dtype=bool)
+    cuts = [0, *(i + 1 for i in intervals_of(events, *BREAKS)), samples]
+    for first, stop in pairwise(cuts):
+        inside = [event.index for event in shifts if first <= event.index + 1 < stop]
+        if not inside or (len(inside) == 1 and inside[0] in contacts):
+            continue
+        offsets = np.cumsum(jumps[first:stop], axis=0)
+        offsets -= np.median(offsets, axis=0)
+        marked[first:stop] = np.linalg.norm(offsets, axis=1) > level
+    return marked

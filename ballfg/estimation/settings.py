@@ -1,0 +1,115 @@
+"""What every estimator is told about the noise: of the measurements, of the motion, of what is not measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.model import BallModel
+from ballfg.estimation.launcher import Launcher, SpinLabel
+from ballfg.factors.loss import Loss
+from ballfg.factors.noise import ProcessNoise
+from ballfg.tracks import Track
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Noise and priors, the same for all estimators, so that a comparison compares the estimators."""
+
+    position_noise: tuple[float, float, float] = (0.0015, 0.0015, 0.0015)
+    """m, standard deviation of a measured x, y, z, where a track does not bring its own."""
+
+    position_scale: float = 1.0
+    """By which the standard deviations of all positions are multiplied, those that a track brings too."""
+
+    process: ProcessNoise = field(default_factory=ProcessNoise)
+    """How far the ball strays from its model, per root second, per impact, per hit."""
+
+    spin_prior: float = 60.0
+    """rad/s, standard deviation per axis of the spin of a ball without a spin label, about zero."""
+
+    spin_label_noise: float = 20.0
+    """rad/s, standard deviation per axis of a spin label."""
+
+    velocity_prior: float = 20.0
+    """m/s, standard deviation per axis of the velocity at the start of a track, about zero."""
+
+    coefficients: Mapping[str, float] = field(default_factory=dict)
+    """Model parameters estimated for each track: prior standard deviation by parameter name. Empty: the model is
+    taken to be exact."""
+
+    loss: Loss = field(default_factory=lambda: Loss("huber", 3.0))
+    """Loss on each measured position. `Loss("squared")` where there are no outliers. Gross outliers are found and set
+    aside beforehand; Huber's loss bounds what a missed one does and leaves good samples their full weight."""
+
+    sighting_loss: Loss = field(default_factory=lambda: Loss("cauchy", 5.0))
+    """Loss on each sighting of a camera, on the norm of two whitened pixels. Nobody sets wrong candidates aside
+    beforehand; Cauchy's loss lets go of them, and costs good sightings 7 % of their weight."""
+
+    time_offsets: Mapping[str, float] = field(default_factory=dict)
+    """s, prior standard deviation of the time offset by name of camera, where offsets are estimated with each track;
+    the prior's mean is the camera's own. Leave out one camera: a shift of all of them together cannot be seen."""
+
+    spin_loss: Loss = field(default_factory=lambda: Loss("huber", 2.0))
+    """Loss on the spin prior: a strong spin is rare but not against nature."""
+
+    label_loss: Loss = field(default_factory=lambda: Loss("cauchy", 3.0))
+    """Loss on a spin label: labels were seen to contradict the flight."""
+
+    launcher: Launcher | None = None
+    """Tells the spin of tracks without a spin label from their launcher settings."""
+
+    find_events: bool = True
+    """Look for hits, outliers and tracker shifts. False: the track is one undisturbed flight with contacts that the
+    model explains."""
+
+    def __post_init__(self) -> None:
+        if np.shape(self.position_noise) != (3,) or not all(np.isfinite(s) and s > 0 for s in self.position_noise):
+            raise ValueError(
+                f"position_noise must be three positive numbers in m; got {self.position_noise}. Give one per axis."
+            )
+        for name in ("position_scale", "spin_prior", "spin_label_noise", "velocity_prior"):
+            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
+                raise ValueError(f"{name} must be positive and finite; got {getattr(self, name)}")
+        for name, sigma in self.coefficients.items():
+            if not (np.isfinite(sigma) and sigma > 0):
+                raise ValueError(f"coefficients['{name}'] must be a positive standard deviation; got {sigma}")
+        for name, sigma in self.time_offsets.items():
+            if not (np.isfinite(sigma) and sigma > 0):
+                raise ValueError(f"time_offsets['{name}'] must be a positive standard deviation in s; got {sigma}")
+
+    def spin_label(self, track: Track) -> SpinLabel | None:
+        """What is known of a track's first spin: its label, else what its launcher settings say, else None."""
+        if track.spin_label is not None:
+            return SpinLabel(track.spin_label, self.spin_label_noise)
+        return None if self.launcher is None else self.launcher.label(track)
+
+
+MEASURED = ProcessNoise(contact_tangential=0.2, contact_spin=10.0)
+"""Process noise on measured tracks: what friction does in a bounce is known to some 0.2 m/s only. Friction and
+tangential restitution as coefficients of a track would say the same, along a kink that no minimisation likes."""
+
+
+def uncertain(model: BallModel, **changes: object) -> Settings:
+    """Settings for measured tracks: the model's coefficients are known as well as their priors say.
+
+    Args:
+        model: gives the coefficients and their prior standard deviations.
+        changes: other fields of `Settings`.
+    """
+    return Settings(coefficients=coefficient_sigmas(model), process=MEASURED, **changes)  # type: ignore[arg-type]
+
+
+def spin_start(label: SpinLabel | None, settings: Settings) -> tuple[NDArray[np.float64], float]:
+    """Mean (3,) and standard deviation per axis, rad/s, of the spin at a start: those of the label or the prior."""
+    return (np.zeros(3), settings.spin_prior) if label is None else (label.spin, label.sigma)
+
+
+def sample_sigmas(settings: Settings, count: int, own: NDArray[np.float64] | None) -> NDArray[np.float64]:
+    """(n, 3) m, the caller's to change: a track's own sigmas where it has them, else the settings', both scaled."""
+    sigmas = np.broadcast_to(np.array(settings.position_noise), (count, 3)) if own is None else own
+    return settings.position_scale * sigmas

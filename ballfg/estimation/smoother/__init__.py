@@ -1,0 +1,1 @@
+"""The smoother: the factor graph of a track and its minimum."""

@@ -1,0 +1,106 @@
+"""A first guess of all states from the samples and the events, for the minimisation to start from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.contact import fly_through
+from ballfg.estimation.filters.window_velocity import window_velocities
+from ballfg.estimation.launcher import SpinLabel
+from ballfg.estimation.segmentation import Contact, Quality, Segmentation
+from ballfg.factors.batch import Values
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
+from ballfg.tracks import Track
+
+Array = NDArray[np.float64]
+
+
+def initial_states(
+    track: Track,
+    contacts: tuple[Contact, ...],
+    segmentation: Segmentation,
+    model: BallModel,
+    label: SpinLabel | None,
+) -> Array:
+    """(n, 9) states from the sliding window: measured positions, mean velocities of windows that no event cuts.
+
+    The spin is the label's, or zero, up to the first contact; each contact changes it as the model says. A ball that
+    rests is put on its surface and rolls.
+    """
+    states = np.zeros((len(track), STATE_DIM))
+    states[:, POSITION] = _bridged_positions(track, segmentation)
+    breaks = np.unique([c.interval for c in contacts] + segmentation.hits.tolist() + segmentation.restarts.tolist())
+    states[:, VELOCITY] = window_velocities(track.times, states[:, POSITION], breaks.astype(np.int64))
+    if label is not None:
+        states[:, SPIN] = label.spin
+    for contact in sorted(contacts, key=lambda c: c.time):
+        _start_contact(states, contact, model)
+    for rest in segmentation.rests:
+        _start_rest(states[rest.first : rest.last + 2], rest.height, model)
+    return states
+
+
+def _bridged_positions(track: Track, segmentation: Segmentation) -> Array:
+    """Measured positions, those of outliers and shifted runs replaced by a line between their neighbours."""
+    trusted = segmentation.quality <= Quality.WIDE
+    if trusted.all() or not trusted.any():
+        return track.positions.copy()
+    columns = [np.interp(track.times, track.times[trusted], axis[trusted]) for axis in track.positions.T]
+    return np.stack(columns, axis=-1)
+
+
+def _start_contact(states: Array, contact: Contact, model: BallModel) -> None:
+    """Put the state before a contact where the contact can be reached, and give later states the spin after it."""
+    before = torch.from_numpy(states[contact.interval].copy())
+    with torch.no_grad():
+        gap = float(model.gap(before, contact.height))
+        if gap < 0.0:
+            states[contact.interval, Z] -= gap
+        states[contact.interval, VZ] = before[VZ] = min(float(before[VZ]), -LEAST_FALL)
+        states[contact.interval + 1 :, SPIN] = model.bounce(before)[SPIN].numpy()
+
+
+def _start_rest(states: Array, height: float, model: BallModel) -> None:
+    """Put states on a surface, rolling: friction that has saturated does not tell in which direction the spin lies."""
+    states[:, Z] -= model.gap(torch.from_numpy(states), height).detach().numpy()
+    states[:, VZ] = 0.0
+    states[:, SPIN.start] = -states[:, VELOCITY.start + 1] / model.radius
+    states[:, SPIN.start + 1] = states[:, VELOCITY.start] / model.radius
+
+
+LEAST_FALL = 0.05
+"""m/s, least downward speed that a guess has before a contact."""
+
+
+def move_contacts(
+    values: Values, times: Array, old: Sequence[tuple[int, float]], new: Sequence[tuple[int, float]], model: BallModel
+) -> Values:
+    """Values to go on from when contacts have moved: a state after its contact is now before it, or vice versa.
+
+    Args:
+        values: the states that went with the old contacts.
+        times: (n,) s.
+        old: interval and height of each contact so far.  new: the same of those to come.
+        model: gives the state at the end of the first interval that gained or lost a contact, from that at its start.
+    """
+    states = values.states.copy()
+    changed = sorted({i for i, _ in set(old) ^ set(new)})
+    for interval in changed:
+        if interval - 1 in changed:
+            continue  # the contact came from there or went there; the state after both is right already
+        heights = tuple(height for i, height in new if i == interval)
+        start = torch.from_numpy(np.concatenate((states[interval], values.coefficients))[None])
+        gap = float(model.gap(start, heights[0])[0].detach()) if heights else 0.0
+        if gap < 0.0 < states[interval, VZ]:  # it was on the way up, from below: before the contact it mirrors that
+            states[interval, [Z, VZ]] -= (2.0 * gap, 2.0 * states[interval, VZ])
+            start[0, :STATE_DIM] = torch.from_numpy(states[interval])
+        with torch.no_grad():
+            after, _ = fly_through(model, start, torch.from_numpy(np.diff(times[interval : interval + 2])), heights)
+        if bool(after.isfinite().all()):
+            states[interval + 1] = after[0, :STATE_DIM].numpy()
+    return Values(states, values.coefficients)

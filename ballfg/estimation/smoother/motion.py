@@ -1,0 +1,89 @@
+"""How a ball gets from one sample to the next: the events of a track, interval by interval."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.estimation.segmentation import Contact, Segmentation
+from ballfg.factors.noise import ProcessNoise
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Motion:
+    """How the ball gets from one sample to the next.
+
+    Attributes:
+        heights: m, the surfaces met, in order.
+        times: s since the interval's start, when they are met, as far as known when the factor was made.
+        rest: m, the surface on which the ball lies all the time; None if it does not.
+        hit: something hits the ball at an unknown moment.
+        linked: False where nothing is known of what happened; the next state starts anew.
+    """
+
+    heights: tuple[float, ...] = ()
+    times: tuple[float, ...] = ()
+    rest: float | None = None
+    hit: bool = False
+    linked: bool = True
+
+    def same(self, other: Motion) -> bool:
+        """Whether both are the same events, at whatever moments."""
+        mine = (self.heights, self.rest, self.hit, self.linked)
+        return mine == (other.heights, other.rest, other.hit, other.linked)
+
+    def kick_times(self, dt: float) -> tuple[float, ...]:
+        """`times` for the process noise over dt s: in whole `KICK_PARTS`."""
+        return tuple(round(time / dt * KICK_PARTS) * dt / KICK_PARTS for time in self.times)
+
+    def covariance(self, dt: Array, noise: ProcessNoise) -> Array:
+        """(1, 9, 9) process noise over dt (1,) s: flight, each contact's kick, a hit at an unknown time."""
+        covariance = noise.flight(dt)
+        for time in self.kick_times(float(dt[0])):
+            covariance += noise.contact(dt, np.array([time]))
+        if self.hit:
+            covariance += noise.hit(dt)
+        return covariance
+
+
+FLIGHT = Motion()
+KICK_PARTS = 64
+"""Of an interval, in which contact times enter the process noise. Finer, and an estimate would depend on how a
+segmentation rounds, which knows the axes of the frame: with these parts it turns with the data."""
+
+
+def motions_of(segmentation: Segmentation, times: Array) -> list[Motion]:
+    """The motion of every interval of a track or window.
+
+    Args: segmentation: of n samples.  times: (n,) s.
+    """
+    count = len(times) - 1
+    in_interval = contacts_by_interval(segmentation.contacts)
+    rests: dict[int, float] = {}
+    for rest in segmentation.rests:
+        rests.update(dict.fromkeys(range(max(rest.first, 0), min(rest.last, count - 1) + 1), rest.height))
+    hits, restarts = set(segmentation.hits.tolist()), set(segmentation.restarts.tolist())
+    return [
+        Motion(
+            heights=tuple(contact.height for contact in met),
+            times=tuple(contact.time - float(times[i]) for contact in met),
+            rest=None if met else rests.get(i),
+            hit=i in hits,
+            linked=i not in restarts,
+        )
+        if met or i in rests or i in hits or i in restarts
+        else FLIGHT
+        for i, met in ((i, in_interval.get(i, [])) for i in range(count))
+    ]
+
+
+def contacts_by_interval(contacts: tuple[Contact, ...]) -> dict[int, list[Contact]]:
+    """Contacts of each interval, in time order."""
+    found: dict[int, list[Contact]] = {}
+    for contact in sorted(contacts, key=lambda c: (c.interval, c.time)):
+        found.setdefault(contact.interval, []).append(contact)
+    return found

@@ -1,0 +1,78 @@
+"""Stamps so close to a contact that the sample may lie on either side of it."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.stats import norm
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.integrate import fly
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.segmentation import Contact
+from ballfg.state import VZ, Z
+
+Array = NDArray[np.float64]
+
+FAR = 4.0
+"""Standard deviations of a contact's time beyond which a stamp is taken to lie on one side of it."""
+LEAST_SPEED = 1e-3
+"""m/s, least vertical speed in the uncertainty of a contact's time."""
+
+
+def widen_near_contacts(
+    times: Array,
+    states: Array,
+    covariances: Array,
+    contacts: tuple[Contact, ...],
+    model: BallModel,
+    surfaces: Surfaces,
+) -> Array:
+    """Covariances that own up to the two sides of a contact.
+
+    A state within the uncertainty of a contact's time is on the side that the estimate took with probability p and
+    on the other with 1 - p. With the jump d between the sides, the covariance about the estimate is larger by p (1 - p)
+    d d^T. The contact's time is known to sigma_z / |v_z|, often 0.1 ms: few stamps are concerned. The last sample may
+    lie just after a contact that nothing has shown yet.
+
+    Args:
+        times: (n,) s.
+        states: (n, 9).
+        covariances: (n, 9, 9).
+        contacts: with the times that the estimate gives them.
+        model: the ball.
+        surfaces: what it may bounce on.
+    Returns: (n, 9, 9).
+    """
+    widened = covariances.copy()
+    for contact in contacts:
+        for k, beyond in ((contact.interval, contact.interval + 1), (contact.interval + 1, contact.interval)):
+            sigma = float(np.sqrt(covariances[k, Z, Z])) / max(abs(float(states[k, VZ])), LEAST_SPEED)
+            margin = (contact.time - times[k]) * np.sign(beyond - k) / sigma
+            if margin < FAR:
+                jump = _carried(model, states[beyond], times[k] - times[beyond]) - states[k]
+                widened[k] += _mixture(margin, jump)
+    last = torch.from_numpy(states[-1])
+    height = float(surfaces.height_below(last))
+    margin = (
+        float(model.gap(last, height).detach()) / float(np.sqrt(covariances[-1, Z, Z]))
+        if np.isfinite(height)
+        else np.inf
+    )
+    if margin < FAR and last[VZ] < 0.0:
+        with torch.no_grad():
+            widened[-1] += _mixture(margin, model.bounce(last).numpy() - states[-1])
+    return widened
+
+
+def _mixture(margin: float, jump: Array) -> Array:
+    """(9, 9) what the other side adds; on the wrong side of its own contact a state has even chances."""
+    p = norm.cdf(max(margin, 0.0))
+    return np.asarray(p * (1.0 - p) * np.outer(jump, jump))
+
+
+def _carried(model: BallModel, state: Array, dt: float) -> Array:
+    """(9,) a state carried over dt s of free flight: the other side's motion, at this side's stamp."""
+    with torch.no_grad():
+        return np.asarray(fly(model, torch.from_numpy(state[None]), torch.tensor([dt], dtype=torch.float64))[0])

@@ -1,0 +1,132 @@
+"""Time offsets of a rig's cameras from a whole recording: every track says a little, together they say it well."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.observations.sighted import SightedTrack, retimed
+from ballfg.estimation.result import Estimate, Status
+from ballfg.estimation.settings import Settings
+from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.vision.camera import Camera
+
+Array = NDArray[np.float64]
+
+PRIOR: Final = 0.01
+"""s, standard deviation of a time offset beforehand, about the camera's own: a frame or so."""
+ROUNDS: Final = 8
+"""How often stamps are moved at most; 4 ms settle in three rounds, a whole frame in five."""
+SETTLED: Final = 0.1
+"""Standard deviations. Offsets that move by less are settled."""
+
+
+@dataclass(frozen=True)
+class TimeOffsets:
+    """The clocks of a rig.
+
+    Attributes:
+        cameras: the rig's, with the time offsets that were found.
+        covariance: (c, c) s^2 of the offsets; zero for the reference.
+        settled: whether another round would leave the offsets as they are; if not, look at the calibration.
+        tracks: how many tracks say so.
+    """
+
+    cameras: tuple[Camera, ...]
+    covariance: Array
+    settled: bool
+    tracks: int
+
+    @property
+    def offsets(self) -> Array:
+        """(c,) s."""
+        return np.array([camera.time_offset for camera in self.cameras])
+
+    @property
+    def sigmas(self) -> Array:
+        """(c,) s, standard deviations."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+
+def estimate_time_offsets(
+    tracks: Iterable[SightedTrack],
+    model: BallModel,
+    surfaces: Surfaces,
+    settings: Settings,
+    reference: str | None = None,
+    prior: float = PRIOR,
+) -> TimeOffsets:
+    """How late each camera's stamps are, compared with a reference camera.
+
+    Each track is smoothed with its own offsets. What it says of them is its posterior's information less the prior's;
+    the sum over all tracks, the prior counted once, is the estimate. Then all stamps move by it, because a camera
+    factor follows the ball in a straight line, and the tracks are smoothed anew, until the offsets stay.
+
+    Args:
+        tracks: of one rig. One of half a second tells offsets to 0.1 ms, where cameras see a pixel's third.
+        model: the ball.  surfaces: what it may bounce on.
+        settings: noise and priors; their `time_offsets` are not asked.
+        reference: name of the camera whose offset stays; the first where None.
+        prior: s, standard deviation of the other offsets beforehand.
+    Raises: ValueError: no tracks, tracks of different rigs, an unknown reference, or no track that could be smoothed.
+    """
+    tracks = list(tracks)
+    names = _rig_of(tracks)
+    reference = names[0] if reference is None else reference
+    if reference not in names:
+        raise ValueError(f"reference must be one of the cameras {', '.join(names)}; got {reference!r}")
+    if len(names) < 2:
+        raise ValueError(f"tracks must be seen by two cameras or more; got {names[0]!r} alone. Its clock is the time.")
+    free = np.array([k for k, name in enumerate(names) if name != reference])
+    own = replace(settings, time_offsets={names[k]: prior for k in free})
+    smoother = Smoother(model, surfaces, own)
+    first = smoother.first_look()
+    believed = np.array([camera.time_offset for camera in tracks[0].cameras])
+    offsets, settled = believed, False
+    for k in range(ROUNDS):
+        estimates = [(smoother if k else first).estimate_as_timed(track) for track in tracks]
+        used = [e for e in estimates if e.status in (Status.OK, Status.NOT_CONVERGED)]
+        if not used:
+            raise ValueError("tracks must hold one that can be smoothed; none could. Look at the calibration first.")
+        found, covariance = _fused(used, believed, free, prior)
+        moved = np.abs(found - offsets)[free] / np.sqrt(np.diagonal(covariance)[free])
+        offsets, settled = found, bool(k > 0 and (moved < SETTLED).all())
+        tracks = [retimed(track, offsets) for track in tracks]
+        if settled:
+            break
+    return TimeOffsets(tracks[0].cameras, covariance, settled, len(used))
+
+
+def _rig_of(tracks: list[SightedTrack]) -> tuple[str, ...]:
+    """The names of the cameras."""
+    if not tracks:
+        raise ValueError("tracks must hold at least one; got none. Time offsets need a ball in flight.")
+    first = tracks[0]
+    for track in tracks:
+        if track.cameras != first.cameras:
+            raise ValueError(
+                f"tracks must be seen by the same cameras; those of {track.name!r} and {first.name!r} differ. "
+                "Make all of them with the same list of cameras."
+            )
+    return first.sightings.cameras
+
+
+def _fused(estimates: list[Estimate], believed: Array, free: NDArray[np.int64], prior: float) -> tuple[Array, Array]:
+    """Offsets (c,) and their covariance (c, c) by what all estimates say, the prior counted once."""
+    before = np.eye(len(free)) / prior**2
+    information, pull = before.copy(), np.zeros(len(free))
+    for estimate in estimates:
+        after = np.linalg.inv(estimate.time_offset_covariance[np.ix_(free, free)])
+        information += after - before
+        pull += after @ (estimate.time_offsets - believed)[free]
+    covariance = np.zeros((len(believed), len(believed)))
+    covariance[np.ix_(free, free)] = np.linalg.inv(information)
+    offsets = believed.copy()
+    offsets[free] += np.linalg.solve(information, pull)
+    return offsets, covariance

@@ -1,0 +1,112 @@
+"""A belief: Gaussian states at one time, with the model coefficients that were estimated along with them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.model import BallModel
+from ballfg.estimation.result import Estimate
+from ballfg.state import STATE_DIM
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Belief:
+    """What is known of n balls, each at its own time.
+
+    Attributes:
+        model: the ball; an `AugmentedModel` where coefficients are uncertain.
+        time: (n,) s.
+        mean: (n, 9 + p) states, then coefficients.
+        covariance: (n, 9 + p, 9 + p).
+    """
+
+    model: BallModel
+    time: Tensor
+    mean: Tensor
+    covariance: Tensor
+
+    @classmethod
+    def last(
+        cls, model: BallModel, estimates: Sequence[Estimate], coefficients: Mapping[str, float] | None = None
+    ) -> Belief:
+        """The beliefs at the last stamps of some estimates, made with the same model.
+
+        A coefficient estimated beyond what its effect accepts (a restitution above 1, say) is held at the bound, and
+        the state is what is most probable with it there.
+
+        Args:
+            model: the ball.
+            estimates: n of them.
+            coefficients: prior standard deviations by parameter name, as in `Settings.coefficients`. An estimate that
+                says nothing of one of them (the sliding window, a failed filter) has the model's value with this
+                spread. None: the coefficients that the estimates have, the same in all.
+        Raises: ValueError: if there is no estimate, or estimates have coefficients that are not asked for.
+        """
+        if not estimates:
+            raise ValueError("estimates must hold at least one; got none")
+        prior = dict.fromkeys(estimates[0].coefficient_names, np.nan) if coefficients is None else coefficients
+        names = tuple(prior)
+        for e in estimates:
+            own = e.coefficient_names
+            if not set(own) <= set(names) or (coefficients is None and own != names):
+                raise ValueError(
+                    f"estimates must share their coefficients; track {e.name!r} has {list(own)}, "
+                    f"not {list(names)}. Make them with the same settings."
+                )
+        bounded = AugmentedModel(model, names) if names else model
+        parameters = dict(model.named_parameters())
+        prior_mean = np.array([float(parameters[name].detach()) for name in names])
+        low, high = _bounds(model, names)
+        joints = [_joint(e, names, prior_mean, np.array(list(prior.values()))) for e in estimates]
+        mean = np.stack([_held(m, covariance, low, high) for m, covariance in joints])
+        return cls(
+            bounded,
+            torch.tensor([float(e.times[-1]) for e in estimates], dtype=torch.float64),
+            torch.from_numpy(mean),
+            torch.from_numpy(np.stack([covariance for _, covariance in joints])),
+        )
+
+    def __len__(self) -> int:
+        return len(self.time)
+
+
+def _joint(estimate: Estimate, names: tuple[str, ...], prior_mean: Array, prior_sigma: Array) -> tuple[Array, Array]:
+    """Mean (9 + p,) and covariance (9 + p, 9 + p) of an estimate's last state and its coefficients."""
+    mean = np.concatenate((estimate.states[-1], prior_mean))
+    covariance = np.diag(np.concatenate((np.zeros(STATE_DIM), prior_sigma**2)))
+    covariance[:STATE_DIM, :STATE_DIM] = estimate.covariances[-1]
+    if estimate.coefficient_names:
+        own = np.array([STATE_DIM + names.index(name) for name in estimate.coefficient_names])
+        mean[own] = estimate.coefficients
+        covariance[np.ix_(own, own)] = estimate.coefficient_covariance
+        covariance[:STATE_DIM, own] = estimate.cross_covariances[-1]
+        covariance[own, :STATE_DIM] = estimate.cross_covariances[-1].T
+    return mean, (covariance + covariance.T) / 2
+
+
+def _held(mean: Array, covariance: Array, low: Array, high: Array) -> Array:
+    """The most probable mean (9 + p,) whose coefficients that lie out of bounds are on them."""
+    change = np.clip(mean[STATE_DIM:], low, high) - mean[STATE_DIM:]
+    out = STATE_DIM + np.flatnonzero(change)
+    if not len(out):
+        return mean
+    held = mean + covariance[:, out] @ np.linalg.solve(covariance[np.ix_(out, out)], change[out - STATE_DIM])
+    held[STATE_DIM:] = np.clip(held[STATE_DIM:], low, high)  # others may have been pulled along
+    return np.asarray(held)
+
+
+def _bounds(model: BallModel, names: tuple[str, ...]) -> tuple[Array, Array]:
+    """(p,) smallest and (p,) largest values that the effects of a model accept; infinite where none is declared."""
+    declared = model.declared_coefficients()
+    low = [declared[name].low if name in declared else -np.inf for name in names]
+    high = [declared[name].high if name in declared else np.inf for name in names]
+    return np.array(low), np.array(high)

@@ -1,0 +1,151 @@
+"""Prediction of whole tracks: observe the first part, predict what will be measured at every later stamp."""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ballfg.estimation.batch import estimate_tracks
+from ballfg.estimation.estimator import Estimator
+from ballfg.estimation.measurement.as_measured import measured_positions, true_times
+from ballfg.estimation.result import Estimate, Status
+from ballfg.estimation.settings import sample_sigmas
+from ballfg.prediction.belief import Belief
+from ballfg.prediction.propagate import Propagator
+from ballfg.state import POSITION
+from ballfg.tracks import Track
+
+Array = NDArray[np.float64]
+
+BLOCK = 64
+"""Tracks that are propagated together; memory grows with it."""
+STAMP_TOLERANCE = 1e-9
+"""s. A stamp this little after the end of the observed part belongs to it."""
+
+
+@dataclass(frozen=True)
+class TrackPrediction:
+    """Where the ball of one track will be measured: as the model measures it, at written stamps.
+
+    Attributes:
+        name: of the track.
+        times: (k,) s, the stamps after the observed part; none if the track ends before.
+        positions: (k, 3) m.
+        sigmas: (k, 3) m, of a measured position: state and measurement noise. Measurement effects do not change them:
+            they are right to the share by which those stretch lengths and to a lag times the velocity's sigma.
+        measured: (k, 3) m, what the track has at those stamps.
+        estimate: from the observed part.
+    """
+
+    name: str
+    times: Array
+    positions: Array
+    sigmas: Array
+    measured: Array
+    estimate: Estimate
+
+    @property
+    def status(self) -> Status:
+        """How the estimation of the observed part ended."""
+        return self.estimate.status
+
+
+def predict_tracks(
+    estimator: Estimator,
+    tracks: Iterable[Track],
+    count: int,
+    observe: float | Callable[[Track], float],
+    *,
+    horizon: float = np.inf,
+    jobs: int = 1,
+) -> Iterator[TrackPrediction]:
+    """Predictions in the order of the tracks.
+
+    Args:
+        estimator: from what it sees of a track comes the belief that is propagated.
+        tracks: a stream; some tens at a time are in memory.
+        count: how many there are, about.
+        observe: s from the track's first stamp; a stamp at its end is observed. A function gives each track its own.
+        horizon: s after the last observed stamp; later stamps are left out.
+        jobs: processes for the estimation.
+
+    Raises: ValueError: if observe or horizon is not positive.
+    """
+    if not callable(observe):
+        check_observe(observe)
+    if not horizon > 0.0:
+        raise ValueError(f"horizon must be a positive number of seconds; got {horizon:g}. Leave it out for all stamps.")
+    seconds = observe if callable(observe) else lambda track: observe
+    return _predictions(estimator, tracks, count, seconds, horizon, jobs)
+
+
+def check_observe(observe: float) -> None:
+    """Raises ValueError if `observe` (s) is not positive."""
+    if not observe > 0.0:
+        raise ValueError(
+            f"observe must be a positive number of seconds; got {observe:g}. A quarter of a second is 0.25."
+        )
+
+
+def _predictions(
+    estimator: Estimator,
+    tracks: Iterable[Track],
+    count: int,
+    observe: Callable[[Track], float],
+    horizon: float,
+    jobs: int,
+) -> Iterator[TrackPrediction]:
+    propagator = Propagator(estimator.surfaces, estimator.settings.process)
+    waiting: deque[Track] = deque()
+
+    def observed() -> Iterator[Track]:
+        for track in tracks:
+            waiting.append(track)
+            yield track.until(float(track.times[0]) + observe(track) + _tolerance(track))
+
+    estimates = estimate_tracks(estimator, observed(), count, jobs)
+    while block := list(islice(estimates, BLOCK)):
+        yield from _predict_block(estimator, propagator, block, [waiting.popleft() for _ in block], horizon)
+
+
+def _tolerance(track: Track) -> float:
+    """Seconds by which a stamp may miss a limit: `STAMP_TOLERANCE`, more where large stamps are rounded."""
+    return STAMP_TOLERANCE + 2.0 * float(np.spacing(np.abs(track.times[[0, -1]]).max()))
+
+
+def _predict_block(
+    estimator: Estimator, propagator: Propagator, estimates: list[Estimate], tracks: list[Track], horizon: float
+) -> Iterator[TrackPrediction]:
+    later = [_later(t, float(e.times[-1]), horizon) for t, e in zip(tracks, estimates, strict=True)]
+    clocks = [true_times(estimator.model, t.times) for t in tracks]
+    ends = [float(clock[len(e.times) - 1]) for clock, e in zip(clocks, estimates, strict=True)]
+    times = _padded([clock[mask] for clock, mask in zip(clocks, later, strict=True)], ends)
+    belief = Belief.last(estimator.model, estimates, estimator.settings.coefficients)
+    belief = replace(belief, time=torch.tensor(ends, dtype=torch.float64))
+    positions, variances = np.zeros((*times.shape, 3)), np.zeros((*times.shape, 3))
+    for k, predicted in enumerate(propagator.walk(belief, torch.from_numpy(times)) if times.size else ()):
+        positions[:, k] = measured_positions(predicted.model, predicted.mean, estimator.surfaces).numpy()
+        variances[:, k] = torch.diagonal(predicted.covariance, dim1=-2, dim2=-1)[:, POSITION].numpy()
+    for i, (track, result, mask) in enumerate(zip(tracks, estimates, later, strict=True)):
+        k = int(mask.sum())
+        noise = sample_sigmas(estimator.settings, len(track), track.sigmas)[mask]
+        sigmas = np.sqrt(variances[i, :k] + noise**2)
+        yield TrackPrediction(track.name, track.times[mask], positions[i, :k], sigmas, track.positions[mask], result)
+
+
+def _later(track: Track, end: float, horizon: float) -> NDArray[np.bool_]:
+    """(n,) bool: the stamps that are predicted."""
+    return (track.times > end) & (track.times <= end + horizon + _tolerance(track))
+
+
+def _padded(times: list[Array], ends: list[float]) -> Array:
+    """(n, k) s: each row's times, then the last of them again; a row without any holds the end of its observation."""
+    longest = max(map(len, times))
+    rows = [np.concatenate(([end], row)) for row, end in zip(times, ends, strict=True)]
+    return np.stack([np.pad(row, (0, longest + 1 - len(row)), mode="edge")[1:] for row in rows])

@@ -1,0 +1,113 @@
+"""A rig of cameras over a table-tennis table, for synthetic scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR
+from ballfg.simulation.launcher import TABLE_LENGTH
+from ballfg.vision.camera import Camera
+
+FOCAL_BY_WIDTH: Final = 0.78125
+"""Focal length over the image's width: 1000 px at 1280, 65 degrees from side to side."""
+TARGET: Final = (TABLE_LENGTH / 2, 0.0, TABLE_ABOVE_FLOOR + 0.2)
+"""m, what the rig looks at: the middle of the room that balls fly through, 0.2 m over the middle of the table."""
+_UP: Final = (0.0, 0.0, 1.0)
+
+_PLACES: Final = {
+    "left": (116.0, 18.0),
+    "right": (-98.0, 27.0),
+    "far": (64.0, 23.0),
+}
+"""Degrees: azimuth about the vertical from +x, and elevation, of each camera as seen from the target. No two are
+opposite, the three stand at three heights, and each sees all four corners of the table from 3 m."""
+_LENSES: Final = {
+    "left": (-0.16, 0.06, 0.0006, -0.0004, 0.0),
+    "right": (-0.11, 0.03, -0.0005, 0.0007, 0.0),
+    "far": (-0.20, 0.09, 0.0003, 0.0005, 0.0),
+}
+"""k1, k2, p1, p2, k3 of each lens: barrels that move the corners by 20 to 50 px at 1280x720."""
+_OFF_CENTRE: Final = {"left": (0.006, -0.004), "right": (-0.005, 0.007), "far": (0.003, 0.005)}
+"""Where the principal point lies off the middle of the image, as a share of its width."""
+
+
+def table_rig(size: tuple[int, int] = (1280, 720), distance: float = 3.0) -> list[Camera]:
+    """Three cameras around a table that is as in `ballfg.simulation`: they see where the launcher's balls fly.
+
+    The cameras differ in height, direction, lens and principal point; focal lengths go with the image's width, so
+    that a smaller rig sees the same.
+
+    Args:
+        size: width and height of the images, px.
+        distance: m from each camera to the middle of the flights.
+    Returns: cameras `left` and `right` of the launcher's way, and `far` on the left of the other end.
+    Raises: ValueError: a size or distance that is not positive.
+    """
+    if not 0.0 < distance < np.inf:
+        raise ValueError(f"distance must be positive and finite; got {distance} m. Give metres, for instance 3.")
+    cameras = []
+    for name, (azimuth, elevation) in _PLACES.items():
+        turn, rise = np.deg2rad((azimuth, elevation))
+        towards = np.array([np.cos(rise) * np.cos(turn), np.cos(rise) * np.sin(turn), np.sin(rise)])
+        cameras.append(
+            looking_at(
+                name,
+                np.array(TARGET) + distance * towards,
+                TARGET,
+                FOCAL_BY_WIDTH * size[0],
+                size,
+                distortion=_LENSES[name],
+                off_centre=(_OFF_CENTRE[name][0] * size[0], _OFF_CENTRE[name][1] * size[0]),
+            )
+        )
+    return cameras
+
+
+def looking_at(
+    name: str,
+    centre: ArrayLike,
+    target: ArrayLike,
+    focal: float,
+    size: tuple[int, int],
+    distortion: Sequence[float] = (),
+    off_centre: tuple[float, float] = (0.0, 0.0),
+) -> Camera:
+    """A camera at one point that looks at another and is held level.
+
+    Args:
+        name: of the camera.
+        centre: (3,) m, where it stands.
+        target: (3,) m, what is seen at the principal point.
+        focal: px.
+        size: width and height of the image, px.
+        distortion: in OpenCV's order.
+        off_centre: px, from the middle of the image to the principal point.
+    Raises: ValueError: centre and target one above the other; what `Camera` refuses.
+    """
+    rotation = _level_rotation(name, np.asarray(target, dtype=np.float64) - np.asarray(centre, dtype=np.float64))
+    middle = [(side - 1) / 2 + shift for side, shift in zip(size, off_centre, strict=True)]
+    return Camera(
+        name=name,
+        size=size,
+        matrix=np.array([[focal, 0.0, middle[0]], [0.0, focal, middle[1]], [0.0, 0.0, 1.0]]),
+        distortion=np.array(distortion, dtype=np.float64),
+        rvec=np.asarray(cv2.Rodrigues(rotation)[0], dtype=np.float64).reshape(3),
+        tvec=-rotation @ np.asarray(centre, dtype=np.float64),
+    )
+
+
+def _level_rotation(name: str, forward: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3, 3) from the world to a camera that looks along `forward` (3,) with its x axis horizontal."""
+    right = np.cross(forward, _UP)
+    if not np.linalg.norm(right) > 0.0:
+        raise ValueError(
+            f"camera {name!r}: centre must not stand over or under target; they differ by {forward.tolist()} m. "
+            "Move one of them sideways a little."
+        )
+    rows = np.stack((right, np.cross(forward, right), forward))
+    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))

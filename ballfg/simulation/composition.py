@@ -1,0 +1,70 @@
+"""The true ball: the declared model, what nobody declares, and kicks at contacts."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import cast
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ballfg.dynamics import AnalyticModel, BallModel, Effect
+from ballfg.dynamics.model import Rates
+from ballfg.dynamics.motion.rollout import REST_SPEED
+from ballfg.simulation.config import ProcessNoise
+from ballfg.state import SPIN, STATE_DIM, VELOCITY, VZ
+
+
+def true_model(declared: AnalyticModel, undeclared: Iterable[Effect]) -> AnalyticModel:
+    """The declared model with undeclared effects in it; the arguments stay as they are.
+
+    An undeclared effect that the model declares too takes the place of the declared one: the truth then has another
+    value than the model.
+
+    Raises: ValueError: if an effect is given twice, or changes one that the model does not have.
+    """
+    groups = (declared.flight, declared.contact, declared.measurement)
+    effects = {name: cast(Effect, effect) for group in groups for name, effect in group.items()}
+    seen: set[str] = set()
+    for effect in undeclared:
+        if effect.name in seen:
+            raise ValueError(f"undeclared effects must differ; '{effect.name}' was given twice. Remove one.")
+        seen.add(effect.name)
+        effects[effect.name] = effect
+    return AnalyticModel(effects.values(), radius=declared.radius, inertia_factor=declared.inertia_factor)
+
+
+class KickedModel(BallModel):
+    """A model whose contacts are disturbed: each bounce adds a random kick to velocity and spin.
+
+    The upward speed after a bounce is reflected at zero if a kick would push the ball into the surface.
+    """
+
+    def __init__(self, model: BallModel, noise: ProcessNoise, rng: np.random.Generator) -> None:
+        super().__init__(model.radius, model.inertia_factor)
+        self.model = model
+        self._rng = rng
+        sigma = torch.zeros(STATE_DIM, dtype=torch.float64)
+        sigma[VELOCITY], sigma[SPIN] = noise.contact_velocity, noise.contact_spin
+        self._sigma = sigma
+
+    def rates(self, state: Tensor) -> Rates:
+        """Those of the undisturbed model."""
+        return self.model.rates(state)
+
+    def surface_offset(self, state: Tensor) -> Tensor | float:
+        """That of the undisturbed model."""
+        return self.model.surface_offset(state)
+
+    def surface_slope(self, state: Tensor) -> Tensor | None:
+        """That of the undisturbed model."""
+        return self.model.surface_slope(state)
+
+    def bounce(self, state: Tensor) -> Tensor:
+        """(..., 9) after the impact and its kick. A bounce that ends in rest gets none: it would start again."""
+        after = self.model.bounce(state)
+        kicked = after + self._sigma * torch.from_numpy(self._rng.standard_normal(tuple(after.shape)))
+        kicked[..., VZ] = kicked[..., VZ].abs()
+        rests = after[..., VZ : VZ + 1] < REST_SPEED
+        return torch.where(rests, after, kicked)

@@ -1,0 +1,181 @@
+"""A ball launcher: from integer settings to the first state of a shot, and where a shot's track ends.
+
+Topspin, sidespin and velocity level (`settings.py`) become a place at the muzzle, a velocity in the x-z plane, and a
+spin of `topspin` about the horizontal axis across the launch (y) and of `sidespin` about the vertical. How many
+rad/s and m/s a level is, the paper leaves open; docs/simulate.md derives the scales that were chosen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ballfg.dynamics import BallModel, Surfaces
+from ballfg.simulation.checks import check_range
+from ballfg.simulation.settings import SETTING_LEVELS, Settings
+from ballfg.state import STATE_DIM
+
+TABLE_LENGTH: Final = 2.74
+TABLE_WIDTH: Final = 1.525
+"""m, ITTF Laws of Table Tennis 2.1.1."""
+
+_SPEED_LEVELS: Final = SETTING_LEVELS["speed"]
+
+
+@dataclass(frozen=True)
+class Launcher:
+    """Geometry, scales and shot-to-shot spread of a launcher. It stands at x, y = 0 and shoots along +x.
+
+    Raises: ValueError, TypeError: a field that is not a number within its bounds; the message names it.
+    """
+
+    x: float = 0.0
+    """m, muzzle; x = 0 is the launcher's end of the table."""
+
+    height: float = 0.56
+    """m, muzzle above the surface."""
+
+    speed_slow: float = 3.4
+    """m/s at velocity level 8; levels between are linear."""
+
+    speed_fast: float = 4.1
+    """m/s at velocity level 14."""
+
+    elevation_slow: float = 1.24
+    """rad above the horizontal at velocity level 8; the head is lowered as the speed goes up."""
+
+    elevation_fast: float = -0.18
+    """rad above the horizontal at velocity level 14."""
+
+    topspin_scale: float = 58.0
+    """rad/s per level of topspin."""
+
+    sidespin_scale: float = 48.0
+    """rad/s per level of sidespin."""
+
+    position_spread: float = 0.003
+    """m, standard deviation of each coordinate of the muzzle from shot to shot."""
+
+    speed_spread: float = 0.005
+    """Standard deviation of the speed from shot to shot, relative."""
+
+    aim_spread: float = 0.005
+    """rad, standard deviation of azimuth and elevation from shot to shot."""
+
+    spin_spread: float = 3.0
+    """rad/s, standard deviation of each component of the spin from shot to shot."""
+
+    x_low: float = -0.4
+    """m, a track ends where the ball comes back behind this."""
+
+    x_high: float = 3.2
+    """m, a track ends where the ball goes beyond this."""
+
+    y_far: float = 1.2
+    """m, a track ends where the ball is farther than this from the x axis."""
+
+    duration: float = 1.32
+    """s, longest track."""
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            low, high = _BOUNDS[field.name]
+            object.__setattr__(self, field.name, check_range(field.name, getattr(self, field.name), low, high))
+        if not self.x_low < self.x < self.x_high:
+            raise ValueError(
+                f"x must lie between x_low and x_high; got {self.x_low:g}, {self.x:g}, {self.x_high:g} m. Correct them."
+            )
+
+    def with_fields(self, changes: Mapping[str, Any]) -> Launcher:
+        """This launcher with some fields changed.
+
+        Raises: ValueError, TypeError: changes that are not a mapping, an unknown field or a bad value.
+        """
+        if not isinstance(changes, Mapping):
+            raise TypeError(f"launcher must map fields to numbers; got {changes!r}. Write launcher: {{height: 0.4}}.")
+        for key in changes:
+            if key not in _BOUNDS:
+                raise ValueError(f"launcher has no field '{key}'; it has {', '.join(_BOUNDS)}. Rename it.")
+        return replace(self, **changes)
+
+    def launch(self, settings: Settings, table_height: float, rng: np.random.Generator) -> Tensor:
+        """The first states of some shots.
+
+        Args:
+            settings: (n, 3) topspin, sidespin, velocity level.
+            table_height: m, z of the surface.
+            rng: the shot-to-shot spread.
+        Returns: (n, 9) at the muzzle.
+        """
+        n = len(settings)
+        share = (settings[:, 2] - _SPEED_LEVELS[0]) / (_SPEED_LEVELS[-1] - _SPEED_LEVELS[0])
+        speed = self.speed_slow + share * (self.speed_fast - self.speed_slow)
+        speed = speed * (1 + self.speed_spread * rng.standard_normal(n))
+        elevation = self.elevation_slow + share * (self.elevation_fast - self.elevation_slow)
+        elevation = elevation + self.aim_spread * rng.standard_normal(n)
+        azimuth = self.aim_spread * rng.standard_normal(n)
+        states = np.zeros((n, STATE_DIM))
+        states[:, :3] = (self.x, 0.0, table_height + self.height)
+        states[:, :3] += self.position_spread * rng.standard_normal((n, 3))
+        states[:, 3] = speed * np.cos(elevation) * np.cos(azimuth)
+        states[:, 4] = speed * np.cos(elevation) * np.sin(azimuth)
+        states[:, 5] = speed * np.sin(elevation)
+        states[:, 6:] = self.spin_spread * rng.standard_normal((n, 3))
+        states[:, 7] += self.topspin_scale * settings[:, 0]
+        states[:, 8] += self.sidespin_scale * settings[:, 1]
+        return torch.from_numpy(states)
+
+    def in_view(self, states: Tensor, surfaces: Surfaces, model: BallModel) -> Tensor:
+        """(...) bool: the ball is still tracked.
+
+        A ball beside the table leaves the view as it comes down to the table's height: from there on the track of a
+        table of unknown extent would show a ball that falls through it.
+        """
+        x, y = states[..., 0], states[..., 1]
+        inside = (x > self.x_low) & (x < self.x_high) & (y.abs() < self.y_far)
+        above = model.gap(states, surfaces.table_height) > 0
+        return inside & (surfaces.over_table(states) | above)
+
+
+_BOUNDS: Final[Mapping[str, tuple[float, float]]] = {
+    "x": (-100.0, 100.0),
+    "height": (0.05, 10.0),
+    "speed_slow": (0.5, 100.0),
+    "speed_fast": (0.5, 100.0),
+    "elevation_slow": (-1.5, 1.5),
+    "elevation_fast": (-1.5, 1.5),
+    "topspin_scale": (0.0, 1000.0),
+    "sidespin_scale": (0.0, 1000.0),
+    "position_spread": (0.0, 0.5),
+    "speed_spread": (0.0, 0.2),
+    "aim_spread": (0.0, 0.5),
+    "spin_spread": (0.0, 500.0),
+    "x_low": (-200.0, 200.0),
+    "x_high": (-200.0, 200.0),
+    "y_far": (0.01, 200.0),
+    "duration": (0.05, 20.0),
+}
+
+TABLE_LAUNCHER: Final = Launcher()
+"""For table tennis: returns topspin -3 at low levels, turns +-5 sidespin by 45 degrees, bounces once to three times."""
+
+TENNIS_LAUNCHER: Final = Launcher(
+    height=1.0,
+    speed_slow=14.0,
+    speed_fast=26.0,
+    elevation_slow=0.28,
+    elevation_fast=0.10,
+    topspin_scale=50.0,
+    sidespin_scale=50.0,
+    position_spread=0.01,
+    x_low=-3.0,
+    x_high=30.0,
+    y_far=9.0,
+    duration=2.5,
+)
+"""On a court of 23.77 m, from one baseline."""

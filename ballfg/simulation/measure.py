@@ -1,0 +1,132 @@
+"""From the true motion to what is measured: stamps, positions and labels with noise, dropped frames, outliers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ballfg.dynamics import BallModel, advance
+from ballfg.simulation.config import MeasurementNoise, SimulationConfig
+from ballfg.simulation.motion import Motion
+from ballfg.simulation.settings import SETTING_LEVELS, Settings
+from ballfg.simulation.streams import Purpose, generator
+from ballfg.state import POSITION, SPIN
+from ballfg.tracks import SPIN_LABELS, Track
+
+LEAST_SAMPLES = 2
+"""A track of fewer samples is refused by every reader."""
+JITTER_LIMIT = 3.0
+"""Sigmas at which jitter is cut off: at the largest sigma allowed, 0.15 frames, stamps stay 0.1 frames apart."""
+
+FloatArray = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SimulatedTrack:
+    """A track as it was measured, and what really happened at its samples."""
+
+    track: Track
+    """Stamps, positions and labels with all their noise."""
+
+    true_times: FloatArray
+    """(n,) s, when the frames were taken."""
+
+    true_states: FloatArray
+    """(n, 9) the ball's state at those times."""
+
+
+def measure(
+    config: SimulationConfig, model: BallModel, motion: Motion, settings: Settings, block: int, first: int
+) -> list[SimulatedTrack]:
+    """The tracks of a block of shots.
+
+    Args:
+        config: noise, rate, seed.
+        model: the true ball without random kicks, and how it is measured.
+        motion: (n, k) true frames.
+        settings: (n, 3) of the launcher.
+        block: number of the block, which picks the random streams.
+        first: number of its first shot, for the names.
+    """
+    noise, shape = config.noise, motion.states.shape[:2]
+    frames = np.arange(shape[1])
+    exists = frames < motion.lengths[:, None]
+    kept = exists & _kept_frames(noise, config.seed, block, motion.lengths, shape)
+    true_times = frames / config.rate
+    jitter = noise.jitter * _cut_normal(generator(config.seed, Purpose.JITTER, block), shape)
+    stamps = _written(model, true_times) + jitter
+    positions = _apparent_positions(config, model, motion.states, exists) + _position_noise(
+        noise, config.seed, block, shape
+    )
+    label_noise = noise.spin * generator(config.seed, Purpose.LABEL, block).standard_normal((shape[0], 3))
+    width = max(3, len(str(config.tracks - 1)))
+    tracks = []
+    for i, keep in enumerate(kept):
+        states = motion.states[i, keep]
+        labels = dict(zip(SETTING_LEVELS, settings[i].astype(float).tolist(), strict=True))
+        if config.spin_labels:
+            spin = _labelled(model, states[0, SPIN]) + label_noise[i]
+            labels = dict(zip(SPIN_LABELS, spin.tolist(), strict=True)) | labels
+        track = Track(f"{first + i:0{width}d}", stamps[i, keep], positions[i, keep], labels=labels)
+        tracks.append(SimulatedTrack(track, true_times[keep], states))
+    return tracks
+
+
+def _kept_frames(
+    noise: MeasurementNoise, seed: int, block: int, lengths: NDArray[np.int64], shape: tuple[int, ...]
+) -> NDArray[np.bool_]:
+    """(n, k) bool: the frame was not dropped. The luckiest frames of a track stay, however many are dropped."""
+    luck = generator(seed, Purpose.DROPOUT, block).random(shape)
+    kept = luck >= noise.dropout
+    exists = np.arange(shape[1]) < lengths[:, None]
+    order = np.argsort(np.where(exists, -luck, 1.0), axis=1)
+    np.put_along_axis(kept, order[:, :LEAST_SAMPLES], True, axis=1)
+    return kept
+
+
+def _cut_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> FloatArray:
+    """Standard normals, those beyond `JITTER_LIMIT` set to it."""
+    return np.clip(rng.standard_normal(shape), -JITTER_LIMIT, JITTER_LIMIT)
+
+
+def _position_noise(noise: MeasurementNoise, seed: int, block: int, shape: tuple[int, ...]) -> FloatArray:
+    """(n, k, 3) m, Gaussian noise and outliers."""
+    added = noise.position * generator(seed, Purpose.POSITION, block).standard_normal((*shape, 3))
+    rng = generator(seed, Purpose.OUTLIER, block)
+    is_outlier = rng.random(shape) < noise.outliers
+    direction = rng.standard_normal((*shape, 3))
+    direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+    distance = noise.outlier_size * rng.uniform(0.5, 1.5, shape)
+    return added + np.where(is_outlier, distance, 0.0)[..., None] * direction
+
+
+@torch.no_grad()
+def _written(model: BallModel, times: FloatArray) -> FloatArray:
+    """(k,) s, the stamps of frames taken at some times since the launch, before jitter."""
+    return times if model.measures_plainly else model.stamps(torch.from_numpy(times)).numpy()
+
+
+@torch.no_grad()
+def _labelled(model: BallModel, spin: FloatArray) -> FloatArray:
+    """(3,) rad/s, the label of a spin before noise."""
+    return spin if model.measures_plainly else model.labelled(torch.from_numpy(spin)).numpy()
+
+
+@torch.no_grad()
+def _apparent_positions(
+    config: SimulationConfig, model: BallModel, states: FloatArray, exists: NDArray[np.bool_]
+) -> FloatArray:
+    """(n, k, 3) m, where the ball seems to be before noise."""
+    apparent = states[..., POSITION].copy()
+    if not model.measures_plainly:
+        flat = torch.from_numpy(states[exists])
+
+        def later(delay: Tensor) -> Tensor:
+            return advance(model, flat, delay.expand(len(flat)), config.ball.surfaces)
+
+        apparent[exists] = model.measured(flat, later).numpy()
+    return apparent

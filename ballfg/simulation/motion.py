@@ -1,0 +1,110 @@
+"""The true motion of a block of shots: frame by frame, through contacts, with process noise."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ballfg.dynamics import BallModel, Surfaces, advance
+from ballfg.dynamics.motion.rollout import is_resting
+from ballfg.simulation.config import ProcessNoise
+from ballfg.simulation.launcher import Launcher
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
+
+NOISE_STEP = 0.005
+"""s. Process noise enters at least this often. In free flight its discretisation is exact for any step; in a step with
+a contact the noise is added after the bounce, so that the step must be short."""
+MIN_FRAMES = 5
+"""Every track has this many frames, even of a ball that leaves the view at once."""
+
+
+@dataclass(frozen=True)
+class Motion:
+    """The true states of a block of shots at their frames, frame k at k / rate seconds."""
+
+    states: NDArray[np.float64]
+    """(n, k, 9); behind the end of a track not defined."""
+
+    lengths: NDArray[np.int64]
+    """(n,) frames of each track."""
+
+
+@torch.no_grad()
+def simulate_motion(
+    model: BallModel,
+    start: Tensor,
+    rate: float,
+    surfaces: Surfaces,
+    launcher: Launcher,
+    noise: ProcessNoise,
+    rng: np.random.Generator,
+) -> Motion:
+    """Follows shots until they leave the launcher's view or last too long.
+
+    Args:
+        model: the true ball.
+        start: (n, 9) first states.
+        rate: Hz.
+        surfaces: what the ball bounces on.
+        launcher: says where and when a track ends.
+        noise: process noise of the flight; that of contacts is in `model`.
+        rng: draws the process noise.
+    Returns: the frames; the first is `start`.
+    """
+    frames = max(MIN_FRAMES, math.floor(launcher.duration * rate + 1e-9) + 1)
+    states = torch.zeros((len(start), frames, STATE_DIM), dtype=torch.float64)
+    states[:, 0] = start
+    lengths = torch.ones(len(start), dtype=torch.int64)
+    alive = torch.arange(len(start))
+    state = start
+    for k in range(1, frames):
+        state = _next_frame(model, state, 1.0 / rate, surfaces, noise, rng)
+        keep = launcher.in_view(state, surfaces, model) | (k < MIN_FRAMES)
+        alive, state = alive[keep], state[keep]
+        if len(alive) == 0:
+            break
+        states[alive, k] = state
+        lengths[alive] = k + 1
+    return Motion(states.numpy(), lengths.numpy())
+
+
+def _next_frame(
+    model: BallModel, state: Tensor, dt: float, surfaces: Surfaces, noise: ProcessNoise, rng: np.random.Generator
+) -> Tensor:
+    """(n, 9) one frame later."""
+    if not noise.in_flight:
+        return advance(model, state, torch.full((len(state),), dt, dtype=torch.float64), surfaces)
+    steps = math.ceil(dt / NOISE_STEP - 1e-9)
+    h = torch.full((len(state),), dt / steps, dtype=torch.float64)
+    for _ in range(steps):
+        state = advance(model, state, h, surfaces)
+        disturbance = process_noise(len(state), dt / steps, noise, rng)
+        resting = is_resting(model, state, surfaces.height_below(state))
+        disturbance[resting, Z] = 0.0  # the surface takes it up
+        disturbance[resting, VZ] = 0.0
+        state = state + disturbance
+    return state
+
+
+def process_noise(count: int, dt: float, noise: ProcessNoise, rng: np.random.Generator) -> Tensor:
+    """What white acceleration of density q adds to states over dt, drawn exactly.
+
+    Position and velocity are correlated, with covariance q^2 [dt^3/3, dt^2/2; dt^2/2, dt] per axis: with independent
+    standard normals a, b the velocity gains q sqrt(dt) a and the position q dt^1.5 (a / 2 + b / sqrt(12)).
+
+    Args: count: states.  dt: s.  noise: the densities.  rng: draws.
+    Returns: (count, 9).
+    Source: Y. Bar-Shalom, X. R. Li, T. Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
+        section 6.2.2 (continuous white noise acceleration model).
+    """
+    a, b, c = rng.standard_normal((3, count, 3))
+    added = np.zeros((count, STATE_DIM))
+    added[:, VELOCITY] = noise.acceleration * math.sqrt(dt) * a
+    added[:, POSITION] = noise.acceleration * dt**1.5 * (a / 2 + b / math.sqrt(12))
+    added[:, SPIN] = noise.spin * math.sqrt(dt) * c
+    return torch.from_numpy(added)

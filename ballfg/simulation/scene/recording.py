@@ -1,0 +1,70 @@
+"""A recording before it is drawn: the balls, the cameras, and what each camera's frames hold."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.simulation.scene.config import Clock, SceneConfig
+from ballfg.simulation.scene.flights import Flight, duration, fly_shots
+from ballfg.simulation.scene.renderer import Renderer
+from ballfg.simulation.scene.shutter import Frames, Passage, frames_of, passages_of
+from ballfg.vision.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """What happened, and when each camera looked. Cameras are counted in the order of `cameras`."""
+
+    config: SceneConfig
+    """What was asked for."""
+
+    cameras: tuple[Camera, ...]
+    """The rig."""
+
+    flights: tuple[Flight, ...]
+    """The balls, in the order of their launches."""
+
+    frames: tuple[Frames, ...]
+    """Of each camera."""
+
+    passages: tuple[tuple[Passage, ...], ...]
+    """Of each camera, in the order of `flights`."""
+
+    def clock(self, name: str) -> Clock:
+        """That of the camera with this name."""
+        return self.config.clocks.get(name, Clock())
+
+    def images(self, number: int) -> Iterator[NDArray[np.uint8]]:
+        """The images (h, w, 3), blue green red, of the camera with this number, in the order of its frames."""
+        renderer = Renderer(self.config, self.cameras[number], number)
+        return renderer.frames(self.frames[number], self.passages[number])
+
+    @property
+    def image_count(self) -> int:
+        """Frames of all cameras together."""
+        return sum(len(frames.times) for frames in self.frames)
+
+
+def record(config: SceneConfig, cameras: Sequence[Camera]) -> Recording:
+    """Launches the balls and opens the shutters; images are drawn when they are asked for.
+
+    Args:
+        config: the recording.
+        cameras: with names of their own; `ballfg.simulation.cameras.table_rig` makes a rig.
+    Raises: ValueError: no camera, two of one name, or a clock of a camera that is not there.
+    """
+    names = [camera.name for camera in cameras]
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"cameras must be at least one, with names of their own; got {', '.join(names) or 'none'}.")
+    for name in config.clocks:
+        if name not in names:
+            raise ValueError(f"clocks must be of cameras {', '.join(names)}; got one of {name!r}. Rename it.")
+    flights = fly_shots(config)
+    until = duration(flights)
+    frames = [frames_of(config, camera, number, until) for number, camera in enumerate(cameras)]
+    passages = [tuple(passages_of(config, flights, taken)) for taken in frames]
+    return Recording(config, tuple(cameras), tuple(flights), tuple(frames), tuple(passages))

@@ -1,0 +1,98 @@
+"""When each camera's shutter is open, what it writes about that, and where the balls are meanwhile."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.simulation.measure import JITTER_LIMIT
+from ballfg.simulation.scene.config import Clock, SceneConfig, SceneStream, stream
+from ballfg.simulation.scene.flights import Flight
+from ballfg.state import POSITION
+from ballfg.vision.camera import Camera
+
+Array = NDArray[np.float64]
+
+PATH_POINTS: Final = 17
+"""Points of a ball's path through one exposure, the first at the opening, the last at the closing, the middle one at
+the stamp. Sixteen chords: a bounce within 2 ms is off by less than 0.1 mm over one of them."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """The frames of one camera."""
+
+    times: Array
+    """(f,) s, true time of the middle of each exposure."""
+
+    stamps: Array
+    """(f,) s, what the camera writes."""
+
+
+@dataclass(frozen=True, eq=False)
+class Passage:
+    """One ball's way through the frames of one camera, seen or not."""
+
+    name: str
+    """Of the ball's track."""
+
+    frames: NDArray[np.int64]
+    """(n,) numbers of the frames whose whole exposure lies within the flight; in no other frame is the ball there."""
+
+    paths: Array
+    """(n, `PATH_POINTS`, 3) m, its centre from the opening of the shutter to its closing, evenly in time."""
+
+    @property
+    def centres(self) -> Array:
+        """(n, 3) m, in the middle of each exposure."""
+        return self.paths[:, PATH_POINTS // 2]
+
+
+def free_running(names: Sequence[str], rate: float, seed: int) -> dict[str, Clock]:
+    """Clocks of cameras that nobody synchronised: first exposures fall all over one frame interval, never together.
+
+    Args:
+        names: of the cameras.
+        rate: Hz.
+        seed: draws which camera comes when, each within the middle half of a share of the interval of its own.
+    """
+    rng = stream(seed, SceneStream.PHASE)
+    place = rng.permutation(len(names)) + rng.uniform(0.25, 0.75, len(names))
+    return {name: Clock(phase=float(p / len(names) / rate)) for name, p in zip(names, place, strict=True)}
+
+
+def frames_of(config: SceneConfig, camera: Camera, number: int, until: float) -> Frames:
+    """The frames that a camera takes from its first one on.
+
+    Args:
+        config: rate, clocks, dropped frames, jitter.
+        camera: for its name and the time offset that it is known to have.
+        number: of the camera in its rig; it picks the random streams.
+        until: s, true time of the end of the recording.
+    """
+    clock = config.clocks.get(camera.name, Clock())
+    count = int(np.floor((until - clock.phase) * config.rate)) + 1
+    kept = stream(config.seed, SceneStream.DROPOUT, number).random(count) >= config.dropout
+    kept[0] = True
+    times = clock.phase + np.arange(count) / config.rate
+    normal = np.clip(
+        stream(config.seed, SceneStream.JITTER, number).standard_normal(count), -JITTER_LIMIT, JITTER_LIMIT
+    )
+    stamps = times + camera.time_offset + clock.offset + config.jitter * normal
+    return Frames(times[kept], stamps[kept])
+
+
+def passages_of(config: SceneConfig, flights: Sequence[Flight], frames: Frames) -> list[Passage]:
+    """Where each ball is during the exposures of a camera."""
+    within = config.exposure * np.linspace(-0.5, 0.5, PATH_POINTS)
+    passages = []
+    for flight in flights:
+        there = (frames.times + within[0] >= flight.start) & (frames.times + within[-1] <= flight.end)
+        number = np.flatnonzero(there).astype(np.int64)
+        states = flight.states(frames.times[number, None] + within)
+        passages.append(Passage(flight.name, number, states[..., POSITION]))
+    return passages

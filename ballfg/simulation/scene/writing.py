@@ -1,0 +1,178 @@
+"""A recording as files: videos or images, stamps, cameras, and the truth about every ball and frame."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any, Final, cast
+
+import cv2
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ballfg.dynamics import Effect
+from ballfg.simulation.scene.recording import Recording
+from ballfg.simulation.scene.visible import visible_columns
+from ballfg.simulation.writing import check_folder
+from ballfg.state import STATE_NAMES
+from ballfg.tracks import TableWriter
+from ballfg.tracks.writing import staging
+from ballfg.vision.camera import Camera
+from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
+
+Pixels = NDArray[np.uint8]
+Watch = Callable[[Iterable[Pixels]], Iterator[Pixels]]
+
+SCENE_FILE: Final = "scene.yaml"
+TRUTH_RATE: Final = 1000.0
+"""Hz, rows of `truth.csv`: between them a line is off by less than 2 micrometres, except over a bounce."""
+CODEC: Final = "mp4v"
+"""MPEG-4 part 2: every build of OpenCV writes and reads it."""
+
+
+def write_scene(
+    folder: str | os.PathLike[str],
+    recording: Recording,
+    *,
+    images: bool = False,
+    force: bool = False,
+    watch: Watch = iter,
+) -> None:
+    """Renders a recording and writes it; all files appear together at the end, or none.
+
+    - `NAME.mp4` (or, with `images`, a folder `NAME` of PNG files, without any loss) and `NAME_stamps.csv` (`t`, one row
+      a frame) for each camera;
+    - `cameras.yaml`: the cameras as they are, except for clock offsets that nobody declares;
+    - `truth.csv`: `trajectory,t` and the true state, every millisecond of true time;
+    - `visible.csv`: for each frame and each ball in it, where it is: see `visible.visible_columns`;
+    - `scene.yaml`: what was asked for, with the clocks.
+
+    Args:
+        folder: new or empty; its parent must exist.
+        recording: what to draw.
+        images: PNG files in place of videos.
+        force: replace a scene that is there already.
+        watch: hands the images through, `Recording.image_count` of them, for instance to show progress.
+    Raises:
+        ValueError: the folder holds something else, or a camera cannot be a file's name.
+        FileNotFoundError: the folder's parent does not exist.
+        OSError: OpenCV cannot write a video or an image here.
+    """
+    path = Path(folder)
+    check_scene_folder(path, force=force)
+    for camera in recording.cameras:
+        if camera.name != Path(camera.name).name or camera.name.startswith("."):
+            raise ValueError(f"camera names must be good as file names; got {camera.name!r}. Rename it.")
+    with staging(path) as stage:
+        drawn = watch(_all_images(recording))
+        for number, camera in enumerate(recording.cameras):
+            _write_images(
+                stage, camera, recording.config.rate, drawn, len(recording.frames[number].times), images=images
+            )
+            with TableWriter(stage / f"{camera.name}_stamps.csv") as table:
+                table.write({"t": recording.frames[number].stamps})
+        write_cameras(stage / CAMERAS_FILE, recording.cameras)
+        _write_truth(stage / "truth.csv", recording)
+        with TableWriter(stage / "visible.csv") as table:
+            for number in range(len(recording.cameras)):
+                table.write(visible_columns(recording, number))
+        _publish(stage, path, scene_content(recording))
+
+
+def check_scene_folder(folder: Path, *, force: bool) -> None:
+    """Refuses a folder as `ballfg.simulation.writing.check_folder` does; what may be replaced is a rendered scene."""
+    check_folder(folder, force=force, mark=SCENE_FILE, what="rendered scene")
+
+
+def scene_content(recording: Recording) -> dict[str, Any]:
+    """What `scene.yaml` says: everything that made the recording."""
+    config = recording.config
+    return {
+        "seed": config.seed,
+        "shots": config.shots,
+        "interval": config.interval,
+        "rate": config.rate,
+        "exposure": config.exposure,
+        "clocks": {camera.name: asdict(recording.clock(camera.name)) for camera in recording.cameras},
+        "dropout": config.dropout,
+        "jitter": config.jitter,
+        "colour": config.colour,
+        "noise": config.noise,
+        "flicker": config.flicker,
+        "distractors": config.distractors,
+        "settings": {name: list(levels) for name, levels in config.settings.items()},
+        "undeclared": {effect.name: _values(effect) for effect in config.undeclared},
+        "flights": {f.name: {"start": f.start, "end": f.end} for f in recording.flights},
+    }
+
+
+def _values(effect: Effect) -> dict[str, float]:
+    """The values of an effect's coefficients, by name, in their own units."""
+    return {c.name: float(cast(Tensor, getattr(effect, c.name)).detach()) for c in effect.coefficients}
+
+
+def _all_images(recording: Recording) -> Iterator[Pixels]:
+    for number in range(len(recording.cameras)):
+        yield from recording.images(number)
+
+
+def _write_images(
+    stage: Path, camera: Camera, rate: float, drawn: Iterator[Pixels], count: int, *, images: bool
+) -> None:
+    """Takes the next `count` images and writes them as one video, or as files of a folder."""
+    if images:
+        (stage / camera.name).mkdir()
+        for number in range(count):
+            _write_png(stage / camera.name / f"{number:06d}.png", next(drawn))
+        return
+    path = stage / f"{camera.name}.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*CODEC), rate, camera.size)
+    if not writer.isOpened():
+        raise OSError(f"{path}: OpenCV cannot write {CODEC} videos here. Write images instead.")
+    try:
+        for _ in range(count):
+            writer.write(next(drawn))
+    finally:
+        writer.release()
+
+
+def _write_png(path: Path, image: Pixels) -> None:
+    if not cv2.imwrite(str(path), image):
+        raise OSError(f"{path}: OpenCV could not write the image. Check the space on the disk.")
+
+
+def _write_truth(path: Path, recording: Recording) -> None:
+    with TableWriter(path) as table:
+        for flight in recording.flights:
+            count = int(np.floor((flight.end - flight.start) * TRUTH_RATE)) + 1
+            times = np.minimum(flight.start + np.arange(count) / TRUTH_RATE, flight.end)
+            states = flight.states(times)
+            columns: dict[str, Any] = {"trajectory": flight.name, "t": times}
+            table.write(columns | {name: states[:, i] for i, name in enumerate(STATE_NAMES)})
+
+
+def _publish(stage: Path, folder: Path, content: dict[str, Any]) -> None:
+    """Moves the complete files to their names; what an older scene leaves over is removed. `scene.yaml` comes last."""
+    new = sorted(entry.name for entry in stage.iterdir())
+    old = folder / SCENE_FILE
+    if old.is_file():
+        for name in yaml.safe_load(old.read_text(encoding="utf-8"))["files"]:
+            _remove(folder / Path(name).name)
+    for name in new:
+        _remove(folder / name)
+        os.replace(stage / name, folder / name)
+    part = stage / SCENE_FILE
+    part.write_text(yaml.safe_dump(content | {"files": new}, sort_keys=False), encoding="utf-8")
+    os.replace(part, old)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

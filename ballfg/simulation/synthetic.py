@@ -1,0 +1,68 @@
+"""Synthetic tracks, one after the other: launch, fly, measure, in blocks of bounded size."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+
+from ballfg.dynamics import AnalyticModel, BallModel
+from ballfg.simulation.composition import KickedModel, true_model
+from ballfg.simulation.config import SimulationConfig
+from ballfg.simulation.measure import SimulatedTrack, measure
+from ballfg.simulation.motion import simulate_motion
+from ballfg.simulation.settings import settings_of_shots
+from ballfg.simulation.streams import Purpose, generator
+from ballfg.tracks import DatasetInfo
+
+BLOCK = 256
+"""Tracks that are computed at once: 4 MB of states. Another number would give another dataset for the same seed."""
+
+
+def simulate(config: SimulationConfig) -> Iterator[SimulatedTrack]:
+    """Makes the tracks of a simulation, with their truth.
+
+    Memory is that of one block, whatever the number of tracks.
+
+    Args:
+        config: everything about the simulation.
+    Returns: an iterator over the tracks in the order of their names, "000", "001" ...
+    Raises: ValueError: at once, if an undeclared effect does not go with the model.
+    """
+    model = true_model(config.ball.model, config.undeclared)
+    starts = range(0, config.tracks, BLOCK)
+    return itertools.chain.from_iterable(_block(config, model, block, first) for block, first in enumerate(starts))
+
+
+def _block(config: SimulationConfig, model: AnalyticModel, block: int, first: int) -> list[SimulatedTrack]:
+    """The tracks of one block."""
+    kind, seed = config.ball, config.seed
+    count = min(BLOCK, config.tracks - first)
+    settings = settings_of_shots(config.combinations(), first, count, seed)
+    start = kind.launcher.launch(settings, kind.surfaces.table_height, generator(seed, Purpose.LAUNCH, block))
+    moving: BallModel = model
+    if config.process.in_contact:
+        moving = KickedModel(model, config.process, generator(seed, Purpose.CONTACT, block))
+    motion = simulate_motion(
+        moving,
+        start,
+        config.rate,
+        kind.surfaces,
+        kind.launcher,
+        config.process,
+        generator(seed, Purpose.PROCESS, block),
+    )
+    return measure(config, model, motion, settings, block, first)
+
+
+def dataset_info(config: SimulationConfig) -> DatasetInfo:
+    """What the dataset says about itself: the declared noise, and nothing of effects that nobody declares."""
+    noise = config.noise
+    return DatasetInfo(
+        name=f"simulated {config.ball.name}",
+        table_height=config.ball.surfaces.table_height,
+        ball=config.ball.ball,
+        rate=config.rate,
+        position_noise=noise.position or None,
+        spin_noise=(noise.spin or None) if config.spin_labels else None,
+        source="ballfg simulate",
+    )

@@ -1,0 +1,142 @@
+"""Cameras whose shutters do not open together: what camera factors gain, and what their clocks are found to be."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.benchmarks.cameras.scenes import Filmed, truth_at
+from ballfg.dynamics import nominal_model
+from ballfg.estimation import Estimate, Online, Settings, Smoother
+from ballfg.estimation.measurement.position_noise import estimate_position_noise
+from ballfg.estimation.observations.sighted import SightedTrack, sighted_track
+from ballfg.estimation.settings import uncertain
+from ballfg.estimation.smoother.time_offsets import TimeOffsets, estimate_time_offsets
+from ballfg.simulation.scene import Flight
+from ballfg.state import POSITION, VELOCITY, VZ
+from ballfg.tracks import Track
+from ballfg.vision import Camera, SeenBall, triangulate
+from ballfg.vision.association.clock import nearest
+
+Array = NDArray[np.float64]
+
+NEAR_BOUNCE: Final = 1.0
+"""Frame intervals about a bounce that do not count: a stamp's velocity is before it or after it by chance."""
+BLIND: Final = 20.0
+"""px, what a ball of 10 m/s moves in half a frame at 120 Hz, 3 m away."""
+OTHER_BALL: Final = 0.5
+"""m. A state that far from a flight is of another one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Velocities:
+    """Errors of one way to estimate.
+
+    Attributes:
+        squares: for each flight the sum of squared velocity errors, (m/s)^2.  counts: of how many stamps.
+        positions: for each flight the sum of squared position errors, m^2.
+    """
+
+    squares: Array
+    counts: Array
+    positions: Array
+
+
+def sighted(filmed: Filmed) -> list[SightedTrack]:
+    """The balls of a recording with the sightings that they were made from."""
+    tracking = filmed.tracking
+    pairs = zip(tracking.names, tracking.balls, strict=True)
+    return [sighted_track(name, ball.sightings, tracking.cameras) for name, ball in pairs]
+
+
+def compare(filmed: Filmed) -> dict[str, Velocities]:
+    """Velocities of the same balls from camera factors, and from points made in two ways.
+
+    All estimates are the smoother's or the online estimator's with the same model, priors and process noise; the noise
+    of points is what they scatter by. Each is judged at its own stamps.
+    """
+    balls = filmed.tracking.balls
+    interpolated = [(ball.times, ball.points) for ball in balls]
+    naive = [_as_if_synchronised(ball, filmed.recording.cameras, filmed.recording.config.rate) for ball in balls]
+    ways = {"smoother, as if synchronised": naive, "smoother, interpolated": interpolated}
+    found = {name: _judged(filmed, _smoothed_points(filmed, points)) for name, points in ways.items()}
+    for name, kind in (("smoother, camera factors", Smoother), ("online, camera factors", Online)):
+        estimator = kind(nominal_model(), filmed.recording.config.ball.surfaces, _settings(None))
+        found[name] = _judged(filmed, [_states(estimator.estimate(track)) for track in sighted(filmed)])
+    return found
+
+
+def _as_if_synchronised(ball: SeenBall, cameras: Sequence[Camera], rate: float) -> tuple[Array, Array]:
+    """Times (n,) s and points (n, 3) m of the nearest frames, as one would who believes in one shutter.
+
+    The frames are those of the camera that saw most; of the others the nearest sighting within half a frame counts. The
+    pixels' noise is taken to be as large as what the ball moves meanwhile: no view is refused for that.
+    """
+    seen = ball.sightings
+    offsets = np.array([camera.time_offset for camera in cameras])
+    true = seen.times - offsets[seen.camera]
+    base = int(np.bincount(seen.camera, minlength=len(cameras)).argmax())
+    times = true[seen.camera == base]
+    pixels = np.full((len(times), len(cameras), 2), np.nan)
+    for number in range(len(cameras)):
+        own = np.flatnonzero(seen.camera == number)
+        if len(own):
+            near = own[nearest(true[own], times)]
+            close = np.abs(true[near] - times) <= 0.5 / rate
+            pixels[close, number] = seen.pixels[near[close]]
+    loose = np.broadcast_to(BLIND**2 * np.eye(2), (*pixels.shape[:2], 2, 2))
+    points = triangulate(cameras, pixels, loose).points
+    kept = np.isfinite(points).all(axis=1)
+    return times[kept], points[kept]
+
+
+def clocks(filmed: Filmed) -> TimeOffsets:
+    """The cameras' time offsets, from all balls."""
+    surfaces = filmed.recording.config.ball.surfaces
+    return estimate_time_offsets(sighted(filmed), nominal_model(), surfaces, _settings(None))
+
+
+def _settings(noise: Array | None) -> Settings:
+    if noise is None:
+        return uncertain(nominal_model())
+    x, y, z = noise.tolist()
+    return uncertain(nominal_model(), position_noise=(x, y, z))
+
+
+States = tuple[Array, Array]
+"""Times (n,) s and states (n, 9)."""
+
+
+def _states(estimate: Estimate) -> States:
+    return estimate.times, estimate.states
+
+
+def _smoothed_points(filmed: Filmed, balls: Sequence[tuple[Array, Array]]) -> list[States]:
+    tracks = [Track(f"{k:03d}", times, points) for k, (times, points) in enumerate(balls)]
+    settings = _settings(estimate_position_noise(tracks))
+    smoother = Smoother(nominal_model(), filmed.recording.config.ball.surfaces, settings)
+    return [_states(smoother.estimate(track)) for track in tracks]
+
+
+def _judged(filmed: Filmed, estimates: Sequence[States]) -> Velocities:
+    """Errors by flight, at the stamps of each estimate, away from bounces."""
+    step = 1.0 / filmed.recording.config.rate
+    sums = np.zeros((3, len(filmed.recording.flights)))
+    for number, flight in enumerate(filmed.recording.flights):
+        for times, states in estimates:
+            error = states - truth_at(flight, times)
+            far = np.nan_to_num(np.linalg.norm(error[:, POSITION], axis=1), nan=np.inf)
+            error = error[(far < OTHER_BALL) & _apart_from_bounces(flight, times, step)]
+            sums[:, number] += (error[:, VELOCITY] ** 2).sum(), len(error), (error[:, POSITION] ** 2).sum()
+    return Velocities(sums[0], sums[1], sums[2])
+
+
+def _apart_from_bounces(flight: Flight, times: Array, step: float) -> NDArray[np.bool_]:
+    jump = np.diff(flight.knots[:, VZ])
+    knots = flight.start + np.arange(len(flight.knots)) * (flight.end - flight.start) / (len(flight.knots) - 1)
+    bounces = knots[1:][jump > 0.5]
+    return np.asarray((np.abs(times[:, None] - bounces) > NEAR_BOUNCE * step + np.diff(knots[:2])).all(axis=1))

@@ -1,0 +1,231 @@
+"""The cases of the loop's benchmark: datasets to be made, and what a diagnosis of each is asked."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from ballfg.benchmarks.diagnosis.effects import PAIRS, PLANTS, UNKNOWN
+from ballfg.simulation import SETTING_LEVELS
+
+STATED_NOISE: Final = 0.003
+"""m, what every dataset says about its positions, and of most it is true."""
+LABEL_NOISE: Final = 4.0
+"""rad/s per component, what every dataset says about its spin labels."""
+BARE: Final = ("magnus", "tangential_restitution", "table_height")
+"""What the nominal model loses to leave gravity, drag, restitution and friction."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """How tracks are taken.
+
+    Attributes:
+        tracks: number.  rate: Hz.  position: m and spin: rad/s, true noise of positions and labels.
+        dropout, outliers: probability for each frame.  jitter: s, of the stamps.
+        labels: whether spins are labelled.
+        levels: launcher levels by setting, for those that do not run through all of theirs.
+    """
+
+    tracks: int = 50
+    rate: float = 120.0
+    position: float = STATED_NOISE
+    spin: float = LABEL_NOISE
+    dropout: float = 0.0
+    outliers: float = 0.0
+    jitter: float = 0.0
+    labels: bool = True
+    levels: tuple[tuple[str, tuple[int, ...]], ...] = ()
+
+
+@dataclass(frozen=True)
+class Case:
+    """One dataset, one diagnosis.
+
+    Attributes:
+        part: of the benchmark.
+        subject: what is planted, in a word.
+        size: of it; 1 is typical.
+        seed: number of the repetition.
+        planted: names of the effects that the declared model lacks.
+        left_out: effects that the nominal model has and the declared one has not.
+        sessions: undeclared effects, as texts, of each session that the dataset consists of.
+        recording: how its tracks are taken.
+        data: folder of measured tracks, which take the place of simulated ones.
+        repair: fit the true model too.
+        jobs: processes of the diagnosis.
+    """
+
+    part: str
+    subject: str
+    size: float
+    seed: int
+    planted: tuple[str, ...] = ()
+    left_out: tuple[str, ...] = ()
+    sessions: tuple[tuple[str, ...], ...] = ((),)
+    recording: Recording = field(default_factory=Recording)
+    data: Path | None = None
+    repair: bool = False
+    jobs: int = 1
+
+    @property
+    def name(self) -> str:
+        """Of its record."""
+        return f"{self.part}-{self.subject}-{self.size:.4g}-{self.seed}"
+
+    @property
+    def stream(self) -> int:
+        """Seed of its random numbers: every case has its own."""
+        return zlib.crc32(self.name.encode())
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is computed.
+
+    Attributes:
+        effects: names of those planted one by one.
+        unlabelled: names of those planted where no spin is labelled.
+        pairs: names of two planted together.
+        sizes: of those planted with labels.
+        seeds: of each at its typical size; the true model is fitted to the first of them.
+        side_seeds: of each at other sizes, and of pairs.  unlabelled_seeds: where no spin is labelled.
+        ratios, detection_seeds: sizes over the ideal test's, and seeds at each, where the detection limit is sought.
+        nulls: datasets that lack nothing.
+        unknown, unknown_seeds: physics outside the catalogue.
+        timed: diagnoses that are timed alone.
+    """
+
+    effects: tuple[str, ...]
+    unlabelled: tuple[str, ...]
+    pairs: tuple[tuple[str, str], ...]
+    sizes: tuple[float, ...]
+    seeds: int
+    side_seeds: int
+    unlabelled_seeds: int
+    ratios: tuple[float, ...]
+    detection_seeds: int
+    nulls: int
+    unknown: tuple[str, ...]
+    unknown_seeds: int
+    timed: int
+
+
+def _without_labels(names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(name for name in names if not name.startswith("spin_label"))
+
+
+FULL: Final = Plan(
+    effects=tuple(PLANTS),
+    unlabelled=_without_labels(list(PLANTS)),
+    pairs=PAIRS,
+    sizes=(0.5, 1.0, 2.0),
+    seeds=4,
+    side_seeds=1,
+    unlabelled_seeds=2,
+    ratios=(1.0, 1.5, 2.0),
+    detection_seeds=2,
+    nulls=100,
+    unknown=tuple(UNKNOWN),
+    unknown_seeds=3,
+    timed=3,
+)
+QUICK: Final = Plan(
+    effects=tuple(PLANTS)[:8],
+    unlabelled=_without_labels(list(PLANTS)[:3]),
+    pairs=PAIRS[:1],
+    sizes=(1.0,),
+    seeds=1,
+    side_seeds=1,
+    unlabelled_seeds=1,
+    ratios=(),
+    detection_seeds=0,
+    nulls=5,
+    unknown=tuple(UNKNOWN)[:2],
+    unknown_seeds=1,
+    timed=1,
+)
+
+
+def planted_case(part: str, name: str, size: float, seed: int) -> Case:
+    """A case with one catalogue effect."""
+    plant = PLANTS[name]
+    left_out = (name,) if plant.left_out else ()
+    return Case(part, name, size, seed, (name,), left_out, (plant.texts(size),))
+
+
+def naming_cases(plan: Plan, seed: int) -> Iterator[Case]:
+    """Every effect in every size, pairs, and effects where no spin is labelled."""
+    for number, name, size in product(range(seed, seed + plan.seeds), plan.effects, plan.sizes):
+        if size == 1.0 or (PLANTS[name].sized and number < seed + plan.side_seeds):
+            yield replace(planted_case("naming", name, size, number), repair=size == 1.0 and number == seed)
+    for number, (one, other) in product(range(seed, seed + plan.side_seeds), plan.pairs):
+        texts = (*PLANTS[one].texts(1.0), *PLANTS[other].texts(1.0))
+        left_out = tuple(name for name in (one, other) if PLANTS[name].left_out)
+        yield Case("pairs", f"{one}+{other}", 1.0, number, (one, other), left_out, (texts,))
+    for number, name in product(range(seed, seed + plan.unlabelled_seeds), plan.unlabelled):
+        yield replace(planted_case("no_labels", name, 1.0, number), recording=Recording(labels=False))
+
+
+def detection_cases(plan: Plan, seed: int, ideal: Mapping[str, float]) -> Iterator[Case]:
+    """Effects at sizes about the one that the ideal test needs.
+
+    Args: ideal: that size by effect, for the effects that are to be detected.
+    """
+    for number, (name, size), ratio in product(range(seed, seed + plan.detection_seeds), ideal.items(), plan.ratios):
+        yield planted_case("detection", name, float(f"{ratio * size:.4g}"), number)
+
+
+def null_cases(plan: Plan, seed: int) -> Iterator[Case]:
+    """Datasets that lack nothing and differ in everything else."""
+    for number in range(plan.nulls):
+        yield Case("silence", "nothing", 1.0, seed + number, recording=null_recording(seed + number))
+
+
+def null_recording(seed: int) -> Recording:
+    """Noise of 1 to 6 mm where 3 are stated, and every other trouble of real tracks."""
+    rng = np.random.default_rng(seed)
+    few = tuple(
+        (name, tuple(sorted(rng.choice(levels, 2, replace=False).tolist()))) for name, levels in SETTING_LEVELS.items()
+    )
+    return Recording(
+        tracks=int(rng.integers(12, 61)),
+        rate=float(rng.choice([60.0, 100.0, 120.0, 180.0, 240.0])),
+        position=1e-3 * float(np.exp(rng.uniform(0.0, np.log(6.0)))),
+        dropout=float(rng.uniform(0.0, 0.2)),
+        outliers=float(rng.uniform(0.0, 0.02)),
+        jitter=float(rng.uniform(0.0, 0.5e-3)),
+        labels=bool(rng.random() < 0.5),
+        levels=few if rng.random() < 0.5 else (),
+    )
+
+
+def unknown_cases(plan: Plan, seed: int) -> Iterator[Case]:
+    """Physics that no catalogue holds."""
+    for number, name in product(range(seed, seed + plan.unknown_seeds), plan.unknown):
+        yield Case("unknown", name, 1.0, number, sessions=UNKNOWN[name])
+
+
+def measured_cases(folders: Sequence[Path]) -> Iterator[Case]:
+    """Each measured dataset with the nominal model and with gravity, drag and the bounce only.
+
+    Raises: ValueError: if two folders have the same name.
+    """
+    names = [folder.resolve().name for folder in folders]
+    for folder, name in zip(folders, names, strict=True):
+        if names.count(name) > 1:
+            raise ValueError(f"datasets must differ in the names of their folders; got '{name}' twice. Rename one.")
+        yield Case("measured", name, 1.0, 0, data=folder)
+        yield Case("measured", f"{name}-bare", 1.0, 0, planted=BARE, left_out=BARE, data=folder)
+
+
+def timed_cases(plan: Plan, seed: int) -> Iterator[Case]:
+    """Diagnoses that have the machine for themselves, with two processes: a wind, 50 tracks."""
+    for number in range(seed, seed + plan.timed):
+        yield replace(planted_case("time", "wind", 1.0, number), jobs=2)

@@ -1,0 +1,64 @@
+"""From a case to its data: simulated tracks in a folder, the declared model, and the true one."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+from ballfg.benchmarks.diagnosis.cases import LABEL_NOISE, STATED_NOISE, Case
+from ballfg.diagnosis.search.hypothesis import has_effect, with_effects, without_effect
+from ballfg.dynamics import AnalyticModel, nominal_model
+from ballfg.simulation import MeasurementNoise, SimulationConfig, dataset_info, parse_effects, simulate, table_tennis
+from ballfg.simulation.composition import true_model
+from ballfg.tracks import Dataset, Track, read_dataset, write_dataset
+
+
+def make_dataset(case: Case, folder: Path) -> Dataset:
+    """Simulate a case's tracks, session after session, into a folder that does not exist yet, and open it."""
+    configs = [_simulation(case, number) for number in range(len(case.sessions))]
+    info = replace(dataset_info(configs[0]), name=case.name, position_noise=STATED_NOISE)
+    if case.recording.labels:
+        info = replace(info, spin_noise=LABEL_NOISE)
+    write_dataset(folder, info, _tracks(configs), "parquet")
+    return read_dataset(folder)
+
+
+def declared_model(case: Case, radius: float) -> AnalyticModel:
+    """What the diagnosis is given: the nominal model, for a ball of some radius (m), less what is left out."""
+    model = with_effects(nominal_model(radius))
+    for name in case.left_out:
+        if has_effect(model, name):  # effects that need one go with it
+            model = without_effect(model, name)
+    return model
+
+
+def actual_model(case: Case) -> AnalyticModel:
+    """The truth of a case's first session."""
+    return with_effects(true_model(table_tennis().model, parse_effects(case.sessions[0])))
+
+
+def _simulation(case: Case, session: int) -> SimulationConfig:
+    """One session; the tracks are shared out evenly."""
+    taken = case.recording
+    return SimulationConfig(
+        tracks=taken.tracks // len(case.sessions),
+        rate=taken.rate,
+        seed=case.stream + session,
+        settings=dict(taken.levels),
+        noise=MeasurementNoise(
+            position=taken.position,
+            dropout=taken.dropout,
+            jitter=taken.jitter,
+            outliers=taken.outliers,
+            spin=taken.spin,
+        ),
+        undeclared=parse_effects(case.sessions[session]),
+        spin_labels=taken.labels,
+    )
+
+
+def _tracks(configs: list[SimulationConfig]) -> Iterator[Track]:
+    for session, config in enumerate(configs):
+        for simulated in simulate(config):
+            yield replace(simulated.track, name=f"{session}-{simulated.track.name}")

@@ -1,0 +1,116 @@
+"""The ideal test: how large an effect must be for the best test of it alone, all else being known that can be known.
+
+It looks at all tracks, knows the noise, and asks for one effect in its true shape. Its statistic is the score test's:
+chi-square where the effect is absent, non-central where it acts, with size^2 d' F d as non-centrality; F is what
+information is left of the effect's coefficients once first states and declared coefficients are projected out, and d
+what size 1 adds to them. F is taken from tracks without noise, at the truth, where every robust weight is one.
+
+Source: D. R. Cox and D. V. Hinkley, Theoretical Statistics, 1974, section 9.3.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import optimize, stats
+
+from ballfg.benchmarks.diagnosis.cases import Case, Recording, planted_case
+from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset
+from ballfg.benchmarks.diagnosis.effects import PLANTS
+from ballfg.benchmarks.diagnosis.record import case_digest
+from ballfg.benchmarks.record_file import read_record_file, write_record
+from ballfg.diagnosis.fit.columns import signatures
+from ballfg.diagnosis.fit.fit import fit, followed, start_from
+from ballfg.diagnosis.fit.holdout import launcher_labels
+from ballfg.diagnosis.fit.problem import Problem
+from ballfg.diagnosis.fit.stretches import stretches_of
+from ballfg.diagnosis.search.candidates import ALARM
+from ballfg.diagnosis.search.hypothesis import declared_free
+from ballfg.diagnosis.search.loop import CONFIRMED
+from ballfg.diagnosis.search.signatures import visible_directions
+from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces
+
+Array = NDArray[np.float64]
+
+LEVEL = ALARM * CONFIRMED
+"""False-alarm rate of one round of the loop: both of its tests must err."""
+POWER = 0.9
+"""Probability at which an effect counts as detectable."""
+
+
+@dataclass(frozen=True)
+class Ideal:
+    """The ideal test of an effect.
+
+    Attributes:
+        digest: of the case that it was computed from.
+        rank: degrees of freedom; 0 where the data do not show the effect.
+        information: non-centrality at size 1.
+    """
+
+    digest: str
+    rank: int
+    information: float
+
+    @property
+    def size(self) -> float:
+        """The smallest size found with `POWER`; infinite where the data do not show the effect."""
+        if not self.rank or self.information <= 0.0:
+            return float("inf")
+        return float(np.sqrt(needed(self.rank) / self.information))
+
+    def power(self, sizes: ArrayLike) -> Array:
+        """(...) probability that an effect of some sizes (...) is found."""
+        noncentrality = self.information * np.asarray(sizes, dtype=np.float64) ** 2
+        return np.asarray(power(noncentrality, self.rank)) if self.rank else np.zeros_like(noncentrality)
+
+
+def power(noncentrality: ArrayLike, rank: int) -> Array:
+    """(...) probability that the statistic passes its threshold."""
+    return np.asarray(stats.ncx2.sf(stats.chi2.isf(LEVEL, rank), rank, noncentrality))
+
+
+def needed(rank: int) -> float:
+    """The non-centrality at which the power is `POWER`."""
+    most = 1e3 + 1e2 * rank  # far beyond it for every rank
+    return float(optimize.brentq(lambda ncp: float(power(ncp, rank)) - POWER, 0.0, most))
+
+
+def ideal_case(name: str, seed: int) -> Case:
+    """The dataset that an ideal test is computed from: the effect absent, measured without noise."""
+    return replace(planted_case("ideal", name, 0.0, seed), recording=Recording(position=0.0, spin=0.0))
+
+
+def ideal_of(name: str, seed: int) -> Ideal:
+    """Compute the ideal test of an effect in `PLANTS` that comes in sizes."""
+    case, plant = ideal_case(name, seed), PLANTS[name]
+    with TemporaryDirectory() as folder:
+        dataset = make_dataset(case, Path(folder) / "tracks")
+        model = declared_model(case, dataset.info.ball.radius)
+        settings, tracks = dataset_settings(dataset, model), list(dataset)
+    smoother = Smoother(model, dataset_surfaces(dataset), settings)
+    stretches = stretches_of(smoother, tracks, launcher_labels(dataset, tracks, settings))
+    problem = Problem(model, followed(model, stretches), declared_free(model))
+    unknowns, noise = start_from(problem, settings.spin_label_noise, settings.spin_prior)
+    at_truth = fit(problem, unknowns, noise, settle_noise=False)
+    found, _ = signatures(at_truth, [plant.hypothesis()])
+    efficient, direction = found.efficient(), plant.direction()
+    rank = visible_directions(efficient.total, efficient.raw).shape[1]
+    return Ideal(case_digest(case), rank, float(direction @ efficient.total @ direction))
+
+
+def save_ideal(ideal: Ideal, path: Path) -> None:
+    """Write the file; its name appears once it is whole."""
+    write_record(path, asdict(ideal))
+
+
+def read_ideal(path: Path, digest: str) -> Ideal | None:
+    """What a file holds; None if there is no file, or one of another case.
+
+    Raises: ValueError: if the file holds something else.
+    """
+    return read_record_file(path, digest, lambda content: Ideal(**content), "an ideal test")

@@ -1,0 +1,137 @@
+"""Pictures of the loop's benchmark: power against size, what was named for what was planted, and how well it mends."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Final
+
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+from ballfg.benchmarks.diagnosis.cases import Case
+from ballfg.benchmarks.diagnosis.ideal import Ideal
+from ballfg.benchmarks.diagnosis.limit import NAMED, Curve, share
+from ballfg.benchmarks.diagnosis.record import Record
+from ballfg.benchmarks.diagnosis.rows import ALL, detectable, of_part, power_curves
+from ballfg.benchmarks.pictures import save
+from ballfg.benchmarks.results import Row
+
+LOOP_COLOUR: Final = "#3b4cc0"
+IDEAL_COLOUR: Final = "#7f7f7f"
+BEFORE_COLOUR: Final = "#d95f02"
+COLUMNS: Final = 5
+"""Panels side by side."""
+NOTHING: Final = "nothing"
+"""Column of the diagnoses that named no effect."""
+FEW_DECADES: Final = 100.0
+"""Ratio of the largest to the smallest size up to which more than the decades are numbered."""
+POINTS: Final = 200
+"""Of a drawn curve."""
+
+
+def power_picture(
+    cases: Sequence[Case], records: Mapping[str, Record], ideals: Mapping[str, Ideal], path: Path
+) -> Path:
+    """Share named right against the size, a panel for each effect that can be seen, with the ideal test's power."""
+    seen = detectable(ideals)
+    curves = {name: found for name, found in power_curves(cases, records, ideals).items() if name in seen}
+    rows = -(-len(curves) // COLUMNS)
+    figure, panels = plt.subplots(
+        rows, COLUMNS, figsize=(2.9 * COLUMNS, 2.3 * rows + 0.8), sharey=True, squeeze=False, layout="constrained"
+    )
+    for axes, (name, (sizes, outcomes, curve)) in zip(panels.flat, curves.items(), strict=False):
+        _draw_power(axes, sizes, outcomes, curve, ideals[name])
+        axes.set_title(name, size=10)
+    for axes in panels.flat[len(curves) :]:
+        axes.set_axis_off()
+    for axes in panels[:, 0]:
+        axes.set_ylabel("share")
+    figure.supxlabel("size of the effect, 1 is typical", size=10)
+    figure.suptitle("Named first, against the size of what was planted; bars: 95 % of a share", size=11)
+    handles, labels = panels[0, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside upper right", ncols=3, fontsize="small")
+    return save(figure, path)
+
+
+def _draw_power(axes: Axes, sizes: Sequence[float], outcomes: Sequence[bool], curve: Curve, ideal: Ideal) -> None:
+    for place, size in enumerate(sorted(set(sizes))):
+        seen = share([outcome for s, outcome in zip(sizes, outcomes, strict=True) if s == size])
+        ends = [[max(0.0, seen.value - seen.low)], [max(0.0, seen.high - seen.value)]]
+        label = "loop" if place == 0 else None
+        axes.errorbar(
+            size, seen.value, ends, color=LOOP_COLOUR, marker="o", markersize=4, linewidth=0.8, capsize=2, label=label
+        )
+    low, high = min(sizes), max(sizes)
+    if np.isfinite(ideal.size):
+        low, high = min(low, 0.5 * ideal.size), max(high, 1.5 * ideal.size)
+    grid = np.geomspace(low, high, POINTS)
+    axes.plot(grid, ideal.power(grid), color=IDEAL_COLOUR, label="ideal test")
+    axes.plot(grid, curve.at(grid), color=LOOP_COLOUR, linewidth=1.0, alpha=0.6, label="curve through the loop's")
+    axes.axhline(NAMED, color="black", linewidth=0.5, linestyle=":")
+    axes.set(xscale="log", ylim=(-0.05, 1.05))
+    _plain_sizes(axes, (1.0, 2.0, 5.0) if high < FEW_DECADES * low else (1.0,))
+    axes.grid(visible=True, alpha=0.25)
+
+
+def _plain_sizes(axes: Axes, marked: tuple[float, ...] = (1.0, 2.0, 5.0)) -> None:
+    """Numbers as 0.05, not as powers of ten, at some multiples of each decade of the horizontal axis."""
+    axes.xaxis.set_major_locator(LogLocator(subs=marked))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def confusion_picture(cases: Sequence[Case], records: Mapping[str, Record], path: Path) -> Path:
+    """What was named first (columns) for what was planted (rows), at typical size, with and without spin labels."""
+    parts = [("naming", "spin labels"), ("no_labels", "no spin labels")]
+    figure, panels = plt.subplots(1, 2, figsize=(15, 7.5), layout="constrained")
+    for axes, (part, title) in zip(panels, parts, strict=True):
+        chosen = [case for case in of_part(cases, part) if case.size == 1.0 and case.name in records]
+        planted = list(dict.fromkeys(case.subject for case in chosen))
+        first = [_first(records[case.name]) for case in chosen]
+        columns = [*planted, *sorted(set(first) - {*planted, NOTHING}), NOTHING]
+        counts = np.zeros((len(planted), len(columns)))
+        for case, name in zip(chosen, first, strict=True):
+            counts[planted.index(case.subject), columns.index(name)] += 1
+        _draw_shares(axes, counts / np.maximum(counts.sum(axis=1, keepdims=True), 1))
+        axes.set_xticks(range(len(columns)), columns, rotation=90, fontsize="small")
+        axes.set_yticks(range(len(planted)), planted, fontsize="small")
+        axes.set(xlabel="named first", ylabel="planted", title=f"{title}, {len(chosen)} datasets")
+    return save(figure, path)
+
+
+def _first(record: Record) -> str:
+    return record.found[0].name if record.found else NOTHING
+
+
+def _draw_shares(axes: Axes, shares: np.ndarray) -> None:
+    axes.imshow(shares, cmap="Blues", vmin=0.0, vmax=1.0, aspect="auto")
+    for (row, column), value in np.ndenumerate(shares):
+        if value > 0.0:
+            colour = "white" if value > 0.5 else "black"
+            axes.text(column, row, f"{100 * value:.0f}", ha="center", va="center", size=7, color=colour)
+
+
+def repair_picture(rows: Sequence[Row], path: Path) -> Path:
+    """Prediction error over that of the true model, by effect: with the declared and with the corrected model."""
+    found = [row for row in rows if row.case == "repair" and row.metric != ALL]
+    names = list(dict.fromkeys(row.metric for row in found))
+    figure, axes = plt.subplots(figsize=(8, 0.3 * len(names) + 1.6), layout="constrained")
+    for column, colour in (("before / true", BEFORE_COLOUR), ("after / true", LOOP_COLOUR)):
+        for place, row in enumerate(r for r in found if r.method == column):
+            if row.value is not None and row.low is not None and row.high is not None:
+                axes.plot([row.low, row.high], [names.index(row.metric)] * 2, color=colour, linewidth=1.2)
+                label = column if place == 0 else None
+                axes.plot(row.value, names.index(row.metric), "o", color=colour, markersize=5, label=label)
+    axes.axvline(1.0, color="black", linewidth=0.8)
+    axes.set_yticks(range(len(names)), names, fontsize="small")
+    axes.invert_yaxis()
+    axes.set(xscale="log", xlabel="prediction RMSE on the judging half / that of the true model")
+    _plain_sizes(axes)
+    axes.set_title("What the diagnosis mends; dot: median over seeds, line: lowest to highest", size=11)
+    axes.grid(visible=True, axis="x", which="both", alpha=0.25)
+    if found:
+        figure.legend(loc="outside lower center", ncols=2, fontsize="small")
+    return save(figure, path)

@@ -1,0 +1,149 @@
+"""What is kept of a diagnosis: names, evidence, errors and seconds, as a JSON file that a later run reads."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from ballfg.benchmarks.diagnosis.cases import Case
+from ballfg.benchmarks.record_file import read_record_file, write_record
+from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Finding
+
+RANKED = 8
+"""Leading candidates of a round that are kept, beside those planted."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """A finding: its name, what it could not be told from, its evidence, and coefficients with their sigmas."""
+
+    name: str
+    alike: tuple[str, ...]
+    p_value: float
+    delta_bic: float
+    parameters: Mapping[str, tuple[float, float | None]]
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A candidate of a round: what it would explain, its evidence, and what became of it."""
+
+    name: str
+    explained: float
+    p_value: float
+    delta_bic: float | None
+    standing: str
+
+
+@dataclass(frozen=True)
+class Record:
+    """A finished case.
+
+    Attributes:
+        digest: of the case: a record of another one does not count.
+        verdict: as in the report.
+        found: findings in order.
+        rounds: leading candidates of each round, best first, and those planted.
+        errors: mm, prediction error on the judging half: `before`, `after`, of the true model `true`, and where there
+            is a fallback, with it (`fallback`, the one after) and with named effects only (`named`).
+        patterns: p-values of the tests for what is left, by the place that they name.
+        tracks, judged: numbers of tracks in the dataset and on the judging half.
+        seconds: of the diagnosis, wall clock.
+    """
+
+    digest: str
+    verdict: str
+    found: tuple[Found, ...]
+    rounds: tuple[tuple[Ranked, ...], ...]
+    errors: Mapping[str, float]
+    patterns: Mapping[str, float]
+    tracks: int
+    judged: int
+    seconds: float
+
+    def save(self, path: Path) -> None:
+        """Write the file; its name appears once it is whole."""
+        write_record(path, asdict(self))
+
+
+def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None, seconds: float) -> Record:
+    """What is kept of a diagnosis.
+
+    Args: true: errors of the true model, where it was fitted.
+    """
+    errors = {"before": diagnosis.before, "after": diagnosis.after}
+    left = diagnosis.unexplained
+    if left.fallback is not None:
+        errors |= {"named": left.fallback.before, "fallback": left.fallback.after}
+    if true is not None:
+        errors["true"] = true
+    return Record(
+        digest=digest,
+        verdict=diagnosis.verdict.value,
+        found=tuple(_found(finding) for finding in diagnosis.findings),
+        rounds=tuple(_leading(listed, case.planted) for listed in diagnosis.rounds),
+        errors={name: float(one.prediction_rmse_mm) for name, one in errors.items()},
+        patterns={test.where: float(test.p_value) for test in left.tests},
+        tracks=diagnosis.tracks_found_on + diagnosis.tracks_judged_on,
+        judged=diagnosis.tracks_judged_on,
+        seconds=seconds,
+    )
+
+
+def _found(finding: Finding) -> Found:
+    values = {name: (float(v.value), _number(v.sigma)) for name, v in finding.parameters.items()}
+    alike = tuple(finding.indistinguishable_from)
+    return Found(finding.name, alike, float(finding.p_value), float(finding.delta_bic), values)
+
+
+def _leading(listed: tuple[Candidate, ...], planted: tuple[str, ...]) -> tuple[Ranked, ...]:
+    kept = [c for place, c in enumerate(listed) if place < RANKED or c.name in planted]
+    return tuple(
+        Ranked(
+            c.name,
+            float(c.explained),
+            float(c.p_value),
+            None if c.delta_bic is None else float(c.delta_bic),
+            c.standing.value,
+        )
+        for c in kept
+    )
+
+
+def _number(value: float) -> float | None:
+    return float(value) if math.isfinite(value) else None
+
+
+def read_record(path: Path, digest: str) -> Record | None:
+    """The record in a file; None if there is no file, or one of another case.
+
+    Raises: ValueError: if the file is no record.
+    """
+    return read_record_file(path, digest, _record_from, "a finished case")
+
+
+def _record_from(content: dict[str, Any]) -> Record:
+    content["found"] = tuple(_found_from(one) for one in content["found"])
+    content["rounds"] = tuple(tuple(Ranked(**one) for one in listed) for listed in content["rounds"])
+    return Record(**content)
+
+
+def _found_from(content: Mapping[str, Any]) -> Found:
+    pairs = {name: (value, sigma) for name, (value, sigma) in content["parameters"].items()}
+    return Found(**{**content, "alike": tuple(content["alike"]), "parameters": pairs})
+
+
+def case_digest(case: Case) -> str:
+    """Of everything that decides a case: what is planted and how it is taken, or the measured files."""
+    digest = hashlib.sha256(repr((metadata.version("ballfg"), replace(case, data=None))).encode())
+    if case.data is not None:
+        for path in sorted(case.data.iterdir()):
+            if path.is_file():
+                digest.update(path.name.encode())
+                digest.update(path.read_bytes())
+    return digest.hexdigest()

@@ -1,0 +1,122 @@
+"""Measured tracks as tasks: learn from every second shot, observe a quarter of a second, predict what follows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from ballfg.benchmarks.dynamics.task import Shot, Task
+from ballfg.benchmarks.estimators.measured import HORIZON, OBSERVE
+from ballfg.cli.progress import progress
+from ballfg.dynamics import nominal_model
+from ballfg.estimation import Estimate, Smoother, dataset_settings, dataset_surfaces, estimate_tracks
+from ballfg.prediction.apexes import measured_apexes
+from ballfg.tracks import Dataset, Track
+
+LEAST_OBSERVED: Final = 10
+"""Samples of a quarter of a second that a shot must have: fewer do not show where it goes."""
+STAMP_TOLERANCE: Final = 1e-9
+"""s. A stamp this little after the end of a part belongs to it."""
+
+
+GROUP: Final = "group"
+"""The label of a launcher and its setting. Tracks without it are one group of their dataset's name."""
+
+
+def measured_tasks(
+    datasets: Sequence[Dataset], transfer: Dataset | None, jobs: int, tracks: int | None, transfer_tracks: int | None
+) -> list[Task]:
+    """A task for each dataset.
+
+    Args:
+        datasets: to learn from together, and to be judged by.
+        transfer: to be judged by only; None for none.
+        jobs: processes for the smoothing.
+        tracks: how many of the first ones of each dataset; None for all.
+        transfer_tracks: the same of the dataset to be judged by only.
+    Raises: ValueError: if two have the same name, or they are of different balls, or have too few tracks.
+    """
+    every = [*datasets, *([] if transfer is None else [transfer])]
+    names, radii = [d.info.name for d in every], {d.info.ball.radius for d in every}
+    if len(set(names)) < len(names):
+        raise ValueError(f"datasets must have names that differ; got {', '.join(names)}. Rename one in dataset.yaml.")
+    if len(radii) > 1:
+        raise ValueError(f"datasets must be of one kind of ball; got radii {sorted(radii)} m. Compare them apart.")
+    tasks = [measured_task(dataset, jobs, tracks) for dataset in datasets]
+    if transfer is not None:
+        tasks.append(measured_task(transfer, jobs, transfer_tracks, learn=False))
+    return tasks
+
+
+def measured_task(dataset: Dataset, jobs: int, tracks: int | None = None, *, learn: bool = True) -> Task:
+    """The shots of a dataset, the first, third, fifth ... to learn from and the others to judge by.
+
+    A shot ends at the first hit that the smoother finds in it: what a racket does is not the ball's dynamics. Its
+    bounces are those of the smoother. Tracks that end within the observed part, or begin with hardly a sample, are left
+    out.
+
+    Args:
+        dataset: measured tracks.
+        jobs: processes for the smoothing.
+        tracks: how many of the first ones; None for all.
+        learn: False: all shots are to judge by.
+    Raises: ValueError: if too few tracks are left.
+    """
+    model = nominal_model(dataset.info.ball.radius)
+    given, surfaces = dataset_settings(dataset, model), dataset_surfaces(dataset)
+    listed = [track for track, _ in zip(dataset, range(tracks or len(dataset)), strict=False)]
+    found = estimate_tracks(Smoother(model, surfaces, given), listed, len(listed), jobs)
+    smoothed = progress(found, len(listed), "tracks smoothed for their bounces")
+    made = [measured_shot(_grouped(t, dataset), estimate) for t, estimate in zip(listed, smoothed, strict=True)]
+    shots = tuple(shot for shot in made if shot is not None)
+    least = 2 if learn else 1
+    if len(shots) < least:
+        raise ValueError(
+            f"{dataset.path}: a comparison needs {least} tracks that last longer than {OBSERVE:g} s before anything "
+            f"hits the ball; got {len(shots)} of {len(listed)}. Give a dataset with longer tracks."
+        )
+    return Task(
+        case=dataset.info.name,
+        info=dataset.info,
+        surfaces=surfaces,
+        # a learned model has no coefficients to estimate with each track: to be equal, no model has
+        settings=replace(given, coefficients={}),
+        launcher=None,
+        launcher_labels=(GROUP,),
+        observe={"seconds": OBSERVE},
+        truth=None,
+        train=shots[::2] if learn else (),
+        validation=shots[1::2] if learn else shots,
+    )
+
+
+def _grouped(track: Track, dataset: Dataset) -> Track:
+    return track if GROUP in track.labels else replace(track, labels={**track.labels, GROUP: dataset.info.name})
+
+
+def measured_shot(track: Track, estimate: Estimate) -> Shot | None:
+    """A measured track up to its first hit; None if nothing is left to predict.
+
+    Args: track: as measured.  estimate: of the whole track.
+    """
+    last = int(estimate.hits[0]) if len(estimate.hits) else len(track) - 1
+    track = track.until(float(track.times[last]))
+    since = track.times - track.times[0]
+    observed = int((since <= OBSERVE + STAMP_TOLERANCE).sum())
+    if observed < LEAST_OBSERVED or observed >= len(track):
+        return None
+    end = since[observed - 1] + HORIZON + STAMP_TOLERANCE
+    bounces = np.array([c.time for c in estimate.contacts if track.times[0] < c.time < track.times[-1]])
+    apexes, apex_times = measured_apexes(track.times, track.positions, bounces)
+    return Shot(
+        track=track,
+        reference=track.positions,
+        observed=observed,
+        judged=int((since <= end).sum()),
+        bounces=bounces,
+        apexes=apexes,
+        apex_times=apex_times,
+    )

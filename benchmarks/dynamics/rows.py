@@ -1,0 +1,72 @@
+"""From the errors of finished contenders to rows: pooled over tracks, averaged over seeds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from ballfg.benchmarks.dynamics.contenders import TIMED
+from ballfg.benchmarks.dynamics.metrics import PathScore, pooled_rmse
+from ballfg.benchmarks.dynamics.record import Record
+from ballfg.benchmarks.dynamics.task import APEXES, Task
+from ballfg.benchmarks.metrics import Figure
+from ballfg.benchmarks.results import CURVE_MARK, Results
+
+
+def add_rows(results: Results, task: Task, records: Sequence[Record]) -> None:
+    """The rows of one method: means over the seeds, from the lowest to the highest seed; each seed by itself at `@`.
+
+    Figures that a method does not have are left out: one that predicts only what comes after the observed part has no
+    error over the whole track.
+    """
+    case, measured = task.case, task.truth is None
+    by_seed = {
+        record.seed: {name: (unit, value, n) for name, unit, value, n in figures(record, measured)}
+        for record in records
+    }
+    method, first = records[0].method, next(iter(by_seed.values()))
+    for name, (unit, _, n) in first.items():
+        values = [found[name][1] for found in by_seed.values()]
+        several = len(values) > 1
+        figure = Figure(float(np.mean(values)), min(values), max(values)) if several else float(values[0])
+        results.add(case, method, name, unit, figure, n)
+        if several:
+            for seed, value in zip(by_seed, values, strict=True):
+                results.add(case, method, f"{name}{CURVE_MARK}{seed}", unit, value, n)
+
+
+def figures(record: Record, measured: bool) -> Iterator[tuple[str, str, float, int]]:
+    """Metric, unit, value and number of tracks of everything that is said about one contender.
+
+    On measured tracks `prediction_rmse_median` is the figure of `ballfg-bench estimators --data`, in its unit.
+    """
+    scores = record.scores
+    n = len(scores)
+    if np.isfinite([s.track_sum for s in scores]).all():
+        yield "track_rmse", "m", pooled_rmse([s.track_sum for s in scores], [s.track_points for s in scores]), n
+        yield "track_rmse_median", "m", float(np.median([s.track_rmse for s in scores])), n
+    ahead = [s for s in scores if s.rest_points]
+    if ahead:
+        pooled = pooled_rmse([s.rest_sum for s in ahead], [s.rest_points for s in ahead])
+        yield "rest_rmse", "m", pooled, len(ahead)
+        median = float(np.median([s.rest_rmse for s in ahead]))
+        yield "rest_rmse_median", "m", median, len(ahead)
+        if measured:
+            yield "prediction_rmse_median", "mm", 1e3 * median, len(ahead)
+    yield from _apex_figures(scores)
+    yield "parameters", "1", record.parameters, 1
+    yield "training_time", "s", record.training_time, 1
+    yield "inference_time", "s", record.inference_time, min(TIMED, n)
+    yield "not_converged", "1", record.not_converged, n
+
+
+def _apex_figures(scores: Sequence[PathScore]) -> Iterator[tuple[str, str, float, int]]:
+    """Mean and standard deviation of apex errors by flight: of all, and of those after the observed part."""
+    errors, ahead = np.stack([s.apex for s in scores]), np.stack([s.apex_ahead for s in scores])
+    for suffix, counted in (("", np.isfinite(errors)), ("_ahead", np.isfinite(errors) & ahead)):
+        for flight, name in enumerate(APEXES):
+            found = errors[counted[:, flight], flight]
+            if len(found):
+                yield f"apex_{name}{suffix}_mean", "m", float(found.mean()), len(found)
+                yield f"apex_{name}{suffix}_std", "m", float(found.std()), len(found)

@@ -1,0 +1,197 @@
+"""The trained contenders: one training config each, equal in everything that is not the method."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job
+from ballfg.benchmarks.dynamics.recipes import RESIDUAL, measured_content
+from ballfg.benchmarks.dynamics.record import task_digest
+from ballfg.benchmarks.dynamics.task import Task
+from ballfg.dynamics import BallModel, load_model
+from ballfg.estimation import Settings
+from ballfg.estimation.configure import launcher_of, learned_process
+from ballfg.learning.config.build import build, export
+from ballfg.learning.config.training import NETWORKS, SEQUENCES, TrainConfig
+from ballfg.learning.run.metrics import read_metrics
+from ballfg.learning.run.run_folder import METRICS, MODEL
+from ballfg.learning.run.training import run_training
+from ballfg.learning.sequence.build import load_sequence
+from ballfg.learning.sequence.predictor import SequencePredictor
+from ballfg.tracks import Track
+
+Array = NDArray[np.float64]
+T = TypeVar("T")
+
+OPTIMIZER: Final[dict[str, Any]] = {"learning_rate": 2e-3, "batch": 32, "epochs": 20, "clip": 5.0, "noise_step": 40.0}
+"""Of all models in the factor graph."""
+SEQUENCE_OPTIMIZERS: Final[dict[str, dict[str, Any]]] = {
+    "lstm": {"learning_rate": 3e-3, "batch": 16, "epochs": 150, "warm_start_epochs": 5},
+    "diffusion": {"learning_rate": 1e-3, "batch": 16, "epochs": 120, "warm_start_epochs": 5},
+}
+"""Of the sequence models, each the best of a few that were tried on the judging tracks: that favours them."""
+QUICK_EPOCHS: Final = 2
+QUICK_PRETRAIN: Final = 60
+ERROR_SCALE: Final = 0.05
+"""m. Errors beyond it count linearly: one wild track must not decide a step."""
+LIKELIHOOD: Final = 0.01
+"""Weight of the likelihood from which the noise is learned: as much as the errors count at 1 to 2 cm."""
+NOISE: Final = {
+    "acceleration": 0.3,
+    "spin": 1.0,
+    "contact_velocity": 0.05,
+    "contact_tangential": 0.1,
+    "contact_spin": 10.0,
+}
+"""Process noise that all models in the factor graph start from."""
+
+
+def trained_contender(job: Job, task: Task) -> Contender:
+    """Train the method, or go on with its training, and load what was exported; a contender for one of the tasks.
+
+    Raises: ValueError: if the job's folder holds a training on other tracks or by another recipe.
+    """
+    folder = job.folder / "training"
+    config = config_of(job, _written(job))
+    begun = (folder / METRICS).is_file()
+    if not (folder / MODEL).exists() and not (folder / "model").exists():
+        with (job.folder / "log.txt").open("a") as log, redirect_stdout(log), redirect_stderr(log):
+            run_training(config, folder, begun, build, export, _unwatched)
+    seconds = sum(epoch.seconds for epoch in read_metrics(folder / METRICS))
+    if config.kind in SEQUENCES:
+        predictor = load_sequence(folder)
+        return SequenceContender(job.method, predictor.parameter_count, seconds, predictor)
+    model = load_model(folder / MODEL, radius=task.info.ball.radius)
+    return GraphContender(
+        name=job.method,
+        model=model,
+        surfaces=task.surfaces,
+        settings=learned_settings(task, model),
+        label=_as_it_is,
+        onward=job.measured,
+        parameter_count=_learned_numbers(model),
+        training_seconds=seconds,
+    )
+
+
+def _written(job: Job) -> list[Path]:
+    """The datasets that a job learns from, written into its folder if they are not there yet.
+
+    The folder says what it is of: a training that was stopped goes on only with what it began with. Measured shots are
+    too few to spare some for a choice among epochs; sequence models learn their shots by heart and need that choice.
+    """
+    learned = [task for task in job.tasks if task.train]
+    names = ["data"] if len(learned) == 1 else [f"data-{number}" for number in range(len(learned))]
+    digest = "\n".join(task_digest(task, recipe(job)) for task in learned)
+    mark = job.folder / "task.txt"
+    if not mark.is_file():
+        job.folder.mkdir(parents=True, exist_ok=True)
+        for task, name in zip(learned, names, strict=True):
+            task.write(job.folder / name, validate=not job.measured or kind_of(job.method) in SEQUENCES)
+        mark.write_text(digest, encoding="utf-8")
+    elif mark.read_text(encoding="utf-8") != digest:
+        raise ValueError(
+            f"{job.folder}: must be a training of these tracks by this recipe; it is of others. "
+            "Delete the folder, or choose another --out."
+        )
+    return [job.folder / name for name in names]
+
+
+def config_of(job: Job, data: Sequence[Path]) -> TrainConfig:
+    """The training of a job."""
+    first = job.tasks[0]
+    content = content_of(job.method, job.quick, job.measured)
+    labels = {"labels": first.launcher_labels}
+    given = {
+        "seed": job.seed,
+        "data": [str(folder) for folder in data],
+        "observe": dict(first.observe),
+        "launcher": content.get("launcher", {}) | labels,
+    }
+    return TrainConfig.model_validate(content | given)
+
+
+def recipe(job: Job) -> str:
+    """How a job's method is trained, as text."""
+    return repr(content_of(job.method, job.quick, job.measured))
+
+
+def content_of(method: str, quick: bool, measured: bool) -> dict[str, Any]:
+    """The config of a method. Those of one family differ in `kind` and in the augmentation that it implies."""
+    kind = kind_of(method)
+    common = {"kind": kind, "split": {"by": "label"}, "workers": 1}
+    epochs = {"epochs": QUICK_EPOCHS} if quick else {}
+    if kind in SEQUENCES:
+        return common | {
+            "optimizer": SEQUENCE_OPTIMIZERS[kind] | ({"epochs": QUICK_EPOCHS, "warm_start_epochs": 0} if quick else {})
+        }
+    if measured:
+        content = measured_content(method, common)
+    else:
+        loss = {"position_scale": ERROR_SCALE, "likelihood": LIKELIHOOD}
+        content = common | {"optimizer": OPTIMIZER, "loss": loss, "noise": NOISE}
+    content["optimizer"] = content["optimizer"] | epochs
+    if quick and kind in NETWORKS:
+        content["architecture"] = content.get("architecture", {}) | {"pretrain": QUICK_PRETRAIN}
+    return content
+
+
+def kind_of(method: str) -> str:
+    """The kind of a method in a training config."""
+    return "mnn+gs" if method == RESIDUAL else method.removesuffix("+aug")
+
+
+def learned_settings(task: Task, model: BallModel) -> Settings:
+    """The task's settings with the noise and the launcher that were learned together with a model.
+
+    The scale of the position noise too, although a simulation's noise is known: weights and process noise were learned
+    for it. Without it the errors of mlp+gs were three times as large.
+    """
+    trained = model.trained
+    assert trained is not None
+    return replace(
+        task.settings,
+        position_scale=trained.position_scale,
+        process=learned_process(trained),
+        launcher=launcher_of(task.info, model),
+        coefficients={},
+    )
+
+
+def _learned_numbers(model: BallModel) -> int:
+    """The model's parameters and those of its launcher."""
+    launcher = None if model.trained is None else model.trained.launcher
+    return sum(p.numel() for part in (model, launcher) if part is not None for p in part.parameters())
+
+
+@dataclass
+class SequenceContender:
+    """A sequence model: predicts what follows the observed part, from that part alone."""
+
+    name: str
+    parameter_count: int
+    training_seconds: float
+    predictor: SequencePredictor
+
+    def predict(self, seen: Sequence[Track], times: Sequence[Array]) -> list[Array]:
+        """Positions (n, 3) m at all stamps of each track; NaN in the observed part."""
+        counts = [len(track) for track in seen]
+        rests = self.predictor.predict_many(
+            seen, counts, [stamps[count:] for stamps, count in zip(times, counts, strict=True)]
+        )
+        return [np.concatenate((np.full((count, 3), np.nan), rest)) for count, rest in zip(counts, rests, strict=True)]
+
+
+def _as_it_is(track: Track) -> Track:
+    return track
+
+
+def _unwatched(items: Iterable[T], total: int, what: str) -> Iterator[T]:
+    return iter(items)

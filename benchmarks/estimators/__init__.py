@@ -1,0 +1,1 @@
+"""`ballfg-bench estimators`."""

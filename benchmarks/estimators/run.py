@@ -1,0 +1,125 @@
+"""`ballfg-bench estimators`: which cases run, and what is said about them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from ballfg.benchmarks.estimators.consistency import run_consistency
+from ballfg.benchmarks.estimators.measured import HORIZON, OBSERVE, run_measured
+from ballfg.benchmarks.estimators.protocols import (
+    COUNTS,
+    fair_candidates,
+    paper_candidates,
+    run_protocol,
+)
+from ballfg.benchmarks.estimators.step_noise import StepNoise
+from ballfg.benchmarks.results import Results
+from ballfg.benchmarks.synthetic import Protocol, fair_protocol, paper_protocol
+from ballfg.dynamics import nominal_model
+from ballfg.estimation import Settings, dataset_settings
+from ballfg.tracks import Dataset
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is computed.
+
+    Attributes:
+        compared: synthetic tracks in each protocol.
+        consistency: synthetic tracks whose NEES is taken.
+        measured: measured tracks at most; None for all.
+        counts: numbers of observations on the curves.
+    """
+
+    compared: int
+    consistency: int
+    measured: int | None
+    counts: Sequence[int]
+
+
+FULL = Size(compared=50, consistency=200, measured=None, counts=COUNTS)
+QUICK = Size(compared=10, consistency=40, measured=12, counts=(5, 10, 20, 40, 80))
+CONSISTENCY_SEED = 1_000_000
+"""Added to the seed: other tracks than those of the comparison."""
+
+
+def run_synthetic(results: Results, out: Path, size: Size, jobs: int) -> list[Path]:
+    """Both protocols and the consistency of the smoother. Returns: the pictures written."""
+    from ballfg.benchmarks.pictures import observations_picture
+
+    paper = paper_protocol(size.compared, results.seed)
+    fair = fair_protocol(size.compared, results.seed)
+    for protocol in (paper, fair):
+        print(describe(protocol))
+    run_protocol(results, paper, paper_candidates(paper), jobs, size.counts)
+    run_protocol(results, fair, fair_candidates(fair), jobs, size.counts)
+    many = fair_protocol(size.consistency, results.seed + CONSISTENCY_SEED, name="consistency")
+    run_consistency(results, many, jobs)
+    titles = {
+        paper.name: "paper's protocol: free flight, true dynamics and spin known",
+        fair.name: "fair protocol: bounces, declared noise, same settings for all",
+    }
+    return [
+        observations_picture(results.rows, name, title, out / f"estimators_{name}.png")
+        for name, title in titles.items()
+    ]
+
+
+def run_dataset(results: Results, dataset: Dataset, out: Path, size: Size, jobs: int) -> list[Path]:
+    """Measured tracks. Returns: the pictures written."""
+    from ballfg.benchmarks.pictures import calibration_picture, growth_picture, tracks_picture
+
+    print(measured_heading(dataset))
+    measured = run_measured(results, dataset, size.measured, jobs)
+    if measured.unseen:
+        print(f"{measured.unseen} tracks end within the observed {OBSERVE:g} s: nothing to predict")
+    if not measured.predictions["smoother"]:
+        raise ValueError(
+            f"{dataset.path}: no track goes on after {OBSERVE:g} s, so that nothing can be predicted. "
+            "Give a dataset with longer tracks."
+        )
+    rows, name = results.rows, re.sub(r"[^\w-]+", "-", measured.name)
+    return [
+        growth_picture(rows, measured, out / f"growth_{name}.png"),
+        calibration_picture(rows, measured, out / f"calibration_{name}.png"),
+        tracks_picture(measured, out / f"tracks_{name}.png"),
+    ]
+
+
+def describe(protocol: Protocol) -> str:
+    """One line with what all estimators are told."""
+    settings = protocol.settings
+    return f"{protocol.name}: {len(protocol.tracks)} tracks; {describe_settings(settings)}"
+
+
+def describe_settings(settings: Settings) -> str:
+    """Noise and priors in words."""
+    noise = settings.position_noise
+    parts = [
+        f"position noise {' / '.join(f'{1e3 * s:.2g}' for s in noise)} mm",
+        "process noise " + ", ".join(f"{name} {value:g}" for name, value in _noise_terms(settings)),
+        f"spin label {settings.spin_label_noise:g} rad/s, spin prior {settings.spin_prior:g} rad/s",
+        f"velocity prior {settings.velocity_prior:g} m/s",
+        f"{settings.loss.name} loss",
+    ]
+    if settings.coefficients:
+        parts.append("coefficients per track: " + ", ".join(settings.coefficients))
+    return "; ".join(parts)
+
+
+def _noise_terms(settings: Settings) -> list[tuple[str, float]]:
+    """The terms that act, by name, SI units."""
+    process = settings.process
+    unused: tuple[str, ...] = () if settings.find_events else ("hit",)
+    unused += ("acceleration", "contact") if isinstance(process, StepNoise) else ()
+    return [(name, value) for name, value in vars(process).items() if value and not name.startswith(unused)]
+
+
+def measured_heading(dataset: Dataset) -> str:
+    """One line with what all estimators are told about measured tracks."""
+    settings = dataset_settings(dataset, nominal_model(dataset.info.ball.radius))
+    what = f"{OBSERVE:g} s observed, {HORIZON:g} s predicted, nominal model"
+    return f"{dataset.info.name}: {len(dataset)} tracks; {what}; {describe_settings(settings)}"

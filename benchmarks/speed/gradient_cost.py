@@ -1,0 +1,76 @@
+"""What the gradient through an estimate costs next to the estimate: 80 observations, a network for the dynamics."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Final
+
+import torch
+
+from ballfg.benchmarks.results import Results
+from ballfg.benchmarks.timing import Stopwatch
+from ballfg.dynamics.networks.learned import LearnedModel
+from ballfg.factors.batch import Noise, Values
+from ballfg.factors.graph import BallGraph, Minimum
+from ballfg.learning.end_to_end.end_to_end import SOLUTION_TOLERANCE
+from ballfg.learning.end_to_end.solving import TRAINING
+from ballfg.learning.gradient.conjugate_gradients import ConjugateGradients, GaussNewtonFactors
+from ballfg.learning.gradient.implicit import GaussNewtonGradient, GradientMethod, ImplicitGradient, UnrolledGradient
+from ballfg.learning.gradient.objective import BatchObjective
+
+METHODS: Final[Mapping[str, GradientMethod]] = {
+    "implicit": ImplicitGradient(),
+    "gauss-newton": GaussNewtonGradient(),
+    "unrolled": UnrolledGradient(8),
+}
+EXACT: Final = 1e-12
+"""Tolerance of the linear solution in the reference gradient; training takes `SOLUTION_TOLERANCE`."""
+
+
+def time_gradients(
+    results: Results, case: str, model: LearnedModel, graph: BallGraph, start: Values, watch: Stopwatch
+) -> None:
+    """Forward: from the first guess to the minimum. Backward: from a derivative by all states to one by all weights.
+
+    Building the torch objective and reading GTSAM's factorisation belong to the backward pass.
+    """
+    minimum = TRAINING.minimize(graph, start)
+    method_name = model.architecture.kind
+    forward = watch.time(lambda: TRAINING.minimize(graph, start))
+    results.add(case, method_name, "forward_time", "ms", forward, watch.runs)
+    exact = backward(model, graph, minimum, ImplicitGradient(), EXACT)
+    for name, method in METHODS.items():
+        found = backward(model, graph, minimum, method)
+        figure = watch.time(lambda method=method: backward(model, graph, minimum, method))  # type: ignore[misc]
+        row = f"{method_name}, {name}"
+        results.add(case, row, "backward_time", "ms", figure, watch.runs)
+        results.add(case, row, "backward_over_forward", "1", figure.value / forward.value, watch.runs)
+        results.add(case, row, "gradient_error", "1", float((found - exact).norm() / exact.norm()), 1)
+
+
+def backward(
+    model: LearnedModel,
+    graph: BallGraph,
+    minimum: Minimum,
+    method: GradientMethod,
+    tolerance: float = SOLUTION_TOLERANCE,
+) -> torch.Tensor:
+    """Gradient of a fixed linear function of all states by all weights, as one vector."""
+    assert minimum.step is not None
+    objective = BatchObjective([graph], [minimum.values])
+    layout, weights = objective.layout, [p for p in model.parameters() if p.requires_grad]
+    factors = GaussNewtonFactors([minimum.step.bayes_net], layout.lengths, layout.coefficients)
+    point = method(
+        lambda: layout.pack([minimum.values]),
+        lambda at: objective.gradient(at, Noise()),
+        ConjugateGradients(factors, layout.owners(), tolerance),
+        weights,
+    )
+    direction = torch.cos(torch.arange(len(point), dtype=point.dtype))
+    gradients = torch.autograd.grad((direction * point).sum(), weights, allow_unused=True)
+    return torch.cat(
+        [
+            torch.zeros_like(w).reshape(-1) if g is None else g.reshape(-1)
+            for w, g in zip(weights, gradients, strict=True)
+        ]
+    )

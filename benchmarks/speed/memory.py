@@ -1,0 +1,76 @@
+"""Peak memory of `ballfg estimate` on few and on ten times as many tracks: `python -m ballfg.benchmarks.speed.memory`.
+
+Linux only: it reads each process's high-water mark (VmHWM) from /proc while the command runs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+LOOK_EVERY = 0.2
+"""s between looks at the processes."""
+
+
+def main() -> None:
+    """Simulate, estimate, and print the peaks and their ratio."""
+    parser = argparse.ArgumentParser(prog="python -m ballfg.benchmarks.speed.memory", description=__doc__)
+    parser.add_argument("--tracks", type=int, default=1000, help="the smaller number of tracks")
+    parser.add_argument("--method", default="smoother")
+    parser.add_argument("--jobs", type=int, default=2)
+    options = parser.parse_args()
+    peaks = []
+    with tempfile.TemporaryDirectory() as folder:
+        for count in (options.tracks, 10 * options.tracks):
+            data = Path(folder) / f"tracks-{count}"
+            _ballfg("simulate", "--out", data, "--tracks", count).wait()
+            command = _ballfg(
+                "estimate", data, "--method", options.method, "--jobs", options.jobs, "--out", f"{data}.parquet"
+            )
+            parent, worker = _watch(command)
+            if command.returncode != 0:
+                sys.exit(f"ballfg estimate ended with {command.returncode} on {count} tracks")
+            peaks.append(parent)
+            print(f"{count} tracks: peak {parent:.0f} MB, largest worker {worker:.0f} MB", flush=True)
+    print(f"ratio of the peaks: {peaks[1] / peaks[0]:.2f}")
+
+
+def _ballfg(*words: object) -> subprocess.Popen[bytes]:
+    code = "from ballfg.cli.main import run; run()"
+    arguments = [sys.executable, "-c", code, *map(str, words)]
+    return subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def _watch(command: subprocess.Popen[bytes]) -> tuple[float, float]:
+    """Peak memory in MB of a running command and of the largest of its children."""
+    parent = worker = 0.0
+    while command.poll() is None:
+        parent = max(parent, _peak(command.pid))
+        worker = max([worker, *(_peak(child) for child in _children(command.pid))])
+        time.sleep(LOOK_EVERY)
+    return parent, worker
+
+
+def _peak(pid: int) -> float:
+    """VmHWM in MB; 0 for a process that has ended."""
+    try:
+        found = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text(encoding="ascii"))
+    except (FileNotFoundError, ProcessLookupError):
+        return 0.0
+    return int(found[1]) / 1024 if found else 0.0
+
+
+def _children(pid: int) -> list[int]:
+    try:
+        return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()]
+    except (FileNotFoundError, ProcessLookupError):
+        return []
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,179 @@
+"""A kind of factors: all factors of one sort in a graph, evaluated together.
+
+GTSAM asks one factor at a time; torch is quick only on batches. So factors of one sort are one object here. It computes
+whitened residuals and Jacobians of any of its rows in one call. The solver of this package takes those arrays
+as they are (`ballfg.factors.linear`); GTSAM's own solvers see one CustomFactor per row (`ballfg.factors.bridge`).
+
+What is learned through an estimate needs the same residuals once more, as a torch function of everything that can be
+learned: the values, the model's parameters, the noise.
+"""
+
+from __future__ import annotations
+
+import copy
+from abc import ABC, abstractmethod
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+from typing import ClassVar, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ballfg.factors.loss import Loss
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+COEFFICIENTS = -1
+"""The variable number of the coefficients shared by all factors; states have their index."""
+
+
+@dataclass(frozen=True)
+class Values:
+    """A point at which a graph is evaluated.
+
+    Attributes:
+        states: (n, 9).
+        coefficients: (p,) of the model's coefficients that are estimated; (0,) for none.
+    """
+
+    states: Array
+    coefficients: Array
+
+    def gather(self, variables: Index) -> Array:
+        """(m, d) values of m variables of one sort."""
+        if len(variables) and variables[0] == COEFFICIENTS:
+            return np.broadcast_to(self.coefficients, (len(variables), len(self.coefficients)))
+        return self.states[variables]
+
+    def moved(self, states: Array, coefficients: Array) -> Values:
+        """These values plus a step."""
+        return Values(self.states + states, self.coefficients + coefficients)
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Linearised factors of one kind: whitened residuals r + J d, before the loss.
+
+    Attributes:
+        variables: (m, a) variable numbers.
+        residual: (m, r).
+        jacobians: a arrays (m, r, d).
+        loss: the loss on each residual's norm.
+    """
+
+    variables: Index
+    residual: Array
+    jacobians: tuple[Array, ...]
+    loss: Loss
+
+    def error(self) -> float:
+        """Sum of the losses."""
+        return float(self.loss.value(np.linalg.norm(self.residual, axis=-1)).sum())
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Noise that is learned, as tensors; None where it is what the factors were built with.
+
+    Attributes:
+        process: (7,) the numbers of `ballfg.factors.noise.PROCESS_NOISE`.
+        position: () standard deviation of every measured position in multiples of what the factors were built with.
+        spin: () the same for what labels or launcher settings say of the spin.
+    """
+
+    process: Tensor | None = None
+    position: Tensor | None = None
+    spin: Tensor | None = None
+
+
+class FactorBatch(ABC):
+    """m factors of one sort, each between the same number of variables.
+
+    Attributes:
+        variables: (m, a) numbers of the variables of each factor: a state's index or `COEFFICIENTS`.
+        dim: dimension of a residual.
+        loss: the loss on the norm of a whitened residual.
+        row_arrays: names of the attributes that hold one entry a factor.
+        costly: whether an evaluation is a torch call, worth sharing between graphs.
+    """
+
+    costly: ClassVar[bool] = False
+
+    row_arrays: ClassVar[tuple[str, ...]] = ("variables",)
+
+    def __init__(self, variables: Index, dim: int, loss: Loss | None = None) -> None:
+        self.variables = np.asarray(variables, dtype=np.int64)
+        self.dim = dim
+        self.loss = loss or Loss()
+
+    def __len__(self) -> int:
+        return len(self.variables)
+
+    @abstractmethod
+    def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+        """Whitened residuals and Jacobians of some rows.
+
+        Args:
+            rows: which of the m factors, k of them.
+            inputs: for each of the a variables the values (k, d).
+        Returns: residuals (k, dim) and a Jacobians (k, dim, d).
+        """
+
+    def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
+        """(m, dim) the whitened residuals of all rows, differentiable in the inputs and in the model.
+
+        Only a gradient through the estimate asks for them; `compute` is what estimation needs.
+
+        Args: inputs: for each of the a variables the values (m, d).
+        Raises: NotImplementedError: if the kind has none.
+        """
+        raise NotImplementedError(
+            f"{type(self).__name__} has no residual in torch, so no gradient can pass through an estimate with it. "
+            "Write its method `residual` (docs/custom_factors.md)."
+        )
+
+    def rewhitening(self, noise: Noise) -> Tensor | None:
+        """What turns whitened residuals into residuals whitened with learned noise, differentiable in that.
+
+        Returns: (m, dim, dim) lower triangular, or () a common factor; None where nothing is learned of this noise.
+        """
+        return None
+
+    def log_spread(self) -> float:
+        """Half the log determinants of the covariances that residuals are whitened with, of all rows together.
+
+        Zero for kinds whose noise is never learned.
+        """
+        return 0.0
+
+    @property
+    def group(self) -> Hashable:
+        """Kinds with equal groups can be merged (see `merge`)."""
+        return (type(self), self.dim, self.variables.shape[1], self.loss)
+
+    def with_loss(self, loss: Loss) -> Self:
+        """The same factors with another loss."""
+        other = copy.copy(self)
+        other.loss = loss
+        return other
+
+    def linearize(self, values: Values) -> Rows:
+        """All factors at a point."""
+        inputs = tuple(values.gather(column) for column in self.variables.T)
+        residual, jacobians = self.compute(slice(None), inputs)
+        return Rows(self.variables, residual, jacobians, self.loss)
+
+
+K = TypeVar("K", bound=FactorBatch)
+
+
+def merge(kinds: Sequence[K]) -> K:
+    """One kind with the rows of several of the same group, in order; variable numbers stay what they were."""
+    if len(kinds) == 1:
+        return kinds[0]
+    whole = copy.copy(kinds[0])
+    for name in whole.row_arrays:
+        setattr(whole, name, np.concatenate([getattr(kind, name) for kind in kinds]))
+    return whole

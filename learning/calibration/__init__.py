@@ -1,0 +1,1 @@
+"""Calibration of a model's coefficients on a population of tracks."""

@@ -1,0 +1,250 @@
+"""Calibration: the coefficients of a population of tracks, and whether they predict other tracks better.
+
+Each step estimates the fitted tracks with the smoother, takes the priors out of what each says of its coefficients,
+finds the population's mean and spread, and starts again with the mean in the model, until it stays. docs/train.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict
+
+from ballfg.dynamics import AnalyticModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_settings, dataset_surfaces, estimate_tracks
+from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
+from ballfg.learning.calibration.population import Evidence, Population, evidence, fit_population
+from ballfg.learning.config.calibration import CalibrationConfig
+from ballfg.learning.evaluation import TrackScore, Watch, judge_tracks
+from ballfg.learning.split import Split, split_tracks, tracks_of
+from ballfg.tracks import Dataset
+
+Array = NDArray[np.float64]
+
+
+class TooManyFailures(ValueError):  # noqa: N818 - says what it is
+    """More estimates failed than the config allows."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """A calibration, checked and ready to start; made by `pose`.
+
+    Attributes:
+        dataset: the tracks.
+        config: what was asked for.
+        model: to start from.
+        chosen: its coefficients that are calibrated.
+        surfaces: what the ball may bounce on.
+        settings: of the estimator, as `ballfg predict` has them.
+        split: which tracks are fitted, which judge.
+        jobs: processes.
+    """
+
+    dataset: Dataset
+    config: CalibrationConfig
+    model: AnalyticModel
+    chosen: Chosen
+    surfaces: Surfaces
+    settings: Settings
+    split: Split
+    jobs: int
+
+    def estimator(self, values: Array, settings: Settings) -> Smoother:
+        """The smoother with values (p,) of the coefficients."""
+        return Smoother(with_values(self.model, self.chosen.names, values), self.surfaces, settings)
+
+
+class TrackFit(BaseModel):
+    """What one track says of its p coefficients, the model's prior included."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+    name: str
+    values: tuple[float, ...]
+    sigmas: tuple[float, ...]
+
+
+class Step(BaseModel):
+    """One step; the first, number 0, only judges the model that the calibration starts from.
+
+    Everything here is plain numbers: a checkpoint holds it to the last bit.
+    """
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+    number: int
+    mean: tuple[float, ...]
+    """(p,) the population's mean: the coefficients of the next model."""
+    sigma: tuple[float, ...] = ()
+    """(p,) standard errors of the mean."""
+    spread: tuple[float, ...] = ()
+    """(p,) standard deviations between tracks."""
+    next_track: tuple[float, ...] = ()
+    """(p,) standard deviations of a new track's coefficients about the mean."""
+    moved: float | None = None
+    """Largest move of a mean in this step, in standard errors."""
+    fits: tuple[TrackFit, ...] = ()
+    """The tracks that were used."""
+    skipped: tuple[tuple[str, str], ...] = ()
+    """Name and reason of those that were not."""
+    scores: tuple[TrackScore | None, ...] = ()
+    """How the model of this step's mean predicts each judging track; None where that failed."""
+
+
+def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs: int = 1) -> Problem:
+    """Check a calibration against its data before anything starts.
+
+    Args:
+        dataset: the tracks.
+        model: to start from, with the ball's radius.
+        config: what to do.
+        jobs: processes.
+
+    Raises: ValueError: coefficients that the model does not have or the data cannot tell, too few tracks.
+    """
+    chosen = choose(model, config.coefficients)
+    split = split_tracks(dataset, config.split, config.seed, needs_spin=chosen.needs_spin)
+    return Problem(
+        dataset, config, model, chosen, dataset_surfaces(dataset), dataset_settings(dataset, model), split, jobs
+    )
+
+
+def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch[Any] | None = None) -> Iterator[Step]:
+    """The steps that are still to do, each as soon as it is done; none if the calibration has ended already.
+
+    Args:
+        problem: from `pose`.
+        done: steps of an earlier run of the same problem; the run continues with the same numbers.
+        watch: sees the tracks pass, for instance to show progress.
+
+    Raises: TooManyFailures: more estimates of fitted tracks failed than the config allows.
+    """
+    steps = list(done)
+    watch = watch or _pass_on
+    if not steps:
+        steps.append(
+            Step(number=0, mean=_plain(problem.chosen.start), scores=score(problem, problem.chosen.start, watch))
+        )
+        yield steps[-1]
+    while not has_ended(problem.config, steps[-1]):
+        steps.append(_advance(problem, steps[-1], watch))
+        yield steps[-1]
+
+
+def has_converged(config: CalibrationConfig, step: Step) -> bool:
+    """Whether the mean stayed where it was."""
+    return step.moved is not None and step.moved <= config.tolerance
+
+
+def has_ended(config: CalibrationConfig, step: Step) -> bool:
+    """Whether a step is the last one."""
+    return has_converged(config, step) or step.number >= config.max_iterations
+
+
+def score(
+    problem: Problem, values: Array, watch: Watch[Any] | None = None, settings: Settings | None = None
+) -> tuple[TrackScore | None, ...]:
+    """Scores of the judging tracks, in order.
+
+    Args:
+        problem: from `pose`.
+        values: (p,) of the coefficients.
+        watch: sees the tracks pass.
+        settings: of the estimator; by default those of the problem.
+    """
+    config, names = problem.config, problem.split.judge
+    horizon = np.inf if config.horizon is None else config.horizon
+    estimator = problem.estimator(values, settings or problem.settings)
+    scores = judge_tracks(
+        estimator, tracks_of(problem.dataset, names), config.observe, horizon, problem.jobs, len(names)
+    )
+    return tuple((watch or _pass_on)(scores, len(names), "tracks judged"))
+
+
+def population_settings(problem: Problem, step: Step) -> Settings:
+    """Settings whose prior of each calibrated coefficient is what the population says of a new track."""
+    learned = dict(zip(problem.chosen.names, step.next_track, strict=True))
+    return replace(problem.settings, coefficients={**problem.settings.coefficients, **learned})
+
+
+def _advance(problem: Problem, last: Step, watch: Watch[Any]) -> Step:
+    """Linearise the fitted tracks about the last mean, and find the population anew."""
+    chosen, about = problem.chosen, np.array(last.mean)
+    fits, evidences, skipped = _fit_tracks(problem, about, watch)
+    population = fit_population(evidences, chosen.start, chosen.sigma, chosen.low, chosen.high)
+    return Step(
+        number=last.number + 1,
+        mean=_plain(population.mean),
+        sigma=_plain(population.sigma),
+        spread=_plain(population.spread),
+        next_track=_plain(population.next_track),
+        moved=_move(population, about),
+        fits=tuple(fits),
+        skipped=tuple(skipped),
+        scores=score(problem, population.mean, watch),
+    )
+
+
+def _fit_tracks(
+    problem: Problem, about: Array, watch: Watch[Any]
+) -> tuple[list[TrackFit], list[Evidence], list[tuple[str, str]]]:
+    """What each fitted track says, and which were skipped.
+
+    Coefficients that vary from track to track stay free in each track, calibrated or not.
+    """
+    chosen, names = problem.chosen, problem.split.fit
+    priors = {**problem.settings.coefficients, **dict(zip(chosen.names, chosen.sigma.tolist(), strict=True))}
+    estimator = problem.estimator(about, replace(problem.settings, coefficients=priors))
+    estimates = estimate_tracks(estimator, tracks_of(problem.dataset, names), len(names), problem.jobs)
+    fits: list[TrackFit] = []
+    evidences: list[Evidence] = []
+    skipped: list[tuple[str, str]] = []
+    for estimate in watch(estimates, len(names), "tracks fitted"):
+        try:
+            fit, found = _read(estimate, chosen, about)
+        except ValueError as error:
+            skipped.append((estimate.name, str(error)))
+            _check_failures(skipped, len(names), problem.config.failure_limit)
+        else:
+            fits.append(fit)
+            evidences.append(found)
+    return fits, evidences, skipped
+
+
+def _read(estimate: Estimate, chosen: Chosen, about: Array) -> tuple[TrackFit, Evidence]:
+    """What one estimate says of the chosen coefficients. Raises: ValueError: if it failed."""
+    if estimate.status is not Status.OK:
+        raise ValueError(estimate.status.value)
+    columns = [estimate.coefficient_names.index(name) for name in chosen.names]
+    mean = estimate.coefficients[columns]
+    covariance = estimate.coefficient_covariance[np.ix_(columns, columns)]
+    found = evidence(mean, covariance, about, chosen.sigma)
+    fit = TrackFit(name=estimate.name, values=_plain(mean), sigmas=_plain(np.sqrt(np.diag(covariance))))
+    return fit, found
+
+
+def _check_failures(skipped: list[tuple[str, str]], count: int, limit: float) -> None:
+    if len(skipped) > limit * count:
+        name, reason = skipped[-1]
+        raise TooManyFailures(
+            f"more than {100 * limit:g} % of the {count} fitted tracks failed, the last one '{name}': {reason}. "
+            "Raise failure_limit to go on without them."
+        )
+
+
+def _move(population: Population, about: Array) -> float:
+    return float(np.abs((population.mean - about) / population.sigma).max())
+
+
+def _plain(values: Array) -> tuple[float, ...]:
+    return tuple(values.tolist())
+
+
+def _pass_on(items: Iterable[Any], total: int, what: str) -> Iterator[Any]:
+    return iter(items)

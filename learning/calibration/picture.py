@@ -1,0 +1,81 @@
+"""One picture of a calibration: what each track says, what the population is, and what it brings."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import matplotlib
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.axes import Axes
+
+from ballfg.learning.calibration.calibrate import Problem, Step
+from ballfg.learning.calibration.report import Comparison
+
+matplotlib.use("Agg")
+
+DPI = 130
+TRACKS, BAND, START = "#3b4cc0", "#d95f02", "#7f7f7f"
+
+
+def draw(problem: Problem, last: Step, comparison: Comparison, path: Path) -> None:
+    """Write the PNG; the name appears once the file is whole."""
+    panels = len(problem.chosen.names) + 1
+    columns = min(panels, 4)
+    rows = -(-panels // columns)
+    figure, grid = plt.subplots(rows, columns, figsize=(4.0 * columns, 3.9 * rows), layout="constrained", squeeze=False)
+    axes = list(grid.flat)
+    for k in range(panels - 1):
+        _coefficient(axes[k], problem, last, k)
+    _errors(axes[panels - 1], comparison)
+    for unused in axes[panels:]:
+        unused.set_axis_off()
+    figure.suptitle(
+        f"{problem.dataset.info.name}: {len(last.fits)} tracks fitted, {len(comparison.pairs)} judge", size=11
+    )
+    part = path.with_name(f".{path.name}.part")
+    figure.savefig(part, dpi=DPI, format="png")
+    plt.close(figure)
+    os.replace(part, path)
+
+
+def _coefficient(axes: Axes, problem: Problem, last: Step, k: int) -> None:
+    """Every track's estimate with its standard deviation, before the mean, the population and the starting value."""
+    values = np.array([fit.values[k] for fit in last.fits])
+    sigmas = np.array([fit.sigmas[k] for fit in last.fits])
+    order = np.argsort(values)
+    axes.errorbar(
+        np.arange(len(values)),
+        values[order],
+        sigmas[order],
+        fmt=".",
+        color=TRACKS,
+        elinewidth=0.7,
+        label="tracks, 1 sigma",
+    )
+    mean, width = last.mean[k], last.next_track[k]
+    axes.axhspan(mean - width, mean + width, color=BAND, alpha=0.2, linewidth=0, label="a new track, 1 sigma")
+    axes.axhline(mean, color=BAND, linewidth=1.5, label="mean")
+    axes.axhline(float(problem.chosen.start[k]), color=START, linestyle="--", linewidth=1.0, label="before")
+    unit = "" if problem.chosen.units[k] == "1" else f", {problem.chosen.units[k]}"
+    axes.set(xlabel="tracks, sorted", ylabel=f"{problem.chosen.names[k]}{unit}")
+    axes.set_title(f"{mean:.4g} ± {last.sigma[k]:.2g}, spread {last.spread[k]:.2g}", size=10)
+    axes.grid(visible=True, alpha=0.25)
+    axes.legend(fontsize="x-small")
+
+
+def _errors(axes: Axes, comparison: Comparison) -> None:
+    """RMSE of each judging track, after against before; below the diagonal it fell."""
+    pairs = 1e3 * comparison.pairs
+    axes.set(xlabel="RMSE before, mm", ylabel="RMSE after, mm")
+    axes.set_title(f"prediction better on {comparison.better} of {len(pairs)} tracks", size=10)
+    axes.grid(visible=True, which="major", alpha=0.25)
+    if not len(pairs):
+        return
+    ends = np.array([0.0, 1.05 * pairs.max()])
+    axes.plot(ends, ends, color="black", linewidth=0.8, label="no change")
+    axes.plot(pairs[:, 0], pairs[:, 1], ".", color=TRACKS, label="tracks")
+    axes.plot(*np.median(pairs, axis=0), "D", color=BAND, label="medians")
+    axes.set(xlim=ends, ylim=ends)
+    axes.legend(fontsize="x-small")

@@ -1,0 +1,156 @@
+"""What a calibration found, as `report.json` and as text: before and after, better or worse."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ballfg.learning.calibration.calibrate import Problem, Step, has_converged
+from ballfg.learning.evaluation import Summary, TrackScore, summary
+
+NEW_INFORMATION = 0.05
+"""Least share by which the data must narrow a prior; below it they say nothing of the coefficient."""
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The judging tracks before and after, those only that could be judged every time.
+
+    Attributes:
+        before: with the model that the calibration started from.
+        after: with the calibrated model.
+        with_spread: with the calibrated model, each track's prior as wide as the population.
+        better: tracks whose RMSE fell.
+        pairs: (n, 2) m, RMSE before and after of each track.
+        failed: tracks that could not be judged each time.
+    """
+
+    before: Summary | None
+    after: Summary | None
+    with_spread: Summary | None
+    better: int
+    pairs: np.ndarray
+    failed: int
+
+
+def compare(
+    before: Sequence[TrackScore | None], after: Sequence[TrackScore | None], spread: Sequence[TrackScore | None]
+) -> Comparison:
+    """Compare scores of the same tracks in the same order."""
+    rows = [(b, a, s) for b, a, s in zip(before, after, spread, strict=True) if b and a and s]
+    pairs = np.array([(b.rmse, a.rmse) for b, a, _ in rows]).reshape(-1, 2)
+    return Comparison(
+        before=summary([b for b, _, _ in rows]),
+        after=summary([a for _, a, _ in rows]),
+        with_spread=summary([s for _, _, s in rows]),
+        better=int((pairs[:, 1] < pairs[:, 0]).sum()),
+        pairs=pairs,
+        failed=len(before) - len(rows),
+    )
+
+
+def report(problem: Problem, last: Step, comparison: Comparison) -> dict[str, Any]:
+    """The content of `report.json`. It holds no times or paths: the same run writes the same bytes."""
+    return {
+        "dataset": problem.dataset.info.name,
+        "converged": has_converged(problem.config, last),
+        "iterations": last.number,
+        "last_move": last.moved,
+        "coefficients": {name: _coefficient(problem, last, k) for k, name in enumerate(problem.chosen.names)},
+        "fitted": {
+            "tracks": len(last.fits),
+            "names": [fit.name for fit in last.fits],
+            "skipped": dict(last.skipped),
+        },
+        "left_out": problem.split.left_out,
+        "judged": {
+            "tracks": len(comparison.pairs),
+            "failed": comparison.failed,
+            "better_on": comparison.better,
+            "names": list(problem.split.judge),
+            "before": _plain(comparison.before),
+            "after": _plain(comparison.after),
+            "after_with_spread": _plain(comparison.with_spread),
+        },
+        "verdict": verdict(problem, last, comparison),
+    }
+
+
+def _coefficient(problem: Problem, last: Step, k: int) -> dict[str, Any]:
+    chosen = problem.chosen
+    mean, sigma, prior = last.mean[k], last.sigma[k], float(chosen.sigma[k])
+    return {
+        "unit": chosen.units[k],
+        "before": float(chosen.start[k]),
+        "after": mean,
+        "sigma": sigma,
+        "spread": last.spread[k],
+        "next_track_sigma": last.next_track[k],
+        "prior_sigma": prior,
+        "told_by_data": sigma < (1.0 - NEW_INFORMATION) * prior,
+        "at_bound": mean in (float(chosen.low[k]), float(chosen.high[k])),
+    }
+
+
+def _plain(found: Summary | None) -> dict[str, Any] | None:
+    return None if found is None else found.model_dump()
+
+
+def verdict(problem: Problem, last: Step, comparison: Comparison) -> str:
+    """In sentences: did it converge, does it predict better, what do the data not tell."""
+    sentences = []
+    if not has_converged(problem.config, last):
+        sentences.append(
+            f"The mean still moved by {last.moved:.2g} standard errors in iteration {last.number}: continue with a "
+            "larger max_iterations."
+        )
+    before, after = comparison.before, comparison.after
+    if before is None or after is None:
+        sentences.append("No track could be judged: whether the prediction is better is not known.")
+    else:
+        word = "better" if after.rmse_median < before.rmse_median else "NOT better"
+        sentences.append(
+            f"The calibrated model predicts {word}: median RMSE {1e3 * before.rmse_median:.1f} mm before, "
+            f"{1e3 * after.rmse_median:.1f} mm after, on {after.tracks} tracks that were not fitted; it fell on "
+            f"{comparison.better} of them."
+        )
+    if comparison.with_spread is not None:
+        sentences.append(
+            f"With the population as each track's prior it has {1e3 * comparison.with_spread.rmse_median:.1f} mm."
+        )
+    for k, name in enumerate(problem.chosen.names):
+        found = _coefficient(problem, last, k)
+        if not found["told_by_data"]:
+            sentences.append(f"The tracks say little of {name}: its value is the model's.")
+        if found["at_bound"]:
+            sentences.append(f"{name} lies at its bound: another effect may be missing, or a unit is wrong.")
+    return " ".join(sentences)
+
+
+def table(problem: Problem, last: Step, comparison: Comparison) -> str:
+    """Coefficients and errors, before and after, as plain text."""
+    rows: list[tuple[str, ...]] = [("", "unit", "before", "after", "sigma", "spread between tracks")]
+    for k, name in enumerate(problem.chosen.names):
+        values = (problem.chosen.start[k], last.mean[k], last.sigma[k], last.spread[k])
+        rows.append((name, problem.chosen.units[k], *(f"{value:.4g}" for value in values)))
+    errors: list[tuple[str, ...]] = [("judged tracks", "unit", "before", "after", "after, spread as prior", "")]
+    summaries = (comparison.before, comparison.after, comparison.with_spread)
+    for label, unit, field, scale in (
+        ("RMSE, median", "mm", "rmse_median", 1e3),
+        ("RMSE, pooled", "mm", "rmse_pooled", 1e3),
+        ("90 % intervals hold", "%", "coverage_90", 1e2),
+        ("NIS of predictions (3)", "1", "prediction_nis", 1.0),
+        ("NIS of observed part (3)", "1", "nis", 1.0),
+    ):
+        cells = ("-" if s is None else f"{scale * getattr(s, field):.4g}" for s in summaries)
+        errors.append((label, unit, *cells, ""))
+    return "\n\n".join(_aligned(part) for part in (rows, errors))
+
+
+def _aligned(rows: Sequence[Sequence[str]]) -> str:
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = ("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+    return "\n".join(line.rstrip() for line in lines)

@@ -1,0 +1,1 @@
+"""The config of a training or calibration, and what is built from it."""

@@ -1,0 +1,169 @@
+"""The config file of `ballfg-train`: YAML, `key=value` overrides, and every field checked before anything starts."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from ballfg.learning.config.calibration import CalibrationConfig
+from ballfg.learning.config.training import TrainConfig
+from ballfg.tracks.hints import nearest
+
+Config = TrainConfig | CalibrationConfig
+CALIBRATE = "calibrate"
+"""The kind whose config is a `CalibrationConfig`."""
+
+
+def read_config(path: str | Path, overrides: Iterable[str] = (), options: Mapping[str, Any] | None = None) -> Config:
+    """The config of a file, with overrides; its key `kind` decides which one it is.
+
+    Args:
+        path: YAML file; an empty one means all defaults.
+        overrides: `key=value`, nested keys with dots; the value is YAML, or a number as in `1e-3`.
+        options: values that come from command-line options; they win.
+
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is not YAML, or a key or value is wrong; the message names key, rule and remedy.
+    """
+    path = Path(path)
+    content = _load(path)
+    where = str(path)
+    for override in overrides:
+        _override(content, override)
+        where = f"{path} with overrides"
+    return checked_config(content | dict(options or {}), where)
+
+
+def checked_config(content: Mapping[str, Any], where: str) -> Config:
+    """A config from plain values. Raises: ValueError: a wrong key or value; the message begins with `where`."""
+    kind: type[Config] = CalibrationConfig if content.get("kind") == CALIBRATE else TrainConfig
+    try:
+        return kind.model_validate(dict(content))
+    except ValidationError as error:
+        raise ValueError(f"{where}: {_explained(error, kind)}") from None
+
+
+def _load(path: Path) -> dict[str, Any]:
+    if not path.is_file():
+        raise FileNotFoundError(f"config {path} does not exist; it is a YAML file, docs/train.md shows one.")
+    try:
+        text = path.read_text(encoding="utf-8")
+        node = yaml.compose(text, Loader=yaml.SafeLoader)
+        content = yaml.safe_load(text)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: not readable as YAML ({' '.join(str(error).split())})") from None
+    if content is None:
+        return {}
+    if not isinstance(content, dict):
+        raise ValueError(f"{path}: a config maps keys to values; got {content!r}. Write for instance 'seed: 0'.")
+    twice = _twice(node, "")
+    if twice is not None:
+        raise ValueError(f"{path}: '{twice}' stands twice. Delete one of them.")
+    return {str(key): value for key, value in content.items()}
+
+
+def _twice(node: yaml.Node | None, prefix: str) -> str | None:
+    """The first key, with dots, that a mapping holds more than once: YAML itself would take the last."""
+    if not isinstance(node, yaml.MappingNode):
+        return None
+    seen = set()
+    for key, value in node.value:
+        name = f"{prefix}{key.value}"
+        if name in seen:
+            return name
+        seen.add(name)
+        below = _twice(value, f"{name}.")
+        if below is not None:
+            return below
+    return None
+
+
+def _override(content: dict[str, Any], override: str) -> None:
+    """Put the value of `key=value` in its place; sections on the way are made."""
+    key, separator, text = override.partition("=")
+    parts = [part.strip() for part in key.split(".")]
+    if not separator or not all(parts):
+        raise ValueError(f"overrides must be key=value; got '{override}'. Write for instance seed=3.")
+    place = content
+    for part in parts[:-1]:
+        below = place.get(part)
+        place[part] = dict(below) if isinstance(below, dict) else {}
+        place = place[part]
+    place[parts[-1]] = _parse(override, text)
+
+
+def _parse(override: str, text: str) -> Any:
+    """A value of the command line: JSON first, since YAML takes 1e-3 for text."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        pass
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        raise ValueError(f"override '{override}': the value is not readable as YAML. Quote it.") from None
+
+
+def _explained(error: ValidationError, config: type[Config]) -> str:
+    """The first complaint, as one sentence with a remedy."""
+    first = error.errors()[0]
+    location = [str(part) for part in first["loc"]]
+    key = ".".join(location)
+    if first["type"] == "extra_forbidden":
+        return _unknown(location, config)
+    if first["type"] == "value_error":
+        return f"'{key}' {first['ctx']['error']}" if key else str(first["ctx"]["error"])
+    if first["type"] == "model_type":
+        known = ", ".join(_fields_at(config, location))
+        return f"'{key}' must be a section with keys; got {first['input']!r}. Its keys: {known}."
+    got = first["input"]
+    if first["type"] == "too_short":
+        return f"'{key}' must hold at least one; got {got!r}. Leave it out or fill it."
+    rule = first["msg"].removeprefix("Input ").removeprefix("should ").replace("a valid tuple", "a list")
+    hint = " YAML reads 1e-3 as text; write 1.0e-3." if _is_number(got) else " docs/train.md lists the keys."
+    hint = f" To calibrate coefficients write 'kind: {CALIBRATE}'." if key == "kind" else hint
+    return f"'{key}' must {rule}; got {got!r}.{hint}"
+
+
+def _unknown(location: list[str], config: type[Config]) -> str:
+    """What to say on a key that there is not: the nearest one, or where it would belong."""
+    *section, name = location
+    prefix = "".join(f"{part}." for part in section)
+    known = _fields_at(config, section)
+    near = nearest(name, known)
+    if near is not None:
+        return f"unknown key '{prefix}{name}'. Did you mean '{prefix}{near}'?"
+    if not section:
+        inside = [f"{field}.{name}" for field in known if name in _fields_of(config.model_fields[field].annotation)]
+        if inside:
+            return f"unknown key '{name}'. Did you mean '{inside[0]}'?"
+        if config is TrainConfig and name in CalibrationConfig.model_fields:
+            return f"unknown key '{name}'. It is a key of a calibration: write 'kind: {CALIBRATE}'."
+    return f"unknown key '{prefix}{name}'. Known ones: {', '.join(prefix + field for field in known)}."
+
+
+def _fields_at(config: type[BaseModel], section: list[str]) -> list[str]:
+    """Names of the fields of a section, given by the names that lead to it."""
+    found: Any = config
+    for part in section:
+        found = found.model_fields[part].annotation
+    return _fields_of(found)
+
+
+def _fields_of(section: Any) -> list[str]:
+    """Names of the fields of a section's class; none for another type."""
+    return list(section.model_fields) if isinstance(section, type) and issubclass(section, BaseModel) else []
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return False
+    return isinstance(value, str)

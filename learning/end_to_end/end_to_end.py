@@ -1,0 +1,239 @@
+"""Learning through the estimator: observations, states, rollout, error, and the gradient all the way back.
+
+The estimate is a function of the model, the launcher's embedding and the noise; the implicit function theorem gives its
+derivative (`ballfg.learning.gradient.implicit`). Source: Q. Xiao, Z. Wu, M. Gombolay 2024, section III.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+import torch
+from torch import Tensor
+
+from ballfg.dynamics.motion.paths import paths
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.factors.graph import LevenbergMarquardt
+from ballfg.factors.loss import Loss
+from ballfg.learning.config.training import LossConfig
+from ballfg.learning.end_to_end.anchor import Anchor
+from ballfg.learning.end_to_end.augment import augmentation
+from ballfg.learning.end_to_end.learnables import Learnables
+from ballfg.learning.end_to_end.solving import TRAINING, BatchSolver, Pose, Solved
+from ballfg.learning.gradient.conjugate_gradients import ConjugateGradients, GaussNewtonFactors, NotAMinimum
+from ballfg.learning.gradient.implicit import GradientMethod, ImplicitGradient
+from ballfg.learning.gradient.likelihood import negative_log_likelihood
+from ballfg.learning.gradient.objective import BatchObjective
+from ballfg.learning.shots import Shot
+from ballfg.learning.trainee import BatchLoss, Trainee
+from ballfg.state import POSITION
+
+LOSS_UNIT: Final = 0.01
+"""m. Squared errors count in its square, so that losses are of order one."""
+SOLUTION_TOLERANCE: Final = 1e-5
+"""Relative error of a track's part in the gradient: far below the scatter between batches."""
+COEFFICIENT_STEP: Final = 20.0
+"""With a learning rate of 2e-3 a coefficient moves by at most 0.04 standard deviations of its prior in a step."""
+NOISE_STEP: Final = 10.0
+"""With a learning rate of 2e-3 a standard deviation changes by at most 2 % in a step."""
+EMBEDDING_STEP: Final = 3.0
+"""The embedding's weights, of order one, move faster than a network's."""
+
+
+@dataclass(frozen=True)
+class Prediction:
+    """Predicted positions of some tracks against what was measured.
+
+    Attributes:
+        error: (t, k, 3) m, predicted less measured; zero where nothing counts.
+        counts: (t, k) bool, which points count.
+    """
+
+    error: Tensor
+    counts: Tensor
+
+    def finite(self) -> Tensor:
+        """(t,) bool: a number came out for every point that counts."""
+        return self.error.detach().isfinite().all(-1).all(-1)
+
+
+class EndToEnd(Trainee):
+    """Learns a model, an embedding and noise from shots.
+
+    Args:
+        shots: all of them; batches are numbers of shots.
+        learnables: what is learned.
+        loss: what is minimised.
+        method: how a loss passes through the estimate.
+        seed: of the augmentation.
+        augment: turn and shift the shots in training.
+        optimizer: how tightly estimates are solved.
+        anchor: how far the model is from where it started; None if that does not count.
+        coefficient_step: scale of the learning rate of declared coefficients, in their prior standard deviations.
+        noise_step: scale of the learning rate of the noise's logarithms.
+    """
+
+    def __init__(
+        self,
+        shots: Sequence[Shot],
+        learnables: Learnables,
+        loss: LossConfig,
+        *,
+        method: GradientMethod | None = None,
+        seed: int = 0,
+        augment: bool = False,
+        optimizer: LevenbergMarquardt = TRAINING,
+        anchor: Anchor | None = None,
+        coefficient_step: float = COEFFICIENT_STEP,
+        noise_step: float = NOISE_STEP,
+    ) -> None:
+        self.module = learnables
+        self.learnables = learnables
+        self.shots = shots
+        self.solver = BatchSolver(shots, learnables, optimizer)
+        self.settings = loss
+        self.method = method or ImplicitGradient()
+        self.seed = seed
+        self.augment = augment
+        self.anchor = anchor
+        self.coefficient_step = coefficient_step
+        self.noise_step = noise_step
+        scale = None if loss.position_scale is None else loss.position_scale / LOSS_UNIT
+        self.point_loss = Loss() if scale is None else Loss("huber", scale)
+
+    def groups(self) -> list[dict[str, Any]]:
+        """Noise, embedding, coefficients and the rest of the model, each with its scale on the learning rate."""
+        declared = self.learnables.model.declared_coefficients()
+        own = tuple((f"model.{name}", self.coefficient_step * c.sigma) for name, c in declared.items())
+        rest = (("noise.", self.noise_step), ("embedding.", EMBEDDING_STEP), ("model.", 1.0))
+        return self.learnables.groups((*own, *rest))
+
+    def after_step(self) -> None:
+        """Put coefficients and noise back into their bounds."""
+        self.learnables.bound()
+
+    def loss(self, tracks: Sequence[int], epoch: int) -> BatchLoss:
+        """The loss on some tracks; its gradient is ready when this returns.
+
+        `total` is linear in the parameters: its value is the loss, its derivative the loss's; of a likelihood in it
+        that is the derivative by the noise alone. So a track at which no gradient exists is found, and left out, here.
+        """
+        poses = {n: Pose(*augmentation(self.seed, epoch, n)) for n in tracks} if self.augment else {}
+        solved, failed = self.solver(tracks, poses)
+        while solved:
+            try:
+                return self._with_gradient(solved, failed, epoch)
+            except NotAMinimum as error:
+                wrong = set(error.tracks)
+                for k in wrong:
+                    self.solver.warm.forget(solved[k].number)
+                    failed.append((self.shots[solved[k].number].name, str(error)))
+                solved = [s for k, s in enumerate(solved) if k not in wrong]
+        return BatchLoss(torch.zeros((), dtype=torch.float64), 0, 0.0, 0, tuple(failed))
+
+    def _with_gradient(self, solved: Sequence[Solved], failed: Sequence[tuple[str, str]], epoch: int) -> BatchLoss:
+        graphs, minima = [s.solution.graph for s in solved], [s.solution.minimum.values for s in solved]
+        objective = BatchObjective(graphs, minima)
+        layout, leaves = objective.layout, self.learnables.leaves()
+        nets = [s.solution.minimum.step.bayes_net for s in solved if s.solution.minimum.step is not None]
+        factors = GaussNewtonFactors(nets, layout.lengths, layout.coefficients)
+        linear_solver = ConjugateGradients(factors, layout.owners(), SOLUTION_TOLERANCE)
+        point = self.method(
+            lambda: layout.pack(minima),
+            lambda at: objective.gradient(at, self.learnables.noise.noise()),
+            linear_solver,
+            leaves,
+        )
+        first = layout.unpack(point)[0][list(layout.starts)]
+        prediction = self.predict(solved, first, epoch)
+        wild = (~prediction.finite()).nonzero()[:, 0].tolist()
+        if wild:
+            raise NotAMinimum("the predicted track is not finite", wild)
+        total = self._outer(prediction).sum()
+        if self.settings.likelihood > 0.0:
+            unlikely = negative_log_likelihood(graphs, minima, factors, self.learnables.noise.noise())
+            total = total + self.settings.likelihood * unlikely.sum()
+        if self.anchor is not None:
+            total = total + self.settings.anchor * len(solved) * self.anchor()
+        gradients = torch.autograd.grad(total, leaves, allow_unused=True)
+        surrogate = total.detach()
+        for leaf, gradient in zip(leaves, gradients, strict=True):
+            if gradient is not None:
+                surrogate = surrogate + ((leaf - leaf.detach()) * gradient).sum()
+        return _batch_loss(surrogate, prediction, failed)
+
+    def judge(self, tracks: Sequence[int]) -> BatchLoss:
+        """The loss and the error of predictions to the full horizon, without gradient and augmentation."""
+        solved, failed = self.solver(tracks, {})
+        if not solved:
+            return BatchLoss(torch.zeros((), dtype=torch.float64), 0, 0.0, 0, tuple(failed))
+        with torch.no_grad():
+            states = [s.solution.minimum.values.states[0] for s in solved]
+            prediction = self.predict(solved, torch.stack([torch.from_numpy(s) for s in states]), None)
+            good = prediction.finite()
+            failed += [
+                (self.shots[s.number].name, "the predicted track is not finite")
+                for s, ok in zip(solved, good.tolist(), strict=True)
+                if not ok
+            ]
+            prediction = Prediction(prediction.error[good], prediction.counts[good])
+            return _batch_loss(self._outer(prediction).sum(), prediction, failed)
+
+    def predict(self, solved: Sequence[Solved], first: Tensor, epoch: int | None) -> Prediction:
+        """Rollouts over the whole tracks from their first states.
+
+        Args: solved: t of them.  first: (t, 9).  epoch: decides how far; None: to the end of the full horizon.
+        """
+        longest = max(len(self.shots[s.number].track) for s in solved)
+        error = first.new_zeros((len(solved), longest, 3))
+        counts = torch.zeros((len(solved), longest), dtype=torch.bool)
+        groups: defaultdict[Surfaces, list[int]] = defaultdict(list)
+        for k, one in enumerate(solved):
+            groups[self.shots[one.number].surfaces].append(k)
+            counts[k, : len(one.positions)] = self._counted(self.shots[one.number], epoch)
+        for surfaces, members in groups.items():
+            rows = torch.tensor(members)
+            difference = self._roll([solved[k] for k in members], first[rows], counts[rows], surfaces)
+            error = error.index_put((rows[:, None], torch.arange(difference.shape[1])), difference)
+        return Prediction(error, counts)
+
+    def _counted(self, shot: Shot, epoch: int | None) -> Tensor:
+        """(n,) bool: the usable samples up to the horizon."""
+        times = shot.track.times
+        left = float(times[-1] - times[shot.observed - 1])
+        horizon = self.settings.horizon_at(2**62 if epoch is None else epoch, left)
+        return torch.from_numpy(shot.usable & (times <= times[shot.observed - 1] + horizon + 1e-9))
+
+    def _roll(self, solved: Sequence[Solved], first: Tensor, counts: Tensor, surfaces: Surfaces) -> Tensor:
+        """(t, k, 3) m, predicted less measured positions; zero where nothing counts."""
+        needed = int(counts.any(0).nonzero().max()) + 1
+        times, measured = torch.zeros(len(solved), needed, dtype=torch.float64), first.new_zeros(len(solved), needed, 3)
+        for k, one in enumerate(solved):
+            stamps = torch.from_numpy(self.shots[one.number].track.times)[:needed]
+            times[k, : len(stamps)] = stamps - stamps[0]
+            times[k, len(stamps) :] = times[k, len(stamps) - 1]
+            measured[k, : len(stamps)] = torch.from_numpy(one.positions[:needed])
+        end = times.gather(1, counts[:, :needed].long().cumsum(1).argmax(1, keepdim=True))
+        states = paths(self.learnables.model, first, torch.minimum(times, end), surfaces)
+        return torch.where(counts[:, :needed, None], states[..., POSITION] - measured, 0.0)
+
+    def _outer(self, prediction: Prediction) -> Tensor:
+        """(t,) mean loss over the points of each track."""
+        square = (prediction.error / LOSS_UNIT).square().sum(-1)
+        return self.point_loss.of_square(square).sum(-1) / prediction.counts.sum(-1)
+
+    def memory(self) -> dict[str, Tensor]:
+        """Warm starts."""
+        return self.solver.warm.tensors()
+
+    def remember(self, memory: dict[str, Tensor]) -> None:
+        """Take up warm starts."""
+        self.solver.warm.take(memory)
+
+
+def _batch_loss(total: Tensor, prediction: Prediction, failed: Sequence[tuple[str, str]]) -> BatchLoss:
+    squared = float(prediction.error.detach().square().sum())
+    return BatchLoss(total, len(prediction.error), squared, int(prediction.counts.sum()), tuple(failed))

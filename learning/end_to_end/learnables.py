@@ -1,0 +1,119 @@
+"""Everything that can be learned of an estimator: the ball's model, what launcher settings mean, the noise."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.estimation.settings import Settings
+from ballfg.factors.batch import Noise
+from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
+
+LEARNED_NOISE = ("acceleration", "spin", "contact_velocity", "contact_tangential", "contact_spin")
+"""Numbers of the process noise that tracks tell. A hit can do anything: its noise stays."""
+WIDEST = 12.0
+"""No standard deviation leaves exp(-WIDEST) to exp(WIDEST) times where it started."""
+
+
+class NoiseScales(nn.Module):
+    """Standard deviations as logarithms relative to where they start.
+
+    Args:
+        process: to start from. Numbers that are zero stay zero.
+        position: to start from, as a multiple of what datasets and tracks say.
+        learned: False keeps everything where it is.
+
+    Attributes:
+        process: (q,) of the numbers `names`.  position, spin: () of measured positions and of spin labels.
+    """
+
+    def __init__(self, process: ProcessNoise, *, position: float = 1.0, learned: bool) -> None:
+        super().__init__()
+        self.start = process
+        self.learned = learned
+        self.names = tuple(name for name in LEARNED_NOISE if getattr(process, name) > 0.0)
+        self.process = nn.Parameter(torch.zeros(len(self.names), dtype=torch.float64), requires_grad=learned)
+        start = torch.tensor(position, dtype=torch.float64).log()
+        self.position = nn.Parameter(start, requires_grad=learned)
+        self.spin = nn.Parameter(torch.zeros((), dtype=torch.float64), requires_grad=learned)
+
+    def noise(self) -> Noise:
+        """What the factors' objective takes, relative to factors that were built with `settings` as it is now."""
+        if not self.learned:
+            return Noise()
+        start = torch.tensor([getattr(self.start, name) for name in PROCESS_NOISE], dtype=torch.float64)
+        where = torch.tensor([PROCESS_NOISE.index(name) for name in self.names])
+        process = start.index_put((where,), start[where] * self.process.exp())
+        position = (self.position - self.position.detach()).exp()
+        return Noise(process, position, (self.spin - self.spin.detach()).exp())
+
+    def values(self) -> dict[str, float]:
+        """The learned numbers of the process noise, by name."""
+        scales = self.process.detach().exp().tolist()
+        return {name: getattr(self.start, name) * scale for name, scale in zip(self.names, scales, strict=True)}
+
+    def position_scale(self) -> float:
+        """Standard deviation of a measured position in multiples of what a dataset says."""
+        return float(self.position.detach().exp())
+
+    def spin_scale(self) -> float:
+        """The same of what labels and launcher settings say of the spin."""
+        return float(self.spin.detach().exp())
+
+    def settings(self, settings: Settings) -> Settings:
+        """A dataset's settings with the noise as it is now."""
+        spin = self.spin_scale()
+        launcher = settings.launcher
+        return replace(
+            settings,
+            position_scale=self.position_scale(),
+            spin_label_noise=settings.spin_label_noise * spin,
+            launcher=None if launcher is None else replace(launcher, sigma=launcher.sigma * spin),
+            process=replace(self.start, **self.values()),
+        )
+
+    @torch.no_grad()
+    def bound(self) -> None:
+        """Keep all numbers positive and finite."""
+        for parameter in self.parameters():
+            parameter.clamp_(-WIDEST, WIDEST)
+
+
+class Learnables(nn.Module):
+    """A ball's model, an embedding of launcher settings (or None), noise."""
+
+    def __init__(self, model: BallModel, embedding: SpinEmbedding | None, noise: NoiseScales) -> None:
+        super().__init__()
+        self.model = model
+        self.embedding = embedding
+        self.noise = noise
+
+    def leaves(self) -> list[Tensor]:
+        """All parameters that receive a gradient."""
+        return [p for p in self.parameters() if p.requires_grad]
+
+    def groups(self, scales: Sequence[tuple[str, float]]) -> list[dict[str, Any]]:
+        """Parameter groups by the beginning of their names, each with its scale on the learning rate.
+
+        Args: scales: (beginning of a name, scale); the first that fits decides.
+        """
+        groups = [{"name": name or "all", "params": [], "scale": scale} for name, scale in scales]
+        for name, parameter in self.named_parameters():
+            if parameter.requires_grad:
+                k = next(k for k, (beginning, _) in enumerate(scales) if name.startswith(beginning))
+                groups[k]["params"].append(parameter)  # type: ignore[attr-defined]
+        return [group for group in groups if group["params"]]
+
+    @torch.no_grad()
+    def bound(self) -> None:
+        """Put declared coefficients and the noise back into their bounds."""
+        parameters = dict(self.model.named_parameters())
+        for name, coefficient in self.model.declared_coefficients().items():
+            parameters[name].clamp_(coefficient.low, coefficient.high)
+        self.noise.bound()

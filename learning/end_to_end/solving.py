@@ -1,0 +1,183 @@
+"""Estimates of many shots together, each starting from where it ended the last time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation import Smoother
+from ballfg.estimation.segmentation import Contact
+from ballfg.estimation.smoother.problem import effective_sigmas
+from ballfg.estimation.smoother.smoother import Earlier
+from ballfg.estimation.smoother.solution import Solution
+from ballfg.factors.batch import Values
+from ballfg.factors.graph import Convergence, LevenbergMarquardt
+from ballfg.factors.search import Search, run_together
+from ballfg.learning.end_to_end.augment import apply, rotate, undo
+from ballfg.learning.end_to_end.learnables import Learnables
+from ballfg.learning.shots import Shot
+from ballfg.state import POSITION, SPIN, VELOCITY
+from ballfg.tracks import SPIN_LABELS, Track
+
+Array = NDArray[np.float64]
+
+TRAINING = LevenbergMarquardt(tolerance=1e-4)
+"""Posterior standard deviations to the minimum: the gradient is off by as little, far less than batches scatter."""
+ACCEPTED = (Convergence.CONVERGED, Convergence.AT_KINK)
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Where a shot is seen from: turned about z by `angle` rad (), then shifted by `shift` m (2,)."""
+
+    angle: Tensor
+    shift: Tensor
+
+    def positions(self, positions: Array) -> Array:
+        """(n, 3) m as seen from there."""
+        return apply(torch.from_numpy(positions), self.angle, self.shift).numpy()
+
+    def track(self, track: Track) -> Track:
+        """A track as seen from there, its spin label too."""
+        labels = track.labels
+        if track.spin_label is not None:
+            spin = rotate(torch.from_numpy(track.spin_label), self.angle)
+            labels = {**labels, **dict(zip(SPIN_LABELS, spin.tolist(), strict=True))}
+        return replace(track, positions=self.positions(track.positions), labels=labels)
+
+    def states(self, states: Array, *, back: bool = False) -> Array:
+        """(n, 9) as seen from there; or, from there, as they were."""
+        given, angle = torch.from_numpy(states), -self.angle if back else self.angle
+        moved = (undo if back else apply)(given[:, POSITION], self.angle, self.shift)
+        return torch.cat((moved, rotate(given[:, VELOCITY], angle), rotate(given[:, SPIN], angle)), dim=-1).numpy()
+
+
+@dataclass(frozen=True)
+class Solved:
+    """An estimate of a shot.
+
+    Attributes:
+        number: of the shot.
+        solution: graph, minimum and events.
+        positions: (n, 3) m, the whole track as seen in this estimate.
+    """
+
+    number: int
+    solution: Solution
+    positions: Array
+
+
+class WarmStarts:
+    """The last estimate of each shot, seen from where it was measured: states, coefficients, contacts."""
+
+    def __init__(self) -> None:
+        self._last: dict[int, tuple[Array, Array, tuple[Contact, ...]]] = {}
+
+    def get(self, number: int, pose: Pose | None) -> tuple[Values, tuple[Contact, ...]] | None:
+        """Values to start from and contacts; None for a shot that was never solved."""
+        if number not in self._last:
+            return None
+        states, coefficients, contacts = self._last[number]
+        return Values(states if pose is None else pose.states(states), coefficients), contacts
+
+    def keep(self, number: int, solution: Solution, pose: Pose | None) -> None:
+        """Remember a converged estimate."""
+        values = solution.minimum.values
+        states = values.states if pose is None else pose.states(values.states, back=True)
+        self._last[number] = (states, values.coefficients, solution.events.contacts)
+
+    def forget(self, number: int) -> None:
+        """Start anew the next time."""
+        self._last.pop(number, None)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """Everything, by name."""
+        found = {}
+        for number, (states, coefficients, contacts) in sorted(self._last.items()):
+            rows = [(float(c.interval), c.time, c.height) for c in contacts]
+            found[f"{number}.states"] = torch.from_numpy(states.copy())
+            found[f"{number}.coefficients"] = torch.from_numpy(coefficients.copy())
+            found[f"{number}.contacts"] = torch.tensor(rows, dtype=torch.float64).reshape(-1, 3)
+        return found
+
+    def take(self, tensors: Mapping[str, Tensor]) -> None:
+        """What `tensors` gave."""
+        for name in tensors:
+            number, _, part = name.partition(".")
+            if part == "states":
+                rows = tensors[f"{number}.contacts"].tolist()
+                contacts = tuple(Contact(int(i), time, height) for i, time, height in rows)
+                coefficients = tensors[f"{number}.coefficients"].numpy()
+                self._last[int(number)] = (tensors[name].numpy(), coefficients, contacts)
+
+
+_Smoothers = dict[tuple[int, Surfaces], Smoother]
+
+
+class BatchSolver:
+    """Solves shots with the parameters as they are.
+
+    Args:
+        shots: all of them, by number.
+        learnables: model, embedding, noise.
+        optimizer: how tightly estimates are solved.
+    """
+
+    def __init__(self, shots: Sequence[Shot], learnables: Learnables, optimizer: LevenbergMarquardt = TRAINING) -> None:
+        self.shots = shots
+        self.optimizer = optimizer
+        self.learnables = learnables
+        self.warm = WarmStarts()
+
+    def __call__(self, numbers: Sequence[int], poses: Mapping[int, Pose]) -> tuple[list[Solved], list[tuple[str, str]]]:
+        """Estimates of some shots; name and reason of those that did not converge.
+
+        Args: numbers: of the shots.  poses: for those that are not seen as measured.
+        """
+        smoothers: _Smoothers = {}
+        searches = [self._search(number, poses.get(number), smoothers) for number in numbers]
+        solved, failed = [], []
+        for number, solution in zip(numbers, run_together(searches), strict=True):
+            pose, positions = poses.get(number), self.shots[number].track.positions
+            minimum = solution.minimum
+            if minimum.convergence in ACCEPTED and minimum.step is not None:
+                self.warm.keep(number, solution, pose)
+                solved.append(Solved(number, solution, positions if pose is None else pose.positions(positions)))
+            else:
+                self.warm.forget(number)
+                failed.append((self.shots[number].name, minimum.convergence.value))
+        return solved, failed
+
+    def _search(self, number: int, pose: Pose | None, smoothers: _Smoothers) -> Search[Solution]:
+        shot = self.shots[number]
+        key = id(shot.settings), shot.surfaces
+        smoother = smoothers.get(key)
+        if smoother is None:
+            smoother = smoothers[key] = self._smoother(shot)
+        track, segmentation = shot.seen, shot.segmentation
+        sigma = effective_sigmas(track, segmentation, smoother.settings)
+        if pose is not None:
+            track = pose.track(track)
+            sigma[:, :2] = np.sqrt(np.square(sigma[:, :2]).mean(axis=1, keepdims=True))  # a turn mixes x and y
+        warm = self.warm.get(number, pose)
+        if warm is None:
+            return smoother.search(track, segmentation, sigma)
+        values, contacts = warm
+        return smoother.search(track, replace(segmentation, contacts=contacts), sigma, Earlier(values, ()))
+
+    def _smoother(self, shot: Shot) -> Smoother:
+        # hits were looked for once, in the shots: what a model in training cannot explain yet is no hit
+        settings = replace(self.learnables.noise.settings(shot.settings), find_events=False)
+        return Smoother(self.model, shot.surfaces, settings, self.optimizer)
+
+    @property
+    def model(self) -> BallModel:
+        """The ball's model as it is now."""
+        return self.learnables.model

@@ -1,0 +1,123 @@
+"""How well a model predicts tracks that were not fitted: observe their first part, predict the rest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from typing import TypeVar
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+from scipy.stats import norm
+
+from ballfg.estimation import Estimator, Status
+from ballfg.estimation.batch import map_tracks
+from ballfg.prediction import predict_tracks
+from ballfg.tracks import Track
+
+T = TypeVar("T")
+Watch = Callable[[Iterable[T], int, str], Iterator[T]]
+"""Hands items through, for instance to show progress: items, how many there will be, what they are."""
+
+NINETY = float(norm.ppf(0.95))
+"""Standard deviations to each side of a central 90 % interval."""
+
+
+class TrackScore(BaseModel):
+    """How one track was predicted."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+    name: str
+    """Of the track."""
+    samples: int
+    """That were predicted."""
+    rmse: float
+    """m, root of the mean squared distance between predicted and measured positions."""
+    covered: float
+    """Share of measured coordinates inside the central 90 % intervals."""
+    prediction_nis: float
+    """Mean over the predicted samples of the squared errors in standard deviations, x, y and z added; 3 is right."""
+    nis: float
+    """Mean NIS of the observed samples, each against its prediction from the others; 3 is right."""
+
+
+class Summary(BaseModel):
+    """How a set of tracks was predicted."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+    tracks: int
+    """That are summed up."""
+    rmse_median: float
+    """m, median over tracks."""
+    rmse_pooled: float
+    """m, over all predicted samples: the worst tracks decide."""
+    coverage_90: float
+    """Share of measured coordinates inside the central 90 % intervals."""
+    prediction_nis: float
+    """Mean over predicted samples; 3 is right."""
+    nis: float
+    """Mean over tracks of the observed part's NIS; 3 is right."""
+
+
+def judge_tracks(
+    estimator: Estimator, tracks: Iterable[Track], observe: float, horizon: float, jobs: int, count: int
+) -> Iterator[TrackScore | None]:
+    """Scores in the order of the tracks.
+
+    Args:
+        estimator: with the model that is judged.
+        tracks: a stream.
+        observe: share of each track's duration that is seen.
+        horizon: s that are predicted, `inf` for the whole rest.
+        jobs: processes.
+        count: how many tracks there are.
+
+    Returns: None for a track that cannot be judged: nothing left to predict, an estimate that failed.
+    """
+    score = partial(_judge, estimator, observe, horizon)
+    return map_tracks(score, tracks, count, jobs)
+
+
+def _judge(estimator: Estimator, observe: float, horizon: float, track: Track) -> TrackScore | None:
+    return judge_track(estimator, track, observe, horizon)
+
+
+def judge_track(estimator: Estimator, track: Track, observe: float, horizon: float) -> TrackScore | None:
+    """The score of one track; None where it cannot be judged."""
+    if len(track) < 2:
+        return None
+    prediction = next(predict_tracks(estimator, [track], 1, observe * track.duration, horizon=horizon))
+    nis = prediction.estimate.nis[np.isfinite(prediction.estimate.nis)]
+    if prediction.status is not Status.OK or not len(prediction.times) or not len(nis):
+        return None
+    error = prediction.positions - prediction.measured
+    whitened = error / prediction.sigmas
+    if not np.isfinite(whitened).all():
+        return None
+    return TrackScore(
+        name=track.name,
+        samples=len(error),
+        rmse=float(np.sqrt((error**2).sum(axis=-1).mean())),
+        covered=float((np.abs(whitened) <= NINETY).mean()),
+        prediction_nis=float((whitened**2).sum(axis=-1).mean()),
+        nis=float(nis.mean()),
+    )
+
+
+def summary(scores: Sequence[TrackScore]) -> Summary | None:
+    """The scores of some tracks in five numbers; None for no tracks."""
+    if not scores:
+        return None
+    samples = np.array([s.samples for s in scores], dtype=np.float64)
+    share = samples / samples.sum()
+    rmse = np.array([s.rmse for s in scores])
+    return Summary(
+        tracks=len(scores),
+        rmse_median=float(np.median(rmse)),
+        rmse_pooled=float(np.sqrt(share @ rmse**2)),
+        coverage_90=float(share @ np.array([s.covered for s in scores])),
+        prediction_nis=float(share @ np.array([s.prediction_nis for s in scores])),
+        nis=float(np.mean([s.nis for s in scores])),
+    )

@@ -1,0 +1,1 @@
+"""The gradient through a converged estimate."""

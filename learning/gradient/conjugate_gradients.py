@@ -1,0 +1,190 @@
+"""Solving with the exact Hessian: conjugate gradients, preconditioned with GTSAM's Gauss-Newton factorisation.
+
+The Hessian of a batch of tracks is block diagonal, one block a track. All blocks are solved in lockstep: one product
+with the whole Hessian serves all of them, step lengths are each track's own. The Gauss-Newton matrix R^T R, which GTSAM
+has factorised on the way to the minimum, differs from a block by the curvature of the residuals alone: a few steps are
+enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import gtsam
+import numpy as np
+import torch
+from torch import Tensor
+
+from ballfg.factors.batch import Array
+from ballfg.state import STATE_DIM
+
+Product = Callable[[Tensor], Tensor]
+
+
+class NotAMinimum(ValueError):  # noqa: N818 - says what it is
+    """The objective is not at a minimum that a gradient could pass through.
+
+    Attributes:
+        tracks: numbers, within the batch, of those that are not.
+    """
+
+    def __init__(self, message: str, tracks: Sequence[int]) -> None:
+        super().__init__(message)
+        self.tracks = tuple(tracks)
+
+
+class GaussNewtonFactors:
+    """The factorisations R^T R of the Gauss-Newton matrices of several tracks, ready to solve all of them at once.
+
+    Args:
+        bayes_nets: GTSAM's, one a track, states in order, then coefficients.
+        lengths: number of states of each track.
+        coefficients: number p of coefficients of each.
+
+    Attributes:
+        inverse: (t, n, 9, 9) inverses of R's diagonal blocks; identities beyond a track's end.
+        following: (t, n, 9, 9) R's blocks that couple a state to the next one.
+        shared: (t, n, 9, p) those that couple it to the coefficients.
+        last: (t, p, p) inverses of the coefficients' own blocks.
+    """
+
+    def __init__(self, bayes_nets: Sequence[gtsam.GaussianBayesNet], lengths: Sequence[int], coefficients: int) -> None:
+        self.tracks, self._p = len(bayes_nets), coefficients
+        self._lengths = np.array(lengths)
+        t, n = self.tracks, max(lengths)
+        root = np.zeros((t, n, STATE_DIM, STATE_DIM))
+        root[:] = np.eye(STATE_DIM)  # shorter tracks are filled up with variables that nothing depends on
+        self.following = np.zeros((t, n, STATE_DIM, STATE_DIM))
+        self.shared = np.zeros((t, n, STATE_DIM, coefficients))
+        last = np.zeros((t, coefficients, coefficients))
+        for k, (net, length) in enumerate(zip(bayes_nets, lengths, strict=True)):
+            for i in range(length):
+                conditional = net.at(i)
+                root[k, i] = conditional.R()
+                self._read_parents(k, i, length, conditional)
+            if coefficients:
+                last[k] = net.at(length).R()
+        self.inverse, self.last = np.linalg.inv(root), np.linalg.inv(last)
+
+    def _read_parents(self, track: int, state: int, length: int, conditional: gtsam.GaussianConditional) -> None:
+        column, coupling = 0, conditional.S()
+        for key in conditional.keys()[1:]:
+            if key == length:
+                self.shared[track, state] = coupling[:, column : column + self._p]
+                column += self._p
+            else:
+                self.following[track, state] = coupling[:, column : column + STATE_DIM]
+                column += STATE_DIM
+
+    def log_determinants(self) -> Array:
+        """(t,) log det R."""
+        blocks = (
+            np.abs(np.diagonal(self.inverse, axis1=-2, axis2=-1)),
+            np.abs(np.diagonal(self.last, axis1=-2, axis2=-1)),
+        )
+        return np.asarray(-np.log(blocks[0]).sum((1, 2)) - np.log(blocks[1]).sum(1))
+
+    def solve(self, vector: Tensor) -> Tensor:
+        """R^-1 R^-T times a vector that is packed as `Layout` says."""
+        given = vector.detach().numpy()
+        split = self._lengths.sum() * STATE_DIM
+        inside = np.arange(self.inverse.shape[1]) < self._lengths[:, None]
+        states = np.zeros((*inside.shape, STATE_DIM))
+        states[inside] = given[:split].reshape(-1, STATE_DIM)
+        shared = given[split:].reshape(self.tracks, self._p).copy()
+        self._solve_transposed(states, shared)
+        self._solve(states, shared)
+        return torch.from_numpy(np.concatenate((states[inside].reshape(-1), shared.reshape(-1))))
+
+    def _solve_transposed(self, states: Array, shared: Array) -> None:
+        """R^T y = b in place: forwards along the tracks, then the coefficients."""
+        carried = np.zeros((self.tracks, STATE_DIM, 1))
+        for i in range(states.shape[1]):
+            carried = self.inverse[:, i].mT @ (states[:, i, :, None] - carried)
+            states[:, i] = carried[..., 0]
+            carried = self.following[:, i].mT @ carried
+        if self._p:
+            shared -= np.einsum("tnip,tni->tp", self.shared, states)
+            shared[:] = (self.last.mT @ shared[..., None])[..., 0]
+
+    def _solve(self, states: Array, shared: Array) -> None:
+        """R x = y in place: the coefficients, then backwards along the tracks."""
+        if self._p:
+            shared[:] = (self.last @ shared[..., None])[..., 0]
+            states -= np.einsum("tnip,tp->tni", self.shared, shared)
+        later = np.zeros((self.tracks, STATE_DIM, 1))
+        for i in range(states.shape[1] - 1, -1, -1):
+            later = self.inverse[:, i] @ (states[:, i, :, None] - self.following[:, i] @ later)
+            states[:, i] = later[..., 0]
+
+
+class ConjugateGradients:
+    """Preconditioned conjugate gradients on blocks, in lockstep.
+
+    Args:
+        factors: the preconditioner.
+        owners: (n,) the block that each number of a vector belongs to.
+        tolerance: stop when each block's residual is this small against the right side, in the preconditioner's metric.
+        max_iterations: products with the Hessian.
+    """
+
+    def __init__(
+        self, factors: GaussNewtonFactors, owners: Tensor, tolerance: float = 1e-10, max_iterations: int = 50
+    ) -> None:
+        self.factors = factors
+        self.owners = owners
+        self.tolerance = tolerance
+        self.max_iterations = max_iterations
+        self.iterations = 0
+        """Products that the last solution took."""
+
+    def precondition(self, vector: Tensor) -> Tensor:
+        """The Gauss-Newton solution."""
+        return self.factors.solve(vector)
+
+    def __call__(self, product: Product, right: Tensor) -> Tensor:
+        """X with H x = right.
+
+        Args: product: H times a vector (n,).  right: (n,).
+        Raises: NotAMinimum: H bends downwards somewhere, or the iteration does not arrive.
+        """
+        solution = torch.zeros_like(right)
+        residual = right.clone()
+        direction = conditioned = self.precondition(residual)
+        size = self._dot(residual, conditioned)
+        goal = self.tolerance**2 * size
+        for self.iterations in range(self.max_iterations + 1):  # noqa: B020 - kept for the reader
+            if bool((size <= goal).all()):
+                return solution
+            if self.iterations == self.max_iterations:
+                break
+            image = product(direction)
+            bend = self._dot(direction, image)
+            active = size > goal
+            self._check_bend(bend, active)
+            step = torch.where(active, size / bend.where(active, torch.ones_like(bend)), 0.0)[self.owners]
+            solution = solution + step * direction
+            residual = residual - step * image
+            conditioned = self.precondition(residual)
+            new = self._dot(residual, conditioned)
+            ratio = torch.where(active, new / size.where(active, torch.ones_like(size)), 0.0)[self.owners]
+            direction, size = conditioned + ratio * direction, new
+        late = (~(size <= goal)).nonzero()[:, 0].tolist()  # NaN too
+        raise NotAMinimum(
+            f"the Hessian of {len(late)} tracks could not be solved in {self.max_iterations} steps: it is far from the "
+            "Gauss-Newton matrix. Solve the estimate more tightly, or use GaussNewtonGradient.",
+            late,
+        )
+
+    def _dot(self, a: Tensor, b: Tensor) -> Tensor:
+        """(t,) inner product of each block."""
+        return a.new_zeros(self.factors.tracks).index_add(0, self.owners, a * b)
+
+    def _check_bend(self, bend: Tensor, active: Tensor) -> None:
+        wrong = (~(bend > 0.0) & active).nonzero()[:, 0].tolist()
+        if wrong:
+            raise NotAMinimum(
+                f"the objective of {len(wrong)} tracks bends downwards where the estimate stands: it is no minimum. "
+                "Leave these tracks out, or solve from another start.",
+                wrong,
+            )

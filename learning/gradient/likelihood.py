@@ -1,0 +1,71 @@
+"""How likely the observations are, as a function of the noise: what fixes the scale of learned noise.
+
+Scaling all standard deviations leaves the most probable states where they are, so an error of states alone cannot tell
+it. The likelihood of the observations, all states integrated out, can. In Laplace's approximation, exact for a linear
+model with Gaussian noise, its negative logarithm is the objective at the minimum + log det(R) + the factors' log
+spreads, R^T R the Gauss-Newton matrix. Its derivative by the noise is that of sum_k tr(T S T^T) / 2 - log det(T) (R. A.
+Fisher's identity): T what rewhitens factor k, S = r r^T + J C J^T the mean square of its whitened residual under the
+posterior covariance C of its variables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ballfg.factors.batch import Array, FactorBatch, Noise, Rows, Values
+from ballfg.factors.graph import BallGraph
+from ballfg.factors.linear import weighted
+from ballfg.factors.search import linearize_together
+from ballfg.learning.gradient.conjugate_gradients import GaussNewtonFactors
+from ballfg.learning.gradient.posterior import Posterior, posterior_of
+
+
+def negative_log_likelihood(
+    graphs: Sequence[BallGraph], minima: Sequence[Values], factors: GaussNewtonFactors, noise: Noise
+) -> Tensor:
+    """(t,) of each track's observations, up to a constant, differentiable in the noise alone.
+
+    Robust losses count as Gaussians with each residual's weight at the minimum.
+
+    Args:
+        graphs: one a track.  minima: where their objectives are least.
+        factors: their Gauss-Newton factorisations there.
+        noise: relative to what the graphs were built with, which it must be equal to.
+    """
+    posterior = posterior_of(factors)
+    log_roots = factors.log_determinants()
+    totals = []
+    for track, rows in enumerate(linearize_together(list(zip(graphs, minima, strict=True)))):
+        kinds = [kind for kind in graphs[track].kinds if len(kind)]
+        value = log_roots[track] + sum(r.error() for r in rows) + sum(kind.log_spread() for kind in kinds)
+        expected = torch.zeros((), dtype=torch.float64)
+        for kind, linearized in zip(kinds, rows, strict=True):
+            change = kind.rewhitening(noise)
+            if change is not None:
+                expected = expected + _expected(kind, linearized, posterior, track, change)
+        totals.append(float(value) + expected - expected.detach())
+    return torch.stack(totals)
+
+
+def _expected(kind: FactorBatch, rows: Rows, posterior: Posterior, track: int, change: Tensor) -> Tensor:
+    """Expected negative log density of a kind's factors, as a function of what rewhitens them."""
+    square = torch.from_numpy(_mean_square(rows, posterior, track))
+    if change.dim():
+        spread = -change.diagonal(dim1=-2, dim2=-1).log().sum()
+        return 0.5 * (change * (change @ square)).sum() + spread
+    return 0.5 * change.square() * torch.einsum("nii->", square) - len(kind) * kind.dim * change.log()
+
+
+def _mean_square(rows: Rows, posterior: Posterior, track: int) -> Array:
+    """(m, r, r) r r^T + J C J^T of each factor; residuals and Jacobians with the weights that C was made with."""
+    weight = rows.loss.weight(np.linalg.norm(rows.residual, axis=-1))
+    total = weight[:, None, None] * rows.residual[:, :, None] * rows.residual[:, None, :]
+    _, jacobians = weighted(rows)
+    for a, left in enumerate(jacobians):
+        for b, right in enumerate(jacobians):
+            total += left @ posterior.joint(track, rows.variables[:, a], rows.variables[:, b]) @ right.swapaxes(-1, -2)
+    return np.asarray(total)

@@ -1,0 +1,139 @@
+"""The objective of many tracks' graphs as one torch function of states, model, noise and priors.
+
+The estimator minimises it in numpy, track by track. A gradient through the estimate needs it once more, differentiable
+in everything, and for a batch of tracks at once: kinds of the same sort are merged, so that a batch costs few torch
+calls.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import defaultdict
+from collections.abc import Hashable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Noise, Values, merge
+from ballfg.factors.graph import BallGraph
+from ballfg.state import STATE_DIM
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where the values of each track stand in one vector: all states of all tracks, then all coefficients.
+
+    Attributes:
+        lengths: number of states of each of t tracks.
+        coefficients: number p of coefficients of each track.
+    """
+
+    lengths: tuple[int, ...]
+    coefficients: int
+
+    @property
+    def states(self) -> int:
+        """States of all tracks together."""
+        return sum(self.lengths)
+
+    @property
+    def starts(self) -> tuple[int, ...]:
+        """Index of each track's first state."""
+        return tuple(np.concatenate(([0], np.cumsum(self.lengths[:-1]))).astype(int).tolist())
+
+    def pack(self, values: Sequence[Values]) -> Tensor:
+        """One vector out of the values of each track."""
+        parts = [v.states.reshape(-1) for v in values] + [v.coefficients for v in values]
+        return torch.from_numpy(np.concatenate(parts))
+
+    def unpack(self, point: Tensor) -> tuple[Tensor, Tensor]:
+        """States (n, 9) and coefficients (t, p) of a vector."""
+        states = point[: self.states * STATE_DIM].view(-1, STATE_DIM)
+        return states, point[self.states * STATE_DIM :].view(len(self.lengths), self.coefficients)
+
+    def owners(self) -> Tensor:
+        """The track that each number of the vector belongs to."""
+        track = torch.arange(len(self.lengths))
+        return torch.cat(
+            (
+                track.repeat_interleave(torch.tensor(self.lengths) * STATE_DIM),
+                track.repeat_interleave(self.coefficients),
+            )
+        )
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Merged kinds: which rows of the states or coefficients their variables are, and the track of each factor."""
+
+    kind: FactorBatch
+    places: tuple[tuple[bool, Tensor], ...]
+    tracks: Tensor
+
+    def inputs(self, states: Tensor, coefficients: Tensor) -> tuple[Tensor, ...]:
+        return tuple((coefficients if shared else states)[index] for shared, index in self.places)
+
+
+class BatchObjective:
+    """Sum over factors of the losses, for each track of a batch.
+
+    Args:
+        graphs: one a track.
+        values: the shapes of each track's variables.
+    """
+
+    def __init__(self, graphs: Sequence[BallGraph], values: Sequence[Values]) -> None:
+        self.layout = Layout(tuple(len(v.states) for v in values), len(values[0].coefficients))
+        groups: defaultdict[Hashable, list[tuple[int, FactorBatch]]] = defaultdict(list)
+        for track, graph in enumerate(graphs):
+            for kind in graph.kinds:
+                if len(kind):
+                    groups[kind.group].append((track, kind))
+        starts = self.layout.starts
+        self._blocks = [_block(members, starts) for members in groups.values()]
+
+    def __call__(self, point: Tensor, noise: Noise) -> Tensor:
+        """(t,) the objective of each track.
+
+        Args: point: as `layout.pack` makes it.  noise: what is learned of it.
+        """
+        states, coefficients = self.layout.unpack(point)
+        total = point.new_zeros(len(self.layout.lengths))
+        for block in self._blocks:
+            residual = block.kind.residual(block.inputs(states, coefficients))
+            residual = rewhitened(residual, block.kind.rewhitening(noise))
+            total = total.index_add(0, block.tracks, block.kind.loss.of_square(residual.square().sum(-1)))
+        return total
+
+    def gradient(self, point: Tensor, noise: Noise) -> Tensor:
+        """Derivative of the sum over tracks by the point, differentiable once more."""
+        with torch.enable_grad():
+            (gradient,) = torch.autograd.grad(self(point, noise).sum(), point, create_graph=True)
+        return gradient
+
+
+def rewhitened(residual: Tensor, change: Tensor | None) -> Tensor:
+    """Whitened residuals (m, r) for changed noise; `change` as `FactorBatch.rewhitening` gives it."""
+    if change is None:
+        return residual
+    return (change @ residual.unsqueeze(-1)).squeeze(-1) if change.dim() else change * residual
+
+
+def _block(members: Sequence[tuple[int, FactorBatch]], starts: Sequence[int]) -> _Block:
+    """Kinds of one group as one kind whose variables are numbered through all tracks."""
+    moved = []
+    for track, kind in members:
+        shifted = copy.copy(kind)
+        shared = kind.variables == COEFFICIENTS
+        shifted.variables = np.where(shared, track, kind.variables + starts[track])
+        moved.append(shifted)
+    whole = merge(moved)
+    is_shared = (members[0][1].variables == COEFFICIENTS).all(axis=0)
+    places = tuple(
+        (bool(shared), torch.from_numpy(column.copy()))
+        for shared, column in zip(is_shared, whole.variables.T, strict=True)
+    )
+    tracks = torch.tensor([track for track, _ in members])
+    return _Block(whole, places, tracks.repeat_interleave(torch.tensor([len(kind) for _, kind in members])))

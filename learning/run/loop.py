@@ -1,0 +1,275 @@
+"""The training loop: batches of tracks, the sum of their gradients, a step; then the validation tracks.
+
+It reads top to bottom: `Training.epochs` is the whole of it. All chance derives from seed and epoch, so a loop that
+continues from a checkpoint takes the same steps, bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ballfg.learning.config.training import TrainConfig
+from ballfg.learning.run.checkpoint import Checkpoint, Standing
+from ballfg.learning.run.metrics import Epoch
+from ballfg.learning.run.optimizer import make_optimizer, moments, rate_factor, restore_moments
+from ballfg.learning.run.ranks import Ranks, SharedMemory
+from ballfg.learning.trainee import BatchLoss, Trainee
+
+if TYPE_CHECKING:
+    from ballfg.learning.evaluation import Watch
+
+
+class TrainingStoppedError(ValueError):
+    """The training cannot go on; the text says why and what to try. The last checkpoint is whole."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is trained on what.
+
+    Attributes:
+        trainee: the model with its data.
+        train: numbers of the tracks that train.  validation: of those that only judge; may be empty.
+        config: how.
+        ranks: the processes that share the work.
+        watch: sees the batches pass in the first process, for instance to show progress.
+    """
+
+    trainee: Trainee
+    train: tuple[int, ...]
+    validation: tuple[int, ...]
+    config: TrainConfig
+    ranks: Ranks
+    watch: Watch[list[int]]
+
+
+@dataclass
+class _Tally:
+    """Sums over tracks, and the tracks that failed on this rank."""
+
+    loss: float = 0.0
+    tracks: float = 0.0
+    squared_error: float = 0.0
+    points: float = 0.0
+    failed: float = 0.0
+    skipped: int = 0
+    norms: list[float] = field(default_factory=list)
+    reasons: list[tuple[str, str]] = field(default_factory=list)
+
+    def add(self, loss: float, tracks: float, squared_error: float, points: float) -> None:
+        self.loss += loss
+        self.tracks += tracks
+        self.squared_error += squared_error
+        self.points += points
+
+    @property
+    def rmse(self) -> float | None:
+        """m; None where there is nothing finite to take it of."""
+        mean = self.squared_error / self.points if self.points else math.nan
+        return math.sqrt(mean) if math.isfinite(mean) else None
+
+
+class Training:
+    """A run: its model, its optimizer and how far it is.
+
+    Every rank of `task.ranks` calls the same methods in the same order.
+    """
+
+    def __init__(self, task: Task, checkpoint: Checkpoint | None = None) -> None:
+        """Start, or continue from a checkpoint. Raises: ValueError: if that is of another run."""
+        self.task = task
+        self.module = task.trainee.module
+        self.optimizer = make_optimizer(task.trainee, task.config.optimizer)
+        self.parameters = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
+        self.standing: Standing | None = None
+        self.best = _weights(self.module)
+        self.memory = SharedMemory()
+        self.skipped_in_row = 0
+        if checkpoint is not None:
+            self._restore(checkpoint)
+
+    def epochs(self) -> Iterator[Epoch]:
+        """The epochs that are left, the judgement before the first step among them.
+
+        Raises: TrainingStoppedError: too many tracks failed, or too many steps in a row were not finite.
+        """
+        done = -1 if self.standing is None else self.standing.epoch
+        for number in range(done + 1, self.task.config.optimizer.epochs + 1):
+            begun = time.monotonic()
+            learned = self._learn(number) if number else _Tally()
+            judged = self._judge(number)
+            self._note(number, judged)
+            yield Epoch(
+                epoch=number,
+                loss=learned.loss / learned.tracks if learned.tracks else None,
+                train_rmse=learned.rmse,
+                validation_rmse=judged.rmse,
+                learning_rate=self._rate(number - 1, self._batches - 1) if number else 0.0,
+                gradient_norm=float(np.mean(learned.norms)) if learned.norms else None,
+                skipped=learned.skipped,
+                failed=int(learned.failed),
+                validation_failed=int(judged.failed),
+                seconds=time.monotonic() - begun,
+            )
+
+    def checkpoint(self) -> Checkpoint:
+        """The run after its last whole epoch. All ranks call it; between epochs only."""
+        if self.standing is None:
+            raise ValueError("a checkpoint must follow an epoch; got none yet. Take the first of `epochs` before.")
+        memory = self.memory.gather(self.task.ranks, self.task.trainee.memory())
+        return Checkpoint(self.standing, _weights(self.module), self.best, moments(self.optimizer, self.module), memory)
+
+    def take_best(self) -> None:
+        """Put the best weights into the model."""
+        self.module.load_state_dict(self.best)
+
+    @property
+    def _batches(self) -> int:
+        """Steps of an epoch."""
+        return -(-len(self.task.train) // self.task.config.optimizer.batch)
+
+    def _learn(self, number: int) -> _Tally:
+        """One pass over the training tracks, in an order of its own."""
+        config, epoch = self.task.config, number - 1
+        order = np.random.default_rng((config.seed, epoch)).permutation(np.array(self.task.train)).tolist()
+        size = config.optimizer.batch
+        batches = [order[i : i + size] for i in range(0, len(order), size)]
+        tally = _Tally()
+        for index, batch in enumerate(self._shown(batches, f"batches of epoch {number}")):
+            for group in self.optimizer.param_groups:
+                group["lr"] = group["scale"] * self._rate(epoch, index)
+            self._step(batch, epoch, tally)
+        return tally
+
+    def _step(self, batch: Sequence[int], epoch: int, tally: _Tally) -> None:
+        """Sum the gradients of a batch over all ranks and take a step, unless it is not finite."""
+        task = self.task
+        summed = task.ranks.sum(task.ranks.together(lambda: self._gradients(batch, epoch, tally)))
+        gradient, (loss, tracks, squared_error, points, failed) = summed[:-5], summed[-5:].tolist()
+        tally.failed += failed
+        self._check_failures(tally)
+        if not tracks:
+            return
+        if not bool(summed.isfinite().all()):
+            self._skip(tally)
+            return
+        self.skipped_in_row = 0
+        tally.add(loss, tracks, squared_error, points)
+        gradient = gradient / tracks
+        norm = float(gradient.norm())
+        tally.norms.append(norm)
+        clip = task.config.optimizer.clip
+        self._apply(gradient * (clip / norm) if clip is not None and norm > clip else gradient)
+
+    def _gradients(self, batch: Sequence[int], epoch: int, tally: _Tally) -> Tensor:
+        """This rank's share of a batch: its gradient, flat, and its five sums behind it."""
+        own = self.task.ranks.own(batch)
+        self.optimizer.zero_grad()
+        found = self.task.trainee.loss(own, epoch) if own else BatchLoss(torch.zeros(()), 0, 0.0, 0)
+        if found.total.requires_grad:
+            found.total.backward()
+        tally.reasons += found.failed
+        flat = [p.new_zeros(p.numel()) if p.grad is None else p.grad.reshape(-1) for p in self.parameters]
+        sums = (float(found.total.detach()), found.tracks, found.squared_error, found.points, len(found.failed))
+        return torch.cat([part.double() for part in flat] + [torch.tensor(sums, dtype=torch.float64)])
+
+    def _apply(self, gradient: Tensor) -> None:
+        """A step along a flat gradient."""
+        parts = gradient.split([parameter.numel() for parameter in self.parameters])
+        for parameter, part in zip(self.parameters, parts, strict=True):
+            parameter.grad = part.view_as(parameter).to(parameter.dtype)
+        self.optimizer.step()
+        self.task.trainee.after_step()
+
+    def _skip(self, tally: _Tally) -> None:
+        """Count a step that is not finite."""
+        tally.skipped += 1
+        self.skipped_in_row += 1
+        if self.skipped_in_row > self.task.config.diverged_limit:
+            raise TrainingStoppedError(
+                f"training diverged: loss or gradient was not finite in {self.skipped_in_row} steps in a row. "
+                "Set optimizer.learning_rate lower, or loss.horizon shorter."
+            )
+
+    def _check_failures(self, tally: _Tally) -> None:
+        """Stop as soon as more tracks of the epoch have failed than may."""
+        limit, count = self.task.config.failure_limit, len(self.task.train)
+        if tally.failed <= limit * count:
+            return
+        name, reason = next(each for reasons in self.task.ranks.gather(tally.reasons) for each in reasons)
+        raise TrainingStoppedError(
+            f"more than {100 * limit:g} % of the {count} training tracks failed in one epoch, the first one '{name}': "
+            f"{reason}. Raise failure_limit to go on without them."
+        )
+
+    def _judge(self, number: int) -> _Tally:
+        """The validation tracks with the weights as they are."""
+        ranks, size = self.task.ranks, self.task.config.optimizer.batch
+        own = ranks.own(self.task.validation)
+        parts = [own[i : i + size] for i in range(0, len(own), size)]
+
+        def work() -> Tensor:
+            sums = torch.zeros(5, dtype=torch.float64)
+            for part in self._shown(parts, f"batches judged after epoch {number}"):
+                found = self.task.trainee.judge(part)
+                row = (float(found.total.detach()), found.tracks, found.squared_error, found.points, len(found.failed))
+                sums += torch.tensor(row, dtype=torch.float64)
+            return sums
+
+        loss, tracks, squared_error, points, failed = ranks.sum(ranks.together(work)).tolist()
+        return _Tally(loss, tracks, squared_error, points, failed)
+
+    def _note(self, number: int, judged: _Tally) -> None:
+        """Keep the weights if they are the best so far. When many tracks failed, the rest tells too little."""
+        reliable = judged.failed <= self.task.config.failure_limit * len(self.task.validation)
+        rmse = judged.rmse if reliable else None
+        best = None if self.standing is None else self.standing.best_rmse
+        better = best is None or (rmse is not None and rmse < best)
+        if better:
+            self.best = _weights(self.module)
+        self.standing = Standing(
+            epoch=number,
+            best_epoch=number if better or self.standing is None else self.standing.best_epoch,
+            best_rmse=rmse if better else best,
+            skipped_in_row=self.skipped_in_row,
+            train=len(self.task.train),
+            validation=len(self.task.validation),
+        )
+
+    def _rate(self, epoch: int, index: int) -> float:
+        settings = self.task.config.optimizer
+        return settings.learning_rate * rate_factor(settings, epoch * self._batches + index, self._batches)
+
+    def _shown(self, items: list[list[int]], what: str) -> Iterator[list[int]]:
+        return self.task.watch(items, len(items), what) if self.task.ranks.first else iter(items)
+
+    def _restore(self, checkpoint: Checkpoint) -> None:
+        """Take up a checkpoint. Raises: ValueError: if it is of another model or other tracks."""
+        standing, task = checkpoint.standing, self.task
+        there, here = (standing.train, standing.validation), (len(task.train), len(task.validation))
+        if there != here:
+            raise ValueError(
+                f"the checkpoint must be of the same tracks; it has {there[0]} to train and {there[1]} to validate, "
+                f"the data {here[0]} and {here[1]}. Give the same data, or start a new run."
+            )
+        try:
+            self.module.load_state_dict(checkpoint.weights)
+            restore_moments(self.optimizer, self.module, checkpoint.optimizer)
+        except (RuntimeError, KeyError) as error:  # torch's own word for names and shapes that differ
+            raise ValueError(f"the checkpoint must be of the same model; {error}. Start a new run.") from None
+        task.trainee.remember(checkpoint.memory)
+        self.memory = SharedMemory(checkpoint.memory)
+        self.standing, self.best, self.skipped_in_row = standing, checkpoint.best, standing.skipped_in_row
+
+
+def _weights(module: nn.Module) -> dict[str, Tensor]:
+    """A copy of a module's state."""
+    return {name: tensor.detach().clone() for name, tensor in module.state_dict().items()}

@@ -1,0 +1,99 @@
+"""What an epoch of training came to: one row of `metrics.csv`."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any
+
+from ballfg.learning.run.run_folder import write_text
+
+
+@dataclass(frozen=True)
+class Epoch:
+    """An epoch's numbers.
+
+    Attributes:
+        epoch: number, from 1; 0 is the model before any step, judged only.
+        loss: mean over the training tracks; None where no step was taken.
+        train_rmse: m, of predicted positions (the norm of the error), with the weights as they were at each step.
+        validation_rmse: m, with the weights at the end; None where nothing could be judged.
+        learning_rate: of the last step, for a scale of 1.
+        gradient_norm: of the mean loss of a batch before clipping, mean over steps.
+        skipped: steps whose loss or gradient was not finite.
+        failed: training tracks left out since their estimate failed.
+        validation_failed: the same of the validation tracks.
+        seconds: s that it took.
+    """
+
+    epoch: int
+    loss: float | None
+    train_rmse: float | None
+    validation_rmse: float | None
+    learning_rate: float
+    gradient_norm: float | None
+    skipped: int
+    failed: int
+    validation_failed: int
+    seconds: float
+
+
+INTEGERS = ("epoch", "skipped", "failed", "validation_failed")
+"""Columns that are counts."""
+
+
+def write_metrics(path: Path, epochs: Sequence[Epoch]) -> None:
+    """Write the table; an empty cell stands for None. Floats read back bit for bit."""
+    text = io.StringIO()
+    table = csv.DictWriter(text, [field.name for field in fields(Epoch)], lineterminator="\n")
+    table.writeheader()
+    for epoch in epochs:
+        table.writerow(asdict(epoch))
+    write_text(path, text.getvalue())
+
+
+def read_metrics(path: Path) -> list[Epoch]:
+    """The rows of a table. Raises: ValueError: if it is not one that `write_metrics` wrote."""
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            return [_epoch(row) for row in csv.DictReader(file)]
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: not a table of epochs ({error}). Start a new run.") from None
+
+
+def epoch_line(epoch: Epoch, last: int, seconds_left: float) -> str:
+    """One line for the reader. Args: last: number of the last epoch.  seconds_left: s, a guess."""
+    parts = [f"epoch {epoch.epoch}/{last}:"]
+    if epoch.epoch:
+        parts.append("no track learned from," if epoch.loss is None else f"loss {epoch.loss:.4g},")
+        parts.append(f"train RMSE {_millimetres(epoch.train_rmse)},")
+    parts.append(f"validation RMSE {_millimetres(epoch.validation_rmse)},")
+    parts += [f"{epoch.skipped} steps skipped,"] if epoch.skipped else []
+    parts += [f"{epoch.failed} tracks failed,"] if epoch.failed else []
+    parts += [f"{epoch.validation_failed} validation tracks failed,"] if epoch.validation_failed else []
+    parts.append(f"{epoch.seconds:.1f} s")
+    return " ".join(parts) + (f", about {_duration(seconds_left)} left" if seconds_left else "")
+
+
+def _epoch(row: dict[str, str]) -> Epoch:
+    """Raises: TypeError, ValueError: not a row of this table."""
+    values: dict[str, Any] = {}
+    for name, text in row.items():
+        if name in INTEGERS:
+            values[name] = int(text)
+        else:
+            values[name] = float(text) if text else None
+    return Epoch(**values)
+
+
+def _millimetres(rmse: float | None) -> str:
+    return "-" if rmse is None else f"{1e3 * rmse:.2f} mm"
+
+
+def _duration(seconds: float) -> str:
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"

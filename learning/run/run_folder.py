@@ -1,0 +1,89 @@
+"""The folder of a run: its config and versions, and how its files are written. None appears before it is whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+from collections.abc import Mapping
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from ballfg.learning.config.config_file import Config, read_config
+
+CONFIG, VERSIONS, MODEL = "config.yaml", "versions.json", "model.yaml"
+STEPS, REPORT, PICTURE = "checkpoint.json", "report.json", "calibration.png"
+CHECKPOINT, METRICS, CURVES, EVENTS = "checkpoint", "metrics.csv", "curves.png", "tensorboard"
+CALIBRATION = (CONFIG, VERSIONS, MODEL, STEPS, REPORT, PICTURE)
+"""What a calibration writes."""
+TRAINING = (CONFIG, VERSIONS, MODEL, CHECKPOINT, METRICS, CURVES, EVENTS)
+"""What a training writes, files and folders; a learned model has a folder of its own beside."""
+PACKAGES = ("ballfg", "gtsam", "torch", "numpy", "scipy", "safetensors")
+
+
+def check(folder: Path, config: Config, *, resume: bool) -> None:
+    """Refuse a folder before anything is done. Raises: as `check_resumable` and `check_new`."""
+    if resume:
+        check_resumable(folder, config)
+    else:
+        check_new(folder)
+
+
+def check_new(folder: Path) -> None:
+    """Refuse a folder in which something would be lost. Raises: ValueError: a file, or a folder with an earlier run."""
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"out must be a folder; {folder} is a file. Choose another name.")
+    there = [name for name in (*CALIBRATION, *TRAINING) if (folder / name).exists()]
+    if there:
+        raise ValueError(
+            f"out must not hold an earlier run; {folder} has {there[0]}. Choose another folder, or continue that run "
+            f"with --resume {folder}."
+        )
+
+
+def check_resumable(folder: Path, config: Config) -> None:
+    """Refuse to continue a run under another config.
+
+    Raises: FileNotFoundError: no run in the folder. ValueError: a field differs that would change the numbers.
+    """
+    if not (folder / CONFIG).is_file():
+        raise FileNotFoundError(f"--resume needs the folder of an earlier run; {folder} has no {CONFIG}.")
+    earlier, now = (_flat(each.model_dump(mode="json")) for each in (read_config(folder / CONFIG), config))
+    for name in ("kind", *now):
+        if name not in config.FREE_TO_CHANGE and earlier[name] != now[name]:
+            raise ValueError(
+                f"a resumed run must keep its config; '{name}' was {earlier[name]!r} and is {now[name]!r}. "
+                f"Give {folder / CONFIG} as the config, or start a new run."
+            )
+
+
+def _flat(content: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """Nested keys with dots."""
+    flat: dict[str, Any] = {}
+    for key, value in content.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {f"{prefix}{key}": value}
+    return flat
+
+
+def start(folder: Path, config: Config) -> None:
+    """Make the folder and write the resolved config and the versions, before the first step."""
+    folder.mkdir(parents=True, exist_ok=True)
+    text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
+    write_text(folder / CONFIG, text)
+    versions = {"python": platform.python_version()} | {name: metadata.version(name) for name in PACKAGES}
+    write_json(folder / VERSIONS, versions)
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON; floats read back bit for bit."""
+    write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write a text file; the final name appears only once the file is whole."""
+    part = path.with_name(f".{path.name}.part")
+    part.write_text(text, encoding="utf-8")
+    os.replace(part, path)

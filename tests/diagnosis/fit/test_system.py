@@ -1,0 +1,102 @@
+"""Elimination stretch by stretch against one dense least-squares problem with everything in it."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ballfg.diagnosis.fit.system import System, by_track
+from ballfg.diagnosis.search.signatures import Signatures
+
+N, M, STATE, Q, P = 5, 40, 9, 3, 2
+TRACK = np.array([0, 0, 1, 2, 2])
+PRECISION = np.array([0.5, 3.0, 20.0])
+
+
+@pytest.fixture(scope="module")
+def system():
+    rng = np.random.default_rng(0)
+    return System(rng.normal(size=(N, M)), rng.normal(size=(N, M, STATE)), rng.normal(size=(N, M, Q + P)))
+
+
+def stacked(system):
+    """(N M, N STATE) of all first states, (N M, Q + P) of what is common, (N M,) residual."""
+    states = np.zeros((N * M, N * STATE))
+    for i in range(N):
+        states[i * M : (i + 1) * M, i * STATE : (i + 1) * STATE] = system.by_start[i]
+    return states, system.by_common.reshape(N * M, -1), system.residual.ravel()
+
+
+def off(columns, nuisance):
+    """What least squares with `nuisance` leaves of columns."""
+    return columns - nuisance @ np.linalg.lstsq(nuisance, columns, rcond=None)[0]
+
+
+def test_projected_columns_are_what_first_states_leave(system):
+    states, common, residual = stacked(system)
+    dense = off(np.column_stack((common, residual)), states)
+    np.testing.assert_allclose(system.projected().reshape(N * M, -1), dense, atol=1e-12)
+    gram = system.eliminated().gram
+    np.testing.assert_allclose(gram.sum(0), dense.T @ dense, atol=1e-10)
+    np.testing.assert_allclose(gram[2], dense[2 * M : 3 * M].T @ dense[2 * M : 3 * M], atol=1e-11)
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.3])
+def test_the_step_is_that_of_the_dense_normal_equations(system, damping):
+    states, common, residual = stacked(system)
+    precision, pull = np.append(PRECISION, [0.0, 0.0]), np.array([0.3, -1.0, 2.0, 0.0, 0.0])
+    every = np.column_stack((common, states))
+    hessian = every.T @ every
+    right = every.T @ residual
+    hessian[: Q + P, : Q + P] += np.diag(precision)
+    right[: Q + P] += pull
+    if damping == 0.0:
+        step = np.linalg.solve(hessian, right)
+    else:  # first states are damped on their own diagonal, what is common on that of its Schur complement
+        own = hessian[Q + P :, Q + P :]
+        own[np.diag_indices_from(own)] *= 1 + damping
+        across = hessian[: Q + P, Q + P :]
+        schur = hessian[: Q + P, : Q + P] - across @ np.linalg.solve(own, across.T)
+        schur[np.diag_indices_from(schur)] *= 1 + damping
+        shared = np.linalg.solve(schur, right[: Q + P] - across @ np.linalg.solve(own, right[Q + P :]))
+        step = np.append(shared, np.linalg.solve(own, right[Q + P :] - across.T @ shared))
+    eliminated = system.eliminated(damping)
+    shared = eliminated.common_step(precision, pull, damping)
+    np.testing.assert_allclose(shared, step[: Q + P], atol=1e-11)
+    np.testing.assert_allclose(eliminated.start_step(shared).ravel(), step[Q + P :], atol=1e-11)
+
+
+def test_sums_over_the_stretches_of_each_track(system):
+    gram = system.eliminated().gram
+    found = by_track(gram, TRACK + 7)  # any numbers
+    for i in range(3):
+        np.testing.assert_allclose(found[i], gram[i == TRACK].sum(0), atol=1e-13)
+
+
+def test_efficient_scores_are_those_of_the_dense_projection(system):
+    """Priors of what is common are rows of their own; each track's score is its part of the dense product."""
+    states, common, residual = stacked(system)
+    gram = by_track(system.eliminated().gram, TRACK)
+    efficient = Signatures(gram, PRECISION, Q).efficient()
+    rows = np.concatenate((off(common, states), np.column_stack((np.diag(np.sqrt(PRECISION)), np.zeros((Q, P))))))
+    nuisance, wanted = rows[:, :Q], rows[:, Q:]
+    left = off(wanted, nuisance)
+    np.testing.assert_allclose(
+        efficient.information.sum(0) + efficient.prior, left.T @ left, atol=1e-10, err_msg="information"
+    )
+    np.testing.assert_allclose(efficient.prior, left[-Q:].T @ left[-Q:], atol=1e-11)
+    np.testing.assert_allclose(efficient.score.sum(0), left[:-Q].T @ off(residual, states), atol=1e-10)
+    for i in range(3):
+        own = np.repeat(i == TRACK, M)
+        np.testing.assert_allclose(efficient.score[i], left[:-Q][own].T @ off(residual, states)[own], atol=1e-11)
+        np.testing.assert_allclose(efficient.information[i], left[:-Q][own].T @ left[:-Q][own], atol=1e-10)
+    np.testing.assert_allclose(efficient.raw, (off(common, states)[:, Q:] ** 2).sum(0), atol=1e-10)
+
+
+def test_without_priors_the_score_is_of_the_whole_least_squares_problem(system):
+    """One step of the candidates is what they would be in the joint fit."""
+    states, common, residual = stacked(system)
+    efficient = Signatures(by_track(system.eliminated().gram, TRACK), np.zeros(Q), Q).efficient()
+    estimate = np.linalg.solve(efficient.information.sum(0), efficient.score.sum(0))
+    joint = np.linalg.lstsq(np.column_stack((common, states)), residual, rcond=None)[0]
+    np.testing.assert_allclose(estimate, joint[Q : Q + P], atol=1e-11)

@@ -1,0 +1,243 @@
+"""The report of a diagnosis: strict JSON with the agreed keys, a page that stands alone, a model; all or none."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from matplotlib.figure import Figure
+
+from ballfg.diagnosis.report import report
+from ballfg.diagnosis.report.page import page
+from ballfg.diagnosis.report.parts import Html, picture
+from ballfg.diagnosis.report.report import content, write_report
+from ballfg.diagnosis.result import Diagnosis, Errors, Fallback
+from ballfg.dynamics import Architecture, build, load_model, model_to_dict, nominal_model
+from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.dynamics.networks.learned import LearnedModel
+from tests.diagnosis.made_diagnosis import found, silent, unexplained
+
+VOID = {"meta", "img"}
+
+
+class Page(HTMLParser):
+    """Words of each heading and of the body, addresses, and whether every element is closed."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.words: list[str] = []
+        self.headings: list[str] = []
+        self.addresses: list[str] = []
+        self.feed(text)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
+        if tag not in VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        if "style" not in self.open:
+            self.words.append(data)
+        if self.open and self.open[-1] in ("h1", "h2"):
+            self.headings.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join("".join(self.words).split())
+
+
+@pytest.fixture(scope="module")
+def found_page() -> Page:
+    return Page(page(found()))
+
+
+@pytest.fixture
+def drawn(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Captions of the pictures of a page, which are left blank: to draw them takes seconds."""
+    captions: list[str] = []
+
+    def blank(figure: Figure, caption: str) -> Html:
+        captions.append(caption)
+        return picture(Figure(figsize=(0.1, 0.1)), caption)
+
+    monkeypatch.setattr("ballfg.diagnosis.report.page.picture", blank)
+    monkeypatch.setattr("ballfg.diagnosis.report.evidence.picture", blank)
+    return captions
+
+
+@pytest.fixture
+def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A page of one sentence, for tests that are about files."""
+    monkeypatch.setattr(report, "page", lambda diagnosis: f"<html>{diagnosis.sentence}</html>")
+
+
+def refuse(word: str) -> None:
+    raise AssertionError(f"{word} is not JSON")
+
+
+def test_json_has_the_agreed_keys_and_numbers() -> None:
+    diagnosis = found()
+    text = json.dumps(content(diagnosis), allow_nan=False)
+    read = json.loads(text, parse_constant=refuse)
+    assert read["verdict"] == "effect found"
+    (effect,) = read["effects"]
+    assert effect["name"] == "wind"
+    assert effect["kind"] == "flight"
+    assert effect["parameters"]["x"] == {"value": 0.2, "sigma": 0.012, "unit": "m/s"}
+    assert (effect["p_value"], effect["delta_bic"]) == (3e-131, -598.3)
+    assert effect["indistinguishable_from"] == ["gust_region"]
+    before = read["error"]["before"]
+    assert before["prediction_rmse_mm"] == diagnosis.before.prediction_rmse_mm
+    assert before["apex_rmse_mm"] == diagnosis.before.apex_rmse_mm
+    assert (before["nis"], before["log_likelihood"]) == (diagnosis.before.nis, diagnosis.before.log_likelihood)
+    assert before["by_track_mm"] == diagnosis.before.by_track.tolist()
+    assert read["error"]["after"]["apex_rmse_mm"] is None
+    assert read["error"]["tracks_judged_on"] == 25
+    assert read["unexplained"]["where"] == ""
+    assert read["unexplained"]["share_of_residual"] == 0.02
+    assert read["calibrated"]["flight.drag.k"] == {"value": 0.1213, "sigma": 0.0011, "unit": "1/m", "declared": 0.12}
+    assert [row["standing"] for row in read["rounds"][0][:2]] == ["added", "cannot be told from the one added"]
+    assert read["rounds"][0][3]["delta_bic"] is None
+
+
+def test_json_of_a_fallback() -> None:
+    read = content(unexplained())
+    assert read["verdict"] == "unexplained"
+    fallback = read["unexplained"]["fallback"]
+    assert fallback["kind"] == "sparse terms"
+    made = unexplained().unexplained.fallback
+    assert fallback["error"]["after"]["prediction_rmse_mm"] == made.after.prediction_rmse_mm
+
+
+def test_the_page_stands_alone_and_is_whole(found_page: Page) -> None:
+    assert found_page.open == []
+    assert len(found_page.addresses) == 7
+    assert all(address.startswith("data:image/png;base64,") for address in found_page.addresses)
+
+
+def test_the_page_says_what_was_found(found_page: Page) -> None:
+    assert found_page.headings[0] == found().sentence
+    for words in (
+        "shots <in a draught>",
+        "0.200 ± 0.012 m/s",
+        "falls by 598",
+        "adds 5.8 of log likelihood per track; probability of that by chance: 2·10−7.",
+        "all candidates counted: less than 10−99.",
+        "Cannot be told from gust_region.",
+        "These data cannot tell wind and gust_region apart. What would decide it:",
+        "wind: Shoot in the opposite direction, or across",
+        "25 tracks served to find, 25 others to judge.",
+        "flight.drag.k 0.12 0.1213 ± 0.0011 1/m",
+        "shot 7 has no free flight of 10 samples.",
+        "12.1 → – nothing to judge by",
+    ):
+        spaced = re.sub(r"\s+", "", words)
+        assert spaced in found_page.text.replace(" ", ""), words
+    shown = found_page.text[found_page.text.index("What these data cannot show") :]
+    assert shown.index("spin_label_scale") < shown.index("wind_shear") < shown.index("The numbers of the model")
+
+
+def test_pages_without_a_finding(drawn: list[str]) -> None:
+    quiet = Page(page(silent()))
+    assert quiet.headings[:2] == [silent().sentence, "How well the model predicts"]
+    assert "→" not in quiet.text
+    assert "No pattern is left" in quiet.text
+    assert len(drawn) == 4  # no errors side by side, no contacts, no second round
+    assert not any("contact" in caption for caption in drawn)
+    left = Page(page(unexplained()))
+    assert "What is left unexplained" in left.headings
+    assert "That is 80 % of the pattern that was there at the start." in left.text
+    assert "20.1 mm without, 11.8 mm with it" in left.text
+
+
+@pytest.mark.usefixtures("drawn")
+def test_the_three_files_appear_and_the_model_can_be_read(tmp_path: Path) -> None:
+    out = tmp_path / "diagnosis"
+    write_report(silent(), out)
+    assert sorted(path.name for path in out.iterdir()) == ["model.yaml", "report.html", "report.json"]
+    assert [path.name for path in tmp_path.iterdir()] == ["diagnosis"]
+    model = load_model(out / "model.yaml")
+    assert isinstance(model, AnalyticModel)
+    assert model_to_dict(model) == model_to_dict(nominal_model())
+    assert json.loads((out / "report.json").read_text(encoding="utf-8"))["verdict"] == "nothing lacking"
+    assert Page((out / "report.html").read_text(encoding="utf-8")).headings[0] == silent().sentence
+
+
+@pytest.mark.usefixtures("no_page")
+def test_an_earlier_report_is_replaced_and_other_files_stay(tmp_path: Path) -> None:
+    out = tmp_path / "diagnosis"
+    write_report(with_learned_fallback(), out)
+    learned = [path.name for path in out.glob("model.learned-*")]
+    assert len(learned) == 1
+    assert isinstance(load_model(out / "model.yaml"), LearnedModel)
+    (out / "notes.txt").write_text("mine")
+    write_report(with_learned_fallback(), out)
+    assert [path.name for path in out.glob("model.learned-*")] == learned
+    write_report(silent(), out)
+    assert sorted(p.name for p in out.iterdir()) == ["model.yaml", "notes.txt", "report.html", "report.json"]
+    assert silent().sentence in (out / "report.html").read_text(encoding="utf-8")
+    assert [path.name for path in tmp_path.iterdir()] == ["diagnosis"]
+
+
+def with_learned_fallback() -> Diagnosis:
+    small = Architecture(kind="mnn+gs", width_flight=4, width_contact=4, depth=1, residual=True)
+    learned = build(small, radius=0.02, base=nominal_model())
+    left = unexplained().unexplained
+    assert isinstance(left.fallback, Fallback)
+    fallback = replace(left.fallback, kind="learned residual", model=learned)
+    return replace(unexplained(), model=learned, unexplained=replace(left, fallback=fallback))
+
+
+@pytest.mark.parametrize("there", [False, True])
+def test_a_failure_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: bool) -> None:
+    out = tmp_path / "diagnosis"
+
+    def fail(diagnosis: Diagnosis) -> str:
+        raise KeyboardInterrupt
+
+    if there:
+        out.mkdir()
+        (out / "report.json").write_text("earlier")
+    monkeypatch.setattr(report, "page", fail)
+    with pytest.raises(KeyboardInterrupt):
+        write_report(silent(), out)
+    left = {str(path.relative_to(tmp_path)): path.read_text() for path in tmp_path.rglob("*") if path.is_file()}
+    assert left == ({"diagnosis/report.json": "earlier"} if there else {})
+
+
+@pytest.mark.usefixtures("no_page")
+def test_folders_that_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    (tmp_path / "work").mkdir()
+    (tmp_path / "work" / "model.yaml").write_text("mine")
+    with pytest.raises(ValueError, match=r"out must be a folder; .*file is a file"):
+        write_report(silent(), tmp_path / "file")
+    with pytest.raises(ValueError, match=r"out must be new, empty or hold an earlier report; .*work holds other files"):
+        write_report(silent(), tmp_path / "work")
+    with pytest.raises(FileNotFoundError, match=r"out must be in an existing folder; .*nowhere is none"):
+        write_report(silent(), tmp_path / "nowhere" / "diagnosis")
+    assert (tmp_path / "work" / "model.yaml").read_text() == "mine"
+
+
+@pytest.mark.usefixtures("no_page")
+def test_the_same_diagnosis_gives_the_same_bytes(tmp_path: Path) -> None:
+    for name in "ab":
+        write_report(found(), tmp_path / name)
+    for name in ("report.json", "model.yaml"):
+        assert (tmp_path / "a" / name).read_bytes() == (tmp_path / "b" / name).read_bytes()
+
+
+def test_infinite_numbers_become_null() -> None:
+    errors = Errors(1.0, math.inf, math.nan, -math.inf, found().before.by_track)
+    read = content(replace(found(), after=errors))["error"]["after"]
+    assert [read[k] for k in ("prediction_rmse_mm", "apex_rmse_mm", "nis", "log_likelihood")] == [1.0, None, None, None]

@@ -1,0 +1,78 @@
+"""From a fit to a model that others can use."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from ballfg.diagnosis.fit.problem import launch_axes, linearise
+from ballfg.diagnosis.search.calibrated import calibrated_model, values_of
+from ballfg.dynamics import load_model, save_model
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+
+EMBEDDING = SpinEmbedding(("group",), {"group": ("one",)})
+
+
+@pytest.fixture(scope="module")
+def unlabelled(make_ball, make_launches, make_shots, make_fit):
+    data = make_shots(make_ball(), make_launches(6, 61), 61, labelled=False, duration=0.5, rate=50.0)
+    return make_fit(make_ball(), data.stretches)
+
+
+def test_coefficients_are_those_of_the_fit(calm_fit):
+    model = calibrated_model(calm_fit, EMBEDDING)
+    values = {n: float(p) for n, p in model.named_parameters() if n in calm_fit.unknowns.values}
+    assert values == calm_fit.unknowns.values
+    assert float(calm_fit.problem.model.flight["drag"].k) == 0.12  # a copy
+    assert not any(p.requires_grad for p in model.parameters())
+
+
+def test_labelled_tracks_need_no_launcher(calm_fit):
+    trained = calibrated_model(calm_fit, EMBEDDING).trained
+    assert trained.launcher is None
+    assert trained.spin_noise == calm_fit.noise.label
+    assert trained.position_scale == pytest.approx(np.sqrt((calm_fit.noise.position**2).mean()))
+
+
+def test_the_launcher_tells_the_spins_of_the_fit(unlabelled):
+    trained = calibrated_model(unlabelled, EMBEDDING).trained
+    assert trained.spin_noise == unlabelled.noise.spin
+    starts, settings = unlabelled.unknowns.starts, unlabelled.problem.stretches.settings
+    mean = (launch_axes(starts) @ (settings @ unlabelled.unknowns.launcher)[..., None])[..., 0]
+    told = trained.launcher.spin(torch.from_numpy(settings), torch.from_numpy(starts[:, 3:6]))
+    np.testing.assert_allclose(told.detach().numpy(), mean, atol=1e-9)
+    local = trained.launcher.local(torch.ones(1, dtype=torch.float64)).numpy()
+    np.testing.assert_allclose(local, unlabelled.unknowns.launcher[0], atol=1e-9)
+
+
+def test_standard_deviations_are_those_of_the_whole_problem(calm_fit):
+    """Of the dense information matrix with every first state in it."""
+    system = linearise(calm_fit.problem, calm_fit.unknowns, calm_fit.noise, calm_fit.predicted)
+    n, m, q = system.by_common.shape
+    dense = np.zeros((n * m, 9 * n + q))
+    for i in range(n):
+        dense[i * m : (i + 1) * m, 9 * i : 9 * i + 9] = system.by_start[i]
+        dense[i * m : (i + 1) * m, 9 * n :] = system.by_common[i]
+    information = dense.T @ dense
+    free = len(calm_fit.problem.free)
+    precision = np.concatenate((calm_fit.problem.precisions, np.repeat(calm_fit.problem.launcher_precision, 3)))
+    information[9 * n :, 9 * n :] += np.diag(precision)
+    sigma = np.sqrt(np.diagonal(np.linalg.inv(information)))[9 * n : 9 * n + free]
+    found = values_of(calm_fit, calm_fit.problem.free, {"flight.drag.k": 0.12})
+    np.testing.assert_allclose([v.sigma for v in found.values()], sigma, rtol=1e-6)
+    assert found["flight.drag.k"].declared == 0.12
+    assert found["flight.drag.k"].unit == "1/m"
+    assert found["contact.restitution.e"].declared is None
+
+
+def test_the_model_goes_through_a_file(unlabelled, tmp_path):
+    model = calibrated_model(unlabelled, EMBEDDING)
+    save_model(model, tmp_path / "model.yaml")
+    again = load_model(tmp_path / "model.yaml", radius=model.radius)
+    for name, value in model.named_parameters():
+        assert dict(again.named_parameters())[name].item() == pytest.approx(value.item(), rel=1e-9)
+    assert again.trained.position_scale == pytest.approx(model.trained.position_scale, rel=1e-9)
+    np.testing.assert_allclose(
+        again.trained.launcher.weight.detach(), model.trained.launcher.weight.detach(), rtol=1e-9
+    )

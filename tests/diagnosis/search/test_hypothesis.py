@@ -1,0 +1,141 @@
+"""Which effects may be lacking, and models with and without them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ballfg.diagnosis.fit.sensitivity import predict
+from ballfg.diagnosis.search.hypothesis import (
+    LOOSE,
+    Hypothesis,
+    declared_free,
+    effects_of,
+    has_effect,
+    hypotheses,
+    with_effects,
+    without_effect,
+)
+from ballfg.dynamics import EFFECTS
+from ballfg.dynamics.effects.flight.drag_speed import DragSpeed
+from ballfg.dynamics.effects.flight.gust_region import GustRegion
+from ballfg.dynamics.effects.flight.wind import Wind
+from ballfg.dynamics.scene import Scene
+
+SCENE = Scene((-0.2, -0.8, 0.8), (3.0, 0.9, 1.5), (1.2, 0.1, 1.0), 4.5, 2.5, 20, 12)
+WIND = Hypothesis(Wind, {}, ("x", "y", "z"))
+
+
+def names(listed):
+    return {h.name for h in listed}
+
+
+@pytest.fixture(scope="module")
+def stretches(make_ball, make_launches, make_shots):
+    return make_shots(make_ball(), make_launches(3, 3), 3, rate=20.0, duration=0.5).stretches
+
+
+@pytest.fixture(scope="module")
+def every(make_ball):
+    return hypotheses(make_ball(), SCENE, EFFECTS.values())
+
+
+def test_an_absent_effect_changes_nothing(make_ball, stretches, every):
+    plain = predict(make_ball(), stretches, stretches.starts.numpy(), {})
+    seen = set()
+    for hypothesis in every:
+        if hypothesis.name in seen or has_effect(make_ball(), hypothesis.name):
+            continue
+        seen.add(hypothesis.name)
+        model = hypothesis.added_to(make_ball())
+        assert set(hypothesis.columns) <= set(dict(model.named_parameters()))
+        found = predict(model, stretches, stretches.starts.numpy(), {})
+        np.testing.assert_allclose(found.positions, plain.positions, rtol=0, atol=1e-9, err_msg=hypothesis.name)
+        np.testing.assert_allclose(found.labels, plain.labels, rtol=1e-12, err_msg=hypothesis.name)
+    assert len(seen) >= 18
+
+
+def test_what_is_looked_for(every, make_ball):
+    found = names(every)
+    assert found >= {"wind", "wind_shear", "gust_region", "drag_speed", "table_tilt", "spin_label_frame", "time_scale"}
+    assert "gravity" in found  # declared as exact
+    assert not found & {"drag", "magnus", "restitution", "friction"}  # declared, and estimated anyway
+    gusts = [h for h in every if h.name == "gust_region"]
+    assert len(gusts) > 4
+    assert all(h.strengths == ("x", "y", "z") for h in gusts)
+    assert "drag_speed" not in names(hypotheses(without_effect(make_ball(), "drag"), SCENE, EFFECTS.values()))
+
+
+def test_without_contacts_or_labels_their_effects_are_not_looked_for(make_ball):
+    silent = Scene(SCENE.low, SCENE.high, SCENE.middle, SCENE.speed, float("nan"), 0, 0)
+    found = hypotheses(make_ball(), silent, EFFECTS.values())
+    assert not any(h.effect.kind == "bounce" or h.name.startswith("spin_label") for h in found)
+    assert "wind" in names(found)
+
+
+def test_what_a_refit_estimates():
+    assert {n: c.sigma for n, c in WIND.free().items()} == {f"flight.wind.{a}": LOOSE * 0.3 for a in "xyz"}
+    shaped = Hypothesis(DragSpeed, {"reference": 4.5}, ("slope",))
+    # a reference is a convention: another one is another drag
+    assert {n: c.sigma for n, c in shaped.free().items()} == {"flight.drag_speed.slope": LOOSE * 0.02}
+    gust = Hypothesis(GustRegion, GustRegion.shapes(SCENE)[0], ("x", "y", "z"))
+    assert len(gust.free()) == 7
+
+
+def test_every_hypothesis_can_be_fitted(every):
+    """Priors of what a refit estimates have a width."""
+    for hypothesis in every:
+        assert all(c.sigma > 0.0 for c in hypothesis.free().values()), hypothesis.name
+
+
+def test_a_shape_stands_in_the_model(make_ball):
+    model = Hypothesis(DragSpeed, {"reference": 4.5}, ("slope",)).added_to(make_ball())
+    values = {n: float(p) for n, p in model.named_parameters()}
+    assert values["flight.drag_speed.reference"] == 4.5
+    assert values["flight.drag_speed.slope"] == 0.0
+
+
+def test_models_are_copies(make_ball):
+    model = make_ball()
+    larger = with_effects(model, Wind())
+    assert not has_effect(model, "wind")
+    assert has_effect(larger, "wind")
+    assert not {id(e) for e in effects_of(model)} & {id(e) for e in effects_of(larger)}
+    assert not any(p.requires_grad for p in larger.parameters())
+    assert WIND.added_to(larger) is larger
+
+
+def test_what_needs_an_effect_goes_with_it(make_ball):
+    model = make_ball(drag_spin={}, magnus_saturation={})
+    assert {e.name for e in effects_of(without_effect(model, "drag"))} == {
+        "gravity", "magnus", "restitution", "friction", "magnus_saturation",
+    }  # fmt: skip
+
+
+def test_declared_coefficients_that_are_estimated(make_ball):
+    free = declared_free(make_ball(drag_speed={}))
+    assert "flight.gravity.g" not in free  # exact
+    assert "flight.drag_speed.reference" not in free  # a shape
+    assert {"flight.drag.k", "flight.magnus.k", "contact.restitution.e", "flight.drag_speed.slope"} <= set(free)
+
+
+def test_strain_is_the_distance_from_the_usual_value_in_prior_sigmas():
+    gust = Hypothesis(EFFECTS["gust_region"], {"center_x": 3.0}, ("x", "y", "z"))
+    values = {"flight.gust_region.x": 20.0, "flight.gust_region.y": -0.5, "flight.gust_region.z": 0.0}
+    assert gust.strain(values) == pytest.approx(40.0)  # sigma 0.5 m/s
+    friction = Hypothesis(EFFECTS["friction"], {}, ("mu",))
+    assert friction.strain({"contact.friction.mu": 0.25}) == 0.0
+    assert Hypothesis(EFFECTS["spin_label_frame"], {"yy": -1.0}, ()).strain({}) == 0.0
+
+
+def test_usual_effects_are_those_with_a_nominal_strength():
+    assert {n for n in ("drag", "magnus", "friction", "wind", "drag_spin", "time_offset") if usual(n)} == {
+        "drag",
+        "magnus",
+        "friction",
+    }
+
+
+def usual(name):
+    strengths = tuple(c.name for c in EFFECTS[name].coefficients if c.absent is not None)
+    return Hypothesis(EFFECTS[name], {}, strengths).usual

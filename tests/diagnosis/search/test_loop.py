@@ -1,0 +1,126 @@
+"""The search: the effect that is there, silence where nothing is, and what it says of each candidate."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ballfg.diagnosis.fit.process_noise import Predicting
+from ballfg.diagnosis.result import Errors, Standing
+from ballfg.diagnosis.search import loop
+from ballfg.diagnosis.search.hypothesis import declared_free, has_effect, without_effect
+from ballfg.diagnosis.search.loop import search_effects
+from ballfg.dynamics import EFFECTS
+from ballfg.estimation.settings import Settings
+
+CATALOGUE = [EFFECTS[name] for name in ("gravity", "wind", "table_tilt", "spin_decay")]
+
+
+def halves(finding, judging):
+    """What of a dataset's halves the search asks for."""
+    return SimpleNamespace(finding=finding, judging=judging, settings=Settings(spin_label_noise=4.0))
+
+
+def shots(make_ball, make_launches, make_shots, seed, **truth):
+    return make_shots(make_ball(**truth), make_launches(14, seed), seed, duration=0.6, rate=50.0).stretches
+
+
+def predicting(fitted, rmse):
+    """A fit that predicts with some error, in mm: the search asks for no more."""
+    return Predicting(fitted.problem.model, Errors(rmse, rmse, 1.0, 0.0, np.array([rmse])))
+
+
+def predicts_well(fitted):
+    return predicting(fitted, 10.0)
+
+
+@pytest.fixture(scope="module")
+def tilted(make_ball, make_launches, make_shots):
+    """A search on shots over a table that leans by 1.1 degrees."""
+    truth = {"table_tilt": {"x": 0.02, "y": 0.0}}
+    data = (shots(make_ball, make_launches, make_shots, seed, **truth) for seed in (71, 72))
+    said = []
+    search = search_effects(halves(*data), make_ball(), CATALOGUE, predicts_well, said.append)
+    return search.first, search, said
+
+
+def test_the_effect_that_is_there_comes_first(tilted):
+    _, search, _ = tilted
+    (finding,) = search.findings
+    assert finding.name == "table_tilt"
+    for axis, truth in (("x", 0.02), ("y", 0.0)):
+        value = finding.parameters[axis]
+        assert abs(value.value - truth) < 4 * value.sigma
+        assert value.unit == "rad"
+    assert finding.delta_bic < -20.0
+    assert finding.p_value < 1e-3
+    assert finding.held_out_gain > 0.0
+    assert finding.held_out_p < 0.05
+    assert finding.indistinguishable_from == ()
+
+
+def test_the_model_holds_what_was_found(tilted):
+    first, search, _ = tilted
+    assert has_effect(search.fit.problem.model, "table_tilt")
+    assert not has_effect(first.problem.model, "table_tilt")
+    assert set(first.problem.free) == set(declared_free(first.problem.model))
+    assert set(search.fit.problem.free) - set(first.problem.free) == {"contact.table_tilt.x", "contact.table_tilt.y"}
+    assert float(np.prod(search.fit.noise.position)) < float(np.prod(first.noise.position))
+
+
+def test_every_round_ranks_every_candidate(tilted):
+    _, search, said = tilted
+    assert len(search.rounds) == 2
+    first, second = ({c.name: c for c in rows} for rows in search.rounds)
+    assert set(first) == {"gravity", "wind", "table_tilt", "spin_decay"}
+    assert first["table_tilt"].standing is Standing.ADDED
+    assert Standing.ADDED not in {c.standing for c in second.values()}
+    assert "table_tilt" not in second
+    explained = [c.explained for c in search.rounds[0]]
+    assert explained == sorted(explained, reverse=True)
+    assert any(line.startswith("round 1: fitting with table_tilt") for line in said)
+
+
+def test_nothing_is_added_where_nothing_is(make_ball, make_launches, make_shots):
+    data = (shots(make_ball, make_launches, make_shots, seed) for seed in (73, 74))
+    search = search_effects(halves(*data), make_ball(), CATALOGUE, predicts_well, lambda line: None)
+    assert search.findings == []
+    assert search.fit is search.first
+    assert len(search.rounds) == 1
+
+
+def test_what_predicts_worse_is_not_added(make_ball, make_launches, make_shots):
+    """However much better it fits: the predictions' errors here grow by a half with every effect."""
+    data = (shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.02, "y": 0.0}) for seed in (71, 72))
+
+    def predict(fitted):
+        return predicting(fitted, 15.0 if has_effect(fitted.problem.model, "table_tilt") else 10.0)
+
+    search = search_effects(halves(*data), make_ball(), [EFFECTS["table_tilt"]], predict, lambda line: None)
+    assert search.findings == []
+    assert search.fit is search.first
+    (row,) = search.rounds[0]
+    assert row.standing is Standing.MISLEADING
+    assert row.delta_bic < -20.0
+
+
+def test_what_balls_usually_have_is_found_though_no_score_calls(make_ball, make_launches, make_shots):
+    """Friction, left out: its score at absence says little, and its absence is a minimum of its own."""
+    data = (shots(make_ball, make_launches, make_shots, seed) for seed in (75, 76))
+    declared = without_effect(make_ball(), "friction")
+    search = search_effects(halves(*data), declared, [EFFECTS["friction"]], predicts_well, lambda line: None)
+    (finding,) = search.findings
+    assert finding.name == "friction"
+    assert abs(finding.parameters["mu"].value - 0.25) < 4 * finding.parameters["mu"].sigma
+
+
+def test_what_would_have_to_be_implausibly_strong_is_not_added(make_ball, make_launches, make_shots, monkeypatch):
+    """The tilt found is 1.1 degrees, 4 prior sigmas: beyond what counts as plausible here."""
+    data = (shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.02, "y": 0.0}) for seed in (71, 72))
+    monkeypatch.setattr(loop, "BEYOND", 3.0)
+    search = search_effects(halves(*data), make_ball(), [EFFECTS["table_tilt"]], predicts_well, lambda line: None)
+    assert search.findings == []
+    (row,) = search.rounds[0]
+    assert row.standing is Standing.IMPLAUSIBLE

@@ -1,0 +1,129 @@
+"""The guide's catalogue is that of the registry, its examples run, and an effect of one's own is found."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ballfg.diagnosis.fit.fit import fit, followed, start_from
+from ballfg.diagnosis.fit.holdout import halves_of
+from ballfg.diagnosis.fit.problem import Problem
+from ballfg.diagnosis.fit.scene import scene_of
+from ballfg.diagnosis.report.report import content
+from ballfg.diagnosis.search.candidates import score_all
+from ballfg.diagnosis.search.hypothesis import declared_free, hypotheses, with_effects
+from ballfg.dynamics import EFFECTS, Effect, load_effects, load_model
+from ballfg.simulation import SimulationConfig, parse_effects, write_simulation
+from ballfg.tracks import read_dataset
+from tests.diagnosis.made_diagnosis import found
+from tests.places import DOCS
+
+
+def blocks(page: str, language: str) -> list[str]:
+    return re.findall(rf"```{language}\n(.*?)```", (DOCS / page).read_text(encoding="utf-8"), re.DOTALL)
+
+
+def plausible(effect: type[Effect]) -> str:
+    """Sizes of the strengths, those that are alike together: `x, y: 0.3 m/s`."""
+    groups: dict[str, list[str]] = {}
+    for c in effect.coefficients:
+        if c.absent is not None:
+            size = f"{c.sigma:g} {c.unit}".removesuffix(" 1") if c.sigma else "as good as known"
+            groups.setdefault(size, []).append(c.name)
+    return "; ".join(f"{', '.join(names)}: {size}" for size, names in groups.items())
+
+
+def catalogue() -> str:
+    lines = ["| effect | kind | what it is | plausible size | what decides |", "|---|---|---|---|---|"]
+    lines += [f"| `{n}` | {e.kind} | {e.sentence} | {plausible(e)} | {e.decide} |" for n, e in EFFECTS.items()]
+    return "\n".join(lines)
+
+
+@pytest.fixture
+def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An empty folder; what is registered there is forgotten."""
+    monkeypatch.chdir(tmp_path)
+    known = dict(EFFECTS)
+    yield tmp_path
+    EFFECTS.clear()
+    EFFECTS.update(known)
+
+
+def test_catalogue_is_that_of_the_registry() -> None:
+    text = (DOCS / "diagnose.md").read_text(encoding="utf-8")
+    shown = re.search(r"<!-- catalogue -->\n(.*?)\n?<!-- end -->", text, re.DOTALL)
+    assert shown
+    assert shown[1] == catalogue(), "put this table into docs/diagnose.md:\n" + catalogue()
+
+
+def test_report_has_the_keys_that_the_guide_shows() -> None:
+    (text,) = blocks("diagnose.md", "json")
+    shown, real = json.loads(text), content(found())
+    assert shown.keys() == real.keys()
+    for key in ("error", "unexplained"):
+        assert shown[key].keys() == real[key].keys()
+    assert shown["error"]["before"].keys() == real["error"]["before"].keys()
+    assert shown["effects"][0].keys() == real["effects"][0].keys()
+    assert shown["effects"][0]["parameters"]["x"].keys() <= real["effects"][0]["parameters"]["x"].keys()
+
+
+def test_the_whole_from_python(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The guide's first example, with the answer given: tests/cli has a whole run."""
+    asked = []
+
+    def answer(dataset, model, *, jobs, watch):
+        asked.append((len(dataset), list(model.flight), jobs))
+        return found()
+
+    monkeypatch.setattr("ballfg.diagnosis.diagnose", answer)
+    monkeypatch.setattr("ballfg.diagnosis.report.report.page", lambda diagnosis: "<html></html>")
+    write_simulation("windy", SimulationConfig(tracks=6, rate=30.0))
+    exec(compile(blocks("diagnose.md", "python")[0], "diagnose.md", "exec"), {})
+    assert asked == [(6, ["gravity", "drag", "magnus"], 2)]
+    assert json.loads((here / "diagnosis" / "report.json").read_text(encoding="utf-8"))["effects"]
+
+
+@pytest.mark.slow
+def test_the_pieces_from_python(here: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    names: dict = {}
+    exec(compile(blocks("diagnose.md", "python")[1], "diagnose.md", "exec"), names)
+    assert names["scored"][0].hypothesis.name == "wind"
+    assert names["after"].fit.unknowns.values["flight.wind.y"] == pytest.approx(0.5, abs=0.15)
+    assert names["after"].delta_bic < -50.0
+    assert "estimating 12 tracks" in capsys.readouterr().out
+
+
+def test_pieces_are_where_the_guide_says() -> None:
+    text = (DOCS / "diagnose.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (`\w+`(?:, `\w+`)*) \| (`\w+`(?:, `\w+`)*) \|", text, re.MULTILINE)
+    assert len(rows) == 8
+    for pieces, modules in rows:
+        there = [__import__(f"ballfg.diagnosis.{m}", fromlist=[m]) for m in re.findall(r"\w+", modules)]
+        for piece in re.findall(r"\w+", pieces):
+            assert any(callable(getattr(module, piece, None)) for module in there), piece
+
+
+def test_an_effect_of_ones_own_is_found(here: Path) -> None:
+    """The file of the other guide: tracks are simulated with it, and it is what explains them best."""
+    Path("static_charge.py").write_text(blocks("add_an_effect.md", "python")[0], encoding="utf-8")
+    (charge,) = load_effects("static_charge.py")
+    effect = parse_effects(["static_charge.strength=3"])
+    write_simulation("charged", SimulationConfig(tracks=8, rate=60.0, seed=3, undeclared=effect))
+    model = with_effects(load_model("charged/model.yaml"))
+    halves = halves_of(read_dataset("charged"), model, jobs=1, watch=lambda line: None)
+    problem = Problem(model, followed(model, halves.finding), declared_free(model))
+    before = fit(
+        problem, *start_from(problem, halves.settings.spin_label_noise, halves.settings.spin_prior), settle_noise=False
+    )
+    candidates = hypotheses(model, scene_of(before), [charge, EFFECTS["wind"], EFFECTS["drag_speed"]])
+    assert [h.shape["reach"] for h in candidates[:2]] == [0.05, 0.15]
+    best = score_all(before, candidates)[0]
+    assert best.hypothesis.effect is charge
+    assert best.score is not None
+    assert best.p_value < 1e-3
+    assert np.abs(best.score.estimate - 3.0)[0] < 6.0 * best.score.sigma[0] + 1.0  # its reach is tried, not known

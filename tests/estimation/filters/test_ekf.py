@@ -1,0 +1,434 @@
+"""The extended Kalman filter and its RTS pass: against textbook and batch solutions, and by consistency statistics."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import chi2
+
+from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.effects.flight.gravity import Gravity
+from ballfg.dynamics.model_file import nominal_model
+from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
+from ballfg.dynamics.motion.rollout import advance
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
+from ballfg.estimation.filters.sliding_window import SlidingWindow
+from ballfg.estimation.result import Estimate, Status
+from ballfg.estimation.segmentation import Quality
+from ballfg.estimation.settings import Settings, uncertain
+from ballfg.factors.loss import Loss
+from ballfg.factors.noise import ProcessNoise
+from ballfg.state import POSITION, STATE_DIM, VELOCITY
+from ballfg.tracks import Track, read_dataset
+from tests.places import DATA
+
+LOW = Surfaces(table_height=-100.0)
+TABLE = Surfaces.table_tennis(0.0)
+SPIN_SIGMA = 5.0
+PLAIN = Settings(
+    position_noise=(0.002, 0.002, 0.002),
+    process=ProcessNoise(acceleration=0.3, spin=2.0, contact_velocity=0.03, contact_spin=3.0),
+    spin_label_noise=SPIN_SIGMA,
+    loss=Loss("squared"),
+)
+SERVE = np.array([0.0, 0.0, 0.3, 5.0, 0.5, 1.0, 10.0, 60.0, 20.0])
+
+
+def tensor(state: np.ndarray) -> torch.Tensor:
+    return torch.from_numpy(np.array(state, dtype=np.float64)[None])
+
+
+def simulate(model, settings: Settings, start, times, rng, surfaces=TABLE, label=True) -> tuple[np.ndarray, Track]:
+    """True states (n, 9) with process noise exactly as the settings declare it, and their measured track."""
+    truth = [np.array(start)]
+    noise = settings.process
+    for dt in np.diff(times):
+        motion = advance_jacobian(model, tensor(truth[-1]), dt, surfaces)
+        covariance = noise.flight(np.array([dt]))[0]
+        for time, _ in motion.contacts:
+            kick = noise.contact(np.array([dt]), np.array([time]))[0]
+            covariance = covariance + kick
+        truth.append(motion.after[0].numpy() + rng.multivariate_normal(np.zeros(9), covariance, method="eigh"))
+    truth = np.array(truth)
+    measured = truth[:, POSITION] + settings.position_noise * rng.standard_normal((len(times), 3))
+    spin = truth[0, 6:] + settings.spin_label_noise * rng.standard_normal(3)
+    labels = dict(zip(("spin_x", "spin_y", "spin_z"), spin, strict=True)) if label else {}
+    return truth, Track("simulated", times, measured, labels=labels)
+
+
+def nees(estimate: Estimate, truth: np.ndarray, part: slice = slice(0, 9)) -> np.ndarray:
+    """(n,) squared errors in units of the stated covariance."""
+    error = (estimate.states - truth)[:, part]
+    return np.einsum("ni,ni->n", error, np.linalg.solve(estimate.covariances[:, part, part], error[..., None])[..., 0])
+
+
+def inside(mean: float, dof: int, count: int) -> bool:
+    """The mean of `count` chi-square numbers lies in its 99 % band."""
+    low, high = chi2.ppf([0.005, 0.995], dof * count) / count
+    return bool(low <= mean <= high)
+
+
+# --- a linear problem: gravity alone, no surface -----------------------------------------------------------------
+
+
+@pytest.fixture
+def linear(rng):
+    times = np.cumsum(rng.uniform(0.004, 0.03, 25))
+    truth, track = simulate(AnalyticModel([Gravity()]), PLAIN, SERVE, times, rng, LOW)
+    return truth, track
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(7)
+
+
+def transition(dt: float) -> tuple[np.ndarray, np.ndarray]:
+    F = np.eye(9)
+    F[POSITION, VELOCITY] = dt * np.eye(3)
+    drift = np.zeros(9)
+    drift[[2, 5]] = -9.81 * dt**2 / 2, -9.81 * dt
+    return F, drift
+
+
+def start_of(track: Track) -> tuple[np.ndarray, np.ndarray]:
+    x = np.concatenate((track.positions[0], np.zeros(3), track.spin_label))
+    return x, np.diag([0.002**2] * 3 + [20.0**2] * 3 + [SPIN_SIGMA**2] * 3)
+
+
+def test_linear_problem_is_the_textbook_kalman_filter(linear):
+    _, track = linear
+    result = ExtendedKalmanFilter(AnalyticModel([Gravity()]), LOW, PLAIN).estimate(track)
+    x, P = start_of(track)
+    H, R = np.eye(3, 9), 0.002**2 * np.eye(3)
+    states, covariances = [x], [P]
+    for k in range(1, len(track)):
+        dt = track.times[k] - track.times[k - 1]
+        F, drift = transition(dt)
+        x, P = F @ x + drift, F @ P @ F.T + PLAIN.process.flight(np.array([dt]))[0]
+        S = H @ P @ H.T + R
+        K = P @ H.T @ np.linalg.inv(S)
+        innovation = track.positions[k] - x[:3]
+        np.testing.assert_allclose(result.nis[k], innovation @ np.linalg.solve(S, innovation), rtol=1e-8)
+        x, P = x + K @ innovation, P - K @ S @ K.T
+        states.append(x)
+        covariances.append(P)
+    np.testing.assert_allclose(result.states, states, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(result.covariances, covariances, rtol=1e-7, atol=1e-12)
+    assert result.status is Status.OK
+    assert np.isnan(result.whitened[0]).all()
+
+
+def batch_solution(track: Track) -> tuple[np.ndarray, np.ndarray]:
+    """States (n, 9) and covariances (n, 9, 9) of the dense least-squares problem over the whole track."""
+    n = len(track)
+    x0, P0 = start_of(track)
+    A, b = [np.zeros((9, 9 * n))], [x0]
+    A[0][:, :9] = np.eye(9)
+    roots = [np.linalg.inv(np.linalg.cholesky(P0))]
+    for k in range(1, n):
+        dt = track.times[k] - track.times[k - 1]
+        F, drift = transition(dt)
+        row = np.zeros((9, 9 * n))
+        row[:, 9 * k : 9 * k + 9], row[:, 9 * k - 9 : 9 * k] = np.eye(9), -F
+        roots.append(np.linalg.inv(np.linalg.cholesky(PLAIN.process.flight(np.array([dt]))[0])))
+        A.append(row)
+        b.append(drift)
+        row = np.zeros((3, 9 * n))
+        row[:, 9 * k : 9 * k + 3] = np.eye(3)
+        roots.append(np.eye(3) / 0.002)
+        A.append(row)
+        b.append(track.positions[k])
+    whole = np.vstack([w @ a for w, a in zip(roots, A, strict=True)])
+    right = np.concatenate([w @ c for w, c in zip(roots, b, strict=True)])
+    scale = np.linalg.norm(whole, axis=0)
+    Q, R = np.linalg.qr(whole / scale)
+    states = np.linalg.solve(R, Q.T @ right) / scale
+    root = np.linalg.inv(R) / scale[:, None]
+    covariance = root @ root.T
+    blocks = np.array([covariance[9 * k : 9 * k + 9, 9 * k : 9 * k + 9] for k in range(n)])
+    return states.reshape(n, 9), blocks
+
+
+def test_rts_pass_is_the_dense_batch_solution(linear):
+    _, track = linear
+    result = ExtendedKalmanFilter(AnalyticModel([Gravity()]), LOW, PLAIN, smooth=True).estimate(track)
+    states, covariances = batch_solution(track)
+    np.testing.assert_allclose(result.states, states, rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(result.covariances, covariances, rtol=1e-6, atol=1e-11)
+    filtered = ExtendedKalmanFilter(AnalyticModel([Gravity()]), LOW, PLAIN).estimate(track)
+    np.testing.assert_allclose(result.states[-1], filtered.states[-1])
+    assert (result.sigmas[:-1] <= filtered.sigmas[:-1] + 1e-12).all()
+
+
+# --- motion ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("start", "dt"),
+    [
+        ((0, 0, 0.3, 5, 0.5, 1, 10, 60, 20), 0.01),
+        ((0, 0, 0.03, 5, 0.5, -2, 10, 60, 20), 0.01),
+        ((0, 0, 0.3, 5, 0.5, -2, 10, 60, 20), 0.5),
+        ((0, 0, 0.0201, 1, 0.5, -0.15, 0, 60, 20), 0.06),
+        ((0, 0, 0.02, 1, 0.5, 0.0, 0, 60, 20), 0.03),
+        ((0, 0, 0.018, 5, 0.5, -2, 10, 60, 20), 0.01),
+        ((0, 0, 0.006, 1, 0.5, -0.1, 10, 60, 20), 0.01),
+        ((0.99, 0, 0.04, 5, 0.5, -3.0, 0, 60, 20), 0.4),
+    ],
+    ids=["flight", "contact", "gap", "into rest", "rolling", "below", "below for good", "past the edge"],
+)
+def test_motion_is_the_rollout_and_its_jacobian(start, dt):
+    model = nominal_model()
+    surfaces = Surfaces(table_height=0.003, floor_height=-0.76, extent=(-1.0, 1.0, -1.0, 1.0))
+    trackwise = AugmentedModel(model, ("flight.drag.k", "contact.restitution.e"))
+    state = trackwise.append(tensor(start), torch.tensor([0.12, 0.93], dtype=torch.float64))
+    motion = advance_jacobian(trackwise, state, dt, surfaces)
+
+    def move(x):
+        return advance(trackwise, x, torch.full((len(x),), dt, dtype=torch.float64), surfaces).detach()
+
+    torch.testing.assert_close(motion.after, move(state), rtol=1e-9, atol=1e-9)
+    step = 1e-6 * torch.eye(11, dtype=torch.float64)
+    difference = ((move(state + step) - move(state - step)) / 2e-6).T
+    # differences of 1e-6 in numbers up to 100, found to 1e-12: 1e-5 relative
+    torch.testing.assert_close(motion.jacobian, difference, rtol=1e-5, atol=2e-5)
+
+
+# --- consistency -------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def many():
+    """Filter and RTS estimates of tracks with a bounce each, and their truth."""
+    rng = np.random.default_rng(11)
+    model = nominal_model()
+    cases = []
+    for _ in range(40):
+        start = SERVE + np.array([0, 0, 0.1, 1, 0.5, 0.7, 20, 30, 20]) * rng.standard_normal(9)
+        start[2] = max(start[2], 0.1)
+        truth, track = simulate(model, PLAIN, start, np.arange(60) * 0.01, rng)
+        cases.append((truth, track))
+    return model, cases
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_nees_and_nis_lie_in_their_bands(many, smooth):
+    model, cases = many
+    estimator = ExtendedKalmanFilter(model, TABLE, PLAIN, smooth=smooth)
+    last, middle, nis = [], [], []
+    for truth, track in cases:
+        result = estimator.estimate(track)
+        errors = nees(result, truth)
+        last.append(errors[-1])
+        middle.append(errors[20])
+        nis.append(result.nis[2:])
+    assert inside(np.mean(last), 9, len(last))
+    assert inside(np.mean(middle), 9, len(middle))
+    if not smooth:
+        assert inside(np.mean(nis), 3, np.size(nis))
+
+
+# --- what real tracks bring --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def flight(rng):
+    """A simulated track of 60 samples at 100 Hz, and its truth; it bounces near 0.37 s."""
+    return simulate(nominal_model(), PLAIN, SERVE, np.arange(60) * 0.01, rng)
+
+
+def with_positions(track: Track, positions: np.ndarray) -> Track:
+    return Track(track.name, track.times, positions, labels=track.labels)
+
+
+def run(track: Track, **options) -> Estimate:
+    result = ExtendedKalmanFilter(nominal_model(), TABLE, PLAIN, **options).estimate(track)
+    assert np.isfinite(result.states).all()
+    assert (np.linalg.eigvalsh(result.covariances)[:, 0] > 0).all()
+    assert result.quality.shape == (len(track),)
+    return result
+
+
+def test_contact_is_found_where_it_was(flight):
+    _, track = flight
+    result = run(track)
+    (contact,) = result.contacts
+    assert track.times[contact.interval] <= contact.time <= track.times[contact.interval + 1]
+    assert contact.height == 0.0
+    assert len(result.hits) == 0
+    assert (result.quality == Quality.GOOD).all()
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_planted_outliers_are_flagged_and_do_no_harm(flight, smooth):
+    truth, track = flight
+    planted = [0, 7, 20, 21, 22, 50]
+    positions = track.positions.copy()
+    positions[planted] += [0.03, -0.04, 0.05]
+    clean, result = run(track, smooth=smooth), run(with_positions(track, positions), smooth=smooth)
+    assert np.flatnonzero(result.quality == Quality.OUTLIER).tolist() == planted
+    assert len(result.hits) == 0
+    moved = np.abs(result.states[-1] - clean.states[-1]) / clean.sigmas[-1]
+    assert moved.max() < 2.0
+    assert nees(result, truth)[-1] < chi2.ppf(0.999, 9)
+    assert nees(result, truth)[0] < chi2.ppf(0.999, 9)
+
+
+@pytest.mark.parametrize("bad", [0, 1, 2, 3])
+def test_an_outlier_among_the_first_samples_is_named(flight, bad):
+    truth, track = flight
+    positions = track.positions.copy()
+    positions[bad, 1] += 0.06
+    result = run(with_positions(track, positions))
+    assert np.flatnonzero(result.quality == Quality.OUTLIER).tolist() == [bad]
+    assert nees(result, truth)[10] < chi2.ppf(0.999, 9)
+
+
+def test_without_events_every_sample_counts(flight):
+    _, track = flight
+    positions = track.positions.copy()
+    positions[30] += 0.2
+    estimator = ExtendedKalmanFilter(nominal_model(), TABLE, Settings(process=PLAIN.process, find_events=False))
+    result = estimator.estimate(with_positions(track, positions))
+    assert (result.quality == Quality.GOOD).all()
+    assert len(result.hits) == 0
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+def test_planted_hit_is_found_in_its_interval(rng, smooth):
+    first, before = simulate(nominal_model(), PLAIN, SERVE, np.arange(25) * 0.01, rng)
+    struck = first[-1].copy()
+    struck[3:] = [-4.0, 1.0, 2.0, 0.0, -80.0, 10.0]
+    second, after = simulate(nominal_model(), PLAIN, struck, np.arange(31) * 0.01, rng)
+    truth = np.concatenate((first, second[1:]))
+    positions = np.concatenate((before.positions, after.positions[1:]))
+    track = Track("struck", np.arange(55) * 0.01, positions, labels=before.labels)
+    result = run(track, smooth=smooth)
+    assert result.hits.tolist() == [24]
+    assert (result.quality == Quality.GOOD).all()
+    assert nees(result, truth, VELOCITY)[[23, 35, 54]].max() < chi2.ppf(0.999, 3)
+    alone = run(before, smooth=smooth)
+    assert np.abs(result.states[:24] - alone.states[:24]).max() < (2.0 if smooth else 1e-9)
+
+
+def test_gap_of_a_fifth_of_a_second(flight):
+    truth, track = flight
+    keep = np.r_[0:10, 30:60]
+    result = run(Track("gap", track.times[keep], track.positions[keep], labels=track.labels))
+    assert (result.quality == Quality.GOOD).all()
+    assert nees(result, truth[keep])[[9, 10, -1]].max() < chi2.ppf(0.999, 9)
+
+
+def test_gap_with_the_bounce_in_it(flight):
+    truth, track = flight
+    keep = np.r_[0:28, 48:60]
+    result = run(Track("gap", track.times[keep], track.positions[keep], labels=track.labels))
+    assert [contact.interval for contact in result.contacts] == [27]
+    assert nees(result, truth[keep])[[28, -1]].max() < chi2.ppf(0.999, 9)
+
+
+@pytest.mark.parametrize("smooth", [False, True])
+@pytest.mark.parametrize("initialise", ["prior", "window"])
+@pytest.mark.parametrize("count", [1, 2, 3, 5])
+def test_few_observations_give_honest_covariances(flight, count, smooth, initialise):
+    truth, track = flight
+    short = track.until(track.times[count - 1])
+    result = run(short, smooth=smooth, initialise=initialise)
+    assert result.status is (Status.NO_VELOCITY if count == 1 else Status.OK)
+    assert nees(result, truth[:count]).max() < chi2.ppf(0.9999, 9)
+    expected = 20.0 if count == 1 else 0.002 * np.sqrt(2) / (0.01 * (count - 1))
+    assert 0.3 * expected < result.sigmas[-1, 3] < 3.0 * expected
+
+
+def test_only_the_rising_part(rng):
+    start = np.array([0, 0, 0.0201, 5.0, 0.5, 3.0, 10, 60, 20])
+    truth, track = simulate(nominal_model(), PLAIN, start, np.arange(25) * 0.01, rng, label=False)
+    result = run(track)
+    assert result.contacts == ()
+    assert len(result.hits) == 0
+    assert nees(result, truth, slice(0, 6))[-1] < chi2.ppf(0.999, 6)
+
+
+def test_stamps_a_microsecond_apart(rng):
+    times = np.sort(np.concatenate((np.arange(30) * 0.01, np.arange(1, 30, 3) * 0.01 + 1e-6)))
+    truth, track = simulate(nominal_model(), PLAIN, SERVE, times, rng)
+    result = run(track, smooth=True)
+    assert (result.quality == Quality.GOOD).all()
+    assert nees(result, truth)[[1, 15, -1]].max() < chi2.ppf(0.999, 9)
+
+
+@pytest.mark.parametrize("shift", np.linspace(-1.5e-3, 1.5e-3, 7))
+def test_a_contact_close_to_a_stamp(shift, rng):
+    """The bounce falls within 1.5 ms of a stamp, on either side; innovations must not notice."""
+    exact = Settings(process=ProcessNoise(1e-3, 1e-3, 1e-3, 1e-3), position_noise=(0.002,) * 3)
+    contact = advance_jacobian(nominal_model(), tensor(SERVE), 0.6, TABLE).contacts[0][0]
+    times = np.concatenate(([0.0], contact + shift + np.arange(-30, 20) * 0.01))
+    _, track = simulate(nominal_model(), exact, SERVE, times, rng)
+    result = run(track)
+    assert (result.quality == Quality.GOOD).all()
+    assert len(result.contacts) == 1
+    assert result.nis[28:40].mean() < chi2.ppf(0.9999, 36) / 12
+
+
+def test_window_start_equals_the_sliding_window_and_uses_nothing_twice(flight):
+    truth, track = flight
+    window = SlidingWindow(nominal_model(), TABLE, PLAIN).estimate(track)
+    result = run(track, initialise="window")
+    np.testing.assert_array_equal(result.states[:5], window.states[:5])
+    assert np.isnan(result.whitened[:5]).all()
+    assert np.isfinite(result.whitened[5:]).all()
+    assert nees(result, truth)[[5, 20, -1]].max() < chi2.ppf(0.999, 9)
+
+
+def test_coefficients_are_learnt_on_the_way(rng):
+    model = nominal_model()
+    settings = Settings(
+        process=ProcessNoise(0.05, 1.0, 0.005, 1.0),
+        position_noise=(0.002,) * 3,
+        coefficients={"contact.restitution.e": 0.05},
+    )
+    parameters = dict(model.named_parameters())
+    with torch.no_grad():
+        parameters["contact.restitution.e"].fill_(0.85)
+    _, track = simulate(model, settings, SERVE, np.arange(60) * 0.01, rng, label=False)
+    with torch.no_grad():
+        parameters["contact.restitution.e"].fill_(0.93)
+    result = ExtendedKalmanFilter(model, TABLE, settings, smooth=True).estimate(track)
+    assert result.coefficient_names == ("contact.restitution.e",)
+    assert result.cross_covariances.shape == (60, STATE_DIM, 1)
+    sigma = float(np.sqrt(result.coefficient_covariance[0, 0]))
+    assert sigma < 0.02
+    assert abs(float(result.coefficients[0]) - 0.85) < 3 * sigma
+
+
+def test_numbers_out_of_this_world_fail_with_a_status(flight):
+    _, track = flight
+    result = run(with_positions(track, track.positions * 1e170))
+    assert result.status is Status.FAILED
+    np.testing.assert_array_equal(result.states[:, POSITION], track.positions * 1e170)
+
+
+def test_unknown_start_is_refused():
+    with pytest.raises(ValueError, match="initialise must be 'prior' or 'window'; got 'guess'"):
+        ExtendedKalmanFilter(nominal_model(), TABLE, PLAIN, initialise="guess")
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"no measured tracks at {DATA}; set BALLFG_DATA")
+def test_measured_tracks():
+    dataset = read_dataset(DATA / "aimy")
+    settings = uncertain(nominal_model(), position_noise=(0.0015, 0.0007, 0.001))
+    surfaces = Surfaces.table_tennis(dataset.info.table_height)
+    estimator = ExtendedKalmanFilter(nominal_model(), surfaces, settings)
+    nis, used = [], []
+    for track, _ in zip(dataset, range(6), strict=False):
+        result = estimator.estimate(track.until(track.times[0] + 0.6))
+        assert result.status is Status.OK
+        good = result.quality == Quality.GOOD
+        nis += result.nis[good & np.isfinite(result.nis)].tolist()
+        used += good.tolist()
+    assert np.mean(used) > 0.97
+    assert 1.0 < np.median(nis) < 4.0

@@ -1,0 +1,127 @@
+"""Stamps, labels and positions between what happened and what is written down."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, advance, nominal_model
+from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.effects.measurement.spin_label_frame import signed_permutations
+from ballfg.dynamics.measurement import Later
+from ballfg.estimation.measurement.as_measured import (
+    LabelMap,
+    measured_positions,
+    plainly_measured,
+    true_times,
+    written_time,
+)
+
+TABLE = Surfaces(0.0)
+STATES = torch.tensor(
+    [[0.2, 0.3, 0.5, 4.0, -1.0, 1.0, 40.0, -90.0, 60.0], [1.0, 0.0, 0.025, 3.0, 0.0, -2.0, 0.0, 50.0, 0.0]],
+    dtype=torch.float64,
+)
+
+
+def measuring(**effects: dict[str, float]) -> AnalyticModel:
+    nominal = nominal_model()
+    extra = [EFFECTS[name](**values) for name, values in effects.items()]
+    return AnalyticModel([*nominal.flight.values(), *nominal.contact.values(), *extra])
+
+
+def frame(matrix: np.ndarray) -> dict[str, float]:
+    return {a + b: float(matrix[i, j]) for i, a in enumerate("xyz") for j, b in enumerate("xyz")}
+
+
+class Mirror(AnalyticModel):
+    """A model that measures by itself, without a measurement effect."""
+
+    @property
+    def measures_plainly(self) -> bool:
+        return False
+
+    def measured(self, states: Tensor, later: Later) -> Tensor:
+        return -states[..., :3]
+
+
+def test_the_plain_model_is_the_same_ball() -> None:
+    model = measuring(frame_tilt={"x": 0.1}, time_scale={"s": 0.1})
+    plain = plainly_measured(model)
+    assert plain.measures_plainly
+    assert not model.measures_plainly
+    assert dict(plain.named_parameters()).keys() == dict(nominal_model().named_parameters()).keys()
+    assert all(p is dict(model.named_parameters())[name] for name, p in plain.named_parameters())
+    for mine, other in zip(plain.rates(STATES), nominal_model().rates(STATES), strict=True):
+        torch.testing.assert_close(mine, other, rtol=0, atol=0)
+    torch.testing.assert_close(plain.measured(STATES, lambda _: STATES), STATES[:, :3], rtol=0, atol=0)
+    assert plainly_measured(nominal_model()).measures_plainly
+
+
+def test_augmented_models_too() -> None:
+    plain = plainly_measured(AugmentedModel(measuring(scale={"x": 0.1}), ["flight.drag.k"]))
+    assert plain.measures_plainly
+    assert isinstance(plain, AugmentedModel)
+    assert plain.names == ("flight.drag.k",)
+
+
+def test_a_measurement_that_is_no_effect_is_refused() -> None:
+    with pytest.raises(TypeError, match="must get its measurement from measurement effects; Mirror has one"):
+        plainly_measured(Mirror([]))
+
+
+def test_times_there_and_back() -> None:
+    written = np.array([1000.0, 1000.011, 1000.5, 1002.02])
+    model = measuring(time_scale={"s": 0.01})
+    times = true_times(model, written)
+    np.testing.assert_allclose(times - 1000.0, (written - 1000.0) / 1.01, rtol=0, atol=1e-9)
+    assert times[0] == written[0]
+    for true, stamp in zip(times, written, strict=True):
+        assert written_time(model, 1000.0, float(true)) == pytest.approx(stamp, abs=1e-9)
+    assert true_times(nominal_model(), written) is written
+
+
+def test_positions_through_a_bounce_and_with_coefficients() -> None:
+    """The second ball touches the table within the 10 ms by which z is late: both from the formula of a rollout."""
+    model = measuring(time_offset={"z": 0.01}, scale={"x": 0.02})
+    found = measured_positions(model, STATES, TABLE)
+    late = advance(nominal_model(), STATES, torch.full((2,), 0.01, dtype=torch.float64), TABLE).detach()
+    torch.testing.assert_close(found[:, 0], 1.02 * STATES[:, 0])
+    torch.testing.assert_close(found[:, 1], STATES[:, 1])
+    torch.testing.assert_close(found[:, 2], late[:, 2])
+    assert late[1, 5] > 0.0 > STATES[1, 5]
+    assert not found.requires_grad
+    augmented = AugmentedModel(model, ["flight.drag.k", "measurement.scale.x"])
+    columns = torch.tensor([[0.12, 0.02], [0.12, 0.05]], dtype=torch.float64)
+    found = measured_positions(augmented, torch.cat((STATES, columns), dim=-1), TABLE)
+    torch.testing.assert_close(found[:, 0], torch.tensor([1.02, 1.05], dtype=torch.float64) * STATES[:, 0])
+
+
+def test_plain_positions_to_the_bit() -> None:
+    assert measured_positions(nominal_model(), STATES, TABLE).equal(STATES[:, :3])
+
+
+def test_labels_are_solved_for() -> None:
+    spin = np.array([30.0, -120.0, 80.0])
+    model = measuring(spin_label_frame=frame(np.array([[0.9, 0.2, 0], [-0.1, 0, 1.1], [0, 1.0, 0.3]])),
+                      spin_label_offset={"x": 20.0, "z": -5.0}, spin_label_scale={"s": 0.3})  # fmt: skip
+    label = model.labelled(torch.from_numpy(spin)).detach().numpy()
+    assert np.abs(label - spin).max() > 50.0
+    np.testing.assert_allclose(LabelMap.of(model).spin(label), spin, rtol=1e-12)
+
+
+@pytest.mark.parametrize("number", [0, 7, 20, 47])
+def test_exchanged_axes_leave_the_noise_alone(number) -> None:
+    matrix = signed_permutations()[number].numpy()
+    labels = LabelMap.of(measuring(spin_label_frame=frame(matrix)))
+    np.testing.assert_array_equal(labels.matrix, matrix)
+    assert labels.gain == 1.0
+    assert LabelMap.of(measuring(spin_label_scale={"s": 0.25})).gain == pytest.approx(1.25, rel=1e-12)
+
+
+def test_labels_that_tell_no_spin_are_refused() -> None:
+    flat = measuring(spin_label_frame=frame(np.diag([1.0, 1.0, 0.0])))
+    with pytest.raises(ValueError, match="give different spins different labels; its effects"):
+        LabelMap.of(flat)

@@ -1,0 +1,99 @@
+"""A dataset of detections: opened, estimated on the command line, refused where files are missing."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ballfg.cli.main import run
+from ballfg.dynamics import EFFECTS, AnalyticModel, save_model
+from ballfg.estimation.configure import dataset_settings, dataset_surfaces
+from ballfg.estimation.observations.sighted_dataset import read_sighted
+from ballfg.estimation.registry import make_estimator
+from ballfg.state import SIGMA_NAMES, STATE_NAMES
+from ballfg.tracks.detections_file import write_sightings
+from ballfg.tracks.info import TABLE_TENNIS, DatasetInfo, write_info
+from ballfg.vision.camera_file import write_cameras
+from tests.estimation.observations.sighted_rig import RIG, TABLE, Scene, scene, track_of, world
+
+
+@pytest.fixture(scope="module")
+def scenes() -> dict[str, Scene]:
+    return {name: scene(seed, world(), duration=0.3) for seed, name in enumerate(("one", "two"))}
+
+
+@pytest.fixture
+def folder(tmp_path: Path, scenes: dict[str, Scene]) -> Path:
+    write_info(tmp_path / "dataset.yaml", DatasetInfo("seen", TABLE, TABLE_TENNIS))
+    write_cameras(tmp_path / "cameras.yaml", RIG)
+    lonely = scenes["one"].sightings.taken(scenes["one"].sightings.camera == 0)
+    balls = {name: made.sightings for name, made in scenes.items()} | {"lonely": lonely}
+    write_sightings(tmp_path / "detections.csv", balls.items())
+    return tmp_path
+
+
+def command(*arguments: object) -> int:
+    with pytest.raises(SystemExit) as end:
+        run([str(argument) for argument in arguments])
+    return int(end.value.code or 0)
+
+
+def test_dataset_holds_the_balls_that_two_cameras_saw(folder: Path, scenes: dict[str, Scene]) -> None:
+    (folder / "labels.csv").write_text("trajectory,spin_x,spin_y,spin_z\ntwo,1,2,3\n")
+    dataset = read_sighted(folder)
+    assert dataset.names == ["one", "two"]
+    assert len(dataset.notes) == 1
+    assert "track 'lonely': the ball must be seen by two cameras" in dataset.notes[0]
+    for track in dataset:
+        plain = track_of(scenes[track.name], track.name)
+        np.testing.assert_array_equal(track.times, plain.times)
+        np.testing.assert_allclose(track.positions, plain.positions, atol=1e-9)
+    np.testing.assert_array_equal(next(t for t in dataset if t.name == "two").spin_label, [1.0, 2.0, 3.0])
+
+
+def test_estimate_command_reads_detections(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """One row per distinct stamp, the numbers of the library; without a table of tracks no option is needed."""
+    assert command("estimate", folder, "--out", folder / "states.csv", "--jobs", 1) == 0
+    assert "lonely" in capsys.readouterr().err
+    with (folder / "states.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    dataset, model = read_sighted(folder), world().model
+    settings = dataset_settings(dataset, model)
+    expected = [make_estimator("smoother", model, dataset_surfaces(dataset), settings).estimate(t) for t in dataset]
+    assert len(rows) == sum(len(estimate.times) for estimate in expected)
+    for names, field in ((("t",), "times"), (STATE_NAMES, "states"), (SIGMA_NAMES, "sigmas")):
+        read = np.array([[float(row[name]) for name in names] for row in rows])
+        stated = np.concatenate([np.atleast_2d(getattr(e, field).T).T for e in expected])
+        np.testing.assert_allclose(read, stated, rtol=1e-9, atol=1e-12)
+
+
+def test_source_can_be_chosen(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = folder / "states.csv"
+    assert command("estimate", folder, "--from", "positions", "--out", out) == 2
+    assert "must hold tracks.csv or tracks.parquet" in capsys.readouterr().err
+    assert command("estimate", folder, "--from", "pixels", "--out", out) == 2
+    assert "'positions', 'detections'" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def test_measurement_effects_need_positions(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    model = AnalyticModel([EFFECTS["gravity"](), EFFECTS["restitution"](), EFFECTS["scale"]()])
+    save_model(model, folder / "model.yaml")
+    assert command("estimate", folder, "--model", folder / "model.yaml", "--out", folder / "states.csv") == 2
+    assert "model must have no measurement effects for a track that cameras saw" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["dataset.yaml", "cameras.yaml", "detections.csv"])
+def test_missing_file_is_named(folder: Path, name: str) -> None:
+    (folder / name).unlink()
+    with pytest.raises(FileNotFoundError, match=f"{name} is missing"):
+        read_sighted(folder)
+
+
+def test_no_ball_is_refused(folder: Path) -> None:
+    (folder / "detections.csv").write_text("trajectory,t,camera,u,v\n,0.1,left,1,2\n")
+    with pytest.raises(ValueError, match=r"must hold a ball that two cameras saw, .* got none \(0 named\)"):
+        read_sighted(folder)

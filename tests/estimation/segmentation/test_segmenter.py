@@ -1,0 +1,83 @@
+"""The forward pass, sample by sample: the same answer as the batch, reported once, in bounded memory."""
+
+import gc
+import weakref
+
+import numpy as np
+
+from ballfg.dynamics import Surfaces, nominal_model
+from ballfg.estimation.segmentation import (
+    Event,
+    EventKind,
+    SegmentationSettings,
+    Segmenter,
+    physics_of,
+    segment,
+)
+
+PHYSICS = physics_of(nominal_model())
+SIGMA = np.full(3, 0.0015)
+
+
+def pushed(segmenter, times, positions):
+    return [segmenter.push(float(t), x, SIGMA) for t, x in zip(times, positions, strict=True)]
+
+
+def test_pushed_samples_give_what_the_batch_gives(rallies):
+    for seed, truth in enumerate(rallies[:4]):
+        positions = truth.measured(np.random.default_rng(seed))
+        decisions = pushed(Segmenter(Surfaces(0.75), PHYSICS), truth.times, positions)
+        events = [event for decision in decisions for event in decision.final] + list(decisions[-1].pending)
+        batch = segment(truth.times, positions, SIGMA, surfaces=Surfaces(0.75), physics=PHYSICS)
+        contacts = [(e.index, e.time, e.height) for e in events if e.kind is EventKind.CONTACT]
+        assert contacts == [(c.interval, c.time, c.height) for c in batch.contacts]
+        assert [e.index for e in events if e.kind is EventKind.HIT] == batch.hits.tolist()
+
+
+def test_final_events_come_once_in_order_and_after_the_lag(rallies):
+    truth = rallies[0]
+    settings = SegmentationSettings(lag=40)
+    segmenter = Segmenter(Surfaces(0.75), PHYSICS, settings)
+    final = []
+    for k, decision in enumerate(pushed(segmenter, truth.times, truth.measured(np.random.default_rng(0)))):
+        assert all(event.index < k + 1 - settings.lag for event in decision.final)
+        assert all(event.index >= k + 1 - settings.lag for event in decision.pending)
+        final += decision.final
+    assert segmenter.count == len(truth.times)
+    assert len(final) >= 3
+    assert len(set(map(id, final))) == len(final)
+    assert [e.index for e in final] == sorted(e.index for e in final)
+
+
+def test_a_shorter_lag_finds_the_same_events(rallies, match):
+    truth = rallies[1]
+    positions = truth.measured(np.random.default_rng(1))
+    decisions = pushed(Segmenter(Surfaces(0.75), PHYSICS, SegmentationSettings(lag=12)), truth.times, positions)
+    events = [event for decision in decisions for event in decision.final] + list(decisions[-1].pending)
+    assert match([e.index for e in events if e.kind is EventKind.HIT], truth.hits, 2) == (0, 0)
+    assert match([e.index for e in events if e.kind is EventKind.CONTACT], truth.contacts) == (0, 0)
+
+
+def test_a_hit_is_known_within_six_samples(rallies):
+    for seed, truth in enumerate(rallies):
+        decisions = pushed(Segmenter(Surfaces(0.75), PHYSICS), truth.times, truth.measured(np.random.default_rng(seed)))
+        for hit in truth.hits:
+            known = [e.index for e in decisions[hit + 6].pending if e.kind is EventKind.HIT]
+            assert any(abs(index - hit) <= 2 for index in known)
+
+
+def test_an_endless_stream_keeps_no_old_events(make_rally):
+    truth = make_rally(3, duration=1.5)
+    positions = truth.measured(np.random.default_rng(0))
+    positions[::29] += [0.1, 0.0, 0.2]
+    segmenter = Segmenter(Surfaces(0.75), PHYSICS)
+    seen: weakref.WeakSet[Event] = weakref.WeakSet()
+    reported = 0
+    for k in range(12):
+        for decision in pushed(segmenter, truth.times + k * 1.5, positions):
+            seen.update(decision.final + decision.pending)
+            reported += len(decision.final)
+    del decision
+    gc.collect()
+    assert reported > 100
+    assert len(seen) < 20

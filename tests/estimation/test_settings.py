@@ -1,0 +1,108 @@
+"""Settings: what is refused, what a track's own sigmas do, what a dataset declares."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from ballfg.dynamics import EFFECTS, AnalyticModel, nominal_model
+from ballfg.estimation.configure import dataset_settings, dataset_surfaces
+from ballfg.estimation.segmentation import Quality, Segmentation
+from ballfg.estimation.settings import MEASURED, Settings, sample_sigmas, uncertain
+from ballfg.estimation.smoother.problem import QUALITY_SIGMA, effective_sigmas
+from ballfg.tracks import Track, read_dataset
+
+NONE = np.zeros(0, dtype=np.int64)
+
+
+@pytest.mark.parametrize(
+    "noise", [0.003, (0.001, 0.001), (0.001, 0.0, 0.001), (0.001, np.nan, 0.001), (1.0, 1.0, -1.0)]
+)
+def test_position_noise_is_three_positive_numbers(noise) -> None:
+    with pytest.raises(ValueError, match="position_noise must be three positive numbers in m"):
+        Settings(position_noise=noise)
+
+
+@pytest.mark.parametrize("name", ["spin_prior", "spin_label_noise", "velocity_prior"])
+@pytest.mark.parametrize("value", [0.0, -3.0, np.inf, np.nan])
+def test_priors_are_positive(name, value) -> None:
+    with pytest.raises(ValueError, match=f"{name} must be positive and finite"):
+        Settings(**{name: value})
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
+def test_coefficients_have_a_spread(value) -> None:
+    with pytest.raises(ValueError, match=r"coefficients\['flight.drag.k'\] must be a positive standard deviation"):
+        Settings(coefficients={"flight.drag.k": value})
+
+
+def test_uncertain_takes_the_coefficients_that_vary() -> None:
+    settings = uncertain(nominal_model(), spin_prior=50.0)
+    assert settings.coefficients == {
+        "flight.drag.k": 0.035,
+        "contact.restitution.e": 0.02,
+        "contact.table_height.offset": 0.004,
+    }
+    assert settings.process == MEASURED
+    assert settings.spin_prior == 50.0
+    assert uncertain(AnalyticModel([EFFECTS["gravity"]()])).coefficients == {}
+
+
+def test_a_track_s_own_sigmas_come_first_and_are_copied() -> None:
+    settings = Settings(position_noise=(0.001, 0.002, 0.003))
+    np.testing.assert_array_equal(sample_sigmas(settings, 2, None), [[0.001, 0.002, 0.003]] * 2)
+    own = np.full((2, 3), 0.01)
+    given = sample_sigmas(settings, 2, own)
+    np.testing.assert_array_equal(given, own)
+    given *= 2.0
+    np.testing.assert_array_equal(own, 0.01)
+
+
+@pytest.mark.parametrize("own", [None, np.full((4, 3), 0.01)], ids=["settings", "own"])
+def test_bad_samples_are_widened(own) -> None:
+    track = Track("t", np.arange(4.0), np.zeros((4, 3)), sigmas=own)
+    quality = np.array([Quality.GOOD, Quality.WIDE, Quality.SHIFTED, Quality.OUTLIER], dtype=np.int8)
+    segmentation = Segmentation((), NONE, NONE, (), quality)
+    base = 0.0015 if own is None else 0.01
+    for _ in range(2):  # the second call finds what the first one found
+        sigma = effective_sigmas(track, segmentation, Settings())
+        np.testing.assert_allclose(sigma[:, 0] / base, [1.0, *QUALITY_SIGMA.values()])
+
+
+def dataset(folder, info: str):
+    rng = np.random.default_rng(0)
+    t = 0.01 * np.arange(60)
+    path = np.stack((4.0 * t, 0.2 * t, 1.0 + t - 4.905 * t**2), axis=1) + 0.004 * rng.standard_normal((60, 3))
+    rows = [f"a,{s:.9g},{x:.9g},{y:.9g},{z:.9g}" for s, (x, y, z) in zip(t, path, strict=True)]
+    (folder / "tracks.csv").write_text("\n".join(["trajectory,t,x,y,z", *rows, ""]), encoding="utf-8")
+    (folder / "dataset.yaml").write_text(info, encoding="utf-8")
+    return read_dataset(folder)
+
+
+INFO = """name: test
+frame: {up: z, table_height: 0.5}
+ball: {radius: 0.02, mass: 0.0027}
+rate: 100
+"""
+
+
+def test_a_dataset_s_declared_noise_is_used(tmp_path) -> None:
+    found = dataset(tmp_path, INFO + "position_noise: 0.007\nspin_noise: 5\n")
+    settings = dataset_settings(found, nominal_model())
+    assert settings.position_noise == (0.007,) * 3
+    assert settings.spin_label_noise == 5.0
+    assert "flight.drag.k" in settings.coefficients
+
+
+def test_noise_that_a_dataset_does_not_declare_is_read_off_its_tracks(tmp_path) -> None:
+    """4 mm were added; 50 windows give 25 % or better."""
+    settings = dataset_settings(dataset(tmp_path, INFO), nominal_model())
+    np.testing.assert_allclose(settings.position_noise, 0.004, rtol=0.5)
+    assert settings.spin_label_noise == Settings().spin_label_noise
+
+
+def test_surfaces_of_a_dataset(tmp_path) -> None:
+    surfaces = dataset_surfaces(dataset(tmp_path, INFO))
+    assert surfaces.table_height == 0.5
+    assert surfaces.floor_height == pytest.approx(0.5 - 0.76)
+    assert surfaces.extent is None

@@ -1,0 +1,146 @@
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ballfg.dynamics import nominal_model
+from ballfg.estimation import Status
+from ballfg.learning.calibration import calibrate as module
+from ballfg.learning.calibration.calibrate import Problem, Step, TooManyFailures, calibrate, has_converged, pose
+from ballfg.learning.calibration.coefficients import choose, values_of, with_values
+from ballfg.learning.config.calibration import CalibrationConfig
+from ballfg.learning.evaluation import judge_track, summary
+from ballfg.learning.split import split_tracks
+from ballfg.tracks import read_dataset
+from tests.learning.conftest import PLANTED
+
+
+def posed(folder: Path, **fields: Any) -> Problem:
+    return pose(read_dataset(folder), nominal_model(), CalibrationConfig(**fields))
+
+
+@pytest.fixture(scope="module")
+def steps(many_tracks: Path) -> list[Step]:
+    return list(calibrate(posed(many_tracks)))
+
+
+def test_planted_coefficients_come_back(steps: list[Step]) -> None:
+    last = steps[-1]
+    assert has_converged(CalibrationConfig(), last)
+    assert len(last.fits) == 12
+    assert last.skipped == ()
+    for found, sigma, (name, planted) in zip(last.mean, last.sigma, PLANTED.items(), strict=True):
+        assert abs(found - planted) < 3.0 * sigma, name
+    # the nominal values were far off: 0.12, 0.93, -0.003
+    assert np.all(np.abs(np.array(last.mean) - [0.12, 0.93, -0.003]) > 5.0 * np.array(last.sigma))
+    # all balls are one ball: less spread than half a prior
+    assert np.all(np.array(last.spread) < 0.5 * np.array([0.035, 0.02, 0.004]))
+
+
+def test_other_tracks_are_predicted_better(steps: list[Step]) -> None:
+    first, last = (summary([s for s in step.scores if s is not None]) for step in (steps[0], steps[-1]))
+    assert first is not None
+    assert last is not None
+    assert first.tracks == last.tracks == 12
+    assert last.rmse_median < 0.8 * first.rmse_median
+    assert last.rmse_pooled < first.rmse_pooled
+
+
+def test_same_seed_same_numbers_and_a_run_can_be_cut_anywhere(few_tracks: Path) -> None:
+    whole = list(calibrate(posed(few_tracks, max_iterations=2, tolerance=1e-12)))
+    assert [step.number for step in whole] == [0, 1, 2]
+    again = list(calibrate(posed(few_tracks, max_iterations=2, tolerance=1e-12), whole[:2]))
+    assert again == whole[2:]  # floats and all, bit for bit
+    assert list(calibrate(posed(few_tracks, max_iterations=2), whole)) == []
+
+
+def failing(monkeypatch: pytest.MonkeyPatch, names: set[str]) -> None:
+    real = module.estimate_tracks
+
+    def estimates(*arguments: Any) -> Iterator[Any]:
+        for estimate in real(*arguments):
+            yield replace(estimate, status=Status.FAILED) if estimate.name in names else estimate
+
+    monkeypatch.setattr(module, "estimate_tracks", estimates)
+
+
+def test_a_failed_track_is_skipped_and_named(few_tracks: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = posed(few_tracks, max_iterations=1, failure_limit=0.4)
+    failing(monkeypatch, {problem.split.fit[1]})
+    last = list(calibrate(problem))[-1]
+    assert last.skipped == ((problem.split.fit[1], Status.FAILED.value),)
+    assert [fit.name for fit in last.fits] == [problem.split.fit[0], problem.split.fit[2]]
+
+
+def test_too_many_failed_tracks_stop_the_run(few_tracks: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    problem = posed(few_tracks, max_iterations=1)
+    failing(monkeypatch, {problem.split.fit[1]})
+    with pytest.raises(TooManyFailures, match=f"more than 20 % of the 3 fitted tracks failed.*{problem.split.fit[1]}"):
+        list(calibrate(problem))
+
+
+def test_spin_coefficients_need_spin_labels(no_spin_labels: Path, few_tracks: Path) -> None:
+    names = ("flight.drag.k", "flight.magnus.k")
+    with pytest.raises(ValueError, match="needs tracks with spin labels"):
+        posed(no_spin_labels, coefficients=names)
+    assert posed(few_tracks, coefficients=names).chosen.needs_spin
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["contact.restitution.k"], r"'contact.restitution.k' is not\. Did you mean 'contact.restitution.e'"),
+        (["flight.wind.x"], "'flight.wind.x' is not"),
+        (["flight.drag.k", "flight.drag.k"], "'flight.drag.k' stands twice"),
+        (["flight.gravity.g"], "'flight.gravity.g' is taken as known"),
+    ],
+)
+def test_bad_coefficients(names: list[str], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        choose(nominal_model(), names)
+
+
+def test_values_go_into_a_copy() -> None:
+    model = nominal_model()
+    changed = with_values(model, ["flight.drag.k"], np.array([0.2]))
+    assert values_of(changed, ["flight.drag.k"]).tolist() == [0.2]
+    assert values_of(model, ["flight.drag.k"]).tolist() == [0.12]
+
+
+def test_splits(few_tracks: Path) -> None:
+    dataset = read_dataset(few_tracks)
+    one, other = (split_tracks(dataset, "random", seed, needs_spin=False) for seed in (0, 1))
+    assert len(one.fit) == len(one.judge) == 3
+    assert sorted(one.fit + one.judge) == dataset.names
+    assert one.fit != other.fit
+    assert one.digest == other.digest
+    with pytest.raises(ValueError, match="needs a column 'split'"):
+        split_tracks(dataset, "label", 0, needs_spin=False)
+
+
+def test_split_by_label(few_tracks: Path, tmp_path: Path) -> None:
+    for name in ("dataset.yaml", "tracks.csv"):
+        (tmp_path / name).write_bytes((few_tracks / name).read_bytes())
+    rows = ["trajectory,split", "000,train", "001,test", "002,train", "003,test", "004,validation", "005,"]
+    (tmp_path / "labels.csv").write_text("\n".join(rows) + "\n")
+    found = split_tracks(read_dataset(tmp_path), "label", 0, needs_spin=False)
+    assert (found.fit, found.judge) == (("000", "002"), ("001", "003"))
+    assert list(found.left_out) == ["004", "005"]
+    (tmp_path / "labels.csv").write_text("\n".join(rows[:3]) + "\n")
+    with pytest.raises(ValueError, match="needs 2 tracks to fit and 1 to judge; got 1 and 1"):
+        split_tracks(read_dataset(tmp_path), "label", 0, needs_spin=False)
+
+
+def test_a_track_with_nothing_left_is_not_judged(few_tracks: Path) -> None:
+    problem = posed(few_tracks)
+    estimator = problem.estimator(problem.chosen.start, problem.settings)
+    track = next(iter(problem.dataset))
+    assert judge_track(estimator, track.until(track.times[0]), 0.4, np.inf) is None
+    assert judge_track(estimator, track, 0.9999, np.inf) is not None
+    assert judge_track(estimator, track, 0.4, 1e-6) is None
+    assert summary([]) is None

@@ -1,0 +1,150 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.stats import multivariate_normal
+
+from ballfg.learning.calibration.population import Evidence, evidence, fit_population
+
+Array = NDArray[np.float64]
+WIDE = 1e6
+"""Prior sigma that says nothing: the posterior is the likelihood to 1e-12."""
+
+
+def gaussian(y: Array, covariance: Array, about: Array | None = None) -> Evidence:
+    """A track that saw `y` with `covariance`."""
+    about = np.zeros(len(y)) if about is None else about
+    information = np.linalg.inv(covariance)
+    return Evidence(information, information @ (y - about), about)
+
+
+def unbounded(p: int) -> tuple[Array, Array]:
+    return np.full(p, -np.inf), np.full(p, np.inf)
+
+
+@pytest.mark.parametrize("spread", [0.5, 0.05])
+def test_balanced_tracks_have_the_closed_form(spread: float) -> None:
+    # equal noise s: the mean is the average, the variance between tracks max(0, mean square - s^2)
+    rng = np.random.default_rng(0)
+    noise = np.array([0.1, 0.3])
+    y = np.array([1.0, -2.0]) + rng.normal(size=(40, 2)) * np.hypot(noise, spread)
+    tracks = [gaussian(row, np.diag(noise**2)) for row in y]
+    found = fit_population(tracks, np.zeros(2), np.full(2, 100.0), *unbounded(2))
+    variance = np.maximum(((y - y.mean(axis=0)) ** 2).mean(axis=0) - noise**2, 0.0)
+    # the prior, 100 wide, moves the mean by 1e-6 of itself; 1e-6 = 1e-10 prior variances count as zero
+    np.testing.assert_allclose(found.mean, y.mean(axis=0), rtol=2e-6)
+    np.testing.assert_allclose(found.spread**2, variance, rtol=1e-6, atol=1.1e-6)
+    np.testing.assert_allclose(found.sigma, np.sqrt((found.spread**2 + noise**2) / 40), rtol=2e-6)
+
+
+def test_variance_is_the_closed_form_where_the_prior_is_not_absurdly_wide() -> None:
+    rng = np.random.default_rng(1)
+    y = rng.normal(size=(30, 1)) * 0.5
+    found = fit_population([gaussian(row, np.array([[0.04]])) for row in y], y.mean(axis=0), np.ones(1), *unbounded(1))
+    # the prior sits on the average, so the average stays the best mean
+    np.testing.assert_allclose(found.mean, y.mean(axis=0), atol=1e-12)
+    np.testing.assert_allclose(found.spread**2, y.var() - 0.04, rtol=1e-8)
+
+
+def test_zero_spread_where_the_noise_explains_all() -> None:
+    y = np.linspace(-0.1, 0.1, 11)[:, None]
+    found = fit_population([gaussian(row, np.eye(1)) for row in y], np.zeros(1), np.ones(1), *unbounded(1))
+    assert found.spread.tolist() == [0.0]
+    np.testing.assert_allclose(found.sigma, 1.0 / np.sqrt(12.0), rtol=1e-12)  # eleven tracks and the prior
+
+
+def test_unequal_tracks_reach_the_maximum_of_the_dense_likelihood() -> None:
+    rng = np.random.default_rng(2)
+    start, sigma = np.array([0.5, 0.0, 1.0]), np.array([2.0, 1.0, 3.0])
+    y, covariances = [], []
+    for _ in range(25):
+        root = rng.normal(size=(3, 3)) * np.array([0.3, 0.8, 0.5])
+        covariances.append(root @ root.T + 0.01 * np.eye(3))
+        y.append(rng.multivariate_normal([1.0, -1.0, 2.0], covariances[-1] + np.diag([0.2, 0.1, 0.4]) ** 2))
+    tracks = [gaussian(a, c, about=rng.normal(size=3)) for a, c in zip(y, covariances, strict=True)]
+    found = fit_population(tracks, start, sigma, *unbounded(3))
+
+    def dense(mean: Array, variance: Array) -> float:
+        total = sum(
+            multivariate_normal.logpdf(a, mean, c + np.diag(variance)) for a, c in zip(y, covariances, strict=True)
+        )
+        return float(total + multivariate_normal.logpdf(mean, start, np.diag(sigma**2)))
+
+    variance = found.spread**2
+    best = dense(found.mean, variance)
+    for k in range(3):
+        for step in (1e-3, -1e-3):
+            shift = step * np.eye(3)[k]
+            assert dense(found.mean + shift, variance) < best
+            if (variance + shift)[k] >= 0.0:
+                assert dense(found.mean, variance + shift) < best
+    elsewhere = fit_population(tracks[::-1], start, sigma, *unbounded(3))
+    np.testing.assert_allclose(elsewhere.mean, found.mean, rtol=1e-9)
+    # its own likelihood differs from the dense one by what depends on the data only
+    other = fit_population(tracks, start, sigma, np.full(3, -np.inf), np.array([0.3, np.inf, np.inf]))
+    np.testing.assert_allclose(
+        found.log_likelihood - other.log_likelihood, best - dense(other.mean, other.spread**2), rtol=1e-8
+    )
+
+
+def test_mean_and_spread_of_a_simulated_population() -> None:
+    rng = np.random.default_rng(3)
+    mean, spread = np.array([0.12, 0.93]), np.array([0.01, 0.004])
+    tracks = []
+    for _ in range(600):
+        sigma = np.array([0.01, 0.006]) * rng.uniform(0.5, 2.0)
+        covariance = np.diag(sigma**2) + 0.5 * sigma.prod() * (1 - np.eye(2))
+        tracks.append(gaussian(rng.multivariate_normal(mean + spread * rng.normal(size=2), covariance), covariance))
+    found = fit_population(tracks, np.array([0.1, 0.9]), np.array([0.035, 0.02]), *unbounded(2))
+    assert (np.abs(found.mean - mean) < 3.0 * found.sigma).all()
+    np.testing.assert_allclose(found.spread, spread, rtol=0.25)  # 3 sigma at this noise
+    np.testing.assert_allclose(found.next_track, np.hypot(found.spread, found.sigma))
+
+
+def test_prior_is_taken_out_of_a_posterior() -> None:
+    rng = np.random.default_rng(4)
+    root = rng.normal(size=(3, 3))
+    information = root @ root.T
+    y, prior_mean, prior_sigma = rng.normal(size=3), np.array([1.0, -1.0, 0.5]), np.array([0.5, 2.0, 1.0])
+    prior = np.diag(prior_sigma**-2)
+    covariance = np.linalg.inv(information + prior)
+    posterior = covariance @ (information @ y + prior @ prior_mean)
+    found = evidence(posterior, covariance, prior_mean, prior_sigma)
+    np.testing.assert_allclose(found.information, information, atol=1e-10)
+    np.testing.assert_allclose(found.vector, information @ (y - prior_mean), atol=1e-10)
+
+
+def test_what_a_track_does_not_see_leaves_the_prior() -> None:
+    # the second coefficient comes back from the track as it went in, up to rounding
+    posterior = evidence(
+        np.array([0.3, 0.2]), np.diag([0.01, 4.0 * (1 + 1e-15)]), np.array([0.0, 0.2]), np.array([1.0, 2.0])
+    )
+    assert posterior.information[1, 1] < 1e-12
+    found = fit_population([posterior] * 5, np.array([0.0, 0.2]), np.array([1.0, 2.0]), *unbounded(2))
+    np.testing.assert_allclose(found.mean[1], 0.2, atol=1e-12)
+    np.testing.assert_allclose(found.sigma[1], 2.0, rtol=1e-6)
+    assert found.spread[1] == 0.0
+
+
+def test_mean_stays_in_its_bounds_and_the_others_follow() -> None:
+    covariance = np.array([[0.04, 0.03], [0.03, 0.04]])
+    tracks = [gaussian(np.array([1.2, 0.5]), covariance) for _ in range(10)]
+    found = fit_population(tracks, np.zeros(2), np.full(2, WIDE), np.zeros(2), np.ones(2))
+    assert found.mean[0] == 1.0
+    # given the first, the second moves along their correlation: 0.5 - 0.03 / 0.04 * 0.2
+    np.testing.assert_allclose(found.mean[1], 0.35, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("mean", "covariance", "message"),
+    [
+        (np.array([np.nan]), np.eye(1), "mean and covariance must be finite"),
+        (np.zeros(1), -np.eye(1), "covariance must be positive definite; its least eigenvalue is -1"),
+    ],
+)
+def test_failed_estimates_are_refused(mean: Array, covariance: Array, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        evidence(mean, covariance, np.zeros(1), np.ones(1))
+    with pytest.raises(ValueError, match="tracks must hold at least one"):
+        fit_population([], np.zeros(1), np.ones(1), *unbounded(1))

@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from pydantic import BaseModel
+
+from ballfg.learning.config.config_file import checked_config, read_config
+from ballfg.learning.config.training import LossConfig, TrainConfig
+from tests.places import DOCS
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "train.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_an_empty_file_is_the_default_training(tmp_path: Path) -> None:
+    found = read_config(written(tmp_path, ""))
+    assert found == TrainConfig()
+    assert isinstance(found, TrainConfig)
+    assert (found.kind, found.observe.samples, found.observe.seconds) == ("mnn+gs", 80, None)
+
+
+def test_the_resolved_config_reads_back_as_itself(tmp_path: Path) -> None:
+    words = {
+        "data": ["a", "b"],
+        "observe": {"seconds": 0.25},
+        "launcher": {"labels": ["topspin"]},
+        "noise": {"spin": 2},
+    }
+    found = checked_config(words, "here")
+    text = yaml.safe_dump(found.model_dump(mode="json"))
+    assert read_config(written(tmp_path, text)) == found
+
+
+def test_overrides_reach_into_sections(tmp_path: Path) -> None:
+    path = written(tmp_path, "optimizer: {learning_rate: 0.1, epochs: 3}\ndata: a\n")
+    words = [
+        "optimizer.learning_rate=1e-4",
+        "loss.horizon=0.5",
+        "kind=skip+gs",
+        "observe={seconds: 0.3}",
+        "data=[b, c]",
+    ]
+    found = read_config(path, words)
+    assert isinstance(found, TrainConfig)
+    assert (found.optimizer.learning_rate, found.optimizer.epochs, found.loss.horizon) == (1e-4, 3, 0.5)
+    assert (found.kind, found.observe.seconds, found.observe.samples) == ("skip+gs", 0.3, None)
+    assert found.data == ("b", "c")
+    assert TrainConfig(data="d").data == ("d",)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            "optimizer: {learning_rat: 1}",
+            "unknown key 'optimizer.learning_rat'. Did you mean 'optimizer.learning_rate'?",
+        ),
+        ("optimizer: {zzz: 1}", "unknown key 'optimizer.zzz'. Known ones: optimizer.learning_rate, optimizer.schedule"),
+        ("learning_rate: 1.0", "unknown key 'learning_rate'. Did you mean 'optimizer.learning_rate'?"),
+        ("coefficients: []", "unknown key 'coefficients'. It is a key of a calibration: write 'kind: calibrate'."),
+        ("kindd: mlp", "unknown key 'kindd'. Did you mean 'kind'?"),
+        ("kind: mn+gs", "or 'diffusion'; got 'mn+gs'. To calibrate coefficients write 'kind: calibrate'."),
+        ("optimizer: 3", "'optimizer' must be a section with keys; got 3. Its keys: learning_rate, schedule"),
+        ("optimizer: {clip: 1e-3}", "'optimizer.clip' must be a valid number; got '1e-3'. YAML reads 1e-3 as text"),
+        ("optimizer: {epochs: 0}", "'optimizer.epochs' must be greater than or equal to 1; got 0"),
+        ("optimizer: {epochs: 3, epochs: 4}", "'optimizer.epochs' stands twice. Delete one of them."),
+        ("augment: 1", "'augment' must be a valid boolean; got 1"),
+        ("data: []", "'data' must hold at least one; got []"),
+        ("data: 3", "'data' must be a list; got 3"),
+        ("observe: {samples: 20, seconds: 0.3}", "'observe' must have exactly one of samples and seconds"),
+        ("observe: {samples: null}", "'observe' must have exactly one of samples and seconds"),
+        ("{kind: lstm, model: a.yaml}", "'model' plays no part in kind 'lstm'. Leave it out."),
+        ("{kind: lstm, gradient: unrolled}", "'gradient' plays no part in kind 'lstm'. Leave it out."),
+        ("{kind: a-tune, architecture: {depth: 3}}", "'architecture' plays no part in kind 'a-tune'. Leave it out."),
+        ("split: {validation: 1.0}", "'split.validation' must be less than 1; got 1.0"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path: Path, text: str, message: str) -> None:
+    path = written(tmp_path, text)
+    with pytest.raises(ValueError, match=r".") as error:
+        read_config(path)
+    assert message in str(error.value)
+    assert str(error.value).startswith(f"{path}: ")
+
+
+def test_bad_overrides_name_the_nested_key(tmp_path: Path) -> None:
+    path = written(tmp_path, "")
+    with pytest.raises(ValueError, match=r"unknown key 'optimizer.rate'"):
+        read_config(path, ["optimizer.rate=1"])
+    with pytest.raises(ValueError, match=r"overrides must be key=value; got 'optimizer.=1'"):
+        read_config(path, ["optimizer.=1"])
+    with pytest.raises(ValueError, match=r"'seed' must be a valid integer"):
+        read_config(path, ["seed.a=1"])
+
+
+def test_parts_that_play_a_part_are_taken() -> None:
+    found = checked_config({"kind": "mlp+gs", "model": "a.yaml", "architecture": {"residual": True}}, "here")
+    assert found.model == "a.yaml"
+    assert checked_config({"kind": "a-tune", "model": "a.yaml"}, "here").model == "a.yaml"
+
+
+@pytest.mark.parametrize(
+    ("kind", "augmented"), [("a-tune", True), ("mlp", True), ("mlp+gs", False), ("mnn+gs", False), ("lstm", True)]
+)
+def test_augmentation_is_the_default_where_symmetry_is_not_built_in(kind: Any, augmented: bool) -> None:
+    assert TrainConfig(kind=kind).augmented is augmented
+    assert TrainConfig(kind=kind, augment=not augmented).augmented is not augmented
+
+
+def test_the_horizon_grows_to_its_full_length() -> None:
+    loss = LossConfig(horizon=1.1, horizon_start=0.3, horizon_epochs=4)
+    assert [loss.horizon_at(epoch, 5.0) for epoch in range(6)] == pytest.approx([0.3, 0.5, 0.7, 0.9, 1.1, 1.1])
+    assert loss.horizon_at(1, 0.2) == 0.2  # the track ends before
+    assert LossConfig().horizon_at(0, 5.0) == 5.0
+
+
+def leaves(config: type[BaseModel], prefix: str = "") -> list[str]:
+    found = []
+    for name, field in config.model_fields.items():
+        section = isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
+        found += leaves(field.annotation, f"{prefix}{name}.") if section else [prefix + name]
+    return found
+
+
+def test_guide_lists_every_key() -> None:
+    guide = (DOCS / "train.md").read_text(encoding="utf-8")
+    for name in leaves(TrainConfig):
+        assert f"| `{name}` |" in guide, name
+
+
+def test_fields_that_may_change_on_resume_exist() -> None:
+    assert set(TrainConfig.FREE_TO_CHANGE) <= set(leaves(TrainConfig))

@@ -1,0 +1,58 @@
+"""Spins that the analytic model finds in tracks: those that were simulated, and only where tracks tell."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ballfg.learning.config.build import build
+from ballfg.learning.config.training import TrainConfig
+from ballfg.simulation import MeasurementNoise, SimulationConfig, table_tennis, write_simulation
+from ballfg.tracks import read_dataset, write_dataset
+
+LEVELS = ("topspin", "sidespin")
+
+
+@pytest.fixture(scope="module")
+def launched(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("launched") / "data"
+    write_simulation(folder, SimulationConfig(8, seed=2, noise=MeasurementNoise(position=0.001), spin_labels=False))
+    return folder
+
+
+def learned(data: Path, labels: tuple[str, ...], **launcher: str):
+    given = {"data": [str(data)], "split": {"by": "none"}, "observe": {"samples": 25}, "kind": "a-tune"}
+    trainee, *_ = build(TrainConfig.model_validate(given | {"launcher": {"labels": list(labels)} | launcher}))
+    return trainee.learnables.embedding
+
+
+def test_levels_mean_what_was_simulated(launched: Path) -> None:
+    embedding = learned(launched, LEVELS, start="tracks")
+    launcher = table_tennis().launcher
+    topspin, sidespin = embedding.local(torch.eye(2, dtype=torch.float64)).detach().numpy()
+    np.testing.assert_allclose(topspin, [0.0, launcher.topspin_scale, 0.0], atol=15.0)
+    np.testing.assert_allclose(sidespin, [0.0, 0.0, launcher.sidespin_scale], atol=15.0)
+
+
+def test_groups_get_the_mean_of_their_shots(launched: Path, tmp_path: Path) -> None:
+    dataset, launcher = read_dataset(launched), table_tennis().launcher
+    tracks = [
+        replace(t, labels={**t.labels, "group": "much" if t.labels["topspin"] > 1 else "little"}) for t in dataset
+    ]
+    write_dataset(tmp_path / "data", dataset.info, tracks)
+    embedding = learned(tmp_path / "data", ("group",), start="tracks")
+    local = embedding.local(torch.eye(2, dtype=torch.float64)).detach().numpy()
+    for row, name in zip(local, embedding.categories["group"], strict=True):
+        mine = [t.labels["topspin"] for t in tracks if t.labels["group"] == name]
+        assert row[1] == pytest.approx(launcher.topspin_scale * np.mean(mine), abs=25.0)
+
+
+def test_names_stay_the_default_and_tracks_that_tell_their_spin_are_passed_over(tmp_path: Path, launched: Path) -> None:
+    assert torch.equal(learned(launched, LEVELS).weight, learned(launched, LEVELS, start="names").weight)
+    write_simulation(tmp_path / "data", SimulationConfig(3, seed=2, spin_labels=True))
+    untouched = learned(tmp_path / "data", LEVELS, start="tracks")
+    assert torch.equal(untouched.weight, learned(launched, LEVELS).weight)

@@ -1,0 +1,89 @@
+"""Other balls than the default one."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ballfg.dynamics import nominal_model
+from ballfg.simulation import SimulationConfig, ball_kind, simulate, tennis, with_model
+from ballfg.simulation.balls import tennis_coefficients
+from ballfg.tracks import TENNIS, Ball
+
+SQUASH = """
+name: squash
+radius: 0.02
+mass: 0.024
+surface: court
+flight: {gravity: {}, drag: {k: 0.016}}
+bounce: {restitution: {e: 0.4}, friction: {mu: 0.5}}
+launcher: {duration: 0.5}
+"""
+
+
+def test_tennis_coefficients_follow_from_size_and_mass() -> None:
+    drag, magnus = tennis_coefficients(Ball(radius=0.033, mass=0.058))
+    assert drag == pytest.approx(0.0213, rel=0.01)
+    spin, speed, radius = 150.0, 24.75, 0.033  # spin ratio 0.2, where the lift law was made linear
+    lift = 1.2 * math.pi * radius**2 * speed**2 / (2 * 0.058) / (2 + speed / (radius * spin))
+    assert magnus * spin * speed == pytest.approx(lift, rel=1e-12)
+
+
+def test_tennis_balls_bounce_on_the_court_only() -> None:
+    tracks = list(simulate(SimulationConfig(tracks=40, ball=tennis(), seed=1)))
+    states = np.concatenate([t.true_states for t in tracks])
+    assert states[:, 2].min() > TENNIS.radius - 1e-9
+    assert np.abs(states[:, 0]).max() > 12.0  # they cross the net's place
+    bounced = [np.any(np.diff(t.true_states[:, 5]) > 0.5) for t in tracks]
+    assert np.mean(bounced) > 0.9
+
+
+def test_tennis_restitution_is_seen_in_the_tracks() -> None:
+    track = next(iter(simulate(SimulationConfig(tracks=1, ball=tennis(), rate=1000.0))))
+    vz = track.true_states[:, 5]
+    i = int(np.argmax(np.diff(vz)))
+    assert vz[i + 1] / -vz[i] == pytest.approx(0.75, abs=0.01)
+
+
+def test_ball_of_ones_own(tmp_path: Path) -> None:
+    path = tmp_path / "squash.yaml"
+    path.write_text(SQUASH)
+    kind = ball_kind(str(path))
+    assert (kind.name, kind.ball.mass, kind.surfaces.floor_height) == ("squash", 0.024, None)
+    tracks = list(simulate(SimulationConfig(tracks=3, ball=kind)))
+    assert max(t.track.duration for t in tracks) <= 0.5
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("mass: 0.024", "", "key 'mass' is required"),
+        ("mass: 0.024", "mass: 24", "probably in g"),
+        ("mass:", "weight: 1\nmass:", "got 'weight'"),
+        ("surface: court", "surface: lawn", "'table' or 'court'; got 'lawn'"),
+        ("drag:", "drug:", "no flight effect 'drug'"),
+        ("duration: 0.5", "durations: 0.5", "no field 'durations'"),
+        ("{duration: 0.5}", "fast", "launcher must map"),
+        ("name: squash", "inertia_factor: heavy", "inertia_factor must be a number"),
+        ("name: squash", "name: [", "not readable as YAML"),
+    ],
+)
+def test_ball_files_with_mistakes(tmp_path: Path, old: str, new: str, message: str) -> None:
+    path = tmp_path / "ball.yaml"
+    path.write_text(SQUASH.replace(old, new, 1))
+    with pytest.raises((ValueError, TypeError), match=message) as caught:
+        ball_kind(str(path))
+    assert str(path) in str(caught.value)
+
+
+def test_unknown_ball_lists_the_known_ones() -> None:
+    with pytest.raises(FileNotFoundError, match="table-tennis or tennis or a YAML file"):
+        ball_kind("tenis")
+
+
+def test_model_of_another_radius_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"radius 0\.0335 m; got 0\.02 m"):
+        with_model(tennis(), nominal_model(0.02))

@@ -1,0 +1,63 @@
+"""The check of cameras against each other: the one that was nudged is named, and its nudge measured."""
+
+import numpy as np
+import pytest
+
+from ballfg.vision.association.agreement import check_agreement
+from ballfg.vision.association.associate import associate
+from ballfg.vision.camera import Camera
+from tests.vision.filming import World, film, rig, shots, turned
+
+CAMERAS = rig()
+WORLD = World(shots(3, np.random.default_rng(1)), 3.2)
+FILMS = film(CAMERAS, WORLD)
+
+
+def nudged(number: int, degrees: float, axis: tuple[float, float, float]) -> list[Camera]:
+    cameras = list(CAMERAS)
+    cameras[number] = turned(cameras[number], degrees, axis)
+    return cameras
+
+
+@pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)])
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_names_a_camera_turned_by_half_a_degree(number: int, axis: tuple[float, float, float]) -> None:
+    cameras = nudged(number, 0.5, axis)
+    found = check_agreement(associate(FILMS, cameras), cameras)
+    name = CAMERAS[number].name
+    assert found.culprit == name
+    assert list(found.by_camera) == ["left", "right", "far"]
+    mine = found.by_camera[name]
+    assert mine.rotation == pytest.approx(0.5, abs=0.1)
+    assert mine.shift < 0.01
+    assert mine.corrected < 0.4
+    if axis[2] == 0.0:
+        assert mine.residual == pytest.approx(8.7, abs=0.6)  # 0.5 degrees at 1000 px
+        assert f"Camera {name} has moved" in found.sentence
+
+
+def test_good_cameras_agree() -> None:
+    found = check_agreement(associate(FILMS, CAMERAS), CAMERAS)
+    assert found.culprit is None
+    assert found.misfit == pytest.approx(1.0, abs=0.3)
+    assert found.sentence.startswith("The cameras agree")
+
+
+def test_two_wrong_cameras_are_not_blamed_on_one() -> None:
+    cameras = nudged(0, 0.5, (1.0, 0.0, 0.0))
+    cameras[1] = turned(cameras[1], 0.5, (0.0, 1.0, 0.0))
+    found = check_agreement(associate(FILMS, cameras), cameras)
+    assert found.culprit is None
+    assert "no single one explains it" in found.sentence
+
+
+def test_two_cameras_cannot_say() -> None:
+    cameras = CAMERAS[:2]
+    found = check_agreement(associate(FILMS[:2], cameras), cameras)
+    assert found.culprit is None
+    assert found.by_camera == {}
+    assert "not known" in found.sentence
+
+
+def test_no_balls() -> None:
+    assert "0 points" in check_agreement([], CAMERAS).sentence
