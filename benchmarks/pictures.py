@@ -16,7 +16,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ballfg.benchmarks.estimators.measured import HORIZON, OBSERVE, Measured
 from ballfg.benchmarks.results import CURVE_MARK, Row
-from ballfg.prediction import TrackPrediction
+from ballfg.estimation import TrackPrediction
 
 matplotlib.use("Agg")
 

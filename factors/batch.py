@@ -1,4 +1,4 @@
-"""A kind of factors: all factors of one sort in a graph, evaluated together.
+"""A batch of factors: all factors of one sort in a graph, evaluated together.
 
 GTSAM asks one factor at a time; torch is quick only on batches. So factors of one sort are one object here. It computes
 whitened residuals and Jacobians of any of its rows in one call. The solver of this package takes those arrays
@@ -54,7 +54,7 @@ class Values:
 
 @dataclass(frozen=True)
 class Rows:
-    """Linearised factors of one kind: whitened residuals r + J d, before the loss.
+    """Linearised factors of one batch: whitened residuals r + J d, before the loss.
 
     Attributes:
         variables: (m, a) variable numbers.
@@ -124,10 +124,10 @@ class FactorBatch(ABC):
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, dim) the whitened residuals of all rows, differentiable in the inputs and in the model.
 
-        Only a gradient through the estimate asks for them; `compute` is what estimation needs.
+        Only a gradient through the estimate asks for them; estimation needs `compute` alone.
 
         Args: inputs: for each of the a variables the values (m, d).
-        Raises: NotImplementedError: if the kind has none.
+        Raises: NotImplementedError: if the batch has none.
         """
         raise NotImplementedError(
             f"{type(self).__name__} has no residual in torch, so no gradient can pass through an estimate with it. "
@@ -144,13 +144,13 @@ class FactorBatch(ABC):
     def log_spread(self) -> float:
         """Half the log determinants of the covariances that residuals are whitened with, of all rows together.
 
-        Zero for kinds whose noise is never learned.
+        Zero for factors whose noise is never learned.
         """
         return 0.0
 
     @property
     def group(self) -> Hashable:
-        """Kinds with equal groups can be merged (see `merge`)."""
+        """Batches with equal groups can be merged (see `merge`)."""
         return (type(self), self.dim, self.variables.shape[1], self.loss)
 
     def with_loss(self, loss: Loss) -> Self:
@@ -159,6 +159,13 @@ class FactorBatch(ABC):
         other.loss = loss
         return other
 
+    def taken(self, rows: Index | slice) -> Self:
+        """Some of the factors, as a batch of their own; variable numbers stay what they were."""
+        part = copy.copy(self)
+        for name in self.row_arrays:
+            setattr(part, name, getattr(self, name)[rows])
+        return part
+
     def linearize(self, values: Values) -> Rows:
         """All factors at a point."""
         inputs = tuple(values.gather(column) for column in self.variables.T)
@@ -166,14 +173,14 @@ class FactorBatch(ABC):
         return Rows(self.variables, residual, jacobians, self.loss)
 
 
-K = TypeVar("K", bound=FactorBatch)
+B = TypeVar("B", bound=FactorBatch)
 
 
-def merge(kinds: Sequence[K]) -> K:
-    """One kind with the rows of several of the same group, in order; variable numbers stay what they were."""
-    if len(kinds) == 1:
-        return kinds[0]
-    whole = copy.copy(kinds[0])
+def merge(batches: Sequence[B]) -> B:
+    """One batch with the rows of several of the same group, in order; variable numbers stay what they were."""
+    if len(batches) == 1:
+        return batches[0]
+    whole = copy.copy(batches[0])
     for name in whole.row_arrays:
-        setattr(whole, name, np.concatenate([getattr(kind, name) for kind in kinds]))
+        setattr(whole, name, np.concatenate([getattr(batch, name) for batch in batches]))
     return whole

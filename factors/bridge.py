@@ -1,4 +1,4 @@
-"""The bridge to GTSAM's own solvers: every row of a kind as a CustomFactor, answered from a batch.
+"""The bridge to GTSAM's own solvers: every row of a batch of factors as a CustomFactor, answered from one call.
 
 GTSAM asks for one factor at a time, in C++ order; torch is quick only on batches. A `Bridge` keeps the last residual
 and Jacobians of every row together with the very bytes of the inputs they belong to. A question about the same inputs
@@ -30,57 +30,57 @@ def key_of(variable: int) -> int:
 
 
 class Bridge:
-    """Answers GTSAM's questions about one kind of factors.
+    """Answers GTSAM's questions about one batch of factors.
 
     A bridge never refers to the factors that it made: a factor holds its callback, the callback the bridge, the bridge
-    the kind. With a reference back the chain would be a cycle through C++, which Python's collector cannot see.
+    the batch. With a reference back the chain would be a cycle through C++, which Python's collector cannot see.
 
     Args:
-        kind: whitens its residuals itself; its loss goes into the factors' noise model.
+        batch: whitens its residuals itself; its loss goes into the factors' noise model.
         on_miss: `changed` evaluates all rows whose inputs differ from what is cached, in one call: right for solvers
             that move all variables at once. `row` evaluates the asked row alone: for iSAM2, where the caller
             prepares the rows that will be asked and a miss is a row that it did not foresee.
 
     Attributes:
-        calls: how often the kind was evaluated.
+        calls: how often the batch was evaluated.
         misses: how often a callback found nothing prepared.
     """
 
-    def __init__(self, kind: FactorBatch, on_miss: OnMiss = "changed") -> None:
+    def __init__(self, batch: FactorBatch, on_miss: OnMiss = "changed") -> None:
         if on_miss not in ("changed", "row"):
             raise ValueError(f"on_miss must be 'changed' or 'row'; got '{on_miss}'")
-        self.kind = kind
+        self.batch = batch
         self.on_miss = on_miss
         self.calls = 0
         self.misses = 0
-        self._inputs: list[tuple[bytes, ...] | None] = [None] * len(kind)
-        self._answers: list[tuple[Array, tuple[Array, ...]] | None] = [None] * len(kind)
+        self._inputs: list[tuple[bytes, ...] | None] = [None] * len(batch)
+        self._answers: list[tuple[Array, tuple[Array, ...]] | None] = [None] * len(batch)
 
     def factor(self, row: int, variables: Sequence[int] | None = None) -> gtsam.CustomFactor:
-        """The CustomFactor of one row; its noise model has unit sigmas and the kind's loss.
+        """The CustomFactor of one row; its noise model has unit sigmas and the batch's loss.
 
         Args:
-            row: of the kind.
-            variables: variable numbers to use in place of the kind's own.
+            row: of the batch.
+            variables: variable numbers to use in place of the batch's own.
         """
-        numbers = self.kind.variables[row].tolist() if variables is None else variables
+        numbers = self.batch.variables[row].tolist() if variables is None else variables
         keys = [key_of(v) for v in numbers]
-        return gtsam.CustomFactor(self.kind.loss.noise_model(self.kind.dim), keys, _callback(self, row, keys))
+        return gtsam.CustomFactor(self.batch.loss.noise_model(self.batch.dim), keys, _callback(self, row, keys))
 
     def factors(self) -> list[gtsam.CustomFactor]:
         """One factor a row."""
-        return [self.factor(row) for row in range(len(self.kind))]
+        return [self.factor(row) for row in range(len(self.batch))]
 
     def prepare(self, rows: Index, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Evaluate rows in one call, check what comes back and keep it for the callbacks.
 
         Args: rows: (k,) which rows.  inputs: for each variable of a factor the values (k, d).
         Returns: whitened residuals (k, r) and Jacobians (k, r, d), as kept.
-        Raises: ValueError: if the kind returns a wrong shape, another type than float64, or a value that is not finite.
+        Raises: ValueError: if the batch returns a wrong shape, another type than float64 or a value that is not finite.
         """
         inputs = tuple(np.ascontiguousarray(block, dtype=np.float64) for block in inputs)
         self.calls += 1
-        residual, jacobians = checked(self.kind, rows, inputs, *self.kind.compute(rows, inputs))
+        residual, jacobians = checked(self.batch, rows, inputs, *self.batch.compute(rows, inputs))
         for k, row in enumerate(rows.tolist()):
             self.keep(row, tuple([x[k] for x in inputs]), residual[k], tuple([j[k] for j in jacobians]))
         return residual, jacobians
@@ -109,7 +109,7 @@ class Bridge:
             return
         vectors: dict[int, Array] = {}
         rows, columns = [], []
-        for r, variables in enumerate(self.kind.variables.tolist()):
+        for r, variables in enumerate(self.batch.variables.tolist()):
             point = [_vector(values, v, vectors) for v in variables]
             if any(p is None for p in point):
                 continue  # a graph of some of the rows only
@@ -143,20 +143,20 @@ def _callback(bridge: Bridge, row: int, keys: Sequence[int]) -> Callback:
 
 
 def checked(
-    kind: FactorBatch, rows: Index | slice, inputs: tuple[Array, ...], residual: Array, jacobians: tuple[Array, ...]
+    batch: FactorBatch, rows: Index | slice, inputs: tuple[Array, ...], residual: Array, jacobians: tuple[Array, ...]
 ) -> tuple[Array, tuple[Array, ...]]:
-    """What a kind returned, contiguous, after checks; GTSAM would end the interpreter, or compute with it silently.
+    """What a batch returned, contiguous, after checks; GTSAM would end the interpreter, or compute with it silently.
 
-    Raises: ValueError: names the kind, the array, the row and the rule.
+    Raises: ValueError: names the batch, the array, the row and the rule.
     """
-    name, count = type(kind).__name__, len(inputs[0])
+    name, count = type(batch).__name__, len(inputs[0])
     if len(jacobians) != len(inputs):
         raise ValueError(
             f"{name}.compute must return one Jacobian per variable, {len(inputs)}; got {len(jacobians)}. "
             "A block left out would end the interpreter."
         )
-    expected: list[tuple[str, Array, tuple[int, ...]]] = [("residual", residual, (count, kind.dim))]
-    expected += [(f"Jacobian {i}", block, (count, kind.dim, inputs[i].shape[-1])) for i, block in enumerate(jacobians)]
+    expected: list[tuple[str, Array, tuple[int, ...]]] = [("residual", residual, (count, batch.dim))]
+    expected += [(f"Jacobian {i}", block, (count, batch.dim, inputs[i].shape[-1])) for i, block in enumerate(jacobians)]
     for label, array, shape in expected:
         _check_array(f"{name}.compute: {label}", array, shape, rows)
     return np.ascontiguousarray(residual), tuple(np.ascontiguousarray(block) for block in jacobians)
@@ -180,7 +180,7 @@ def _check_array(what: str, array: Array, shape: tuple[int, ...], rows: Index | 
 
 def nonlinear_graph(graph: BallGraph) -> tuple[gtsam.NonlinearFactorGraph, list[Bridge]]:
     """A graph for GTSAM's own optimizers, with the bridges that answer for it (they count the calls)."""
-    bridges = [Bridge(kind) for kind in graph.kinds if len(kind)]
+    bridges = [Bridge(batch) for batch in graph.batches if len(batch)]
     result = gtsam.NonlinearFactorGraph()
     for bridge in bridges:
         for factor in bridge.factors():

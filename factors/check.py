@@ -1,4 +1,4 @@
-"""Central differences of every Jacobian block of any kind of factors."""
+"""Every Jacobian block of a batch of factors against central differences."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class BlockError:
     """How far one Jacobian block is from differences of the residual.
 
     Attributes:
-        row: of the kind.  column: which variable of the factor.  variable: its number.
+        row: of the batch.  column: which variable of the factor.  variable: its number.
         entry: (i, j) of the worst element.
         given: what `compute` says there.  difference: what differences say.
         relative: their distance over the block's largest element.
@@ -40,26 +40,26 @@ class BlockError:
         )
 
 
-def jacobian_errors(kind: FactorBatch, values: Values, step: float = STEP) -> list[BlockError]:
+def jacobian_errors(batch: FactorBatch, values: Values, step: float = STEP) -> list[BlockError]:
     """One entry per row and block: `compute`'s Jacobians against five-point central differences of its residuals.
 
-    Args: kind: any.  values: the point, best one at which residuals are not zero.  step: see `STEP`.
+    Args: batch: any.  values: the point, best one at which residuals are not zero.  step: see `STEP`.
     """
-    inputs = tuple(np.array(values.gather(column)) for column in kind.variables.T)
-    _, jacobians = kind.compute(slice(None), inputs)
+    inputs = tuple(np.array(values.gather(column)) for column in batch.variables.T)
+    _, jacobians = batch.compute(slice(None), inputs)
     errors = []
     for column, given in enumerate(jacobians):
-        difference = _differences(kind, inputs, column, step)
+        difference = _differences(batch, inputs, column, step)
         scale = np.maximum(np.abs(difference).max(axis=(1, 2)), np.finfo(float).tiny)
         off = np.abs(given - difference) / scale[:, None, None]
         off = np.where(np.isfinite(off), off, np.inf)
-        for row in range(len(kind)):
+        for row in range(len(batch)):
             i, j = np.unravel_index(int(off[row].argmax()), off[row].shape)
             errors.append(
                 BlockError(
                     row,
                     column,
-                    int(kind.variables[row, column]),
+                    int(batch.variables[row, column]),
                     (int(i), int(j)),
                     float(given[row, i, j]),
                     float(difference[row, i, j]),
@@ -69,28 +69,28 @@ def jacobian_errors(kind: FactorBatch, values: Values, step: float = STEP) -> li
     return errors
 
 
-def check_factor(kind: FactorBatch, values: Values, tolerance: float = 1e-6, step: float = STEP) -> float:
-    """The worst relative error of a kind's Jacobians.
+def check_factor(batch: FactorBatch, values: Values, tolerance: float = 1e-6, step: float = STEP) -> float:
+    """The worst relative error of a batch's Jacobians.
 
-    Args: kind: any.  values: the point.  tolerance: relative to a block's largest element.  step: see `STEP`.
+    Args: batch: any.  values: the point.  tolerance: relative to a block's largest element.  step: see `STEP`.
     Raises: AssertionError: if a block is further off than that; the message names the worst.
     """
-    worst = max(jacobian_errors(kind, values, step), key=lambda error: error.relative)
+    worst = max(jacobian_errors(batch, values, step), key=lambda error: error.relative)
     if not worst.relative <= tolerance:
-        raise AssertionError(f"{type(kind).__name__}: {worst}; allowed {tolerance:.1e}")
+        raise AssertionError(f"{type(batch).__name__}: {worst}; allowed {tolerance:.1e}")
     return worst.relative
 
 
-def _differences(kind: FactorBatch, inputs: tuple[Array, ...], column: int, step: float) -> Array:
+def _differences(batch: FactorBatch, inputs: tuple[Array, ...], column: int, step: float) -> Array:
     """(m, r, d) derivative of the residuals by one variable, (8 (f1 - f-1) - (f2 - f-2)) / 12h."""
     block = inputs[column]
-    result = np.empty((len(block), kind.dim, block.shape[-1]))
+    result = np.empty((len(block), batch.dim, block.shape[-1]))
     for j in range(block.shape[-1]):
         h = step * np.maximum(np.abs(block[:, j]), 1.0)
         at = {}
         for shift in (-2, -1, 1, 2):
             moved = block.copy()
             moved[:, j] += shift * h
-            at[shift] = kind.compute(slice(None), (*inputs[:column], moved, *inputs[column + 1 :]))[0]
+            at[shift] = batch.compute(slice(None), (*inputs[:column], moved, *inputs[column + 1 :]))[0]
         result[:, :, j] = (8 * (at[1] - at[-1]) - (at[2] - at[-2])) / (12 * h[:, None])
     return result

@@ -1,6 +1,6 @@
 """Dynamics factors: the next state is what the model makes of this one, up to process noise.
 
-Three kinds share everything but the motion over the interval: free flight, flight through named contacts, and rest on
+Three classes share everything but the motion over the interval: free flight, flight through named contacts, and rest on
 a surface. A hit is a flight whose process noise contains the hit.
 """
 
@@ -26,11 +26,17 @@ from ballfg.factors.noise import Kicks, whitening, whitening_tensor
 from ballfg.state import STATE_DIM
 
 
+def model_width(model: BallModel) -> int:
+    """How many coefficients of a model travel with the state: those of an `AugmentedModel`."""
+    return model.width if isinstance(model, AugmentedModel) else 0
+
+
 class DynamicsFactors(FactorBatch):
     """r = W (x_{i+1} - F(x_i, dt_i; coefficients)), W the whitening of the process noise.
 
     Args:
-        model: an `AugmentedModel` adds its coefficients as a third variable of every factor.
+        model: an `AugmentedModel` adds the coefficients as a third variable of every factor. Its own are the first
+            of them; the motion does not depend on the others, which observations brought along.
         states: (m,) indices i; each factor ties state i to state i + 1.
         dt: (m,) s.
         covariance: (m, 9, 9) of the process noise gathered over dt.
@@ -51,6 +57,7 @@ class DynamicsFactors(FactorBatch):
         if not (dt > 0).all():
             raise ValueError(f"dt must be positive; got {dt.min():g} s. Sort the times and drop repeats.")
         self.model = model
+        self.width = model_width(model)
         self.dt = dt
         self.whitening = whitening(covariance)
         kicks = kicks or Kicks.none(len(states))
@@ -71,7 +78,7 @@ class DynamicsFactors(FactorBatch):
 
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, 9) whitened residuals in torch."""
-        start = inputs[0] if len(inputs) == 2 else torch.cat((inputs[0], inputs[2]), dim=-1)
+        start = inputs[0] if len(inputs) == 2 else torch.cat((inputs[0], inputs[2][:, : self.width]), dim=-1)
         offset = inputs[1] - self.moved(start)[:, :STATE_DIM]
         return (torch.from_numpy(self.whitening) @ offset.unsqueeze(-1)).squeeze(-1)
 
@@ -89,14 +96,18 @@ class DynamicsFactors(FactorBatch):
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, 9) and Jacobians (k, 9, 9), (k, 9, 9) and, with coefficients, (k, 9, p)."""
-        start = inputs[0] if len(inputs) == 2 else np.concatenate((inputs[0], inputs[2]), axis=-1)
+        start = inputs[0] if len(inputs) == 2 else np.concatenate((inputs[0], inputs[2][:, : self.width]), axis=-1)
         after, jacobian = self.propagate(torch.from_numpy(np.ascontiguousarray(start)), rows)
         root = self.whitening[rows]
         residual = np.einsum("nij,nj->ni", root, inputs[1] - after.numpy()[:, :STATE_DIM])
         by_start = -(root @ jacobian.numpy()[:, :STATE_DIM])
         if len(inputs) == 2:
             return residual, (by_start, root)
-        return residual, (by_start[..., :STATE_DIM], root, by_start[..., STATE_DIM:])
+        by_coefficients = by_start[..., STATE_DIM:]
+        others = inputs[2].shape[-1] - self.width
+        if others:
+            by_coefficients = np.pad(by_coefficients, ((0, 0), (0, 0), (0, others)))
+        return residual, (by_start[..., :STATE_DIM], root, by_coefficients)
 
 
 class FlightFactors(DynamicsFactors):
@@ -164,7 +175,8 @@ class ContactFactors(SurfaceFactors):
 
     def contact_times(self, values: Values) -> Array:
         """(m, c) s since the start of each interval; NaN where the ball never gets to the surface."""
-        start = np.concatenate([values.gather(v) for v in (self.variables[:, 0], *self.variables[:, 2:].T)], axis=-1)
+        own = np.broadcast_to(values.coefficients[: self.width], (len(self), self.width))
+        start = np.concatenate((values.states[self.variables[:, 0]], own), axis=-1)
         heights = self._surfaces(slice(None))
         with torch.no_grad():
             return fly_through(self.model, torch.from_numpy(start), torch.from_numpy(self.dt), heights)[1].numpy()

@@ -1,16 +1,16 @@
-"""A factor graph over one track: its kinds of factors, its objective, and the loop that minimises it."""
+"""A factor graph over one track: its factors, its objective, and the loop that minimises it."""
 
 from __future__ import annotations
 
 import enum
-from collections.abc import Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
 from ballfg.factors.batch import FactorBatch, Rows, Values
 from ballfg.factors.linear import Step, solve
-from ballfg.factors.search import Search, run
 
 
 @dataclass(frozen=True)
@@ -18,14 +18,14 @@ class BallGraph:
     """Factors over n states and p shared coefficients.
 
     Attributes:
-        kinds: the factors, one object a kind.
+        batches: the factors; those of one sort are one object.
     """
 
-    kinds: tuple[FactorBatch, ...]
+    batches: tuple[FactorBatch, ...]
 
     def linearize(self, values: Values) -> list[Rows]:
-        """All kinds at a point, each in one batch."""
-        return [kind.linearize(values) for kind in self.kinds if len(kind)]
+        """All factors at a point, one call for each batch."""
+        return [batch.linearize(values) for batch in self.batches if len(batch)]
 
     def error(self, values: Values) -> float:
         """The objective: sum of all losses; half the squared whitened residuals where none is robust."""
@@ -36,6 +36,24 @@ def objective(linearized: Sequence[Rows]) -> float:
     """Sum of all losses; infinite where a residual is not a number."""
     total = sum(rows.error() for rows in linearized)
     return total if np.isfinite(total) else np.inf
+
+
+R = TypeVar("R")
+
+Question = tuple[BallGraph, Values]
+Search = Generator[Question, list[Rows], R]
+"""A computation that asks for linearisations: it yields a graph and a point, and is sent the graph linearised there.
+Several searches can so share a torch call (`ballfg.factors.lockstep`)."""
+
+
+def run(search: Search[R]) -> R:
+    """The result of one search, answered as it asks."""
+    try:
+        graph, values = next(search)
+        while True:
+            graph, values = search.send(graph.linearize(values))
+    except StopIteration as end:
+        return end.value
 
 
 class Convergence(enum.Enum):
@@ -82,24 +100,6 @@ MOST_DAMPING = 1e8
 
 
 @dataclass(frozen=True)
-class _Point:
-    """Values, the graph linearised there, the objective."""
-
-    values: Values
-    linearized: Sequence[Rows]
-    error: float
-
-    def moved(self, graph: BallGraph, step: Step, share: float = 1.0) -> Search[_Point]:
-        """The point a step, or a share of it, further on."""
-        return _point(graph, self.values.moved(share * step.states, share * step.coefficients))
-
-
-def _point(graph: BallGraph, values: Values) -> Search[_Point]:
-    linearized = yield graph, values
-    return _Point(values, linearized, objective(linearized))
-
-
-@dataclass(frozen=True)
 class LevenbergMarquardt:
     """Settings of the minimisation.
 
@@ -119,19 +119,19 @@ class LevenbergMarquardt:
         return run(self.search(graph, values))
 
     def search(self, graph: BallGraph, values: Values) -> Search[Minimum]:
-        """Minimise a graph's objective from a starting point, asking for linearisations (`ballfg.factors.search`).
+        """Minimise a graph's objective from a starting point, asking for linearisations.
 
         Each iteration tries the Gauss-Newton step; where it does not reduce the objective, lambda grows until a
         step does. The length of an undamped step in the metric of J^T J, |J d|, is the distance to the minimum in
         posterior standard deviations: free of units, and what `tolerance` bounds. When the lengths fall so quickly that
         the next step would be within the tolerance, the present one is the last.
         """
-        point = yield from _point(graph, values)
+        point = _Point(values, (yield graph, values))
         if not np.isfinite(point.error):
             return Minimum(values, point.error, None, Convergence.NOT_FINITE, 1)
         damping, growth, last = 0.0, 10.0, np.inf
         for iteration in range(1, self.max_iterations + 1):
-            step = _try_solve(point, damping)
+            step = solve(point.linearized, point.values, damping)
             length = np.sqrt(2 * abs(step.decrease)) if step is not None and damping == 0.0 else np.inf
             if step is not None and length < self.tolerance:
                 return Minimum(point.values, point.error, step, Convergence.CONVERGED, iteration)
@@ -147,11 +147,19 @@ class LevenbergMarquardt:
             elif length < AT_KINK:
                 return Minimum(point.values, point.error, step, Convergence.AT_KINK, iteration)
             elif damping > MOST_DAMPING:
-                return Minimum(point.values, point.error, _try_solve(point, 0.0), Convergence.STUCK, iteration)
+                final = solve(point.linearized, point.values)
+                return Minimum(point.values, point.error, final, Convergence.STUCK, iteration)
             else:
                 damping, growth = max(self.first_damping, growth * damping), 2.0 * growth
-        final = _try_solve(point, 0.0)
+        final = solve(point.linearized, point.values)
         return Minimum(point.values, point.error, final, Convergence.TOO_MANY_ITERATIONS, self.max_iterations)
+
+
+class _Point:
+    """Values, the graph linearised there, the objective."""
+
+    def __init__(self, values: Values, linearized: Sequence[Rows]) -> None:
+        self.values, self.linearized, self.error = values, linearized, objective(linearized)
 
 
 def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> Search[_Point]:
@@ -160,23 +168,12 @@ def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> Searc
     Where the objective bends r times as much along the step as the linear model says (friction between slip and grip
     does), the whole step brings (2 - r) of its promise and 1 / r of it is best. Whole steps then creep or diverge.
     """
-    whole = yield from point.moved(graph, step)
+    values = point.values.moved(step.states, step.coefficients)
+    whole = _Point(values, (yield graph, values))
     gain = (point.error - whole.error) / max(step.decrease, np.finfo(float).tiny)
     if damping > 0.0 or gain > WHOLE or step.decrease > NEAR or not np.isfinite(whole.error):
         return whole
-    nearer = yield from point.moved(graph, step, 1.0 / (2.0 - gain))
+    share = 1.0 / (2.0 - gain)
+    values = point.values.moved(share * step.states, share * step.coefficients)
+    nearer = _Point(values, (yield graph, values))
     return nearer if nearer.error < min(point.error, whole.error) else whole
-
-
-def _try_solve(point: _Point, damping: float) -> Step | None:
-    """The linear solution, or None where the system is singular."""
-    try:
-        step = solve(point.linearized, point.values, damping)
-    except RuntimeError as error:  # GTSAM's text changed between versions; the word did not
-        if "Indetermin" not in str(error):
-            raise
-        return None
-    return step if np.isfinite(step.states).all() else None
-
-
-__all__ = ["BallGraph", "Convergence", "LevenbergMarquardt", "Minimum", "objective"]

@@ -48,15 +48,14 @@ def weighted(rows: Rows) -> tuple[Array, tuple[Array, ...]]:
     return rows.residual * (root / along)[:, None], tuple(turn @ j for j in rows.jacobians)
 
 
-def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> Step:
+def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> Step | None:
     """Minimise the linearised, reweighted objective.
 
     Args:
-        linearized: all kinds of a graph at `values`.
+        linearized: all batches of a graph at `values`.
         values: the point; its shapes give the variables.
         damping: Marquardt's lambda, relative to the diagonal of J^T J.
-
-    Raises: RuntimeError: from GTSAM, when the system is singular; its text holds `Indetermin`.
+    Returns: None where the system is singular or its solution is not finite.
     """
     n, p = len(values.states), len(values.coefficients)
     pieces = [(rows.variables, *weighted(rows)) for rows in linearized]
@@ -65,10 +64,17 @@ def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> S
         _append(graph, np.where(variables == COEFFICIENTS, n, variables), residual, jacobians)
     if damping:
         _damp(graph, np.sqrt(damping * _diagonal(pieces, n, p)), n, p)
-    bayes_net = graph.eliminateSequential(_in_order(n + (p > 0)), gtsam.EliminateQR)
+    try:
+        bayes_net = graph.eliminateSequential(_in_order(n + (p > 0)), gtsam.EliminateQR)
+    except RuntimeError as error:  # GTSAM's text changed between versions; the word did not
+        if "Indetermin" not in str(error):
+            raise
+        return None
     solution = bayes_net.optimize()
     states = solution.vector(list(range(n))).reshape(n, STATE_DIM)
     coefficients = solution.at(n) if p else np.zeros(0)
+    if not np.isfinite(states).all():
+        return None
     decrease = 0.0
     for variables, residual, jacobians in pieces:
         change = _apply(variables, jacobians, states, coefficients)

@@ -57,16 +57,21 @@ class SpinLabelFactors(PriorFactors):
 
 
 class CoefficientPriorFactors(PriorFactors):
-    """The coefficients of a track lie about the model's own values, its passengers about what they are believed to be.
+    """The coefficients of a track lie about the model's own values.
 
-    Args: model: with the coefficients.  sigma: (p,) standard deviations, those of passengers last.
+    Args:
+        model: with the coefficients.
+        sigma: (p,) standard deviations.
+        others: how many coefficients that are not the model's follow its own; nothing is said of them here.
     """
 
-    def __init__(self, model: AugmentedModel, sigma: Array) -> None:
+    def __init__(self, model: AugmentedModel, sigma: Array, others: int = 0) -> None:
         _check_sigma(sigma)
         self.model = model
-        mean = model.means().detach().numpy()
-        super().__init__(np.array([COEFFICIENTS]), mean[None], np.diag(1.0 / sigma)[None])
+        self.others = others
+        mean = np.append(model.means().detach().numpy(), np.zeros(others))
+        root = np.pad(np.diag(1.0 / sigma), ((0, 0), (0, others)))
+        super().__init__(np.array([COEFFICIENTS]), mean[None], root[None])
 
     @property
     def group(self) -> Hashable:
@@ -75,7 +80,8 @@ class CoefficientPriorFactors(PriorFactors):
 
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, p) whitened residuals in torch, differentiable in the model's own values too."""
-        return self._whitened(inputs[0] - self.model.means())
+        means = self.model.means()
+        return self._whitened(inputs[0] - torch.cat((means, means.new_zeros(self.others))))
 
 
 def state_prior(state: int, mean: Array, sigma: Array) -> PriorFactors:
@@ -104,10 +110,11 @@ def _about_spin(spin: Array, sigma: Array) -> tuple[Array, Array]:
     return mean, root
 
 
-def coefficient_prior(mean: Array, sigma: Array) -> PriorFactors:
-    """Prior on the shared coefficients: mean (p,) and sigma (p,)."""
+def coefficient_prior(mean: Array, sigma: Array, before: int = 0) -> PriorFactors:
+    """Prior on shared coefficients: mean (p,) and sigma (p,); of those after the first `before`, where it is not 0."""
     _check_sigma(sigma)
-    return PriorFactors(np.array([COEFFICIENTS]), mean[None], np.diag(1.0 / sigma)[None])
+    root = np.pad(np.diag(1.0 / sigma), ((0, 0), (before, 0)))
+    return PriorFactors(np.array([COEFFICIENTS]), np.append(np.zeros(before), mean)[None], root[None])
 
 
 def _check_sigma(sigma: Array) -> None:

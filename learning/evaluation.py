@@ -10,9 +10,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 from scipy.stats import norm
 
-from ballfg.estimation import Estimator, Status
+from ballfg.estimation import Estimator, Status, predict_tracks
 from ballfg.estimation.batch import map_tracks
-from ballfg.prediction import predict_tracks
 from ballfg.tracks import Track
 
 T = TypeVar("T")

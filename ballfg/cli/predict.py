@@ -15,7 +15,7 @@ from ballfg.cli.progress import progress
 if TYPE_CHECKING:
     import numpy as np
 
-    from ballfg.prediction import TrackPrediction
+    from ballfg.estimation import TrackPrediction
 
 
 def predict(
@@ -33,7 +33,7 @@ def predict(
 
     Example: ballfg predict data/ballgun --observe 0.25 --out predictions.csv
     """
-    from ballfg.prediction import check_observe, predict_tracks
+    from ballfg.estimation import check_observe, predict_tracks
     from ballfg.tracks import TableWriter
 
     statuses: Counter[str] = Counter()

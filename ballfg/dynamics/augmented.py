@@ -6,7 +6,7 @@ written for a `BallModel` (flight, contacts, rollouts, their Jacobians) works on
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -22,16 +22,14 @@ class AugmentedModel(BallModel):
     Args:
         model: any ball model.
         names: parameter names as in `model.named_parameters()`, for instance `flight.drag.k`.
-        passengers: further coefficients in the columns after those, which the motion does not look at, with what they
-            are believed to be: time offsets of cameras, for instance.
 
     Attributes:
-        names: of the parameters.  passengers: names of the others.
+        names: of the parameters.
 
     Raises: ValueError: if a name is not a scalar parameter of the model.
     """
 
-    def __init__(self, model: BallModel, names: Sequence[str], passengers: Mapping[str, float] | None = None) -> None:
+    def __init__(self, model: BallModel, names: Sequence[str]) -> None:
         super().__init__(model.radius, model.inertia_factor)
         parameters = dict(model.named_parameters())
         for name in names:
@@ -40,20 +38,17 @@ class AugmentedModel(BallModel):
                 raise ValueError(f"'{name}' is not a scalar parameter of the model; there are: {scalars}")
         self.model = model
         self.names = tuple(names)
-        believed = dict(passengers or {})
-        self.passengers = tuple(believed)
-        self._believed = torch.tensor(list(believed.values()), dtype=torch.float64)
         self._level = model.surface_slope(torch.zeros(STATE_DIM, dtype=torch.float64)) is None
 
     @property
     def width(self) -> int:
         """How many columns follow the state."""
-        return len(self.names) + len(self.passengers)
+        return len(self.names)
 
     def means(self) -> Tensor:
-        """(p,) the model's own values, as its parameters are now, and what the passengers are believed to be."""
+        """(p,) the model's own values, as its parameters are now."""
         parameters = dict(self.model.named_parameters())
-        return torch.cat((*(parameters[name].reshape(1) for name in self.names), self._believed))
+        return torch.stack([parameters[name].reshape(()) for name in self.names])
 
     def bound(self, state: Tensor) -> BallModel:
         """The model with each state's own coefficients."""

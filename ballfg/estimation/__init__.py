@@ -6,17 +6,19 @@ from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
 from ballfg.estimation.filters.sliding_window import SlidingWindow
 from ballfg.estimation.launcher import Launcher
-from ballfg.estimation.observations.sighted import SightedTrack, in_order, sighted_track
 from ballfg.estimation.observations.sighted_dataset import SightedDataset, read_sighted
+from ballfg.estimation.observations.sightings import CameraSightings, in_order, sighted_track
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.registry import ESTIMATORS, make_estimator
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import Settings, uncertain
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.estimation.smoother.time_offsets import TimeOffsets, estimate_time_offsets
+from ballfg.estimation.track_prediction import TrackPrediction, check_observe, predict_tracks
 
 __all__ = [
     "ESTIMATORS",
+    "CameraSightings",
     "Estimate",
     "Estimator",
     "ExtendedKalmanFilter",
@@ -24,17 +26,19 @@ __all__ = [
     "Online",
     "Settings",
     "SightedDataset",
-    "SightedTrack",
     "SlidingWindow",
     "Smoother",
     "Status",
     "TimeOffsets",
+    "TrackPrediction",
+    "check_observe",
     "dataset_settings",
     "dataset_surfaces",
     "estimate_time_offsets",
     "estimate_tracks",
     "in_order",
     "make_estimator",
+    "predict_tracks",
     "read_sighted",
     "sighted_track",
     "uncertain",

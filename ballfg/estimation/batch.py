@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
+from functools import partial
 from typing import TypeVar
 
 import joblib
@@ -25,7 +27,13 @@ BATCH = 16
 
 def estimate_tracks(estimator: Estimator, tracks: Iterable[Track], count: int, jobs: int) -> Iterator[Estimate]:
     """Estimates in the order of the tracks: `map_tracks` of an estimator."""
-    return map_tracks(estimator.estimate, tracks, count, jobs)
+    for estimate in map_tracks(partial(_without_world, estimator), tracks, count, jobs):
+        yield replace(estimate, world=estimator.world)
+
+
+def _without_world(estimator: Estimator, track: Track) -> Estimate:
+    """The estimate without the model, which need not travel between processes with every track."""
+    return replace(estimator.estimate(track), world=None)
 
 
 def map_tracks(function: Callable[[Track], R], tracks: Iterable[Track], count: int, jobs: int) -> Iterator[R]:

@@ -29,7 +29,7 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
     info, trained = dataset.info, model.trained
     if info.position_noise is not None:
         noise = (info.position_noise,) * 3
-    elif isinstance(dataset, SightedDataset):
+    elif dataset.rough:
         noise = Settings().position_noise
     else:
         x, y, z = estimate_position_noise(islice(iter(dataset), TRACKS_FOR_NOISE)).tolist()

@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from typing import ClassVar
 
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.observations.given import given
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.settings import Settings
+from ballfg.factors.batch import FactorBatch
+from ballfg.prediction.state import World
 from ballfg.tracks import Track
+from ballfg.tracks.checks import check_scale
+
+LEAST_CHECKED = 3
+"""Samples from which a track's scale can be told."""
 
 
 class Estimator(ABC):
@@ -17,7 +25,7 @@ class Estimator(ABC):
 
     Args:
         model: the ball.
-        surfaces: what it may bounce on.
+        surfaces: that it may bounce on.
         settings: noise and priors.
 
     Raises: ValueError: if the model has measurement effects and the estimator does not undo them.
@@ -36,10 +44,34 @@ class Estimator(ABC):
         self.model = model
         self.surfaces = surfaces
         self.settings = settings
+        self.world = World(model, surfaces, settings.process)
+
+    def __repr__(self) -> str:
+        effects = type(self.model).__name__
+        noise = " / ".join(f"{1e3 * s:g}" for s in self.settings.position_noise)
+        return f"{type(self).__name__}({effects}, table at {self.surfaces.table_height:g} m, noise {noise} mm)"
 
     @abstractmethod
-    def estimate(self, track: Track) -> Estimate:
+    def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
         """The states of a track, one per stamp.
 
-        Never raises for what the data hold: a track too short or too wild gives a status that says so.
+        A track too short or too wild gives a status that says so.
+
+        Args:
+            track: stamps, positions, observations, labels.
+            factors: further factors, each on one state of the track, by its index.
+        Raises:
+            TypeError: if track is not a `Track`.
+            ValueError: if its numbers cannot be metres and seconds.
         """
+
+    def prepared(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Track:
+        """The track with further factors among its observations, after a check of its units; errors as `estimate`."""
+        if not hasattr(track, "observations"):
+            raise TypeError(
+                f"track must be a Track; got {type(track).__name__}. Make one with Track(times, positions): (n,) s and "
+                "(n, 3) m."
+            )
+        if len(track) >= LEAST_CHECKED:
+            check_scale(f"track {track.name!r}", track.times, track.positions, track.sigmas, None)
+        return track.observed(*given(factors))

@@ -1,4 +1,4 @@
-"""The estimators by name."""
+"""The estimators by name: those of the package, of the user, and of other installed packages."""
 
 from __future__ import annotations
 
@@ -9,14 +9,19 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
 from ballfg.estimation.filters.sliding_window import SlidingWindow
-from ballfg.estimation.measurement.invert_measurement import ThroughMeasurement
+from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.registry import Registry
 
-ESTIMATORS: Final[dict[str, type[Estimator]]] = {
-    estimator.name: estimator for estimator in (Smoother, Online, ExtendedKalmanFilter, SlidingWindow)
-}
+ESTIMATORS: Final[Registry[Estimator]] = Registry(
+    "estimator", group="ballfg.estimators", base=Estimator, remedy="docs/estimators.md has an example."
+)
+register_estimator = ESTIMATORS.register
+"""Lets an estimator be named by commands and benchmarks; may decorate the class."""
+for _own in (Smoother, Online, ExtendedKalmanFilter, SlidingWindow):
+    register_estimator(_own)
 
 
 def make_estimator(name: str, model: BallModel, surfaces: Surfaces, settings: Settings) -> Estimator:
@@ -27,5 +32,5 @@ def make_estimator(name: str, model: BallModel, surfaces: Surfaces, settings: Se
     if name not in ESTIMATORS:
         raise ValueError(f"method must be one of {', '.join(ESTIMATORS)}; got '{name}'")
     if not model.measures_plainly:
-        return ThroughMeasurement(ESTIMATORS[name], model, surfaces, settings)
+        return InvertMeasurement(ESTIMATORS[name], model, surfaces, settings)
     return ESTIMATORS[name](model, surfaces, settings)

@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import enum
+from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.estimation.segmentation import Contact
-from ballfg.factors.batch import Rows
-from ballfg.factors.covariance import Covariances
-from ballfg.factors.linear import weighted
-from ballfg.state import POSITION
+from ballfg.prediction.ahead import Ahead
+from ballfg.prediction.state import BallState, World
+from ballfg.state import SIGMA_NAMES, STATE_DIM, STATE_NAMES
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
 
 Array = NDArray[np.float64]
-
-LEAST_INFORMATION = 1e-6
-"""Share of the posterior's information that the other samples are given at least."""
 
 
 class Status(enum.Enum):
@@ -46,23 +48,25 @@ class Estimate:
         name: of the track.
         times: (n,) s, the track's stamps.
         states: (n, 9) position m, velocity m/s, spin rad/s.
-        covariances: (n, 9, 9).
+        covariances: (n, 9, 9) in the products of those units.
         status: how the estimation ended.
-        whitened: (n, 3) whitened innovations. For a filter: measured minus predicted position; for a smoother:
-            measured position minus its prediction from all other samples. Each divided by its standard deviation:
-            standard normal where model and noise are right. NaN where a method has none. Of a `SightedTrack`, (m, 2):
-            one row a sighting, pixels in place of positions.
+        innovations: whitened innovations by name of the observation, (m, dim) each. For a filter: measured minus
+            predicted; for a smoother: measured minus its prediction from all other measurements. Each divided by its
+            standard deviation: standard normal where model and noise are right. NaN where a method has none. The
+            observation that tells where the ball is comes first: "position" (n, 3), or "sighting" (m, 2) in pixels.
         coefficient_names: of the p model parameters that were estimated with the track.
-        coefficients: (p,).  coefficient_covariance: (p, p).
+        coefficients: (p,) in their own units.
+        coefficient_covariance: (p, p) in the products of those units.
         cross_covariances: (n, 9, p) between each state and the coefficients.
+        unknown_names: of the q unknowns that observations added: time offsets of cameras, for instance.
+        unknowns: (q,) in their own units.
+        unknown_covariance: (q, q) in the products of those units.
         contacts: with a surface, in order.
-        hits: intervals (between samples i and i+1) in which something hit the ball.
-        quality: (n,) `segmentation.Quality` of each sample.
+        hits: (h,) intervals (between samples i and i+1) in which something hit the ball; indices.
+        quality: (n,) index of `segmentation.Quality`, of each sample.
         error: objective at the minimum; NaN for methods without one.
         iterations: linear solutions of a minimisation, 0 for methods without one.
-        cameras: names of the c cameras of a `SightedTrack`, where an estimate was made from its sightings.
-        time_offsets: (c,) s, of the cameras: their own, or as estimated. `times` are true by these.
-        time_offset_covariance: (c, c) s^2, zero for those that were not estimated.
+        world: model, surfaces and process noise that the states were estimated with; they carry them forward.
     """
 
     name: str
@@ -70,87 +74,79 @@ class Estimate:
     states: Array
     covariances: Array
     status: Status
-    whitened: Array
+    innovations: Mapping[str, Array] = field(default_factory=dict)
     coefficient_names: tuple[str, ...] = ()
     coefficients: Array = field(default_factory=lambda: np.zeros(0))
     coefficient_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     cross_covariances: Array = field(default_factory=lambda: np.zeros((0, 9, 0)))
+    unknown_names: tuple[str, ...] = ()
+    unknowns: Array = field(default_factory=lambda: np.zeros(0))
+    unknown_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
     contacts: tuple[Contact, ...] = ()
     hits: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     quality: NDArray[np.int8] = field(default_factory=lambda: np.zeros(0, dtype=np.int8))
     error: float = np.nan
     iterations: int = 0
-    cameras: tuple[str, ...] = ()
-    time_offsets: Array = field(default_factory=lambda: np.zeros(0))
-    time_offset_covariance: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    world: World | None = None
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __repr__(self) -> str:
+        speed = float(np.linalg.norm(self.states[0, 3:6]))
+        status = self.status.name.lower().replace("_", " ")
+        return (
+            f"Estimate({self.name!r}, {len(self)} states over {self.times[-1] - self.times[0]:.3f} s, {status};\n"
+            f"    {len(self.contacts)} contacts, {len(self.hits)} hits, {speed:.2f} m/s at the start)"
+        )
+
+    def __getitem__(self, sample: int) -> BallState:
+        """The state at a sample, with the coefficients and what is known of them."""
+        joint = np.zeros((STATE_DIM + len(self.coefficients),) * 2)
+        joint[:STATE_DIM, :STATE_DIM] = self.covariances[sample]
+        if self.coefficient_names:
+            joint[:STATE_DIM, STATE_DIM:] = self.cross_covariances[sample]
+            joint[STATE_DIM:, :STATE_DIM] = self.cross_covariances[sample].T
+            joint[STATE_DIM:, STATE_DIM:] = self.coefficient_covariance
+        mean = np.concatenate((self.states[sample], self.coefficients))
+        return BallState(float(self.times[sample]), mean, joint, self.coefficient_names, self.world, self.name)
+
+    @property
+    def last(self) -> BallState:
+        """The state at the last sample."""
+        return self[-1]
+
+    @property
+    def whitened(self) -> Array:
+        """(m, dim) whitened innovations of the observation that tells where the ball is."""
+        return next(iter(self.innovations.values()))
 
     @property
     def sigmas(self) -> Array:
-        """(n, 9) standard deviations of the states."""
+        """(n, 9) standard deviations of the states, m, m/s and rad/s."""
         return np.sqrt(np.diagonal(self.covariances, axis1=-2, axis2=-1))
 
     @property
     def nis(self) -> Array:
-        """(n,) squared length of the whitened innovations: chi-square with as many degrees of freedom as they have."""
+        """(m,) squared length of `whitened`, dimensionless: chi-square with `dim` degrees of freedom."""
         return np.asarray((self.whitened**2).sum(axis=-1))
 
+    def predict(self, horizon: float, step: float = 0.01) -> Ahead:
+        """The path of the ball from the last sample on; arguments and errors as those of `BallState.predict`."""
+        return self.last.predict(horizon, step)
 
-def whiten_innovation(innovation: Array, covariance: Array) -> Array:
-    """(n, 3) innovations divided by the root of their covariances (n, 3, 3)."""
-    root = np.linalg.cholesky(covariance)
-    return np.asarray(np.linalg.solve(root, innovation[..., None])[..., 0])
+    def to_frame(self) -> DataFrame:
+        """A pandas table with the columns of `ballfg estimate`: t, the state and its standard deviations.
 
+        Raises: ImportError: without pandas.
+        """
+        import pandas
 
-def leave_one_out(states: Array, covariances: Array, measured: Array, sigma: Array, samples: Rows) -> Array:
-    """(n, 3) whitened innovations of a smoother: each sample against its prediction from all others.
+        columns = {"t": self.times, **dict(zip(STATE_NAMES, self.states.T, strict=True))}
+        return pandas.DataFrame(columns | dict(zip(SIGMA_NAMES, self.sigmas.T, strict=True)))
 
-    With the sample's share M taken out of the posterior information, the others know the position to C = (P^-1 - M)^-1;
-    without the sample's pull g = M (x - z) (for a robust loss: its gradient) they place it at x + C g. The measurement
-    z lies z - x - C g from there, with covariance R + C.
+    def plot(self) -> Figure:
+        """A picture of position, velocity and spin over time, each with a band of two standard deviations."""
+        from ballfg.estimation.picture import picture
 
-    Args:
-        states: (n, 9).  covariances: (n, 9, 9).
-        measured: (n, 3) m.  sigma: (n, 3) m.
-        samples: the position factors, linearised at the states.
-    """
-    residual, (jacobian,) = weighted(samples)
-    jacobian = jacobian[..., POSITION]
-    pull = (jacobian.swapaxes(-1, -2) @ residual[..., None])[..., 0]
-    information = np.linalg.inv(covariances[:, POSITION, POSITION])
-    axes = np.arange(3)
-    others = information - jacobian.swapaxes(-1, -2) @ jacobian
-    # a sample that alone decides its position leaves nothing: bound C, the whitened distance goes to zero
-    others[:, axes, axes] += LEAST_INFORMATION * information[:, axes, axes]
-    covariance = np.linalg.inv(others)
-    distance = measured - states[:, POSITION] - (covariance @ pull[..., None])[..., 0]
-    covariance[:, axes, axes] += sigma**2
-    return whiten_innovation(distance, np.asarray(covariance, dtype=np.float64))
-
-
-def leave_sighting_out(sightings: Rows, covariances: Covariances) -> Array:
-    """(m, 2) whitened innovations of a smoother: each sighting against its prediction from all others.
-
-    As `leave_one_out`, in pixels that are whitened by their noise: with H the Jacobian of a sighting and S = H P H^T
-    its share of what is known of it, the others know what it will show to C = S (1 - S)^-1, and see it at a distance
-    -(r + C r) from there; for a robust loss, H and r in S and in the pull are the weighted ones. The covariance of that
-    is 1 + C.
-
-    Args:
-        sightings: the camera factors, linearised at the minimum.
-        covariances: of the states there and of the coefficients.
-    """
-    state = sightings.variables[:, 0]
-    plain, (residual, jacobians) = np.concatenate(sightings.jacobians, axis=-1), weighted(sightings)
-    pulled = np.concatenate(jacobians, axis=-1)
-    joint = covariances.states[state]
-    if len(jacobians) > 1:
-        cross = covariances.cross[state]
-        both = np.broadcast_to(covariances.coefficients, (len(state), *covariances.coefficients.shape))
-        joint = np.block([[joint, cross], [cross.swapaxes(-1, -2), both]])
-    gain = joint @ pulled.swapaxes(-1, -2)
-    # a sighting that alone decides what it shows leaves nothing: bound C, the whitened distance goes to zero
-    left = np.linalg.inv((1.0 + LEAST_INFORMATION) * np.eye(2) - pulled @ gain)
-    others = joint + gain @ left @ gain.swapaxes(-1, -2)
-    pull = pulled.swapaxes(-1, -2) @ residual[..., None]
-    distance = -sightings.residual - (plain @ others @ pull)[..., 0]
-    return whiten_innovation(distance, np.eye(2) + plain @ others @ plain.swapaxes(-1, -2))
+        return picture(self)

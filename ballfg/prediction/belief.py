@@ -12,7 +12,7 @@ from torch import Tensor
 
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
-from ballfg.estimation.result import Estimate
+from ballfg.prediction.state import BallState
 from ballfg.state import STATE_DIM
 
 Array = NDArray[np.float64]
@@ -35,42 +35,42 @@ class Belief:
     covariance: Tensor
 
     @classmethod
-    def last(
-        cls, model: BallModel, estimates: Sequence[Estimate], coefficients: Mapping[str, float] | None = None
+    def of(
+        cls, model: BallModel, states: Sequence[BallState], coefficients: Mapping[str, float] | None = None
     ) -> Belief:
-        """The beliefs at the last stamps of some estimates, made with the same model.
+        """The beliefs that some states are, estimated with the same model.
 
         A coefficient estimated beyond what its effect accepts (a restitution above 1, say) is held at the bound, and
         the state is what is most probable with it there.
 
         Args:
             model: the ball.
-            estimates: n of them.
-            coefficients: prior standard deviations by parameter name, as in `Settings.coefficients`. An estimate that
-                says nothing of one of them (the sliding window, a failed filter) has the model's value with this
-                spread. None: the coefficients that the estimates have, the same in all.
-        Raises: ValueError: if there is no estimate, or estimates have coefficients that are not asked for.
+            states: n of them.
+            coefficients: prior standard deviations by parameter name, as in `Settings.coefficients`. A state that
+                knows nothing of one of them (the sliding window's, a failed filter's) has the model's value with this
+                spread. None: the coefficients that the states have, the same in all.
+        Raises: ValueError: if there is no state, or states have coefficients that are not asked for.
         """
-        if not estimates:
-            raise ValueError("estimates must hold at least one; got none")
-        prior = dict.fromkeys(estimates[0].coefficient_names, np.nan) if coefficients is None else coefficients
+        if not states:
+            raise ValueError("states must hold at least one; got none")
+        prior = dict.fromkeys(states[0].coefficient_names, np.nan) if coefficients is None else coefficients
         names = tuple(prior)
-        for e in estimates:
-            own = e.coefficient_names
+        for state in states:
+            own = state.coefficient_names
             if not set(own) <= set(names) or (coefficients is None and own != names):
                 raise ValueError(
-                    f"estimates must share their coefficients; track {e.name!r} has {list(own)}, "
+                    f"states must share their coefficients; that of track {state.name!r} has {list(own)}, "
                     f"not {list(names)}. Make them with the same settings."
                 )
         bounded = AugmentedModel(model, names) if names else model
         parameters = dict(model.named_parameters())
         prior_mean = np.array([float(parameters[name].detach()) for name in names])
         low, high = _bounds(model, names)
-        joints = [_joint(e, names, prior_mean, np.array(list(prior.values()))) for e in estimates]
+        joints = [_joint(state, names, prior_mean, np.array(list(prior.values()))) for state in states]
         mean = np.stack([_held(m, covariance, low, high) for m, covariance in joints])
         return cls(
             bounded,
-            torch.tensor([float(e.times[-1]) for e in estimates], dtype=torch.float64),
+            torch.tensor([state.time for state in states], dtype=torch.float64),
             torch.from_numpy(mean),
             torch.from_numpy(np.stack([covariance for _, covariance in joints])),
         )
@@ -79,17 +79,13 @@ class Belief:
         return len(self.time)
 
 
-def _joint(estimate: Estimate, names: tuple[str, ...], prior_mean: Array, prior_sigma: Array) -> tuple[Array, Array]:
-    """Mean (9 + p,) and covariance (9 + p, 9 + p) of an estimate's last state and its coefficients."""
-    mean = np.concatenate((estimate.states[-1], prior_mean))
+def _joint(state: BallState, names: tuple[str, ...], prior_mean: Array, prior_sigma: Array) -> tuple[Array, Array]:
+    """Mean (9 + p,) and covariance (9 + p, 9 + p) of a state and of all coefficients."""
+    mean = np.concatenate((state.state, prior_mean))
     covariance = np.diag(np.concatenate((np.zeros(STATE_DIM), prior_sigma**2)))
-    covariance[:STATE_DIM, :STATE_DIM] = estimate.covariances[-1]
-    if estimate.coefficient_names:
-        own = np.array([STATE_DIM + names.index(name) for name in estimate.coefficient_names])
-        mean[own] = estimate.coefficients
-        covariance[np.ix_(own, own)] = estimate.coefficient_covariance
-        covariance[:STATE_DIM, own] = estimate.cross_covariances[-1]
-        covariance[own, :STATE_DIM] = estimate.cross_covariances[-1].T
+    own = np.array([*range(STATE_DIM), *(STATE_DIM + names.index(name) for name in state.coefficient_names)])
+    mean[own] = state.mean
+    covariance[np.ix_(own, own)] = state.joint
     return mean, (covariance + covariance.T) / 2
 
 

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
+from typing import Final
 
 from .checks import Findings, check_scale, tidy
 from .grouping import Index, RowGroup, groups, scan
@@ -20,6 +21,9 @@ class Dataset:
     Iterating streams the file, so that one track at a time is in memory; each `for` loop starts again at the first.
     The tracks come in the order in which their names first appear.
     """
+
+    rough: Final = False
+    """The positions of the tracks were measured."""
 
     def __init__(
         self, path: Path, info: DatasetInfo, source: RowSource, index: Index, labels: LabelTable, notes: list[str]

@@ -1,7 +1,10 @@
-"""One measured track: stamps, positions, their noise, and what is known about the shot."""
+"""One measured track: stamps, positions, other observations, and what is known about the shot."""
+
+from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from typing import Any, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,9 +15,20 @@ Label = float | str
 FloatArray = NDArray[np.float64]
 
 
+class Measurements(Protocol):
+    """What a track needs to know of an observation (`ballfg.estimation.Observation`)."""
+
+    name: Any
+    """Text, the sort of the measurements."""
+
+    def taken(self, samples: NDArray[np.bool_]) -> Self:
+        """The measurements of the samples (n,) bool of the track that stay."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
 class Track:
-    """A ball's measured positions over time.
+    """A ball's measured positions over time, with whatever else was measured of it.
 
     The arrays are copied and converted to float64; every field is checked when the track is made.
     Two tracks are equal only if they are the same object.
@@ -38,6 +52,12 @@ class Track:
     labels: Mapping[str, Label] = field(default_factory=dict)
     """What is known about the shot: spin_x, spin_y, spin_z (rad/s, at the first sample), group, launcher settings."""
 
+    observations: tuple[Any, ...] = ()
+    """What was measured beside the positions: `ballfg.estimation.Observation`s, one of a name."""
+
+    rough: bool = False
+    """Whether the positions were made from the observations. Events are found in them; they measure nothing anew."""
+
     def __post_init__(self) -> None:
         _check_name(self.name)
         times = _float_array(self.name, "times", self.times)
@@ -56,12 +76,23 @@ class Track:
         object.__setattr__(self, "positions", positions)
         object.__setattr__(self, "sigmas", sigmas)
         object.__setattr__(self, "labels", _checked_labels(self.name, self.labels))
+        object.__setattr__(self, "observations", tuple(self.observations))
+        _check_observations(self.name, self.observations, self.rough)
 
     def __len__(self) -> int:
         return len(self.times)
 
     def __repr__(self) -> str:
-        return f"Track({self.name!r}, {len(self)} samples, {self.duration:.3f} s)"
+        beside = "".join(f", {observation!r}" for observation in self.observations)
+        return f"Track({self.name!r}, {len(self)} samples, {self.duration:.3f} s{beside})"
+
+    def observed(self, *observations: Measurements) -> Track:
+        """The track with further observations.
+
+        Args: observations: `ballfg.estimation.Observation`s, one of a name.
+        Raises: ValueError: if the track has an observation of that name.
+        """
+        return replace(self, observations=(*self.observations, *observations)) if observations else self
 
     @property
     def duration(self) -> float:
@@ -76,7 +107,7 @@ class Track:
             return None
         return np.array(values, dtype=np.float64)
 
-    def between(self, start: float, end: float) -> "Track":
+    def between(self, start: float, end: float) -> Track:
         """The samples with start <= time <= end, as a new track.
 
         The spin labels hold at the first sample only, so they are left out when that sample is.
@@ -96,14 +127,31 @@ class Track:
         if not inside[0]:
             labels = {key: value for key, value in labels.items() if key not in SPIN_LABELS}
         sigmas = None if self.sigmas is None else self.sigmas[inside]
-        return replace(self, times=self.times[inside], positions=self.positions[inside], sigmas=sigmas, labels=labels)
+        return replace(
+            self,
+            times=self.times[inside],
+            positions=self.positions[inside],
+            sigmas=sigmas,
+            labels=labels,
+            observations=tuple(observation.taken(inside) for observation in self.observations),
+        )
 
-    def until(self, end: float) -> "Track":
+    def until(self, end: float) -> Track:
         """The samples with time <= end (s, in the track's own time), as a new track.
 
         Raises: ValueError: if the first sample is later than that.
         """
         return self.between(-np.inf, end)
+
+
+def _check_observations(track: str, observations: tuple[Measurements, ...], rough: bool) -> None:
+    names = [observation.name for observation in observations]
+    if len(set(names)) < len(names):
+        raise ValueError(
+            f"track {track!r}: observations must have different names; got {names}. Join those of one name."
+        )
+    if rough and not names:
+        raise ValueError(f"track {track!r}: rough positions must come with the observations that they were made from.")
 
 
 def _check_name(name: object) -> None:

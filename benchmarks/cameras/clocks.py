@@ -13,7 +13,7 @@ from ballfg.benchmarks.cameras.scenes import Filmed, truth_at
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Estimate, Online, Settings, Smoother
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
-from ballfg.estimation.observations.sighted import SightedTrack, sighted_track
+from ballfg.estimation.observations.sightings import sighted_track
 from ballfg.estimation.settings import uncertain
 from ballfg.estimation.smoother.time_offsets import TimeOffsets, estimate_time_offsets
 from ballfg.simulation.scene import Flight
@@ -46,7 +46,7 @@ class Velocities:
     positions: Array
 
 
-def sighted(filmed: Filmed) -> list[SightedTrack]:
+def sighted(filmed: Filmed) -> list[Track]:
     """The balls of a recording with the sightings that they were made from."""
     tracking = filmed.tracking
     pairs = zip(tracking.names, tracking.balls, strict=True)

@@ -98,7 +98,7 @@ class GraphContender:
         for first in range(0, len(estimates), BLOCK):
             block = estimates[first : first + BLOCK]
             rests = [t[len(e.times) :] for e, t in zip(block, times[first : first + BLOCK], strict=True)]
-            belief = Belief.last(self.model, block, self.settings.coefficients)
+            belief = Belief.of(self.model, [e.last for e in block], self.settings.coefficients)
             states = propagator.rollout(belief, _padded(rests)).states
             for estimate, path, rest in zip(block, states, rests, strict=True):
                 found.append(np.concatenate((estimate.states[:, POSITION], path[: len(rest), POSITION])))

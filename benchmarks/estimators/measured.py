@@ -17,13 +17,14 @@ from ballfg.estimation import (
     ESTIMATORS,
     Estimate,
     Status,
+    TrackPrediction,
     dataset_settings,
     dataset_surfaces,
     estimate_tracks,
     make_estimator,
+    predict_tracks,
 )
 from ballfg.estimation.segmentation import Quality
-from ballfg.prediction import TrackPrediction, predict_tracks
 from ballfg.tracks import Dataset
 
 Array = NDArray[np.float64]

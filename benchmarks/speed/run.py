@@ -18,14 +18,13 @@ from ballfg.benchmarks.speed.network import fitted_network, parameter_count
 from ballfg.benchmarks.synthetic import gaussian_settings
 from ballfg.benchmarks.timing import Stopwatch, quartiles
 from ballfg.cli.progress import progress
-from ballfg.dynamics import AnalyticModel, BallModel, Surfaces, fly_jacobian, model_from_dict, nominal_model
+from ballfg.dynamics import AnalyticModel, BallModel, Surfaces, fly_jacobian, model_from_dict, nominal_model, rollout
 from ballfg.dynamics.analytic import coefficient_sigmas
-from ballfg.dynamics.motion import rollout
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.learned import build
 from ballfg.estimation import Estimator, Online, Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.smoother.initial import initial_states
-from ballfg.estimation.smoother.problem import Events, build_graph, effective_sigmas, initial_values
+from ballfg.estimation.smoother.problem import Events
 from ballfg.factors.batch import Values
 from ballfg.factors.bridge import nonlinear_graph, to_gtsam
 from ballfg.factors.covariance import marginal_covariances
@@ -100,11 +99,9 @@ def problem_settings(coefficients: dict[str, float] | None = None) -> Settings:
 
 def _problem(smoother: Smoother, track: Track) -> tuple[BallGraph, Values]:
     """The track's graph and the point from which the minimisation starts."""
-    segmentation = smoother.segment(track)
-    sigma = effective_sigmas(track, segmentation, smoother.settings)
-    graph = build_graph(track, smoother.trackwise, Events((), segmentation), sigma, smoother.settings)
-    states = initial_states(track, (), segmentation, smoother.model, smoother.settings.spin_label(track))
-    return graph, initial_values(states, smoother.trackwise, smoother.settings)
+    problem = smoother.problem(track)
+    states = initial_states(track, (), problem.segmentation, smoother.model, smoother.settings.spin_label(track))
+    return problem.graph(Events((), problem.segmentation)), problem.start(states)
 
 
 def _time_model(results: Results, name: str, model: BallModel, track: Track, watch: Stopwatch) -> None:
@@ -197,7 +194,7 @@ def _time_prediction(results: Results, name: str, estimator: Estimator, track: T
     estimate = estimator.estimate(track)
     propagator = Propagator(estimator.surfaces, estimator.settings.process)
     times = torch.from_numpy(track.times[-1] + np.arange(1, round(HORIZON * RATE) + 1) / RATE)[None]
-    belief = Belief.last(estimator.model, [estimate])
+    belief = Belief.of(estimator.model, [estimate.last])
     figure = watch.time(lambda: propagator.rollout(belief, times))
     results.add(CASE, name, "prediction_time", "ms", figure, watch.runs)
 

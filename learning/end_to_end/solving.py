@@ -18,8 +18,8 @@ from ballfg.estimation.smoother.problem import effective_sigmas
 from ballfg.estimation.smoother.smoother import Earlier
 from ballfg.estimation.smoother.solution import Solution
 from ballfg.factors.batch import Values
-from ballfg.factors.graph import Convergence, LevenbergMarquardt
-from ballfg.factors.search import Search, run_together
+from ballfg.factors.graph import Convergence, LevenbergMarquardt, Search
+from ballfg.factors.lockstep import run_together
 from ballfg.learning.end_to_end.augment import apply, rotate, undo
 from ballfg.learning.end_to_end.learnables import Learnables
 from ballfg.learning.shots import Shot
@@ -50,7 +50,10 @@ class Pose:
         if track.spin_label is not None:
             spin = rotate(torch.from_numpy(track.spin_label), self.angle)
             labels = {**labels, **dict(zip(SPIN_LABELS, spin.tolist(), strict=True))}
-        return replace(track, positions=self.positions(track.positions), labels=labels)
+        rotation = torch.stack([rotate(axis, self.angle) for axis in torch.eye(3, dtype=torch.float64)], dim=-1)
+        shift = torch.cat((self.shift, self.shift.new_zeros(1)))
+        turned = tuple(observation.turned(rotation, shift) for observation in track.observations)
+        return replace(track, positions=self.positions(track.positions), labels=labels, observations=turned)
 
     def states(self, states: Array, *, back: bool = False) -> Array:
         """(n, 9) as seen from there; or, from there, as they were."""
@@ -168,9 +171,10 @@ class BatchSolver:
             sigma[:, :2] = np.sqrt(np.square(sigma[:, :2]).mean(axis=1, keepdims=True))  # a turn mixes x and y
         warm = self.warm.get(number, pose)
         if warm is None:
-            return smoother.search(track, segmentation, sigma)
+            return smoother.search(smoother.problem(track, segmentation, sigma))
         values, contacts = warm
-        return smoother.search(track, replace(segmentation, contacts=contacts), sigma, Earlier(values, ()))
+        problem = smoother.problem(track, replace(segmentation, contacts=contacts), sigma)
+        return smoother.search(problem, Earlier(values))
 
     def _smoother(self, shot: Shot) -> Smoother:
         # hits were looked for once, in the shots: what a model in training cannot explain yet is no hit

@@ -19,7 +19,7 @@ from torch import Tensor
 from ballfg.factors.batch import Array, FactorBatch, Noise, Rows, Values
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.linear import weighted
-from ballfg.factors.search import linearize_together
+from ballfg.factors.lockstep import linearize_together
 from ballfg.learning.gradient.conjugate_gradients import GaussNewtonFactors
 from ballfg.learning.gradient.posterior import Posterior, posterior_of
 
@@ -40,7 +40,7 @@ def negative_log_likelihood(
     log_roots = factors.log_determinants()
     totals = []
     for track, rows in enumerate(linearize_together(list(zip(graphs, minima, strict=True)))):
-        kinds = [kind for kind in graphs[track].kinds if len(kind)]
+        kinds = [kind for kind in graphs[track].batches if len(kind)]
         value = log_roots[track] + sum(r.error() for r in rows) + sum(kind.log_spread() for kind in kinds)
         expected = torch.zeros((), dtype=torch.float64)
         for kind, linearized in zip(kinds, rows, strict=True):

@@ -88,7 +88,7 @@ class BatchObjective:
         self.layout = Layout(tuple(len(v.states) for v in values), len(values[0].coefficients))
         groups: defaultdict[Hashable, list[tuple[int, FactorBatch]]] = defaultdict(list)
         for track, graph in enumerate(graphs):
-            for kind in graph.kinds:
+            for kind in graph.batches:
                 if len(kind):
                     groups[kind.group].append((track, kind))
         starts = self.layout.starts

@@ -14,8 +14,7 @@ from ballfg.benchmarks.speed import run as speed
 from ballfg.benchmarks.speed.network import GRAVITY, fitted_network, parameter_count
 from ballfg.benchmarks.speed.run import problem_model, run_speed
 from ballfg.benchmarks.synthetic import fair_protocol
-from ballfg.estimation import Estimate, Status
-from ballfg.prediction import TrackPrediction
+from ballfg.estimation import Estimate, Status, TrackPrediction
 
 SMALL = Size(compared=3, consistency=4, measured=None, counts=(5, 20))
 

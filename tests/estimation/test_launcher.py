@@ -9,15 +9,13 @@ import pytest
 import torch
 
 from ballfg import simulation as simulate_module
-from ballfg.dynamics import Surfaces, nominal_model
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics import Surfaces, nominal_model, rollout
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.dynamics.trained import Trained
 from ballfg.estimation import ExtendedKalmanFilter, Online, Settings, SlidingWindow, Smoother
 from ballfg.estimation.configure import dataset_settings, launcher_of
 from ballfg.estimation.launcher import FIRST_SAMPLES, Launcher
 from ballfg.estimation.settings import MEASURED
-from ballfg.estimation.smoother.problem import build_graph, effective_sigmas
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.loss import Loss
 from ballfg.factors.prior import PriorFactors, SpinLabelFactors
@@ -113,8 +111,8 @@ def settings_with(launcher: Launcher | None, **changes) -> Settings:
 def kinds_of(track: Track, settings: Settings) -> list[object]:
     smoother = Smoother(nominal_model(), TABLE, settings)
     events = smoother.segment(track)
-    solution = smoother.solve(track, events, effective_sigmas(track, events, settings))
-    return list(build_graph(track, smoother.model, solution.events, np.full((len(track), 3), 0.001), settings).kinds)
+    solution = smoother.solve(smoother.problem(track, events))
+    return list(smoother.problem(track, events, np.full((len(track), 3), 0.001)).graph(solution.events).batches)
 
 
 def test_the_smoother_s_graph_has_one_word_on_the_first_spin(launcher) -> None:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ballfg.estimation.result import LEAST_INFORMATION, Estimate, Status, leave_one_out, whiten_innovation
+from ballfg.estimation.observations.innovation import LEAST_INFORMATION, leave_position_out, whiten_innovation
+from ballfg.estimation.result import Estimate, Status
 from ballfg.factors.batch import Values
 from ballfg.factors.loss import Loss
 from ballfg.factors.position import PositionFactors
@@ -19,7 +20,7 @@ def spd(rng: np.random.Generator, n: int, size: int) -> np.ndarray:
 def test_sigmas_and_nis() -> None:
     covariances = np.tile(np.diag(np.arange(1.0, 10.0) ** 2), (2, 1, 1))
     whitened = np.array([[1.0, 2.0, 2.0], [np.nan, np.nan, np.nan]])
-    estimate = Estimate("t", np.arange(2.0), np.zeros((2, 9)), covariances, Status.OK, whitened)
+    estimate = Estimate("t", np.arange(2.0), np.zeros((2, 9)), covariances, Status.OK, {"position": whitened})
     np.testing.assert_array_equal(estimate.sigmas, [np.arange(1.0, 10.0)] * 2)
     np.testing.assert_array_equal(estimate.nis, [9.0, np.nan])
     assert estimate.contacts == ()
@@ -57,7 +58,7 @@ def test_leave_one_out_takes_the_sample_back_out(loss) -> None:
     assert core.sum() >= 2
     expected = whiten_innovation(z - mean, C + R)
     np.testing.assert_allclose(
-        leave_one_out(states, covariances, z, sigma, rows)[core], expected[core], rtol=1e-4, atol=1e-5
+        leave_position_out(states, covariances, z, sigma, rows)[core], expected[core], rtol=1e-4, atol=1e-5
     )
 
 
@@ -67,7 +68,7 @@ def test_a_sample_that_stands_alone_surprises_nobody() -> None:
     states = np.zeros((1, 9))
     covariances = np.eye(9)[None] * 1e-4  # all of it the sample's own
     rows = PositionFactors(np.array([0]), states[:, :3], sigma).linearize(Values(states, np.zeros(0)))
-    whitened = leave_one_out(states, covariances, states[:, :3] + 1e-3, sigma, rows)
+    whitened = leave_position_out(states, covariances, states[:, :3] + 1e-3, sigma, rows)
     np.testing.assert_allclose(whitened, 1e-3 / 0.01 * np.sqrt(LEAST_INFORMATION), rtol=1e-3)
 
 

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import nominal_model
+from ballfg.dynamics import nominal_model, rollout
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.motion import rollout
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge, from_gtsam, key_of, nonlinear_graph, to_gtsam
@@ -103,7 +102,7 @@ def test_values_travel_there_and_back(rng):
 def test_a_factor_linearises_to_the_rows_of_its_kind(rng):
     graph, start = problem(rng, coefficients=True)
     values = to_gtsam(start)
-    for kind in graph.kinds:
+    for kind in graph.batches:
         rows = kind.linearize(start)
         for row, factor in enumerate(Bridge(kind).factors()):
             matrix, b = factor.linearize(values).jacobian()
@@ -114,7 +113,7 @@ def test_a_factor_linearises_to_the_rows_of_its_kind(rng):
 
 def test_a_miss_evaluates_all_changed_rows_at_once(rng):
     graph, start = problem(rng)
-    bridge = Bridge(graph.kinds[1])
+    bridge = Bridge(graph.batches[1])
     factors, values = bridge.factors(), to_gtsam(start)
     for factor in factors:
         factor.linearize(values)
@@ -122,8 +121,8 @@ def test_a_miss_evaluates_all_changed_rows_at_once(rng):
     assert (bridge.calls, bridge.misses) == (1, 1)
     values.update(STATE_KEY + 4, start.states[4] + 1e-9)
     seen = []
-    compute = bridge.kind.compute
-    bridge.kind.compute = lambda rows, inputs: (seen.append(rows.tolist()), compute(rows, inputs))[1]
+    compute = bridge.batch.compute
+    bridge.batch.compute = lambda rows, inputs: (seen.append(rows.tolist()), compute(rows, inputs))[1]
     for factor in factors:
         factor.linearize(values)
     assert seen == [[3, 4]]
@@ -134,13 +133,13 @@ def test_rows_without_values_are_left_alone(rng):
     part = gtsam.Values()
     for i in (2, 3):
         part.insert(STATE_KEY + i, start.states[i])
-    bridge = Bridge(graph.kinds[1])
+    bridge = Bridge(graph.batches[1])
     assert np.isfinite(bridge.factor(2).error(part))
 
 
 def test_prepared_rows_are_answered_without_a_call(rng):
     graph, start = problem(rng)
-    bridge = Bridge(graph.kinds[1], "row")
+    bridge = Bridge(graph.batches[1], "row")
     rows = np.array([1, 5])
     bridge.prepare(rows, (start.states[rows], start.states[rows + 1]))
     values = to_gtsam(start)
@@ -153,7 +152,7 @@ def test_prepared_rows_are_answered_without_a_call(rng):
 def test_an_unknown_policy_is_refused(rng):
     graph, _ = problem(rng)
     with pytest.raises(ValueError, match="on_miss must be 'changed' or 'row'; got 'all'"):
-        Bridge(graph.kinds[0], "all")
+        Bridge(graph.batches[0], "all")
 
 
 class Bad(FactorBatch):
@@ -226,7 +225,7 @@ def test_memory_order_does_not_matter(order):
 def test_nothing_keeps_a_graph_alive(rng):
     graph, start = problem(rng)
     _, optimizer, bridges = gtsam_minimum(graph, start)
-    watched = [weakref.ref(bridge) for bridge in bridges] + [weakref.ref(kind) for kind in graph.kinds]
+    watched = [weakref.ref(bridge) for bridge in bridges] + [weakref.ref(kind) for kind in graph.batches]
     del graph, optimizer, bridges
     gc.collect()
     assert [ref() for ref in watched] == [None] * len(watched)
@@ -252,7 +251,7 @@ def test_isam2_lets_go_of_removed_factors(rng):
 
 def test_the_checker_names_the_bad_block(rng):
     graph, start = problem(rng, coefficients=True)
-    kind = graph.kinds[1]
+    kind = graph.batches[1]
     assert check_factor(kind, start) < 1e-6
     compute = kind.compute
 

@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Surfaces
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Surfaces, rollout
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.segmentation import Segmentation
@@ -20,9 +19,9 @@ from ballfg.estimation.smoother.smoother import Earlier, Smoother
 from ballfg.estimation.smoother.solution import Solution
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import Convergence, LevenbergMarquardt
+from ballfg.factors.lockstep import run_together
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
-from ballfg.factors.search import run_together
 from ballfg.learning.config.training import LossConfig
 from ballfg.learning.end_to_end.end_to_end import EndToEnd
 from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
@@ -119,8 +118,8 @@ class Estimates:
         scale, searches = self.noise.position_scale(), []
         for k, (track, events) in enumerate(zip(self.tracks, self.segmentations, strict=True)):
             sigma = effective_sigmas(track, events, self.settings) * scale
-            earlier = Earlier(self.starts[k], ()) if self.starts else None
-            searches.append(smoother.search(track, events, sigma, earlier))
+            earlier = Earlier(self.starts[k]) if self.starts else None
+            searches.append(smoother.search(smoother.problem(track, events, sigma), earlier))
         found = run_together(searches)
         assert all(s.minimum.convergence is Convergence.CONVERGED for s in found)
         return found

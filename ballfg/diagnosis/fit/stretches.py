@@ -131,7 +131,7 @@ def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[_Stretch]
     settings = np.zeros(len(launcher.embedding.names)) if known is None else known
     segmentation = smoother.segment(track)
     sigma = effective_sigmas(track, segmentation, smoother.settings)
-    solution = smoother.solve(track, segmentation, sigma)
+    solution = smoother.solve(smoother.problem(track, segmentation, sigma))
     estimate, segmentation = smoother.result(track, sigma, solution), solution.events.segmentation
     rests = [rest.first for rest in segmentation.rests]
     stretches = []

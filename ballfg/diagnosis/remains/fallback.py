@@ -23,7 +23,7 @@ from ballfg.dynamics.networks.learned import LearnedModel, build
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation.configure import dataset_settings, dataset_surfaces
 from ballfg.estimation.measurement.as_measured import plainly_measured
-from ballfg.estimation.measurement.invert_measurement import ThroughMeasurement
+from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.learning.config.training import LossConfig, OptimizerConfig, TrainConfig
@@ -119,7 +119,7 @@ def _as_happened(base: AnalyticModel, dataset: Dataset, tracks: Sequence[Track])
     settings = dataset_settings(dataset, base)
     if base.measures_plainly:
         return list(tracks), settings
-    through = ThroughMeasurement(Smoother, base, dataset_surfaces(dataset), settings)
+    through = InvertMeasurement(Smoother, base, dataset_surfaces(dataset), settings)
     undone = [through.undo(track) for track in tracks]
     return [u.track for u in undone if u.settled], through.smoother.settings
 

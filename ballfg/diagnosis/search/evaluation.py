@@ -17,10 +17,10 @@ from ballfg.diagnosis.search.score import score_tests
 from ballfg.diagnosis.search.signatures import Signatures
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation import TrackPrediction, predict_tracks
 from ballfg.estimation.registry import make_estimator
 from ballfg.estimation.settings import Settings
 from ballfg.prediction.apexes import measured_apexes, path_apex
-from ballfg.prediction.tracks import TrackPrediction, predict_tracks
 from ballfg.tracks import Track
 
 Array = NDArray[np.float64]

@@ -5,6 +5,7 @@ docs/estimators_ekf.md has the equations, what the filter does at contacts, hits
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -21,15 +22,20 @@ from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.rts import FilterRecord, fly_back, rts_smooth
 from ballfg.estimation.filters.sliding_window import SlidingWindow, first_pair
 from ballfg.estimation.filters.window_velocity import WINDOW
-from ballfg.estimation.result import Array, Estimate, Status, leave_one_out
+from ballfg.estimation.observations.innovation import leave_position_out
+from ballfg.estimation.observations.observation import Context
+from ballfg.estimation.result import Array, Estimate, Status
 from ballfg.estimation.segmentation import Contact, Quality
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start
 from ballfg.estimation.smoother.near_contact import widen_near_contacts
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
+from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
 from ballfg.tracks import Track
 
-GATE = float(chi2.isf(1e-6, 3))
+GATE_CHANCE = 1e-6
+"""Share of good measurements that are not used."""
+GATE = float(chi2.isf(GATE_CHANCE, 3))
 """Squared whitened innovation, 30.7, beyond which a sample is not used: one good sample in a million."""
 REJECTED_FOR_HIT = 4
 """So many samples in a row beyond the gate are no outliers: something hit the ball before the first of them."""
@@ -94,6 +100,24 @@ class _BallFilter(FilterpyEKF):
         """The update of filterpy with a measured position."""
         self.update(measured, lambda _: self.H, lambda x: x[POSITION])
 
+    def correct_by(self, factors: FactorBatch, gated: bool) -> Array:
+        """(dim,) whitened innovation of a factor on the present state; the update of filterpy with its residual.
+
+        The factor's loss gives the noise its weight; with a gate, a measurement beyond it is not used.
+        """
+        inputs = (self.x[None, :STATE_DIM], self.x[None, STATE_DIM:])[: factors.variables.shape[1]]
+        (residual,), blocks = factors.compute(slice(None), inputs)
+        H = np.zeros((factors.dim, len(self.x)))
+        H[:, :STATE_DIM] = blocks[0][0]
+        if len(blocks) > 1:
+            H[:, STATE_DIM:] = blocks[1][0]
+        unit = np.eye(factors.dim)
+        whitened = np.linalg.solve(np.linalg.cholesky(H @ self.P @ H.T + unit), -residual)
+        if not gated or whitened @ whitened <= chi2.isf(GATE_CHANCE, factors.dim):
+            (weight,) = factors.loss.weight(np.array([np.linalg.norm(whitened)]))
+            self.update(np.zeros(factors.dim), lambda _: H, lambda _: residual, R=unit / weight)
+        return np.asarray(whitened)
+
 
 class ExtendedKalmanFilter(Estimator):
     """The extended Kalman filter; with `smooth`, followed by a Rauch-Tung-Striebel pass.
@@ -127,29 +151,30 @@ class ExtendedKalmanFilter(Estimator):
         super().__init__(model, surfaces, settings)
         if initialise not in ("prior", "window"):
             raise ValueError(f"initialise must be 'prior' or 'window'; got {initialise!r}")
-        self.trackwise = trackwise_model(model, settings)
+        self.ball = trackwise_model(model, settings)
         self.smooth = smooth
         self.initialise = initialise
         if smooth:
             self.name = "ekf+rts"  # type: ignore[misc]  # the class's name is that of its default
 
-    def estimate(self, track: Track) -> Estimate:
+    def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
         """The states of a track, each given the samples so far; with `smooth` given all samples.
 
         Coefficients are those of the last sample; cross covariances tie each state to the coefficients at that state.
         """
+        track = self.prepared(track, factors)
         run = _Run(self, track)
         record = run.record
         if not run.finite():
             return self._failed(track, run)
         mean, covariance = rts_smooth(record) if self.smooth else (record.mean, record.covariance)
         if record.start > 0 and (self.smooth or self.initialise == "prior"):
-            fly_back(self.trackwise, record.start, track.times, run.flight_noise, mean, covariance)
+            fly_back(self.ball, record.start, track.times, run.flight_noise, mean, covariance)
         whitened = record.whitened
         if self.smooth:
             samples = record.position_rows(mean, track.positions, run.sigma)
             states = mean[:, :STATE_DIM], covariance[:, :STATE_DIM, :STATE_DIM]
-            whitened = leave_one_out(*states, track.positions, run.sigma, samples)
+            whitened = leave_position_out(*states, track.positions, run.sigma, samples)
         return self._result(track, run, mean, covariance, whitened)
 
     def _result(self, track: Track, run: _Run, mean: Array, covariance: Array, whitened: Array) -> Estimate:
@@ -164,7 +189,8 @@ class ExtendedKalmanFilter(Estimator):
             states=states,
             covariances=honest,
             status=_status(run.record.used),
-            whitened=whitened,
+            innovations={"position": whitened, **run.innovations},
+            world=self.world,
             coefficient_names=tuple(self.settings.coefficients),
             coefficients=mean[-1, STATE_DIM:],
             coefficient_covariance=covariance[-1, STATE_DIM:, STATE_DIM:],
@@ -200,6 +226,9 @@ class _Run:
         self.flight_noise = owner.settings.process.flight(np.diff(track.times))
         self.means = coefficient_means(owner.model, owner.settings)
         self.skipped: set[int] = set()
+        context = Context(track, owner.model, owner.settings, self.sigma)
+        self.beside = [(one, one.batch(context)) for one in track.observations if not one.locates]
+        self.innovations = {one.name: np.full((len(batch), batch.dim), np.nan) for one, batch in self.beside}
         self.record = FilterRecord.empty(len(track), STATE_DIM + len(self.means))
         with np.errstate(over="ignore", invalid="ignore"):  # ends in Status.FAILED
             self._filter()
@@ -260,7 +289,7 @@ class _Run:
         record.start = start
         record.quality[:first] = Quality.OUTLIER
         self.skipped.update(range(first + 1, second))
-        ball = _BallFilter(owner.trackwise, owner.surfaces, mean, covariance)
+        ball = _BallFilter(owner.ball, owner.surfaces, mean, covariance)
         self._store(ball, start, used=True)
         return ball
 
@@ -318,8 +347,16 @@ class _Run:
         used = not self.settings.find_events or k - 1 in self.record.hits or bool(whitened @ whitened <= GATE)
         if used:
             ball.correct(measured)
+        self._correct_beside(ball, k)
         self._store(ball, k, used)
         return used
+
+    def _correct_beside(self, ball: _BallFilter, k: int) -> None:
+        """Update with everything else that was measured at sample k."""
+        for observation, batch in self.beside:
+            for row in observation.filter_rows(batch, k):
+                one = batch.taken(np.array([row]))
+                self.innovations[observation.name][row] = ball.correct_by(one, self.settings.find_events)
 
     def _store(self, ball: _BallFilter, k: int, used: bool) -> None:
         self.record.mean[k] = ball.x

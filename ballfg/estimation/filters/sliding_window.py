@@ -6,6 +6,7 @@ Roto-Translational Invariant Representations", section IV: the average velocity 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import combinations
 
 import numpy as np
@@ -19,6 +20,7 @@ from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import WINDOW
 from ballfg.estimation.result import Array, Estimate, Status
 from ballfg.estimation.settings import sample_sigmas, spin_start
+from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
 from ballfg.tracks import Track
 
@@ -48,8 +50,9 @@ class SlidingWindow(Estimator):
 
     name = "sliding-window"
 
-    def estimate(self, track: Track) -> Estimate:
-        """The states of a track; a single sample has no velocity and the status says so."""
+    def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
+        """The states of a track, from its positions alone; a single sample has no velocity and the status says so."""
+        track = self.prepared(track, factors)
         n = len(track)
         sigma = sample_sigmas(self.settings, n, track.sigmas)
         first = np.maximum(np.arange(n) - WINDOW + 1, 0)
@@ -72,7 +75,8 @@ class SlidingWindow(Estimator):
             states=states,
             covariances=covariances,
             status=Status.OK if n > 1 else Status.NO_VELOCITY,
-            whitened=np.full((n, 3), np.nan),
+            innovations={"position": np.full((n, 3), np.nan)},
+            world=self.world,
             cross_covariances=np.zeros((n, STATE_DIM, 0)),
         )
 

@@ -6,6 +6,7 @@ track is shifted by h(x) - p(x), x the states that the smoother finds in the shi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -26,10 +27,10 @@ from ballfg.estimation.measurement.as_measured import (
     true_times,
     written_time,
 )
-from ballfg.estimation.observations.sighted import SightedTrack
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import Settings, sample_sigmas
 from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks import SPIN_LABELS, Track
 
@@ -60,7 +61,7 @@ class Undone:
     settled: bool
 
 
-class ThroughMeasurement(Estimator):
+class InvertMeasurement(Estimator):
     """An estimator of true states from what a model with measurement effects has written down.
 
     Stamps of the result are as written, its states are true. The shift of a sample is found by the smoother for all
@@ -73,10 +74,11 @@ class ThroughMeasurement(Estimator):
         kind: the estimator.
         model: the ball, with measurement effects.  surfaces: what it may bounce on.  settings: noise and priors.
 
-    Raises: ValueError: if the model's spin labels do not tell the spin; from `estimate`, for a `SightedTrack`.
+    Raises: ValueError: if the model's spin labels do not tell the spin; from `estimate`, for a track whose
+        positions are rough.
     """
 
-    name = "through-measurement"
+    name = "invert-measurement"
     undoes_measurement = True
 
     def __init__(self, kind: type[Estimator], model: BallModel, surfaces: Surfaces, settings: Settings) -> None:
@@ -87,9 +89,9 @@ class ThroughMeasurement(Estimator):
         self.smoother = Smoother(plain, surfaces, own)
         self.inner = self.smoother if kind is Smoother else kind(plain, surfaces, own)
 
-    def estimate(self, track: Track) -> Estimate:
+    def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
         """The true states at the written stamps; `NOT_CONVERGED` where the shifts did not settle."""
-        undone = self.undo(track)
+        undone = self.undo(self.prepared(track, factors))
         found = undone.estimate if self.inner is self.smoother else self.inner.estimate(undone.track)
         lost = found.status is Status.OK and not undone.settled
         contacts = (replace(c, time=written_time(self.model, float(track.times[0]), c.time)) for c in found.contacts)
@@ -97,12 +99,13 @@ class ThroughMeasurement(Estimator):
             found,
             times=track.times,
             contacts=tuple(contacts),
+            world=self.world,
             status=Status.NOT_CONVERGED if lost else found.status,
         )
 
     def undo(self, track: Track) -> Undone:
         """The track as it happened, and what the smoother makes of it; of shifts that do not settle, the steadiest."""
-        if isinstance(track, SightedTrack):
+        if track.rough:
             raise ValueError(
                 "model must have no measurement effects for a track that cameras saw: they act on positions, and there "
                 "are none. Leave the model's section measurement empty, or estimate from positions."

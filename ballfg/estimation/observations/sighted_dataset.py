@@ -5,12 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
+from typing import Final
 
-from ballfg.estimation.observations.sighted import NeverSeenByTwoError, SightedTrack, sighted_track
+from ballfg.estimation.observations.sightings import NeverSeenByTwoError, sighted_track
 from ballfg.tracks.detections_file import DETECTIONS_FILE, read_sightings
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
 from ballfg.tracks.sightings import Sightings
+from ballfg.tracks.track import Track
 from ballfg.vision.camera import Camera
 from ballfg.vision.camera_file import CAMERAS_FILE, read_cameras
 
@@ -24,6 +26,9 @@ class SightedDataset:
         cameras: of the rig.
         notes: what was ignored or left out, one sentence each.
     """
+
+    rough: Final = True
+    """The positions of the tracks are made from the sightings."""
 
     def __init__(
         self,
@@ -48,7 +53,7 @@ class SightedDataset:
     def __len__(self) -> int:
         return len(self._tracks)
 
-    def __iter__(self) -> Iterator[SightedTrack]:
+    def __iter__(self) -> Iterator[Track]:
         return iter(self._tracks.values())
 
     def __repr__(self) -> str:

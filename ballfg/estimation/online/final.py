@@ -15,7 +15,6 @@ from ballfg.estimation.online.window import Window
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation import Contact, Segmentation
 from ballfg.estimation.settings import Settings
-from ballfg.estimation.smoother.problem import effective_sigmas
 from ballfg.estimation.smoother.smoother import Earlier, Smoother
 from ballfg.factors.batch import COEFFICIENTS, Array, FactorBatch, Index, Values
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
@@ -93,10 +92,10 @@ def final_estimate(
     """
     first = window.first
     part = track if first == 0 else track.between(float(track.times[first]), float(track.times[-1]))
-    sigma = effective_sigmas(part, found, smoother.settings)
     values = Values(window.states, window.coefficients)
     summaries = [LinearFactors(factor, values, first) for factor in (window.shared if first else [])]
-    late = smoother.result(part, sigma, smoother.solve(part, found, sigma, Earlier(values, summaries)))
+    problem = smoother.problem(part, found)
+    late = smoother.result(problem, smoother.solve(problem, Earlier(values, summaries)))
     if not frozen:
         return late
     joints = np.array([f.joint for f in frozen])

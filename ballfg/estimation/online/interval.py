@@ -10,7 +10,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import steps_over
 from ballfg.estimation.smoother.motion import FLIGHT, Motion
@@ -27,7 +26,7 @@ class Interval:
     """One linked interval: its factor, and the last answer that its torch batch gave.
 
     Args:
-        kind: one row, between states i and i + 1 of the stream.
+        batch: one row, between states i and i + 1 of the stream.
         motion: what happens.
         covariance: (9, 9) of the process noise.
 
@@ -36,15 +35,15 @@ class Interval:
         group: intervals of one group can be evaluated together.
     """
 
-    def __init__(self, kind: DynamicsFactors, motion: Motion, covariance: Array) -> None:
-        self.kind = kind
+    def __init__(self, batch: DynamicsFactors, motion: Motion, covariance: Array) -> None:
+        self.batch = batch
         self.motion = motion
         self.covariance = covariance
-        self.index = int(kind.variables[0, 0])
-        self.bridge = Bridge(kind, on_miss="row")
+        self.index = int(batch.variables[0, 0])
+        self.bridge = Bridge(batch, on_miss="row")
         self.slot: int | None = None
-        steps = 1 if motion.heights else steps_over(float(kind.dt[0]))
-        self.group = (type(kind), len(motion.heights), steps)
+        steps = 1 if motion.heights else steps_over(float(batch.dt[0]))
+        self.group = (type(batch), len(motion.heights), steps)
 
 
 class IntervalMaker:
@@ -68,25 +67,25 @@ class IntervalMaker:
             return self._flight(index, dt)
         states, duration = np.array([index]), np.array([dt])
         covariance = motion.covariance(duration, self.noise)
-        kind: DynamicsFactors
+        batch: DynamicsFactors
         if motion.heights:
-            kind = ContactFactors(self.model, states, duration, covariance, np.array([motion.heights]))
+            batch = ContactFactors(self.model, states, duration, covariance, np.array([motion.heights]))
         elif motion.rest is not None:
-            kind = RestFactors(self.model, states, duration, covariance, np.array([motion.rest]))
+            batch = RestFactors(self.model, states, duration, covariance, np.array([motion.rest]))
         else:
-            kind = FlightFactors(self.model, states, duration, covariance)
-        return Interval(kind, motion, covariance[0])
+            batch = FlightFactors(self.model, states, duration, covariance)
+        return Interval(batch, motion, covariance[0])
 
     def _flight(self, index: int, dt: float) -> Interval:
         scale = np.empty(STATE_DIM)
         scale[POSITION] = self.noise.acceleration * math.sqrt(dt**3 / 3)
         scale[VELOCITY] = self.noise.acceleration * math.sqrt(dt)
         scale[SPIN] = self.noise.spin * math.sqrt(dt)
-        kind = copy.copy(self._template)
-        kind.variables = kind.variables.copy()
-        kind.variables[0, :2] = index, index + 1
-        kind.dt, kind.whitening = np.array([dt]), self._root / scale
-        return Interval(kind, FLIGHT, self._correlation * (scale[:, None] * scale))
+        batch = copy.copy(self._template)
+        batch.variables = batch.variables.copy()
+        batch.variables[0, :2] = index, index + 1
+        batch.dt, batch.whitening = np.array([dt]), self._root / scale
+        return Interval(batch, FLIGHT, self._correlation * (scale[:, None] * scale))
 
 
 def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coefficients: Array) -> tuple[list[Array], int]:
@@ -105,7 +104,7 @@ def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coeffici
         groups.setdefault(interval.group, []).append(k)
     result: list[Array] = [np.empty(0)] * len(intervals)
     for members in groups.values():
-        batch = merge([intervals[k].kind for k in members])
+        batch = merge([intervals[k].batch for k in members])
         point = np.empty((len(members), STATE_DIM + len(coefficients)))
         point[:, :STATE_DIM], point[:, STATE_DIM:] = start[members], coefficients
         moved, jacobian = batch.propagate(torch.from_numpy(point), slice(None))
@@ -123,7 +122,7 @@ def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coeffici
 
 def store(interval: Interval, start: Array, after: Array, coefficients: Array, piece: Array) -> None:
     """Whiten one interval's propagation and keep it for iSAM2's question; `piece` as from `evaluate`."""
-    _keep(interval, _whitened(interval.kind, piece[None], start[None], after[None], coefficients), 0)
+    _keep(interval, _whitened(interval.batch, piece[None], start[None], after[None], coefficients), 0)
 
 
 Answers = tuple[tuple[Array, ...], Array, tuple[Array, ...]]
@@ -145,8 +144,3 @@ def _whitened(batch: DynamicsFactors, pieces: Array, start: Array, after: Array,
 def _keep(interval: Interval, answers: Answers, row: int) -> None:
     inputs, residual, blocks = answers
     interval.bridge.keep(0, tuple([x[row] for x in inputs]), residual[row], tuple([j[row] for j in blocks]))
-
-
-def coefficient_count(model: BallModel) -> int:
-    """How many coefficients are estimated with the states."""
-    return len(model.names) if isinstance(model, AugmentedModel) else 0

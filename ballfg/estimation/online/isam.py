@@ -16,13 +16,14 @@ from numpy.typing import NDArray
 
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.launcher import SpinLabel
-from ballfg.estimation.online.interval import Interval, IntervalMaker, coefficient_count, evaluate, store
-from ballfg.estimation.online.sighting import Sighting, prepare
+from ballfg.estimation.online.interval import Interval, IntervalMaker, evaluate, store
+from ballfg.estimation.online.measurement import Measurement, prepare
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.motion import FLIGHT, Motion
 from ballfg.estimation.smoother.problem import coefficient_means, start_priors
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
+from ballfg.factors.dynamics import model_width
 from ballfg.factors.position import PositionFactors
 from ballfg.factors.prior import coefficient_prior
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
@@ -54,8 +55,9 @@ class Sample:
         factor: multiple of that with which it takes part.
         motion: how the ball got here from the sample before.
         label: what is known of the spin, on the first sample of a track.
-        slots: where iSAM2 keeps the sample's own factors: what was measured first, then priors.
-        sightings: what cameras saw at this moment; where there are some, the position only helps to find events.
+        slots: where iSAM2 keeps the sample's own factors: its position's first, where it was measured.
+        measured: whether the position was measured; if not, it was made from the measurements and helps to find events.
+        measurements: everything else that was measured at this moment.
     """
 
     time: float
@@ -65,7 +67,8 @@ class Sample:
     motion: Motion = FLIGHT
     label: SpinLabel | None = None
     slots: tuple[int, ...] = ()
-    sightings: list[Sighting] = field(default_factory=list)
+    measured: bool = True
+    measurements: list[Measurement] = field(default_factory=list)
 
     @property
     def sigma(self) -> Array:
@@ -78,7 +81,7 @@ class Update:
     """What one update did.
 
     Attributes:
-        innovation: (3,) whitened, (2,) of a sighting; NaN where nothing predicted the sample.
+        innovation: (dim,) whitened, of the position or of what stands for it; NaN where nothing predicted the sample.
         evaluated: factors of the motion evaluated, the new one among them.
         calls: torch calls for them.
         variables: states that iSAM2 eliminated again.
@@ -112,7 +115,7 @@ class IncrementalWindow:
         self.settings = settings
         self.position_sigma = position_sigma
         self.maker = IntervalMaker(model, settings.process)
-        self.p = coefficient_count(model)
+        self.p = model_width(model)
         self._own_means = coefficient_means(model.model, settings) if self.p else np.zeros(0)  # type: ignore[arg-type]
         self._own_sigmas = np.array(list(settings.coefficients.values()))
         self.first = 0
@@ -186,10 +189,10 @@ class IncrementalWindow:
         It is the new state's linearisation point only: closer to the final answer than the prediction, it saves
         relinearisations, and a robust loss gets a weight near the one that it ends with.
         """
-        if sample.sightings:
-            for sighting in sample.sightings:
-                predicted, covariance = sighting.corrected(predicted, covariance)
-            return predicted, sample.sightings[0].innovation
+        if not sample.measured:
+            for measurement in sample.measurements:
+                predicted, covariance = measurement.corrected(predicted, covariance)
+            return predicted, sample.measurements[0].innovation
         innovation = sample.position - predicted[POSITION]
         noise = np.diag(sample.sigma**2)
         inverse = np.linalg.inv(np.linalg.cholesky(covariance[POSITION, POSITION] + noise))
@@ -199,7 +202,13 @@ class IncrementalWindow:
             weight = self.settings.loss.weight(np.array([np.linalg.norm(whitened)]))
             spread = covariance[POSITION, POSITION] + noise / weight
             pull = np.asarray(np.linalg.solve(spread, innovation), dtype=np.float64)
-        return predicted + covariance[:, POSITION] @ pull, whitened
+        state = predicted + covariance[:, POSITION] @ pull
+        if sample.measurements:
+            gain = np.linalg.solve(covariance[POSITION, POSITION] + noise, covariance[POSITION]).T
+            covariance = covariance - gain @ covariance[POSITION]
+            for measurement in sample.measurements:
+                state, covariance = measurement.corrected(state, covariance)
+        return state, whitened
 
     def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
         """Do ahead what iSAM2 will do: move the states whose solution left the thresholds, evaluate their factors.
@@ -215,8 +224,8 @@ class IncrementalWindow:
         if shared:
             self.coefficient_theta = self.coefficient_theta + self.coefficient_delta
             self.coefficient_delta = np.zeros(self.p)
-        seen = [(sighting, k) for k in np.flatnonzero(moved) for sighting in self.samples[k].sightings]
-        prepare([sighting for sighting, _ in seen], self.theta[[k for _, k in seen]])
+        seen = [(measurement, k) for k in np.flatnonzero(moved) for measurement in self.samples[k].measurements]
+        prepare([measurement for measurement, _ in seen], self.theta[[k for _, k in seen]])
         either = moved[:-1] | moved[1:] | shared
         touched = [interval for k in np.flatnonzero(either) if (interval := self.intervals[k]) is not None]
         begins = [interval.index - self.first for interval in touched]
@@ -244,7 +253,7 @@ class IncrementalWindow:
         graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
         if interval is not None:
             graph.push_back(interval.bridge.factor(0))
-        prepare(sample.sightings, np.tile(state, (len(sample.sightings), 1)))
+        prepare(sample.measurements, np.tile(state, (len(sample.measurements), 1)))
         for factor in self._measured(sample, key - STATE_KEY):
             graph.push_back(factor)
         for prior in priors:
@@ -269,9 +278,8 @@ class IncrementalWindow:
 
     def _measured(self, sample: Sample, state: int) -> list[gtsam.NonlinearFactor]:
         """The factors of what was measured at a sample."""
-        if sample.sightings:
-            return [sighting.factor(state) for sighting in sample.sightings]
-        return [self._position_factor(sample, state)]
+        position = [self._position_factor(sample, state)] if sample.measured else []
+        return position + [measurement.factor(state) for measurement in sample.measurements]
 
     def _position_factor(self, sample: Sample, state: int) -> gtsam.NonlinearFactor:
         """The observation's factor; without a robust loss it is linear, and GTSAM never has to ask for it."""
@@ -282,8 +290,8 @@ class IncrementalWindow:
             origin = gtsam.Values()
             origin.insert(STATE_KEY + state, np.zeros(STATE_DIM))
             return gtsam.LinearContainerFactor(factor, origin)
-        kind = PositionFactors(np.array([state]), sample.position[None], sample.sigma[None], self.settings.loss)
-        return Bridge(kind, "row").factor(0)
+        batch = PositionFactors(np.array([state]), sample.position[None], sample.sigma[None], self.settings.loss)
+        return Bridge(batch, "row").factor(0)
 
     def _update(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int], last: dict[int, int]

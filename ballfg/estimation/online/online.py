@@ -11,11 +11,11 @@ from numpy.typing import ArrayLike, NDArray
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
-from ballfg.estimation.observations.sighted import SightedTrack
+from ballfg.estimation.observations.observation import Context, Observation
 from ballfg.estimation.online.events import SIGMA_FACTOR, EventTracker, contact_step, first_difference
 from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unknown
 from ballfg.estimation.online.isam import Sample, Update
-from ballfg.estimation.online.sighting import Sighting
+from ballfg.estimation.online.measurement import Measurement
 from ballfg.estimation.online.stream import SightingStream
 from ballfg.estimation.online.window import Window
 from ballfg.estimation.result import Estimate, Status
@@ -24,7 +24,8 @@ from ballfg.estimation.settings import Settings, sample_sigmas
 from ballfg.estimation.smoother.motion import FLIGHT, Motion, motions_of
 from ballfg.estimation.smoother.problem import trackwise_model
 from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.state import STATE_DIM
+from ballfg.factors.batch import FactorBatch
+from ballfg.prediction.state import BallState
 from ballfg.tracks import Track
 from ballfg.vision.camera import Camera
 
@@ -38,16 +39,12 @@ YOUNG = 20
 """Samples after a contact in which the estimate may still move it to another interval."""
 
 
-@dataclass(frozen=True)
-class OnlineState:
-    """What is known after an observation.
+@dataclass(frozen=True, kw_only=True, repr=False)
+class OnlineState(BallState):
+    """The state of the ball after a measurement, and what the update did.
 
     Attributes:
-        time: s.
-        state: (9,) position m, velocity m/s, spin rad/s, of the ball at that time.
-        covariance: (9, 9).
-        coefficients: (p,) of the model, where they are estimated.
-        innovation: (3,) the observation against its prediction, whitened, (2,) of a sighting; NaN where nothing
+        innovation: (3,) the position against its prediction, whitened, (2,) of a sighting; NaN where nothing
             predicted it.
         motion: how the ball got here from the last observation.
         revised: how many of the last samples were taken back and explained anew.
@@ -56,10 +53,6 @@ class OnlineState:
         status: OK, or what to try.
     """
 
-    time: float
-    state: Array
-    covariance: Array
-    coefficients: Array
     innovation: Array
     motion: Motion
     revised: int
@@ -104,7 +97,7 @@ class Online(Estimator):
                 "passed. Find the offsets beforehand with estimate_time_offsets and give the cameras that it returns."
             )
         self.cameras = tuple(cameras)
-        self.trackwise = trackwise_model(model, settings)
+        self.ball = trackwise_model(model, settings)
         self.physics = physics_of(model)
         self.lag = lag
         self.reset()
@@ -118,13 +111,20 @@ class Online(Estimator):
         self._frozen: list[Frozen] | None = None  # states that left the window, where someone asks for them
         self._counts = np.zeros(2, dtype=np.int64)
 
-    def push(self, time: float, position: ArrayLike, sigma: ArrayLike | None = None) -> OnlineState:
-        """Take in an observation.
+    def push(
+        self,
+        time: float,
+        position: ArrayLike,
+        sigma: ArrayLike | None = None,
+        observations: Sequence[Observation] = (),
+    ) -> OnlineState:
+        """Take in a measured position, and what else was measured at that time.
 
         Args:
             time: s, later than the last.
             position: (3,) m.
             sigma: (3,) m, its standard deviation; the settings' where None.
+            observations: of this moment, as of a track with this one sample: `RadarSpeed(0, 6.2, 0.1)`, for instance.
         Returns: the newest state. It is valid for good; the window's own arrays move on.
         Raises: ValueError: if the time does not increase, or a number is not finite.
         """
@@ -133,9 +133,14 @@ class Online(Estimator):
         point = np.array(position, dtype=np.float64)
         if not (np.isfinite(spread) & (spread > 0.0)).all():
             raise ValueError(f"sigma must be positive and finite, in m; got {sigma!r}. Leave it out if it is unknown.")
-        if self._samples and self._samples[-1].sightings:
+        if self._samples and not self._samples[-1].measured:
             raise ValueError("push must not follow push_sighting in one stream; call reset in between.")
-        return self._observe(Sample(float(time), point, spread))
+        sample = Sample(float(time), point, spread)
+        if observations:
+            moment = Track("stream", np.array([sample.time]), point[None], spread[None])
+            beside = self._measurements(moment.observed(*observations))
+            sample.measurements += [measurement for found in beside.values() for _, measurement in found]
+        return self._observe(sample)
 
     def push_sighting(self, time: float, camera: str, pixel: ArrayLike, covariance: ArrayLike) -> OnlineState | None:
         """Take in what one camera saw, at its own stamp.
@@ -151,7 +156,7 @@ class Online(Estimator):
         """
         if self._stream is None:
             raise ValueError("cameras must be given to use push_sighting; got none. Pass them to Online.")
-        if self._samples and not self._samples[-1].sightings:
+        if self._samples and self._samples[-1].measured:
             raise ValueError("push_sighting must not follow push in one stream; call reset in between.")
         samples, joined = self._stream.take(float(time), camera, pixel, covariance)
         if joined is not None:
@@ -165,7 +170,7 @@ class Online(Estimator):
         """Take in a sample."""
         changed = self.events.push(sample.time, sample.position, sample.stated)  # also checks the numbers
         if self.window is None:
-            self.window = Window(self.trackwise, self.settings, float(sample.stated.min()))
+            self.window = Window(self.ball, self.settings, float(sample.stated.min()))
         self._counts[:] = 0
         self._samples.append(sample)
         status, rebuilt = Status.OK if len(self._samples) > 1 else Status.NO_VELOCITY, False
@@ -176,12 +181,12 @@ class Online(Estimator):
             status, update = self._repair(error, status)
         return self._state(self.window, self._samples[-1], update, revised, rebuilt, status)
 
-    def _join(self, sighting: Sighting) -> OnlineState:
+    def _join(self, sighting: Measurement) -> OnlineState:
         """Take in one more sighting of the newest sample."""
         assert self.window is not None
         self._counts[:] = 0
         status, rebuilt, sample = Status.OK, False, self._samples[-1]
-        sample.sightings.append(sighting)
+        sample.measurements.append(sighting)
         try:
             update = self.window.attach(sighting)
         except (RuntimeError, ValueError) as error:
@@ -214,8 +219,8 @@ class Online(Estimator):
         times, positions = np.array([s.time for s in samples]), np.array([s.position for s in samples])
         segmentation = self.events.segmentation(window.first, times, positions)
         motions = motions_of(self.events.moved(segmentation, window.first), times)
-        sighted = np.array([bool(s.sightings) for s in samples])
-        factors = np.where(sighted, 1.0, SIGMA_FACTOR[segmentation.quality])  # the loss sets wrong sightings aside
+        measured = np.array([s.measured for s in samples])
+        factors = np.where(measured, SIGMA_FACTOR[segmentation.quality], 1.0)  # the loss sets wrong sightings aside
         settled = max(held - LATEST_CHANGE, 0)
         motions[: max(settled - 1, 0)] = [s.motion for s in samples[1:settled]]
         factors[:settled] = [s.factor for s in samples[:settled]]
@@ -268,7 +273,7 @@ class Online(Estimator):
                 self._frozen += [unknown(s, self.settings, self.window.p) for s in self._samples[:-1]]
             first = self.window.first + len(self._samples) - 1
             newest = replace(self._samples[-1], motion=FLIGHT, slots=())
-        self.window = Window(self.trackwise, self.settings, float(newest.stated.min()))
+        self.window = Window(self.ball, self.settings, float(newest.stated.min()))
         self.window.first = first
         self._samples = [newest]
         try:
@@ -281,9 +286,11 @@ class Online(Estimator):
     ) -> OnlineState:
         return OnlineState(
             time=sample.time,
-            state=window.theta[-1] + window.delta[-1],
-            covariance=window.newest_covariance[:STATE_DIM, :STATE_DIM].copy(),
-            coefficients=window.coefficients,
+            mean=np.concatenate((window.theta[-1] + window.delta[-1], window.coefficients)),
+            joint=window.newest_covariance.copy(),
+            coefficient_names=tuple(self.settings.coefficients),
+            world=self.world,
+            name="stream",
             innovation=update.innovation,
             motion=sample.motion,
             revised=revised,
@@ -293,25 +300,29 @@ class Online(Estimator):
             status=status,
         )
 
-    def estimate(self, track: Track) -> Estimate:
+    def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
         """The states of a track: all samples pushed, then the window minimised to a tight tolerance.
 
-        States that left the window before the end are as they were when they left it. `whitened` are the
-        innovations of the pushes. In a `SightedTrack` events are found in its positions; all else rests on sightings.
+        States that left the window before the end are as they were when they left it. The innovations are those of the
+        pushes. Events are found in the positions, also where these are rough.
         """
+        track = self.prepared(track, factors)
         self.reset()
         self._frozen = []
         label = self.settings.spin_label(track)
         sigma = sample_sigmas(self.settings, len(track), track.sigmas)
         samples = [
-            Sample(float(t), position, spread, label=label if k == 0 else None)
+            Sample(float(t), position, spread, label=label if k == 0 else None, measured=not track.rough)
             for k, (t, position, spread) in enumerate(zip(track.times, track.positions, sigma, strict=True))
         ]
-        sightings = self._sightings(track) if isinstance(track, SightedTrack) else []
-        for k, sighting in sightings:
-            samples[k].sightings.append(sighting)
+        beside = self._measurements(track)
+        for measurements in beside.values():
+            for k, measurement in measurements:
+                samples[k].measurements.append(measurement)
         states = [self._observe(sample) for sample in samples]
-        innovations = [sighting.innovation for _, sighting in sightings] or [state.innovation for state in states]
+        innovations = {} if track.rough else {"position": np.array([state.innovation for state in states])}
+        for name, measurements in beside.items():
+            innovations[name] = np.array([measurement.innovation for _, measurement in measurements])
         assert self.window is not None
         smoother = Smoother(self.model, self.surfaces, self.settings)
         first = self.window.first
@@ -321,11 +332,18 @@ class Online(Estimator):
         self.reset()
         lost = any(state.status is Status.FAILED for state in states)
         status = Status.NOT_CONVERGED if lost else result.status
-        return replace(result, whitened=np.array(innovations), status=status)
+        return replace(result, innovations=innovations, status=status)
 
-    def _sightings(self, track: SightedTrack) -> list[tuple[int, Sighting]]:
-        """The sightings of a track, each with the number of its sample."""
-        seen = track.sightings
-        rows = zip(track.state.tolist(), seen.camera.tolist(), seen.pixels, seen.covariances, track.delay, strict=True)
-        loss = self.settings.sighting_loss
-        return [(k, Sighting(track.bank, camera, z, r, float(d), loss)) for k, camera, z, r, d in rows]
+    def _measurements(self, track: Track) -> dict[str, list[tuple[int, Measurement]]]:
+        """What was measured beside positions, by name of the observation: each with the number of its sample."""
+        context = Context(track, self.model, self.settings, sample_sigmas(self.settings, len(track), track.sigmas))
+        found = {}
+        for observation in track.observations:
+            batch = observation.batch(context)
+            if batch.variables.shape[1] > 1:
+                raise ValueError(
+                    f"track {track.name!r}: the estimator 'online' takes observations of one state each; "
+                    f"'{observation.name}' looks at other variables too. Use the smoother."
+                )
+            found[observation.name] = [(k, Measurement(one)) for k, one in observation.single_rows(batch)]
+        return found

@@ -14,10 +14,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ballfg.estimation.observations.sighted import LOOSE, SAME_MOMENT, filled
-from ballfg.estimation.observations.sighted_path import AROUND, BEFORE, Path, Rays, rough_path
+from ballfg.estimation.observations.ray_path import AROUND, BEFORE, Path, Rays, rough_path
+from ballfg.estimation.observations.sightings import LOOSE, SAME_MOMENT, filled
 from ballfg.estimation.online.isam import Sample
-from ballfg.estimation.online.sighting import Sighting
+from ballfg.estimation.online.measurement import Measurement
+from ballfg.factors.camera import CameraFactors
 from ballfg.factors.loss import Loss
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.camera import Camera
@@ -55,7 +56,7 @@ class SightingStream:
 
     def take(
         self, time: float, camera: str, pixel: ArrayLike, covariance: ArrayLike
-    ) -> tuple[list[Sample], Sighting | None]:
+    ) -> tuple[list[Sample], Measurement | None]:
         """Take in a sighting.
 
         Args: as those of `Online.push_sighting`.
@@ -82,15 +83,23 @@ class SightingStream:
         self._rays = ray if self._rays is None else self._rays.joined(ray, MOST_RAYS, self._period(true))
         joins = self._newest is not None and true - self._newest.time <= SAME_MOMENT
         base = self._newest.time if joins and self._newest is not None else true
-        sighting = Sighting(self.bank, number, row.pixels[0], row.covariances[0], true - base, self.loss)
+        sighting = self._measurement(row, true - base)
         if joins and self._newest is not None:
             if not self._held:
                 return [], sighting
-            self._newest.sightings.append(sighting)
+            self._newest.measurements.append(sighting)
         else:
-            self._newest = Sample(true, np.zeros(3), np.ones(3), sightings=[sighting])
+            self._newest = Sample(true, np.zeros(3), np.ones(3), measured=False, measurements=[sighting])
             self._held.append(self._newest)
         return self._placed(), None
+
+    def _measurement(self, row: Sightings, delay: float) -> Measurement:
+        """One sighting, `delay` s later than its sample."""
+        where = np.zeros(1, dtype=np.int64)
+        factors = CameraFactors(
+            where, row.camera, row.pixels, row.covariances, self.bank, np.array([delay]), loss=self.loss
+        )
+        return Measurement(factors)
 
     def _period(self, now: float) -> float:
         """s, of the slowest camera that sees the ball."""

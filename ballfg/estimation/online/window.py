@@ -6,7 +6,7 @@ import gtsam
 import numpy as np
 
 from ballfg.estimation.online.isam import IncrementalWindow, Sample, Update
-from ballfg.estimation.online.sighting import Sighting, prepare
+from ballfg.estimation.online.measurement import Measurement, prepare
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
 from ballfg.state import STATE_DIM
 
@@ -31,23 +31,23 @@ class Window(IncrementalWindow):
         self.theta = self.theta[:count]
         self._read_back()
 
-    def attach(self, sighting: Sighting) -> Update:
-        """One more sighting of the newest sample, which holds it already.
+    def attach(self, measurement: Measurement) -> Update:
+        """One more measurement of the newest sample, which holds it already.
 
         Raises: RuntimeError or ValueError: as `append`.
         """
         _, count, calls = self._relinearize(None)
-        sighting.corrected(self.states[-1], self.newest_covariance[:STATE_DIM, :STATE_DIM])
-        prepare([sighting], self.theta[-1:])
+        measurement.corrected(self.states[-1], self.newest_covariance[:STATE_DIM, :STATE_DIM])
+        prepare([measurement], self.theta[-1:])
         newest = STATE_KEY + self.first + len(self.samples) - 1
         graph = gtsam.NonlinearFactorGraph()
-        graph.push_back(sighting.factor(newest - STATE_KEY))
+        graph.push_back(measurement.factor(newest - STATE_KEY))
         last = {newest: 1, COEFFICIENT_KEY: 2} if self.p and len(self.theta) > 1 else {}
         slots = self._update(graph, gtsam.Values(), [], last)
         sample = self.samples[-1]
-        sample.slots = (*slots, *sample.slots)
+        sample.slots = (*sample.slots, *slots)
         self._read_back()
-        return Update(sighting.innovation, count, calls, int(self._result.getVariablesReeliminated()))
+        return Update(measurement.innovation, count, calls, int(self._result.getVariablesReeliminated()))
 
     def reweigh(self, numbers: list[int]) -> None:
         """Put in anew the factors of the positions of some samples of the window, whose noise has changed."""

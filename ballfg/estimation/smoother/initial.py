@@ -14,6 +14,7 @@ from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.segmentation import Contact, Quality, Segmentation
 from ballfg.factors.batch import Values
+from ballfg.factors.dynamics import model_width
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
 from ballfg.tracks import Track
 
@@ -94,7 +95,7 @@ def move_contacts(
         if interval - 1 in changed:
             continue  # the contact came from there or went there; the state after both is right already
         heights = tuple(height for i, height in new if i == interval)
-        start = torch.from_numpy(np.concatenate((states[interval], values.coefficients))[None])
+        start = torch.from_numpy(np.concatenate((states[interval], values.coefficients[: model_width(model)]))[None])
         gap = float(model.gap(start, heights[0])[0].detach()) if heights else 0.0
         if gap < 0.0 < states[interval, VZ]:  # it was on the way up, from below: before the contact it mirrors that
             states[interval, [Z, VZ]] -= (2.0 * gap, 2.0 * states[interval, VZ])

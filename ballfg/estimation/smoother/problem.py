@@ -1,9 +1,8 @@
-"""From a track and the events in it to a factor graph.
+"""The problem of one track: its observations, and the factor graph that they and the events in the track make.
 
 Every interval between two samples gets one dynamics factor: free flight, flight through the contacts found in it, or
 rest on a surface; a hit adds its jump to the process noise. An interval that nothing links (a long gap with a hit in
-it) gets none. Every sample gets a position factor, or in a track that cameras saw every sighting a camera factor; the
-first state of each linked piece gets a prior.
+it) gets none. Every observation of the track gives its factors; the first state of each linked piece gets a prior.
 """
 
 from __future__ import annotations
@@ -18,18 +17,25 @@ from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import steps_over
 from ballfg.estimation.launcher import SpinLabel
-from ballfg.estimation.observations.sighted import SightedTrack
+from ballfg.estimation.observations.observation import Context, Observation, Unknowns, unknowns_of
+from ballfg.estimation.observations.positions import observations_of
 from ballfg.estimation.segmentation import Contact, Quality, Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start
 from ballfg.estimation.smoother.motion import motions_of
 from ballfg.factors.batch import FactorBatch, Values
-from ballfg.factors.camera import FIXED, CameraFactors
-from ballfg.factors.dynamics import ContactFactors, FlightFactors, RestFactors
+from ballfg.factors.covariance import Covariances
+from ballfg.factors.dynamics import ContactFactors, FlightFactors, RestFactors, model_width
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.noise import Kicks
-from ballfg.factors.position import PositionFactors
-from ballfg.factors.prior import CoefficientPriorFactors, PriorFactors, spin_label, spin_prior, state_prior
+from ballfg.factors.prior import (
+    CoefficientPriorFactors,
+    PriorFactors,
+    coefficient_prior,
+    spin_label,
+    spin_prior,
+    state_prior,
+)
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 
@@ -49,41 +55,15 @@ class Events:
     segmentation: Segmentation
 
 
-def trackwise_model(model: BallModel, settings: Settings, track: Track | None = None) -> BallModel:
-    """The model, augmented by the coefficients that are estimated for each track.
-
-    Args:
-        model: the ball.
-        settings: name the coefficients, and the cameras whose time offsets are estimated.
-        track: for one that cameras saw, these offsets are among the coefficients.
-    Raises: ValueError: if the settings name a camera that the track does not have.
-    """
-    offsets = {}
-    if isinstance(track, SightedTrack):
-        names = track.sightings.cameras
-        for name in settings.time_offsets:
-            if name not in names:
-                raise ValueError(f"time_offsets must name cameras of the track, {', '.join(names)}; got {name!r}")
-            offsets[PASSENGER + name] = -float(track.moved[names.index(name)])
-    plain = not (settings.coefficients or offsets)
-    return model if plain else AugmentedModel(model, tuple(settings.coefficients), offsets)
-
-
-PASSENGER = "time_offset."
-"""What the name of a camera's time offset begins with among the passengers of an `AugmentedModel`."""
+def trackwise_model(model: BallModel, settings: Settings) -> BallModel:
+    """The model, augmented by the coefficients that are estimated for each track."""
+    return AugmentedModel(model, tuple(settings.coefficients)) if settings.coefficients else model
 
 
 def coefficient_means(model: BallModel, settings: Settings) -> Array:
     """(p,) the model's own values of the coefficients that are estimated."""
     parameters = dict(model.named_parameters())
     return np.array([float(parameters[name].detach()) for name in settings.coefficients])
-
-
-def coefficient_sigmas(model: BallModel, settings: Settings) -> Array:
-    """(p,) prior standard deviations of the coefficients of a model from `trackwise_model`, time offsets last."""
-    offsets = model.passengers if isinstance(model, AugmentedModel) else ()
-    own = [settings.time_offsets[name.removeprefix(PASSENGER)] for name in offsets]
-    return np.array([*settings.coefficients.values(), *own])
 
 
 def effective_sigmas(track: Track, segmentation: Segmentation, settings: Settings) -> Array:
@@ -94,53 +74,83 @@ def effective_sigmas(track: Track, segmentation: Segmentation, settings: Setting
     return sigma
 
 
-def build_graph(track: Track, model: BallModel, events: Events, sigma: Array, settings: Settings) -> BallGraph:
-    """The factor graph of one track.
+class TrackProblem:
+    """What is to be minimised for one track: made once, solved for whatever events are tried.
 
     Args:
-        track: stamps, positions, labels.
-        model: the ball, from `trackwise_model`.
-        events: contacts, hits, rests.
-        sigma: (n, 3) m, of the positions; those of a track that cameras saw take no part.
+        track: stamps, positions, observations, labels.
+        model: the ball, without the coefficients that are estimated with the track.
         settings: noise and priors.
-    Returns: the graph; its first kind holds what was measured.
+        segmentation: the events to start from.
+        sigma: (n, 3) m, standard deviations of the positions; those of `effective_sigmas` where None.
+
+    Attributes:
+        ball: the model with the coefficients that are estimated.
+        observations: of the track, positions among them.
+        unknowns: that the observations add; they follow the coefficients of the ball.
+        observed: the factors of each observation, by its name.
+        added: further factors, for whoever likes to add some before the problem is solved.
+
+    Raises: ValueError: if the settings ask an observation for unknowns that it does not have.
     """
-    kinds: list[FactorBatch] = [_measured(track, model, sigma, settings)]
-    kinds += _dynamics(track.times, model, events, settings)
-    kinds += _priors(track, events.segmentation, settings)
-    if isinstance(model, AugmentedModel):
-        kinds.append(CoefficientPriorFactors(model, coefficient_sigmas(model, settings)))
-    return BallGraph(tuple(kinds))
+
+    def __init__(
+        self,
+        track: Track,
+        model: BallModel,
+        settings: Settings,
+        segmentation: Segmentation,
+        sigma: Array | None = None,
+    ) -> None:
+        self.track = track
+        self.model = model
+        self.settings = settings
+        self.segmentation = segmentation
+        self.sigma = effective_sigmas(track, segmentation, settings) if sigma is None else sigma
+        self.ball = trackwise_model(model, settings)
+        self.observations: tuple[Observation, ...] = observations_of(track)
+        self.unknowns: Unknowns = unknowns_of(self.observations, settings)
+        self.width = model_width(self.ball)
+        columns = {name: self.width + k for k, name in enumerate(self.unknowns.names)}
+        self.context = Context(track, model, settings, self.sigma, columns)
+        self.observed = {one.name: one.batch(self.context) for one in self.observations}
+        self.added: list[FactorBatch] = []
+
+    @property
+    def coefficient_sigmas(self) -> Array:
+        """(p + q,) prior standard deviations of the ball's coefficients and of the unknowns, in their own units."""
+        return np.append(np.array(list(self.settings.coefficients.values())), self.unknowns.sigmas)
+
+    def graph(self, events: Events) -> BallGraph:
+        """The factor graph for some events."""
+        batches: list[FactorBatch] = [*self.observed.values(), *self.added]
+        batches += _dynamics(self.track.times, self.ball, events, self.settings)
+        batches += _priors(self.track, events.segmentation, self.settings)
+        own, others = self.coefficient_sigmas[: self.width], len(self.unknowns.names)
+        if isinstance(self.ball, AugmentedModel):
+            batches.append(CoefficientPriorFactors(self.ball, own, others))
+        if others:
+            batches.append(coefficient_prior(self.unknowns.means, self.unknowns.sigmas, self.width))
+        return BallGraph(tuple(batches))
+
+    def start(self, states: Array) -> Values:
+        """Values to start from: states (n, 9), the model's own coefficients, unknowns of zero."""
+        means = coefficient_means(self.model, self.settings)
+        return Values(states, np.append(means, np.zeros(len(self.unknowns.names))))
+
+    def innovations(self, values: Values, covariances: Covariances | None) -> dict[str, Array]:
+        """Whitened innovations at a minimum, by name of the observation; NaN without covariances."""
+        if covariances is None:
+            return {name: np.full((len(batch), batch.dim), np.nan) for name, batch in self.observed.items()}
+        return {
+            one.name: one.innovations(self.context, self.observed[one.name].linearize(values), values, covariances)
+            for one in self.observations
+        }
 
 
-def _measured(track: Track, model: BallModel, sigma: Array, settings: Settings) -> FactorBatch:
-    """What was measured: positions, or the pixels of a track that cameras saw."""
-    if not isinstance(track, SightedTrack):
-        return PositionFactors(np.arange(len(track)), track.positions, sigma, settings.loss)
-    seen = track.sightings
-    return CameraFactors(
-        track.state,
-        seen.camera,
-        seen.pixels,
-        seen.covariances,
-        track.bank,
-        track.delay,
-        _columns(seen.cameras, model),
-        settings.sighting_loss,
-    )
-
-
-def _columns(cameras: tuple[str, ...], model: BallModel) -> NDArray[np.int64] | None:
-    """(cameras,) which coefficient is each camera's time offset; None where none is estimated."""
-    if not (isinstance(model, AugmentedModel) and model.passengers):
-        return None
-    names = (*model.names, *model.passengers)
-    return np.array([names.index(PASSENGER + c) if PASSENGER + c in names else FIXED for c in cameras])
-
-
-def contact_kinds(graph: BallGraph) -> list[ContactFactors]:
+def contact_batches(graph: BallGraph) -> list[ContactFactors]:
     """The graph's contact factors."""
-    return [kind for kind in graph.kinds if isinstance(kind, ContactFactors)]
+    return [batch for batch in graph.batches if isinstance(batch, ContactFactors)]
 
 
 def _dynamics(times: Array, model: BallModel, events: Events, settings: Settings) -> list[FactorBatch]:
@@ -160,22 +170,22 @@ def _dynamics(times: Array, model: BallModel, events: Events, settings: Settings
             groups["rest", 0].append(i)
         else:
             groups["flight", steps_over(float(dt[i]))].append(i)
-    kinds: list[FactorBatch] = []
-    for (motion_kind, _), members in groups.items():
+    batches: list[FactorBatch] = []
+    for (motion_sort, _), members in groups.items():
         rows = np.array(members)
         kicks = Kicks(
             np.array([motions[i].kick_times(float(dt[i])) for i in members]),
             np.array([motions[i].hit for i in members]),
         )
-        if motion_kind == "contact":
+        if motion_sort == "contact":
             heights = np.array([motions[i].heights for i in members])
-            kinds.append(ContactFactors(model, rows, dt[rows], covariance[rows], heights, kicks))
-        elif motion_kind == "rest":
+            batches.append(ContactFactors(model, rows, dt[rows], covariance[rows], heights, kicks))
+        elif motion_sort == "rest":
             resting = np.array([motions[i].rest for i in members])
-            kinds.append(RestFactors(model, rows, dt[rows], covariance[rows], resting, kicks))
+            batches.append(RestFactors(model, rows, dt[rows], covariance[rows], resting, kicks))
         else:
-            kinds.append(FlightFactors(model, rows, dt[rows], covariance[rows], kicks))
-    return kinds
+            batches.append(FlightFactors(model, rows, dt[rows], covariance[rows], kicks))
+    return batches
 
 
 def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> list[FactorBatch]:
@@ -183,18 +193,18 @@ def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> lis
 
     Of the first one that is the label, where there is one, or what the launcher's settings say; else the spin prior.
     """
-    kinds: list[FactorBatch] = []
+    batches: list[FactorBatch] = []
     launch = None if settings.launcher is None else settings.launcher.settings(track)
     if settings.launcher is not None and launch is not None:
         spread = np.full((1, 3), settings.launcher.sigma)
         embedding, loss = settings.launcher.embedding, settings.label_loss
-        kinds.append(LauncherSpinFactors(np.array([0]), launch[None], embedding, spread, loss))
-        kinds.append(_wide_prior(0, track.positions[0], settings))
+        batches.append(LauncherSpinFactors(np.array([0]), launch[None], embedding, spread, loss))
+        batches.append(_wide_prior(0, track.positions[0], settings))
     else:
-        kinds += start_priors(0, track.positions[0], settings.spin_label(track), settings)
+        batches += start_priors(0, track.positions[0], settings.spin_label(track), settings)
     for interval in segmentation.restarts:
-        kinds += start_priors(int(interval) + 1, track.positions[int(interval) + 1], None, settings)
-    return kinds
+        batches += start_priors(int(interval) + 1, track.positions[int(interval) + 1], None, settings)
+    return batches
 
 
 def start_priors(state: int, position: Array, label: SpinLabel | None, settings: Settings) -> list[FactorBatch]:
@@ -224,10 +234,3 @@ def _wide_prior(state: int, position: Array, settings: Settings) -> PriorFactors
 
 UNINFORMATIVE_SPIN = 2000.0
 """rad/s, prior about zero beside the label or the spin prior, should their robust loss set them aside."""
-
-
-def initial_values(states: Array, model: BallModel, settings: Settings) -> Values:
-    """A start for the minimisation from states (n, 9)."""
-    if isinstance(model, AugmentedModel):
-        return Values(states, np.append(coefficient_means(model.model, settings), np.zeros(len(model.passengers))))
-    return Values(states, np.zeros(0))

@@ -1,4 +1,4 @@
-"""Minimising from a rough start: a spin label that was set aside on the way is asked once more.
+"""A minimisation begun again: a spin label that was set aside on the way is asked once more.
 
 Cauchy's loss lets go. On the way from a rough start a spin may leave its label so far behind that it hardly pulls
 any more; the search then ends in another minimum, or on a slope. Where a label ends like that, convex losses lead to
@@ -10,33 +10,30 @@ from __future__ import annotations
 import numpy as np
 
 from ballfg.factors.batch import Values
-from ballfg.factors.graph import BallGraph, LevenbergMarquardt, Minimum
+from ballfg.factors.graph import BallGraph, LevenbergMarquardt, Minimum, Search
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.prior import SpinLabelFactors
-from ballfg.factors.search import Search
 
 LABELS = (LauncherSpinFactors, SpinLabelFactors)
-"""Kinds that say what a spin is before the flight is looked at. That a few of many sightings are far off is a matter of
-course; of the one label that a track has it is news."""
+"""Factors that tell a spin before the flight is looked at. A few of many sightings are far off as a matter of course;
+the one label that a track has is not."""
 
 
-def search_twice(optimizer: LevenbergMarquardt, graph: BallGraph, values: Values) -> Search[Minimum]:
-    """The lowest minimum found from a start: `optimizer.search`, and where a loss has let go, from another one too."""
-    minimum = yield from optimizer.search(graph, values)
-    if not _lets_go(graph, minimum.values):
-        return minimum
-    held = yield from optimizer.search(_convex(graph), values)
-    again = yield from optimizer.search(graph, held.values)
-    return again if again.error < minimum.error else minimum
-
-
-def _lets_go(graph: BallGraph, values: Values) -> bool:
+def label_let_go(graph: BallGraph, values: Values) -> bool:
     """Whether the loss of a label pulls less the further away the spin is, and the spin is far away."""
-    able = [kind for kind in graph.kinds if isinstance(kind, LABELS) and kind.loss.convex != kind.loss]
-    return any((np.linalg.norm(kind.linearize(values).residual, axis=-1) > kind.loss.scale).any() for kind in able)
+    able = [batch for batch in graph.batches if isinstance(batch, LABELS) and batch.loss.convex != batch.loss]
+    return any((np.linalg.norm(batch.linearize(values).residual, axis=-1) > batch.loss.scale).any() for batch in able)
+
+
+def minimise_with_restart(
+    optimizer: LevenbergMarquardt, graph: BallGraph, start: Values, found: Minimum
+) -> Search[Minimum]:
+    """The lower of a minimum that was found and of the one that convex losses on labels lead to."""
+    held = yield from optimizer.search(_convex(graph), start)
+    again = yield from optimizer.search(graph, held.values)
+    return again if again.error < found.error else found
 
 
 def _convex(graph: BallGraph) -> BallGraph:
     """The graph with labels that never let go."""
-    kinds = (kind.with_loss(kind.loss.convex) if isinstance(kind, LABELS) else kind for kind in graph.kinds)
-    return BallGraph(tuple(kinds))
+    return BallGraph(tuple(b.with_loss(b.loss.convex) if isinstance(b, LABELS) else b for b in graph.batches))

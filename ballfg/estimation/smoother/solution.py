@@ -12,7 +12,8 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.segmentation import Contact
 from ballfg.estimation.smoother.motion import contacts_by_interval
-from ballfg.estimation.smoother.problem import Events, contact_kinds
+from ballfg.estimation.smoother.problem import Events, contact_batches
+from ballfg.factors.dynamics import model_width
 from ballfg.factors.graph import BallGraph, Minimum
 from ballfg.state import VZ
 
@@ -37,11 +38,11 @@ def contacts_at_ends(times: Array, solution: Solution, model: BallModel, surface
     taken = {c.interval for c in events.contacts} | set(events.segmentation.hits.tolist())
     for rest in events.segmentation.rests:
         taken |= set(range(rest.first, rest.last + 1))
+    coefficients = np.tile(values.coefficients[: model_width(model)], (2, 1))
     found = []
     for inside, beyond in ((1, 0), (last - 1, last)) if last > 0 else ():
         interval = min(inside, beyond)
-        states = np.concatenate((values.states[[inside, beyond]], np.tile(values.coefficients, (2, 1))), axis=1)
-        pair = torch.from_numpy(states)
+        pair = torch.from_numpy(np.concatenate((values.states[[inside, beyond]], coefficients), axis=1))
         height = surfaces.level_below(pair)[0]
         with torch.no_grad():
             above, below = model.gap(pair, height).tolist()
@@ -62,9 +63,9 @@ def timed_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
     """The contacts with the times that the estimate gives them; unchanged where it gives none."""
     grouped = contacts_by_interval(solution.events.contacts)
     timed: list[Contact] = []
-    for kind in contact_kinds(solution.graph):
+    for batch in contact_batches(solution.graph):
         for interval, elapsed in zip(
-            kind.variables[:, 0].tolist(), kind.contact_times(solution.minimum.values), strict=True
+            batch.variables[:, 0].tolist(), batch.contact_times(solution.minimum.values), strict=True
         ):
             for contact, tau in zip(grouped[interval], elapsed.tolist(), strict=True):
                 time = float(times[interval] + tau) if np.isfinite(tau) else contact.time

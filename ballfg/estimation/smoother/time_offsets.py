@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.observations.sighted import SightedTrack, retimed
-from ballfg.estimation.result import Estimate, Status
+from ballfg.estimation.observations.sightings import sightings_of
+from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.tracks import Track
 from ballfg.vision.camera import Camera
 
 Array = NDArray[np.float64]
@@ -23,6 +24,7 @@ PRIOR: Final = 0.01
 """s, standard deviation of a time offset beforehand, about the camera's own: a frame or so."""
 ROUNDS: Final = 8
 """How often stamps are moved at most; 4 ms settle in three rounds, a whole frame in five."""
+USABLE: Final = (Status.OK, Status.NOT_CONVERGED)
 SETTLED: Final = 0.1
 """Standard deviations. Offsets that move by less are settled."""
 
@@ -55,7 +57,7 @@ class TimeOffsets:
 
 
 def estimate_time_offsets(
-    tracks: Iterable[SightedTrack],
+    tracks: Iterable[Track],
     model: BallModel,
     surfaces: Surfaces,
     settings: Settings,
@@ -87,44 +89,46 @@ def estimate_time_offsets(
     own = replace(settings, time_offsets={names[k]: prior for k in free})
     smoother = Smoother(model, surfaces, own)
     first = smoother.first_look()
-    believed = np.array([camera.time_offset for camera in tracks[0].cameras])
+    believed = sightings_of(tracks[0]).time_offsets
     offsets, settled = believed, False
     for k in range(ROUNDS):
-        estimates = [(smoother if k else first).estimate_as_timed(track) for track in tracks]
-        used = [e for e in estimates if e.status in (Status.OK, Status.NOT_CONVERGED)]
+        estimates = [((smoother if k else first).estimate(track, move_stamps=False), track) for track in tracks]
+        used = [sightings_of(t).found_offsets(e) for e, t in estimates if e.status in USABLE]
         if not used:
             raise ValueError("tracks must hold one that can be smoothed; none could. Look at the calibration first.")
         found, covariance = _fused(used, believed, free, prior)
         moved = np.abs(found - offsets)[free] / np.sqrt(np.diagonal(covariance)[free])
         offsets, settled = found, bool(k > 0 and (moved < SETTLED).all())
-        tracks = [retimed(track, offsets) for track in tracks]
+        tracks = [sightings_of(track).with_offsets(track, offsets) for track in tracks]
         if settled:
             break
-    return TimeOffsets(tracks[0].cameras, covariance, settled, len(used))
+    return TimeOffsets(sightings_of(tracks[0]).cameras, covariance, settled, len(used))
 
 
-def _rig_of(tracks: list[SightedTrack]) -> tuple[str, ...]:
+def _rig_of(tracks: list[Track]) -> tuple[str, ...]:
     """The names of the cameras."""
     if not tracks:
         raise ValueError("tracks must hold at least one; got none. Time offsets need a ball in flight.")
-    first = tracks[0]
+    first = sightings_of(tracks[0])
     for track in tracks:
-        if track.cameras != first.cameras:
+        if sightings_of(track).cameras != first.cameras:
             raise ValueError(
-                f"tracks must be seen by the same cameras; those of {track.name!r} and {first.name!r} differ. "
+                f"tracks must be seen by the same cameras; those of {track.name!r} and {tracks[0].name!r} differ. "
                 "Make all of them with the same list of cameras."
             )
     return first.sightings.cameras
 
 
-def _fused(estimates: list[Estimate], believed: Array, free: NDArray[np.int64], prior: float) -> tuple[Array, Array]:
-    """Offsets (c,) and their covariance (c, c) by what all estimates say, the prior counted once."""
+def _fused(
+    found: list[tuple[Array, Array]], believed: Array, free: NDArray[np.int64], prior: float
+) -> tuple[Array, Array]:
+    """Offsets (c,) and their covariance (c, c) from those of all tracks, the prior counted once."""
     before = np.eye(len(free)) / prior**2
     information, pull = before.copy(), np.zeros(len(free))
-    for estimate in estimates:
-        after = np.linalg.inv(estimate.time_offset_covariance[np.ix_(free, free)])
+    for offsets_of_track, covariance_of_track in found:
+        after = np.linalg.inv(covariance_of_track[np.ix_(free, free)])
         information += after - before
-        pull += after @ (estimate.time_offsets - believed)[free]
+        pull += after @ (offsets_of_track - believed)[free]
     covariance = np.zeros((len(believed), len(believed)))
     covariance[np.ix_(free, free)] = np.linalg.inv(information)
     offsets = believed.copy()

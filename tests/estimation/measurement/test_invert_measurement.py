@@ -13,7 +13,7 @@ from ballfg.dynamics import EFFECTS, AnalyticModel, Architecture, Coefficient, E
 from ballfg.dynamics.measurement import Later, MeasurementEffect
 from ballfg.estimation import ESTIMATORS, Estimate, Settings, Smoother, Status, make_estimator
 from ballfg.estimation.measurement import invert_measurement as through_measurement
-from ballfg.estimation.measurement.invert_measurement import ThroughMeasurement
+from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
 from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import MeasurementNoise, SimulatedTrack, SimulationConfig, parse_effects, simulate
 from ballfg.state import POSITION, SPIN, VELOCITY
@@ -182,7 +182,7 @@ def test_short_tracks(count, plain) -> None:
 
 def test_label_noise_is_that_of_the_spin() -> None:
     estimator = make_estimator("ekf", declared(EFFECTS["spin_label_scale"](s=1.0)), SURFACES, SETTINGS)
-    assert isinstance(estimator, ThroughMeasurement)
+    assert isinstance(estimator, InvertMeasurement)
     assert estimator.inner.settings.spin_label_noise == pytest.approx(2.0, rel=1e-12)
     assert estimator.settings is SETTINGS
 

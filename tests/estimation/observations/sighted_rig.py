@@ -12,7 +12,8 @@ import torch
 
 from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model
 from ballfg.dynamics.motion.rollout import advance
-from ballfg.estimation.observations.sighted import SightedTrack, in_order, sighted_track
+from ballfg.estimation.observations.sightings import in_order, sighted_track
+from ballfg.tracks import Track
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.camera import Camera
 
@@ -101,7 +102,7 @@ def scene(
     return seen(truth(launch(rng), times[order], ball), camera[order], times[order], rng, rig)
 
 
-def track_of(made: Scene, name: str = "ball", cameras: Sequence[Camera] = RIG) -> SightedTrack:
+def track_of(made: Scene, name: str = "ball", cameras: Sequence[Camera] = RIG) -> Track:
     """The track of a scene, as cameras with these time offsets take it."""
     return sighted_track(name, in_order(made.sightings, cameras), cameras)
 

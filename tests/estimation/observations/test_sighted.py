@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import chi2
 
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
-from ballfg.estimation.observations.sighted import SAME_MOMENT, SightedTrack, in_order, sighted_track
-from ballfg.estimation.observations.sighted_path import BEFORE, Rays, rough_path
+from ballfg.estimation.observations.ray_path import BEFORE, Rays, rough_path
+from ballfg.estimation.observations.sightings import SAME_MOMENT, in_order, sighted_track, sightings_of
 from ballfg.estimation.registry import make_estimator
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
@@ -67,9 +67,10 @@ def test_sightings_of_one_moment_share_a_state(ball: World) -> None:
     made = scene(1, ball, phases=(0.0, 0.0, 1e-4 * 120.0), duration=0.2)
     track = track_of(made)
     assert len(track) == 24
-    np.testing.assert_array_equal(track.state, np.repeat(np.arange(24), 3))
-    np.testing.assert_allclose(track.delay.reshape(-1, 3), np.tile([0.0, 0.0, 1e-4], (24, 1)), atol=1e-12)
-    assert track.delay.max() < SAME_MOMENT
+    seen = sightings_of(track)
+    np.testing.assert_array_equal(seen.state, np.repeat(np.arange(24), 3))
+    np.testing.assert_allclose(seen.delay.reshape(-1, 3), np.tile([0.0, 0.0, 1e-4], (24, 1)), atol=1e-12)
+    assert seen.delay.max() < SAME_MOMENT
     estimate = smoother(ball).estimate(track)
     assert np.abs(estimate.states - made.truth[::3])[:, :3].max() < 1.5e-3
 
@@ -89,11 +90,12 @@ def test_one_camera_alone_still_gives_states(ball: World) -> None:
 
 def test_between_takes_the_sightings_along(made: Scene) -> None:
     part = track_of(made).between(0.1, 0.2)
-    assert isinstance(part, SightedTrack)
-    assert len(part) == len(part.sightings) == 37
-    np.testing.assert_array_equal(part.state, np.arange(37))
-    np.testing.assert_allclose(part.sightings.times - part.times, 0.0, atol=1e-12)
-    assert repr(part) == "SightedTrack('ball', 37 samples of 37 sightings)"
+    seen = sightings_of(part)
+    assert part.rough
+    assert len(part) == len(seen) == 37
+    np.testing.assert_array_equal(seen.state, np.arange(37))
+    np.testing.assert_allclose(seen.sightings.times - part.times, 0.0, atol=1e-12)
+    assert "CameraSightings(37 of 37 samples)" in repr(part)
 
 
 def test_refuses_what_is_no_track(made: Scene) -> None:
@@ -176,7 +178,7 @@ def test_covariances_and_innovations_are_honest() -> None:
     low, high = chi2.ppf([0.005, 0.995], 9 * tracks) / tracks
     assert low < np.mean(values) < high
     assert np.mean(nis) == pytest.approx(2.0, abs=0.15)
-    assert estimate.whitened.shape == (len(track.sightings), 2)
+    assert estimate.whitened.shape == (len(sightings_of(track)), 2)
 
 
 def test_innovation_is_the_distance_from_what_all_others_predict(ball: World, made: Scene) -> None:

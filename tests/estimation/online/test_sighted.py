@@ -45,7 +45,7 @@ def test_final_estimate_is_the_smoothers(ball: World, seed: int, phases: tuple[f
     assert len(online.contacts) == len(smoothed.contacts) == 1
     assert (np.abs(online.states - smoothed.states) / smoothed.sigmas).max() < tolerance
     assert online.error == pytest.approx(smoothed.error, rel=1e-5)
-    assert online.whitened.shape == (len(track.sightings), 2)
+    assert online.whitened.shape == (len(track.observations[0]), 2)
     assert np.nanmedian(online.nis) == pytest.approx(1.39, abs=0.5)  # the median of chi-square with 2 degrees
 
 
@@ -77,7 +77,7 @@ def test_cameras_of_one_moment_join(ball: World) -> None:
     states = pushed(online, made)
     assert online.window is not None
     assert len(online.window) == 18
-    assert [len(sample.sightings) for sample in online.window.samples] == [3] * 18
+    assert [len(sample.measurements) for sample in online.window.samples] == [3] * 18
     assert np.linalg.norm((states[-1].state - made.truth[-1])[:3]) < 2e-3
     last = [np.trace(state.covariance[:3, :3]) for state in states[-3:]]
     assert last[0] > last[1] > last[2]  # each of them tells more of the same moment

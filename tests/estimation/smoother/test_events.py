@@ -12,15 +12,13 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import Surfaces, contact_time, nominal_model
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics import Surfaces, contact_time, nominal_model, rollout
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact
 from ballfg.estimation.settings import Settings, uncertain
 from ballfg.estimation.smoother.initial import initial_states, move_contacts
-from ballfg.estimation.smoother.problem import effective_sigmas, initial_values
 from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.factors.search import run
+from ballfg.factors.graph import run
 from ballfg.tracks import Track
 
 SIGMA = 0.0015
@@ -104,12 +102,12 @@ def test_a_contact_in_the_wrong_interval_moves_to_the_right_one(shift, settings)
     track = Track("t", LATER, measured(truth_at(LATER)))
     smoother = Smoother(MODEL, TABLE, settings)
     found = smoother.segment(track)
-    right = [c.interval for c in smoother.solve(track, found, effective_sigmas(track, found, settings)).events.contacts]
+    right = [c.interval for c in smoother.solve(smoother.problem(track, found)).events.contacts]
     planted = tuple(
         Contact(c.interval + shift * (i == 0), c.time + 0.01 * shift, c.height) for i, c in enumerate(found.contacts)
     )
     wrong = replace(found, contacts=planted)
-    solution = smoother.solve(track, wrong, effective_sigmas(track, wrong, settings))
+    solution = smoother.solve(smoother.problem(track, wrong))
     assert [c.interval for c in solution.events.contacts] == right
     assert len(solution.events.segmentation.hits) == 0
 
@@ -120,7 +118,11 @@ def test_values_to_go_on_from_change_sides_with_their_contact() -> None:
     track = Track("t", TIMES, measured(states))
     bounce = bounces(states)[0]
     found = Smoother(MODEL, TABLE, EXACT).segment(track)
-    start = initial_values(initial_states(track, found.contacts, found, MODEL, None), MODEL, EXACT)
+    start = (
+        Smoother(MODEL, TABLE, EXACT)
+        .problem(track, found)
+        .start(initial_states(track, found.contacts, found, MODEL, None))
+    )
     start.states[:] = states
     forward = move_contacts(start, TIMES, ((bounce, 0.0),), ((bounce + 1, 0.0),), MODEL)
     assert forward.states[bounce + 1, 5] < 0.0  # now before the contact
@@ -180,7 +182,7 @@ def test_a_hit_that_the_segmentation_missed_is_marked(settings) -> None:
     track = Track("t", TIMES, measured(states))
     smoother = Smoother(MODEL, TABLE, settings)
     blind = replace(smoother.segment(track), hits=np.zeros(0, dtype=np.int64))
-    solution = smoother.solve(track, blind, effective_sigmas(track, blind, settings))
+    solution = smoother.solve(smoother.problem(track, blind))
     hits = solution.events.segmentation.hits
     assert len(hits) == 1
     assert 19 <= hits[0] <= 21
@@ -329,8 +331,8 @@ def test_an_impossible_contact_is_a_status_not_an_exception(settings) -> None:
     track = Track("t", TIMES[:20], measured(states))
     smoother = Smoother(MODEL, TABLE, settings)
     found = replace(smoother.segment(track), contacts=(Contact(8, 0.085, -60.0),))
-    sigma = effective_sigmas(track, found, settings)
-    estimate = smoother.result(track, sigma, run(smoother._settle(track, found, sigma, None)))
+    problem = smoother.problem(track, found)
+    estimate = smoother.result(problem, run(smoother._settle(problem, found, None)))
     assert estimate.status is Status.FAILED
     assert "table height" in estimate.status.value
     assert np.isfinite(estimate.covariances).all()

@@ -16,7 +16,6 @@ import pytest
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.settings import uncertain
-from ballfg.estimation.smoother.problem import effective_sigmas
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import BallGraph, LevenbergMarquardt
@@ -88,12 +87,12 @@ def test_time_shift(track) -> None:
 def test_order_of_factors(track) -> None:
     smoother = Smoother(MODEL, Surfaces.table_tennis(0.76), SETTINGS)
     segmentation = smoother.segment(track)
-    solution = smoother.solve(track, segmentation, effective_sigmas(track, segmentation, SETTINGS))
+    solution = smoother.solve(smoother.problem(track, segmentation))
     values = solution.minimum.values
     start = Values(values.states + np.repeat((1e-3, 1e-2, 1.0), 3), values.coefficients)
     minima = [
         LevenbergMarquardt().minimize(BallGraph(kinds), start)
-        for kinds in (solution.graph.kinds, solution.graph.kinds[::-1])
+        for kinds in (solution.graph.batches, solution.graph.batches[::-1])
     ]
     sigma = smoother.estimate(track).sigmas
     assert np.abs((minima[0].values.states - minima[1].values.states) / sigma).max() < TOLERANCE

@@ -8,7 +8,7 @@ import pytest
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, nominal_model
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
-from ballfg.estimation.smoother.problem import build_graph, effective_sigmas
+from ballfg.estimation.smoother.problem import effective_sigmas
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import BallGraph, LevenbergMarquardt
@@ -106,13 +106,13 @@ def brute_force(model, surfaces: Surfaces, settings: Settings, track: Track, sam
     smoother = Smoother(model, surfaces, settings)
     segmentation = smoother.segment(track)
     sigma = effective_sigmas(track, segmentation, settings)
-    solution = smoother.solve(track, segmentation, sigma)
-    graph = build_graph(track, smoother.trackwise, solution.events, sigma, settings)
+    solution = smoother.solve(smoother.problem(track, segmentation, sigma))
+    graph = smoother.problem(track, segmentation, sigma).graph(solution.events)
     whitened = []
     for k in samples:
         others = np.delete(np.arange(len(track)), k)
         kept = PositionFactors(others, track.positions[others], sigma[others], settings.loss)
-        minimum = LevenbergMarquardt().minimize(BallGraph((kept, *graph.kinds[1:])), solution.minimum.values)
+        minimum = LevenbergMarquardt().minimize(BallGraph((kept, *graph.batches[1:])), solution.minimum.values)
         C = _position_covariance(minimum.step, k)
         root = np.linalg.cholesky(C + np.diag(sigma[k] ** 2))
         whitened.append(np.linalg.solve(root, track.positions[k] - minimum.values.states[k, :3]))
@@ -163,11 +163,11 @@ def test_order_of_factors_does_not_matter(gravity_model) -> None:
     track = falling_track()
     smoother = Smoother(gravity_model, NOWHERE, PLAIN)
     segmentation = smoother.segment(track)
-    solution = smoother.solve(track, segmentation, effective_sigmas(track, segmentation, PLAIN))
+    solution = smoother.solve(smoother.problem(track, segmentation))
     start = Values(solution.minimum.values.states + 0.01, np.zeros(0))
     optimizer = LevenbergMarquardt()
     forward = optimizer.minimize(solution.graph, start)
-    backward = optimizer.minimize(BallGraph(solution.graph.kinds[::-1]), start)
+    backward = optimizer.minimize(BallGraph(solution.graph.batches[::-1]), start)
     sigma = smoother.estimate(track).sigmas
     assert np.abs((forward.values.states - backward.values.states) / sigma).max() < 1e-7
     assert forward.error == pytest.approx(backward.error, rel=1e-10)

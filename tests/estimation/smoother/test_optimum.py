@@ -174,7 +174,10 @@ def solved():
         track = simulated.track
         segmentation = smoother.segment(track)
         sigma = effective_sigmas(track, segmentation, SETTINGS)
-        solution, closer = smoother.solve(track, segmentation, sigma), tight.solve(track, segmentation, sigma)
+        solution, closer = (
+            smoother.solve(smoother.problem(track, segmentation, sigma)),
+            tight.solve(tight.problem(track, segmentation, sigma)),
+        )
         reference = Reference(track, solution.events.contacts)
         start = solution.minimum.values.states + np.repeat((5e-4, 5e-2, 5.0), 3) * rng.standard_normal((len(track), 9))
         scale = np.tile(np.repeat((SIGMA, 0.1, 5.0), 3), len(track))

@@ -5,14 +5,13 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.estimation.observations.sighted import SightedTrack, retimed
+from ballfg.estimation.observations.sightings import sightings_of
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
-from ballfg.estimation.smoother.problem import trackwise_model
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.estimation.smoother.time_offsets import estimate_time_offsets
+from ballfg.tracks import Track
 from tests.estimation.observations.sighted_rig import RIG, World, late, scene, track_of, world
 
 TRUE = np.array([0.0, 0.004, -0.0015])
@@ -24,7 +23,7 @@ def ball() -> World:
     return world()
 
 
-def unsuspecting(seed: int, ball: World) -> SightedTrack:
+def unsuspecting(seed: int, ball: World) -> Track:
     """A flight whose stamps are late, in the hands of who does not know it."""
     return track_of(scene(seed, ball, rig=late(TRUE), duration=0.4), str(seed), RIG)
 
@@ -34,16 +33,15 @@ def test_a_track_finds_its_offsets_and_moves_its_stamps(ball: World) -> None:
     made = scene(0, ball, rig=late(TRUE), duration=0.4)
     estimate = Smoother(ball.model, ball.surfaces, settings).estimate(track_of(made, cameras=RIG))
     assert estimate.status is Status.OK
-    assert estimate.cameras == ("left", "right", "back")
-    error = estimate.time_offsets - TRUE
+    assert estimate.unknown_names == ("time_offset.right", "time_offset.back")
+    error = estimate.unknowns - TRUE[1:]
     assert np.abs(error).max() < 2e-4
-    sigma = np.sqrt(np.diagonal(estimate.time_offset_covariance))
-    assert sigma[0] == 0.0
-    assert (np.abs(error[1:]) < 3.0 * sigma[1:]).all()
-    assert (sigma[1:] < 1.5e-4).all()
+    sigma = np.sqrt(np.diagonal(estimate.unknown_covariance))
+    assert (np.abs(error) < 3.0 * sigma).all()
+    assert (sigma < 1.5e-4).all()
     assert estimate.coefficient_names == ()
     assert estimate.cross_covariances.shape == (len(estimate.times), 9, 0)
-    stamps = made.sightings.times - estimate.time_offsets[made.sightings.camera]
+    stamps = made.sightings.times - np.append(0.0, estimate.unknowns)[made.sightings.camera]
     np.testing.assert_allclose(estimate.times, np.sort(stamps), atol=2e-5)
     velocity = (estimate.states - made.truth)[np.argsort(stamps), 3:6]
     assert np.median(np.linalg.norm(velocity, axis=1)) < 0.02
@@ -69,16 +67,22 @@ def test_another_reference_shifts_them_all(ball: World) -> None:
     np.testing.assert_allclose(apart[0], apart[1], atol=1e-5)
 
 
-def test_model_carries_offsets_that_the_motion_does_not_see(ball: World) -> None:
+def moved_by(track: Track, offsets: tuple[float, ...]) -> Track:
+    return sightings_of(track).with_offsets(track, np.array(offsets))
+
+
+def test_offsets_follow_the_coefficients_of_the_ball(ball: World) -> None:
     settings = Settings(coefficients={"flight.drag.k": 0.02}, time_offsets={"back": 0.01})
-    track = retimed(unsuspecting(4, ball), np.array([0.0, 0.0, 0.002]))
-    model = trackwise_model(ball.model, settings, track)
-    assert isinstance(model, AugmentedModel)
-    assert (model.names, model.passengers, model.width) == (("flight.drag.k",), ("time_offset.back",), 2)
-    assert model.means()[1] == -0.002  # believed where it was before the track was moved
-    np.testing.assert_allclose(track.moved, [0.0, 0.0, 0.002])
+    track = moved_by(unsuspecting(4, ball), (0.0, 0.0, 0.002))
+    problem = Smoother(ball.model, ball.surfaces, settings).problem(track)
+    assert (problem.ball.names, problem.width) == (("flight.drag.k",), 1)
+    assert problem.unknowns.names == ("time_offset.back",)
+    assert problem.unknowns.means == [-0.002]  # believed where it was before the track was moved
+    assert problem.unknowns.origins == [0.002]
+    np.testing.assert_allclose(sightings_of(track).moved, [0.0, 0.0, 0.002])
+    np.testing.assert_allclose(problem.coefficient_sigmas, [0.02, 0.01])
     with pytest.raises(ValueError, match="must name cameras of the track, left, right, back; got 'top'"):
-        trackwise_model(ball.model, Settings(time_offsets={"top": 0.01}), track)
+        Smoother(ball.model, ball.surfaces, Settings(time_offsets={"top": 0.01})).problem(track)
 
 
 def test_refuses_what_tells_no_offset(ball: World) -> None:
@@ -87,7 +91,7 @@ def test_refuses_what_tells_no_offset(ball: World) -> None:
         estimate_time_offsets([], ball.model, ball.surfaces, Settings())
     with pytest.raises(ValueError, match="reference must be one of the cameras left, right, back; got 'top'"):
         estimate_time_offsets([track], ball.model, ball.surfaces, Settings(), "top")
-    other = retimed(track, np.array([0.0, 0.001, 0.0]))
+    other = moved_by(track, (0.0, 0.001, 0.0))
     with pytest.raises(ValueError, match="seen by the same cameras"):
         estimate_time_offsets([track, other], ball.model, ball.surfaces, Settings())
     with pytest.raises(ValueError, match="cannot move stamps that have passed"):

@@ -48,7 +48,7 @@ def test_estimates_are_the_smoother_s() -> None:
         smoother = Smoother(usual_ball(), TABLE, settings, TIGHT)
         sigma = settings.position_scale * np.tile(settings.position_noise, (OBSERVED, 1))
         assert sigma[0, 0] == pytest.approx(0.002 * np.exp(0.4))
-        alone = smoother.solve(seen, shot.segmentation, sigma)
+        alone = smoother.solve(smoother.problem(seen, shot.segmentation, sigma))
         np.testing.assert_allclose(
             one.solution.minimum.values.states, alone.minimum.values.states, rtol=1e-7, atol=1e-7
         )
@@ -147,7 +147,7 @@ def test_sigmas_of_a_turned_shot_do_not_depend_on_the_axes() -> None:
     for pose in poses:
         batch.warm.forget(0)
         (one,), _ = batch((0,), {0: pose})
-        root = one.solution.graph.kinds[0].information_root
+        root = one.solution.graph.batches[0].information_root
         np.testing.assert_allclose(root, np.tile((200.0, 200.0, 500.0), (OBSERVED, 1)), rtol=1e-12)
         found.append(pose.states(one.solution.minimum.values.states, back=True))
     np.testing.assert_allclose(found[0], found[1], rtol=1e-7, atol=1e-7)

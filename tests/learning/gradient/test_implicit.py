@@ -100,7 +100,7 @@ def test_the_problem_is_a_hard_one(analytic: Estimates) -> None:
     """Bounces, robust losses in their tails, residuals that bend: or the tests below prove little."""
     for found in analytic.solve():
         assert len(found.events.contacts) == 1
-        rows = [(kind.loss, kind.linearize(found.minimum.values).residual) for kind in found.graph.kinds]
+        rows = [(kind.loss, kind.linearize(found.minimum.values).residual) for kind in found.graph.batches]
         tails = [loss.name for loss, r in rows if np.linalg.norm(r, axis=1).max() > loss.scale]
         assert "huber" in tails
         assert found.minimum.error > 15.0

@@ -155,7 +155,7 @@ def test_robust_losses_count_as_gaussians_with_their_weights() -> None:
     """Samples far in the tail of Huber's loss. How weights follow the noise is left out: 4 % are seen."""
     noise = NoiseScales(NOISE, learned=True)
     estimates = Estimates(GRAVITY, falling().tracks, replace(PLAIN, loss=Loss("huber", 1.5)), noise, Surfaces(-100.0))
-    norms = [np.linalg.norm(s.graph.kinds[0].linearize(s.minimum.values).residual, axis=1) for s in estimates.solve()]
+    norms = [np.linalg.norm(s.graph.batches[0].linearize(s.minimum.values).residual, axis=1) for s in estimates.solve()]
     assert max(n.max() for n in norms) > 3.0
     check_gradient(estimates, lambda: likelihood(estimates).sum(), 0.05)
 

@@ -12,13 +12,13 @@ from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.factors.batch import Values
 from ballfg.factors.dynamics import FlightFactors
-from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt
+from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Search, run
 from ballfg.factors.launcher import LauncherSpinFactors
+from ballfg.factors.lockstep import linearize_together, run_together
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.factors.position import PositionFactors
 from ballfg.factors.prior import CoefficientPriorFactors, spin_prior, state_prior
-from ballfg.factors.search import Search, linearize_together, run, run_together
 
 NOISE = ProcessNoise(acceleration=0.5, spin=10.0)
 SIGMA = 0.003

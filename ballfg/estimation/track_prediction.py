@@ -126,7 +126,7 @@ def _predict_block(
     clocks = [true_times(estimator.model, t.times) for t in tracks]
     ends = [float(clock[len(e.times) - 1]) for clock, e in zip(clocks, estimates, strict=True)]
     times = _padded([clock[mask] for clock, mask in zip(clocks, later, strict=True)], ends)
-    belief = Belief.last(estimator.model, estimates, estimator.settings.coefficients)
+    belief = Belief.of(estimator.model, [e.last for e in estimates], estimator.settings.coefficients)
     belief = replace(belief, time=torch.tensor(ends, dtype=torch.float64))
     positions, variances = np.zeros((*times.shape, 3)), np.zeros((*times.shape, 3))
     for k, predicted in enumerate(propagator.walk(belief, torch.from_numpy(times)) if times.size else ()):

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import AnalyticModel, BallModel, Effect
-from ballfg.estimation import Settings, make_estimator
+from ballfg.estimation import Settings, TrackPrediction, make_estimator, predict_tracks
 from ballfg.factors.noise import ProcessNoise
-from ballfg.prediction import TrackPrediction, predict_tracks
 from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects, simulate
 
 CONFIG = SimulationConfig(tracks=3, rate=60.0, seed=5, noise=MeasurementNoise(position=0.002, spin=4.0))

@@ -10,9 +10,9 @@ import torch
 
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.dynamics.motion.rollout import advance
-from ballfg.estimation import Settings, Status, dataset_settings, dataset_surfaces, make_estimator
+from ballfg.estimation import Settings, Status, dataset_settings, dataset_surfaces, make_estimator, predict_tracks
 from ballfg.factors.noise import ProcessNoise
-from ballfg.prediction import Belief, predict_tracks
+from ballfg.prediction import Belief
 from ballfg.state import SPIN, VZ
 from ballfg.tracks import Track, read_dataset
 from tests.places import DATA
@@ -127,7 +127,7 @@ COEFFICIENTS = {"flight.drag.k": 0.03, "contact.restitution.e": 0.02}
 def test_coefficients_come_with_their_correlations(tracks):
     settings = replace(SETTINGS, coefficients=COEFFICIENTS)
     estimate = estimator("smoother", settings).estimate(tracks[0])
-    belief = Belief.last(nominal_model(), [estimate], COEFFICIENTS)
+    belief = Belief.of(nominal_model(), [estimate.last], COEFFICIENTS)
     assert belief.mean.shape == (1, 11)
     np.testing.assert_array_equal(belief.mean[0, 9:], estimate.coefficients)
     np.testing.assert_array_equal(belief.covariance[0, :9, 9:], estimate.cross_covariances[-1])
@@ -138,7 +138,7 @@ def test_an_estimator_without_coefficients_has_their_prior(tracks):
     """So that the sliding window's intervals say what it does not know about drag and bounce."""
     settings = replace(SETTINGS, coefficients=COEFFICIENTS)
     windowed, smoothed = (estimator(m, settings).estimate(tracks[0]) for m in ("sliding-window", "smoother"))
-    belief = Belief.last(nominal_model(), [windowed, smoothed], COEFFICIENTS)
+    belief = Belief.of(nominal_model(), [windowed.last, smoothed.last], COEFFICIENTS)
     parameters = dict(nominal_model().named_parameters())
     assert belief.mean[0, 9:].tolist() == [float(parameters[name].detach()) for name in COEFFICIENTS]
     np.testing.assert_allclose(belief.covariance[0, 9:, 9:], np.diag([0.03**2, 0.02**2]))
@@ -153,23 +153,23 @@ def test_coefficients_are_held_within_their_bounds(tracks):
     settings = replace(SETTINGS, coefficients=COEFFICIENTS)
     estimate = estimator("smoother", settings).estimate(tracks[0])
     beyond = replace(estimate, coefficients=np.array([-0.01, 1.05]))
-    belief = Belief.last(nominal_model(), [beyond])
+    belief = Belief.of(nominal_model(), [beyond.last])
     np.testing.assert_allclose(belief.mean[0, 9:], [0.0, 1.0], atol=1e-15)
     change = np.linalg.solve(estimate.coefficient_covariance, [0.01, -0.05])
     expected = estimate.states[-1] + estimate.cross_covariances[-1] @ change
     np.testing.assert_allclose(belief.mean[0, :9], expected)
-    torch.testing.assert_close(belief.covariance, Belief.last(nominal_model(), [estimate]).covariance)
+    torch.testing.assert_close(belief.covariance, Belief.of(nominal_model(), [estimate.last]).covariance)
 
 
 def test_beliefs_refuse_what_does_not_fit(tracks):
     settings = replace(SETTINGS, coefficients=COEFFICIENTS)
     windowed, smoothed = (estimator(m, settings).estimate(tracks[0]) for m in ("sliding-window", "smoother"))
     with pytest.raises(ValueError, match="at least one"):
-        Belief.last(nominal_model(), [])
+        Belief.of(nominal_model(), [])
     with pytest.raises(ValueError, match="estimates must share their coefficients; track '0'"):
-        Belief.last(nominal_model(), [smoothed, windowed])
+        Belief.of(nominal_model(), [smoothed.last, windowed.last])
     with pytest.raises(ValueError, match="estimates must share their coefficients; track '0'"):
-        Belief.last(nominal_model(), [smoothed], {})
+        Belief.of(nominal_model(), [smoothed.last], {})
 
 
 # --- do the intervals hold? --------------------------------------------------------------------------------------

@@ -1,0 +1,111 @@
+"""Readings in the folder of a dataset: one table a sort, `trajectory,t,<values>,sigma`."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.estimation.observations.observation import Observation
+from ballfg.estimation.observations.registry import OBSERVATIONS
+from ballfg.tracks import TableWriter, Track, csv_errors
+from ballfg.tracks.rows import KEY
+
+Array = NDArray[np.float64]
+
+
+@dataclass
+class ReadingTables:
+    """The readings of all trajectories of a folder.
+
+    Attributes:
+        rows: of each sort of reading, by trajectory: (m, 2 + dim) t (s), the values and sigma, in their own units.
+        notes: what was ignored, one sentence each.
+    """
+
+    rows: dict[type[Observation], dict[str, Array]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def attached(self, track: Track) -> Track:
+        """The track with its readings; those before its first and after its last sample are left out."""
+        found = []
+        for sort, tables in self.rows.items():
+            table = tables.get(track.name)
+            if table is None:
+                continue
+            inside = table[(table[:, 0] >= track.times[0]) & (table[:, 0] <= track.times[-1])]
+            if len(inside):
+                found.append(sort.from_table(track, inside))
+        return track.observed(*found)
+
+
+def read_readings(folder: str | PathLike[str], trajectories: Collection[str]) -> ReadingTables:
+    """All tables of readings that lie in a folder, of every registered sort.
+
+    Args: folder: of a dataset.  trajectories: names of its tracks.
+    Raises: ValueError: a missing column, a row of an unknown trajectory, or a cell that is no number; the message names
+        file, line and column.
+    """
+    tables, known = ReadingTables(), set(trajectories)
+    for sort in OBSERVATIONS.values():
+        path = Path(folder) / (sort.file or "")
+        if path.is_file():
+            tables.rows[sort] = _read(path, sort, known, tables.notes)
+    return tables
+
+
+def write_readings(folder: str | PathLike[str], tracks: Iterable[Track]) -> list[Path]:
+    """Writes the readings of tracks as tables into the folder of their dataset.
+
+    Args: folder: it exists.  tracks: with their observations.
+    Returns: the files; none where no track has readings.
+    """
+    tables: defaultdict[str, list[tuple[str, dict[str, Array]]]] = defaultdict(list)
+    for track in tracks:
+        for observation in track.observations:
+            if observation.file is not None:
+                tables[observation.file].append((track.name, dict(observation.table(track))))
+    for name, parts in tables.items():
+        with TableWriter(Path(folder) / name) as writer:
+            for trajectory, columns in parts:
+                writer.write({KEY: trajectory, **columns})
+    return [Path(folder) / name for name in tables]
+
+
+def _read(path: Path, sort: type[Observation], known: set[str], notes: list[str]) -> dict[str, Array]:
+    """Rows of each trajectory of one table."""
+    header = csv_errors.read_header(path)
+    wanted = ("t", *sort.columns, "sigma")
+    for name in (KEY, *wanted):
+        if header.count(name) != 1:
+            raise ValueError(
+                f"{path}: must have the columns {', '.join((KEY, *wanted))}, each once; got {','.join(header)!r}. "
+                f"Add or rename {name!r}."
+            )
+    notes += [f"{path.name}: column {name!r} ignored" for name in header if name not in (KEY, *wanted)]
+    places, key = [header.index(name) for name in wanted], header.index(KEY)
+    rows: defaultdict[str, list[list[float]]] = defaultdict(list)
+    for line, cells in csv_errors.records(path):
+        if len(cells) != len(header):
+            raise ValueError(
+                f"{path}, line {line}: must have {len(header)} cells; got {len(cells)}. Complete the line."
+            )
+        if cells[key] not in known:
+            raise ValueError(
+                f"{path}, line {line}: trajectory {cells[key]!r} must have a track; there is none of that name. "
+                "Names are compared as text, zeros included."
+            )
+        for place in places:
+            if not csv_errors.is_number(cells[place]) or (header[place] == "sigma" and not float(cells[place]) > 0.0):
+                rule = "a positive number" if header[place] == "sigma" else "a number"
+                raise ValueError(
+                    f"{path}, line {line}, column {header[place]!r}: must be {rule}; got {cells[place]!r}. "
+                    "Correct it, or delete the line."
+                )
+        rows[cells[key]].append([float(cells[place]) for place in places])
+    return {name: np.array(numbers) for name, numbers in rows.items()}

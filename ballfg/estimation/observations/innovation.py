@@ -1,0 +1,77 @@
+"""Whitened innovations of a smoother: each measurement against its prediction from all others."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.factors.batch import Rows
+from ballfg.factors.covariance import Covariances
+from ballfg.factors.linear import weighted
+from ballfg.state import POSITION
+
+Array = NDArray[np.float64]
+
+LEAST_INFORMATION = 1e-6
+"""Share of the posterior's information that the other measurements are given at least."""
+
+
+def whiten_innovation(innovation: Array, covariance: Array) -> Array:
+    """(n, r) innovations divided by the root of their covariances (n, r, r)."""
+    root = np.linalg.cholesky(covariance)
+    return np.asarray(np.linalg.solve(root, innovation[..., None])[..., 0])
+
+
+def leave_position_out(states: Array, covariances: Array, measured: Array, sigma: Array, samples: Rows) -> Array:
+    """(n, 3) whitened innovations of positions.
+
+    With the sample's share M taken out of the posterior information, the others know the position to C = (P^-1 - M)^-1;
+    without the sample's pull g = M (x - z) (for a robust loss: its gradient) they place it at x + C g. The measurement
+    z lies z - x - C g from there, with covariance R + C.
+
+    Args:
+        states: (n, 9).  covariances: (n, 9, 9).
+        measured: (n, 3) m.  sigma: (n, 3) m.
+        samples: the position factors, linearised at the states.
+    """
+    residual, (jacobian,) = weighted(samples)
+    jacobian = jacobian[..., POSITION]
+    pull = (jacobian.swapaxes(-1, -2) @ residual[..., None])[..., 0]
+    information = np.linalg.inv(covariances[:, POSITION, POSITION])
+    axes = np.arange(3)
+    others = information - jacobian.swapaxes(-1, -2) @ jacobian
+    # a sample that alone decides its position leaves nothing: bound C, the whitened distance goes to zero
+    others[:, axes, axes] += LEAST_INFORMATION * information[:, axes, axes]
+    covariance = np.linalg.inv(others)
+    distance = measured - states[:, POSITION] - (covariance @ pull[..., None])[..., 0]
+    covariance[:, axes, axes] += sigma**2
+    return whiten_innovation(distance, np.asarray(covariance, dtype=np.float64))
+
+
+def leave_one_out(rows: Rows, covariances: Covariances) -> Array:
+    """(m, r) whitened innovations of factors on one state each, and on the coefficients where they see them.
+
+    As `leave_position_out`, in the units of whitened residuals: with H the Jacobian of a measurement and S = H P H^T
+    its share of what is known of it, the others know what it will show to C = S (1 - S)^-1, and see it at a distance
+    -(r + C r) from there; for a robust loss, H and r in S and in the pull are the weighted ones. The covariance of that
+    is 1 + C.
+
+    Args:
+        rows: the factors, linearised at the minimum.
+        covariances: of the states there and of the coefficients.
+    """
+    state, unit = rows.variables[:, 0], np.eye(rows.residual.shape[1])
+    plain, (residual, jacobians) = np.concatenate(rows.jacobians, axis=-1), weighted(rows)
+    pulled = np.concatenate(jacobians, axis=-1)
+    joint = covariances.states[state]
+    if len(jacobians) > 1:
+        cross = covariances.cross[state]
+        both = np.broadcast_to(covariances.coefficients, (len(state), *covariances.coefficients.shape))
+        joint = np.block([[joint, cross], [cross.swapaxes(-1, -2), both]])
+    gain = joint @ pulled.swapaxes(-1, -2)
+    # a measurement that alone decides what it shows leaves nothing: bound C, the whitened distance goes to zero
+    left = np.linalg.inv((1.0 + LEAST_INFORMATION) * unit - pulled @ gain)
+    others = joint + gain @ left @ gain.swapaxes(-1, -2)
+    pull = pulled.swapaxes(-1, -2) @ residual[..., None]
+    distance = -rows.residual - (plain @ others @ pull)[..., 0]
+    return whiten_innovation(distance, unit + plain @ others @ plain.swapaxes(-1, -2))

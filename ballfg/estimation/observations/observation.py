@@ -1,0 +1,187 @@
+"""What an observation is: measurements of one sort, and all that estimators ask of them.
+
+Estimators know this interface only. A sort of measurement of one's own is a subclass and a registration
+(docs/custom_factors.md); most are a `Reading`, which asks for one function in torch.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar, Self
+
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ballfg.dynamics.model import BallModel
+from ballfg.estimation.observations.innovation import leave_one_out
+from ballfg.estimation.settings import Settings
+from ballfg.factors.batch import FactorBatch, Rows, Values
+from ballfg.factors.covariance import Covariances
+from ballfg.tracks import Track
+
+if TYPE_CHECKING:
+    from ballfg.estimation.result import Estimate
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Unknowns:
+    """What an observation adds to the unknowns of a track: the time offset of a camera, for instance.
+
+    Attributes:
+        names: of q unknowns, different from those of other observations.
+        means: (q,) in the unknowns' own units, of their prior, from the origins on.
+        sigmas: (q,) in the unknowns' own units, standard deviations of their prior.
+        origins: (q,) in the unknowns' own units, what the factors count them from; a minimisation starts there.
+    """
+
+    names: tuple[str, ...] = ()
+    means: Array = field(default_factory=lambda: np.zeros(0))
+    sigmas: Array = field(default_factory=lambda: np.zeros(0))
+    origins: Array = field(default_factory=lambda: np.zeros(0))
+
+
+@dataclass(frozen=True)
+class Context:
+    """What an observation is told when it makes its factors.
+
+    Attributes:
+        track: that it belongs to.
+        model: the ball.
+        settings: noise, losses and priors.
+        sigma: (n, 3) m, standard deviation of each position of the track, samples of bad quality included.
+        columns: place of each unknown, by name, among the coefficients that all factors of the track share.
+    """
+
+    track: Track
+    model: BallModel
+    settings: Settings
+    sigma: Array
+    columns: Mapping[str, int] = field(default_factory=dict)
+
+
+class Observation(ABC):
+    """Measurements of one sort that belong to a track.
+
+    Attributes:
+        name: of the sort; a track holds one observation of a name.
+        state: (m,) index of the sample of the track that each of the m measurements tells of, ascending.
+        locates: whether it tells where the ball is. The positions of such a track were made from it.
+        file: name of its table in the folder of a dataset; None where it has no table of its own.
+        columns: of that table, beside `trajectory`, `t` (s) and `sigma`.
+    """
+
+    name: ClassVar[str]
+    locates: ClassVar[bool] = False
+    file: ClassVar[str | None] = None
+    columns: ClassVar[tuple[str, ...]] = ()
+    state: Index
+
+    def __len__(self) -> int:
+        return len(self.state)
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({len(self)} of {len(np.unique(self.state))} samples)"
+
+    @abstractmethod
+    def batch(self, context: Context) -> FactorBatch:
+        """The factors of all m measurements, in order, each on the state of its sample.
+
+        Where the observation has unknowns, `COEFFICIENTS` is a second variable, and `context.columns` tells their
+        places in it.
+        """
+
+    @abstractmethod
+    def taken(self, samples: NDArray[np.bool_]) -> Self:
+        """The measurements of some samples of the track, whose samples are then numbered anew.
+
+        Args: samples: (n,) bool, which samples of the track stay.
+        """
+
+    def turned(self, rotation: Tensor, shift: Tensor) -> Observation:
+        """The same measurements as seen in another frame: p -> rotation p + shift.
+
+        Args: rotation: (3, 3) about the vertical, dimensionless.  shift: (3,) m.
+        Raises: ValueError: if the observation cannot be turned.
+        """
+        raise ValueError(
+            f"tracks with the observation '{self.name}' cannot be turned. Train without augmentation (augment: false), "
+            f"or write {type(self).__name__}.turned."
+        )
+
+    def unknowns(self, settings: Settings) -> Unknowns:
+        """What the observation adds to the unknowns of the track; nothing by default.
+
+        Raises: ValueError: if the settings ask for unknowns that the observation does not have.
+        """
+        return Unknowns()
+
+    def innovations(self, context: Context, rows: Rows, values: Values, covariances: Covariances) -> Array:
+        """(m, dim) whitened: each measurement against its prediction from all others.
+
+        Args:
+            context: that the factors were made with.
+            rows: the factors linearised at the minimum.
+            values: the minimum.
+            covariances: of the states there and of the coefficients.
+        """
+        return leave_one_out(rows, covariances)
+
+    def retimed(self, track: Track, estimate: Estimate) -> Track | None:
+        """The track with the stamps that the unknowns call for; None, the default, where its stamps stay."""
+        return None
+
+    def onto(self, old: Track, new: Track) -> Observation:
+        """The same measurements on a track of the same ball with other stamps.
+
+        Args: old: track that the observation belongs to.  new: track without it.
+        Raises: ValueError: if the observation cannot change its stamps.
+        """
+        raise ValueError(
+            f"track {old.name!r}: the observation '{self.name}' cannot stand beside time offsets that are estimated, "
+            f"because it does not know how its samples move. Write {type(self).__name__}.onto, or fix the offsets."
+        )
+
+    @classmethod
+    def from_table(cls, track: Track, rows: Array) -> Self:
+        """The observation of a track from its rows of the table.
+
+        Args: track: with its stamps.  rows: (m, 2 + dim) t s, the columns and sigma in their own units.
+        Raises: ValueError: if the observation has no table, or the rows do not suit the track.
+        """
+        raise ValueError(f"the observation '{cls.name}' has no table of its own: {cls.__name__}.file is None")
+
+    def table(self, track: Track) -> Mapping[str, Array]:
+        """The columns `t`, those of the values, and `sigma`, (m,) each, in s and their own units.
+
+        Args: track: that the observation belongs to.
+        Raises: ValueError: if the observation has no table.
+        """
+        raise ValueError(f"the observation '{self.name}' has no table of its own: {type(self).__name__}.file is None")
+
+    def filter_rows(self, batch: FactorBatch, sample: int) -> Index:
+        """(k,) rows of the batch that a filter updates with at a sample; none where positions stand for them."""
+        return np.zeros(0, dtype=np.int64) if self.locates else np.flatnonzero(self.state == sample)
+
+    def single_rows(self, batch: FactorBatch) -> Iterator[tuple[int, FactorBatch]]:
+        """The measurements one by one, as they come in on a stream: sample, and a batch of one factor on state 0."""
+        for row, sample in enumerate(self.state.tolist()):
+            one = batch.taken(np.array([row]))
+            one.variables = np.zeros_like(one.variables)
+            yield sample, one
+
+
+def unknowns_of(observations: tuple[Observation, ...], settings: Settings) -> Unknowns:
+    """The unknowns of several observations, one after the other."""
+    found = [observation.unknowns(settings) for observation in observations]
+    return Unknowns(
+        tuple(name for one in found for name in one.names),
+        np.concatenate([np.zeros(0), *(one.means for one in found)]),
+        np.concatenate([np.zeros(0), *(one.sigmas for one in found)]),
+        np.concatenate([np.zeros(0), *(one.origins for one in found)]),
+    )

@@ -1,0 +1,47 @@
+"""Positions: the observation that most tracks have, and the usual one alone."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.estimation.observations.innovation import leave_position_out
+from ballfg.estimation.observations.observation import Array, Context, Observation
+from ballfg.factors.batch import Rows, Values
+from ballfg.factors.covariance import Covariances
+from ballfg.factors.position import PositionFactors
+from ballfg.tracks import Track
+
+
+class Positions(Observation):
+    """The measured positions of a track, one at each sample.
+
+    Args: positions: (n, 3) m.
+    """
+
+    name: ClassVar[str] = "position"
+    locates: ClassVar[bool] = True
+
+    def __init__(self, positions: Array) -> None:
+        self.positions = positions
+        self.state = np.arange(len(positions))
+
+    def batch(self, context: Context) -> PositionFactors:
+        """Position factors with the standard deviations and the loss of the context."""
+        return PositionFactors(self.state, self.positions, context.sigma, context.settings.loss)
+
+    def taken(self, samples: NDArray[np.bool_]) -> Positions:
+        """The positions of some samples."""
+        return Positions(self.positions[samples])
+
+    def innovations(self, context: Context, rows: Rows, values: Values, covariances: Covariances) -> Array:
+        """(n, 3) whitened: each position against its prediction from all others."""
+        return leave_position_out(values.states, covariances.states, self.positions, context.sigma, rows)
+
+
+def observations_of(track: Track) -> tuple[Observation, ...]:
+    """All observations of a track: its positions, unless they were made from the others, and what it brings beside."""
+    measured = () if track.rough else (Positions(track.positions),)
+    return (*measured, *track.observations)

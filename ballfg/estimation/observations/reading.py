@@ -1,0 +1,196 @@
+"""Readings of an instrument: numbers that follow from the state of the ball, by one function in torch."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Hashable, Mapping
+from functools import partial
+from typing import ClassVar, Final, Self
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from torch import Tensor
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.integrate import batch_jacobian, rk4_step
+from ballfg.estimation.observations.observation import Array, Context, Index, Observation
+from ballfg.factors.batch import FactorBatch
+from ballfg.factors.loss import Loss
+from ballfg.state import SPIN, VELOCITY
+from ballfg.tracks import Track
+
+FARTHEST: Final = 0.05
+"""s. A reading that lies farther from every sample is refused: over so long the ball may bounce."""
+
+
+class Reading(Observation):
+    """Readings of one instrument, with independent Gaussian noise.
+
+    A subclass names itself, its columns in a file, and writes `predicted`. Jacobians, the gradient of learning, the
+    update of filters, innovations, reading and writing follow from that.
+
+    Args:
+        state: (m,) index of the sample that is nearest in time to each reading.
+        values: (m, dim), or (m,) where dim is 1, in the units of the columns.
+        sigma: standard deviation of each value in the same units; a number, (m,), or (m, dim).
+        delay: (m,) s, time of each reading minus the stamp of its sample; zero where None. The state is carried so
+            far in free flight.
+
+    Attributes:
+        file: name of the table in the folder of a dataset, with the columns `trajectory`, `t`, those of the values,
+            and `sigma`.
+        columns: of the values in that table; `dim` of them.
+        loss: on the norm of a whitened reading.
+
+    Raises: ValueError: a wrong shape, a value that is not finite, a sigma that is not positive.
+    """
+
+    file: ClassVar[str | None]
+    loss: ClassVar[Loss] = Loss("huber", 3.0)
+
+    def __init__(self, state: ArrayLike, values: ArrayLike, sigma: ArrayLike, delay: ArrayLike | None = None) -> None:
+        m, dim = np.size(state), len(self.columns)
+        self.state: Index = np.asarray(state, dtype=np.int64).reshape(m)
+        given = np.asarray(values, dtype=np.float64)
+        if given.shape not in ((m, dim), (m,) if dim == 1 else (m, dim)):
+            raise ValueError(f"values of '{self.name}' must have shape ({m}, {dim}); got {given.shape}")
+        self.values: Array = given.reshape(m, dim)
+        spread = np.asarray(sigma, dtype=np.float64)
+        self.sigma: Array = np.broadcast_to(spread[:, None] if spread.ndim == 1 else spread, (m, dim)).copy()
+        self.delay: Array = np.zeros(m) if delay is None else np.asarray(delay, dtype=np.float64).reshape(m)
+        if not np.isfinite(self.values).all() or not np.isfinite(self.delay).all():
+            raise ValueError(f"values of '{self.name}' must be finite; leave out readings that are not")
+        if not (np.isfinite(self.sigma).all() and (self.sigma > 0.0).all()):
+            raise ValueError(f"sigma of '{self.name}' must be positive and finite; leave out readings without a sigma")
+        if (np.diff(self.state) < 0).any():
+            raise ValueError(f"state of '{self.name}' must ascend; sort the readings by time")
+
+    @abstractmethod
+    def predicted(self, state: Tensor) -> Tensor:
+        """(..., dim) what the instrument would read of balls in states (..., 9), without noise."""
+
+    @classmethod
+    def at(cls, track: Track, times: ArrayLike, values: ArrayLike, sigma: ArrayLike) -> Self:
+        """Readings at times of their own, each with the nearest sample of the track.
+
+        Args: track: with its stamps.  times: (m,) s.  values: (m, dim).  sigma: as for the class.
+        Raises: ValueError: a reading that is farther than `FARTHEST` from every sample.
+        """
+        when = np.asarray(times, dtype=np.float64)
+        order = np.argsort(when, kind="stable")
+        when, given = when[order], np.asarray(values, dtype=np.float64)[order]
+        spread = np.asarray(sigma, dtype=np.float64)
+        after = np.clip(np.searchsorted(track.times, when), 1 if len(track) > 1 else 0, len(track) - 1)
+        before = np.maximum(after - 1, 0)
+        state = np.where(when - track.times[before] < track.times[after] - when, before, after)
+        delay = when - track.times[state]
+        if len(delay) and np.abs(delay).max() > FARTHEST:
+            worst = int(np.abs(delay).argmax())
+            raise ValueError(
+                f"track {track.name!r}: readings '{cls.name}' must lie within {FARTHEST:g} s of a sample; the one at "
+                f"t={when[worst]:g} s is {abs(delay[worst]):.3g} s away. Check its clock, or leave it out."
+            )
+        return cls(state, given, spread[order] if spread.ndim else spread, delay)
+
+    @classmethod
+    def from_table(cls, track: Track, rows: Array) -> Self:
+        """The readings of a track from its rows of the table."""
+        return cls.at(track, rows[:, 0], rows[:, 1:-1], rows[:, -1])
+
+    def taken(self, samples: NDArray[np.bool_]) -> Self:
+        """The readings of some samples."""
+        kept = samples[self.state]
+        number = np.cumsum(samples) - 1
+        return type(self)(number[self.state[kept]], self.values[kept], self.sigma[kept], self.delay[kept])
+
+    def onto(self, old: Track, new: Track) -> Self:
+        """The same readings, with the nearest samples of another track."""
+        return type(self).at(new, old.times[self.state] + self.delay, self.values, self.sigma)
+
+    def batch(self, context: Context) -> FactorBatch:
+        """One factor a reading."""
+        return ReadingFactors(self, context.model)
+
+    def table(self, track: Track) -> Mapping[str, Array]:
+        """Columns of the file, in order, without the trajectory: t (m,) s, the values (m,) and sigma (m,)."""
+        values = dict(zip(self.columns, self.values.T, strict=True))
+        return {"t": track.times[self.state] + self.delay, **values, "sigma": self.sigma[:, 0]}
+
+
+class RadarSpeed(Reading):
+    """The speed of the ball, m/s, as a radar beside the flight or a speed gun with a known angle tells it."""
+
+    name: ClassVar[str] = "speed"
+    file: ClassVar[str | None] = "speeds.csv"
+    columns: ClassVar[tuple[str, ...]] = ("speed",)
+
+    def predicted(self, state: Tensor) -> Tensor:
+        """(..., 1) m/s, length of the velocity."""
+        return state[..., VELOCITY].square().sum(-1, keepdim=True).clamp_min(LEAST_SPEED**2).sqrt()
+
+    def turned(self, rotation: Tensor, shift: Tensor) -> RadarSpeed:
+        """A speed is the same in every frame."""
+        return self
+
+
+LEAST_SPEED: Final = 1e-6
+"""m/s. Below it the direction of the velocity, and so the derivative of its length, is taken to be none."""
+
+
+class SpinReading(Reading):
+    """The spin of the ball, rad/s, as a camera that reads its marks tells it in mid-flight."""
+
+    name: ClassVar[str] = "spin"
+    file: ClassVar[str | None] = "spins.csv"
+    columns: ClassVar[tuple[str, ...]] = ("wx", "wy", "wz")
+    loss: ClassVar[Loss] = Loss("cauchy", 3.0)
+
+    def predicted(self, state: Tensor) -> Tensor:
+        """(..., 3) rad/s."""
+        return state[..., SPIN]
+
+    def turned(self, rotation: Tensor, shift: Tensor) -> SpinReading:
+        """The spins turn along."""
+        return SpinReading(self.state, self.values @ rotation.numpy().T, self.sigma, self.delay)
+
+
+class ReadingFactors(FactorBatch):
+    """r = (h(x_i carried over the delay) - z_i) / sigma_i.
+
+    Args:
+        reading: gives h, z, sigma, the delays and the loss.
+        model: carries states in free flight; asked only where a delay is not zero.
+    """
+
+    row_arrays: ClassVar[tuple[str, ...]] = ("variables", "values", "sigma", "delay")
+    costly: ClassVar[bool] = True
+
+    def __init__(self, reading: Reading, model: BallModel) -> None:
+        super().__init__(reading.state[:, None], len(reading.columns), reading.loss)
+        self.predicted = reading.predicted
+        self.sort = type(reading)
+        self.model = model
+        self.values, self.sigma, self.delay = reading.values, reading.sigma, reading.delay
+
+    @property
+    def group(self) -> Hashable:
+        """Besides the usual: the sort of the reading and the model."""
+        return (*super().group, self.sort, id(self.model))  # type: ignore[misc]
+
+    def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+        """Whitened residuals (k, dim) and Jacobians (k, dim, 9)."""
+        numbers = (torch.from_numpy(a[rows]) for a in (self.values, self.sigma, self.delay))
+        function = partial(self._whitened, *numbers)
+        residual, jacobian = batch_jacobian(function, torch.from_numpy(inputs[0]), outputs=self.dim)
+        return residual.numpy(), (jacobian.numpy(),)
+
+    def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
+        """(m, dim) whitened residuals in torch."""
+        numbers = (torch.from_numpy(a) for a in (self.values, self.sigma, self.delay))
+        return self._whitened(*numbers, inputs[0])
+
+    def _whitened(self, values: Tensor, sigma: Tensor, delay: Tensor, state: Tensor) -> Tensor:
+        if bool(delay.any()):
+            state = rk4_step(self.model.rates, state, delay.unsqueeze(-1))
+        return (self.predicted(state) - values) / sigma

@@ -1,0 +1,269 @@
+"""Sightings: what cameras saw of one ball, each at its own stamp, and the track with rough positions made from them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, ClassVar, Final, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.estimation.observations.observation import Context, Observation, Unknowns
+from ballfg.estimation.observations.ray_path import Path, Rays, rough_path
+from ballfg.estimation.settings import Settings
+from ballfg.factors.camera import FIXED, CameraFactors
+from ballfg.state import STANDARD_GRAVITY, Z
+from ballfg.tracks.sightings import Sightings
+from ballfg.tracks.track import Label, Track
+from ballfg.vision.camera import Camera
+from ballfg.vision.projection import CameraBank
+
+if TYPE_CHECKING:
+    from ballfg.estimation.result import Estimate
+
+Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+
+TIME_OFFSET: Final = "time_offset."
+"""What the name of a camera's time offset begins with among the unknowns of a track."""
+OFFSET_SETTLED: Final = 1e-5
+"""s. An offset that moves by less is settled: the path bends by a nanometre meanwhile."""
+
+SAME_MOMENT: Final = 2e-4
+"""s. Sightings closer than this share a state, and a camera factor carries it over the rest in a straight line: at
+20 m/s^2 that is wrong by 0.4 um. States closer together would cost time and tell nothing."""
+LOOSE: Final = 0.05
+"""m. Where the rays around a moment leave the position more open than this, its neighbours in time tell it better."""
+LOOSE_SIGMA: Final = 0.1
+"""m, standard deviation of a position that was interpolated in time: a bounce may lie between its neighbours."""
+LOOSE_GROWTH: Final = 2.0
+"""m/s, growth of that with the time to the next moment that rays fix: what a window's velocity is worth."""
+
+
+class NeverSeenByTwoError(ValueError):
+    """No two cameras saw the ball within a few frames: there is no telling where it was."""
+
+
+class CameraSightings(Observation):
+    """Where cameras saw the ball, in pixels.
+
+    The stamps of its track are the true times of sightings; those closer than `SAME_MOMENT` share a sample. Where
+    `Settings.time_offsets` names cameras, their time offsets are unknowns of the track.
+
+    Args:
+        sightings: m of them, in order of true time.
+        cameras: c of them, in the order of `sightings.cameras`; their time offsets are in the stamps of the track.
+        state: (m,) index of the sample that each sighting belongs to, ascending.
+        delay: (m,) s, true time of each sighting minus the stamp of its sample: 0 to `SAME_MOMENT`.
+        moved: (c,) s, by which the time offsets were moved since the track was made: the prior of an offset is about
+            where it was then.
+    """
+
+    name: ClassVar[str] = "sighting"
+    locates: ClassVar[bool] = True
+
+    def __init__(
+        self, sightings: Sightings, cameras: tuple[Camera, ...], state: Index, delay: Array, moved: Array
+    ) -> None:
+        self.sightings = sightings
+        self.cameras = cameras
+        self.state = state
+        self.delay = delay
+        self.moved = moved
+
+    @property
+    def bank(self) -> CameraBank:
+        """The cameras in torch; one object for all tracks of a rig."""
+        return _bank(self.cameras)
+
+    @property
+    def time_offsets(self) -> Array:
+        """(c,) s, of the cameras as they are in the stamps."""
+        return np.array([camera.time_offset for camera in self.cameras])
+
+    def batch(self, context: Context) -> CameraFactors:
+        """Camera factors; with time offsets among the coefficients where they are unknown."""
+        names = [TIME_OFFSET + name for name in self.sightings.cameras]
+        columns = np.array([context.columns.get(name, FIXED) for name in names])
+        return CameraFactors(
+            self.state,
+            self.sightings.camera,
+            self.sightings.pixels,
+            self.sightings.covariances,
+            self.bank,
+            self.delay,
+            columns if (columns != FIXED).any() else None,
+            context.settings.sighting_loss,
+        )
+
+    def unknowns(self, settings: Settings) -> Unknowns:
+        """The time offsets that the settings name, s, each counted from that of its camera.
+
+        Raises: ValueError: if the settings name a camera that the track does not have.
+        """
+        names = self.sightings.cameras
+        for name in settings.time_offsets:
+            if name not in names:
+                raise ValueError(f"time_offsets must name cameras of the track, {', '.join(names)}; got {name!r}")
+        chosen = [names.index(name) for name in settings.time_offsets]
+        return Unknowns(
+            tuple(TIME_OFFSET + name for name in settings.time_offsets),
+            -self.moved[chosen],
+            np.array(list(settings.time_offsets.values())),
+            self.time_offsets[chosen],
+        )
+
+    def found_offsets(self, estimate: Estimate) -> tuple[Array, Array]:
+        """Time offsets (c,) s of all cameras after an estimate, and their covariance (c, c) s^2.
+
+        Those that were not estimated are the cameras' own, with zero covariance.
+        """
+        rows = [estimate.unknown_names.index(n) for n in estimate.unknown_names if n.startswith(TIME_OFFSET)]
+        cameras = [self.sightings.cameras.index(estimate.unknown_names[r].removeprefix(TIME_OFFSET)) for r in rows]
+        offsets, covariance = self.time_offsets, np.zeros((len(self.cameras),) * 2)
+        offsets[cameras] = estimate.unknowns[rows]
+        covariance[np.ix_(cameras, cameras)] = estimate.unknown_covariance[np.ix_(rows, rows)]
+        return offsets, covariance
+
+    def retimed(self, track: Track, estimate: Estimate) -> Track | None:
+        """The track with the time offsets that were found; None where they moved by less than `OFFSET_SETTLED`."""
+        offsets, _ = self.found_offsets(estimate)
+        return None if np.abs(offsets - self.time_offsets).max() < OFFSET_SETTLED else self.with_offsets(track, offsets)
+
+    def with_offsets(self, track: Track, offsets: Array) -> Track:
+        """The track as it is with other time offsets (c,) s; `moved` tells by how much they moved."""
+        cameras = tuple(replace(c, time_offset=float(d)) for c, d in zip(self.cameras, offsets, strict=True))
+        again = sighted_track(track.name, in_order(self.sightings, cameras), cameras, track.labels)
+        seen = sightings_of(again)
+        seen.moved = self.moved + offsets - self.time_offsets
+        return again.observed(*(other.onto(track, again) for other in track.observations if other is not self))
+
+    def taken(self, samples: NDArray[np.bool_]) -> CameraSightings:
+        """The sightings of some samples."""
+        rows = samples[self.state]
+        number = np.cumsum(samples) - 1
+        return CameraSightings(
+            self.sightings.taken(rows), self.cameras, number[self.state[rows]], self.delay[rows], self.moved
+        )
+
+
+def sightings_of(track: Track) -> CameraSightings:
+    """The sightings of a track.
+
+    Raises: ValueError: if it has none.
+    """
+    for observation in track.observations:
+        if observation.name == CameraSightings.name:
+            return cast(CameraSightings, observation)
+    raise ValueError(f"track {track.name!r} must have sightings of cameras; it has none. Make it with sighted_track.")
+
+
+def sighted_track(
+    name: str, sightings: Sightings, cameras: Sequence[Camera], labels: Mapping[str, Label] | None = None
+) -> Track:
+    """The track of one ball that cameras saw.
+
+    Its `positions` and `sigmas` are rough, made from the rays about each stamp: good enough to find events in and to
+    start from. The smoother and the online estimator use camera factors in their place; the extended Kalman filter and
+    the sliding window know positions only, and use these. Neighbouring ones share rays, so their errors go together.
+
+    Args:
+        name: of the trajectory.
+        sightings: of the ball, in order of true time.
+        cameras: of the rig, in any order; those that `sightings` names must be among them.
+        labels: what is known of the shot.
+    Raises: ValueError: if a camera is missing, rows are not in order of true time, or the ball was never in the view of
+        two cameras within a few frames.
+    """
+    rig = cameras_of(sightings, cameras)
+    times = true_times_of(sightings, rig)
+    if (np.diff(times) < 0.0).any():
+        row = int(np.argmax(np.diff(times) < 0.0)) + 1
+        raise ValueError(
+            f"track {name!r}: sightings must be in order of true time; row {row}, camera "
+            f"{sightings.cameras[sightings.camera[row]]!r}, is earlier than the one before. Sort them with `in_order`."
+        )
+    first = _firsts(times)
+    moments = times[first]
+    state = np.cumsum(first) - 1
+    path = filled(moments, rough_path(Rays.of(sightings, times, rig), moments), name)
+    seen = CameraSightings(sightings, rig, state, times - moments[state], np.zeros(len(rig)))
+    return Track(name, moments, path.positions, path.sigmas, dict(labels or {}), observations=(seen,), rough=True)
+
+
+def cameras_of(sightings: Sightings, cameras: Sequence[Camera]) -> tuple[Camera, ...]:
+    """The cameras that sightings name, in their order. Raises: ValueError: if one is missing."""
+    known = {camera.name: camera for camera in cameras}
+    for name in sightings.cameras:
+        if name not in known:
+            raise ValueError(
+                f"cameras must hold every camera of the sightings; {name!r} is missing among {', '.join(known)}. "
+                "Add it to cameras.yaml, or leave its sightings out."
+            )
+    return tuple(known[name] for name in sightings.cameras)
+
+
+def true_times_of(sightings: Sightings, cameras: Sequence[Camera]) -> Array:
+    """(m,) s, when sightings happened: stamps less the time offsets of the cameras, in the order of their numbers."""
+    offsets = np.array([camera.time_offset for camera in cameras])
+    return np.asarray(sightings.times - offsets[sightings.camera])
+
+
+def in_order(sightings: Sightings, cameras: Sequence[Camera]) -> Sightings:
+    """The sightings in order of true time, as the cameras' time offsets have it."""
+    times = true_times_of(sightings, cameras_of(sightings, cameras))
+    return sightings.taken(np.argsort(times, kind="stable"))
+
+
+@lru_cache(maxsize=64)
+def _bank(cameras: tuple[Camera, ...]) -> CameraBank:
+    return CameraBank(cameras)
+
+
+def _firsts(times: Array) -> NDArray[np.bool_]:
+    """(m,) whether a sighting begins a state of its own."""
+    first = np.ones(len(times), dtype=bool)
+    begun = times[0]
+    for row in range(1, len(times)):
+        first[row] = times[row] - begun > SAME_MOMENT
+        begun = times[row] if first[row] else begun
+    return first
+
+
+def filled(moments: Array, path: Path, name: str) -> Path:
+    """The path with what rays leave open interpolated in time, extrapolated at its ends.
+
+    Args: moments: (n,) s, of the path.  path: from `rough_path`.  name: of the track, for the message.
+    Raises: NeverSeenByTwoError: if rays fix no position at all.
+    """
+    firm = path.sigmas.max(axis=1) <= LOOSE
+    if not firm.any():
+        raise NeverSeenByTwoError(
+            f"track {name!r}: the ball must be seen by two cameras within a few frames; it never is. "
+            "Leave the track out, or look at the time offsets of the cameras."
+        )
+    if firm.all():
+        return path
+    (at,), (gaps,) = np.nonzero(firm), np.nonzero(~firm)
+    place = np.searchsorted(at, gaps)
+    before, after = at[np.maximum(place - 1, 0)], at[np.minimum(place, len(at) - 1)]
+    since, until = moments[gaps] - moments[before], moments[after] - moments[gaps]
+    whole = since + until
+    share = np.where(whole > 0.0, since / np.where(whole > 0.0, whole, 1.0), 0.0)[:, None]
+    share = share**2 * (3.0 - 2.0 * share)  # Hermite's blend of the two extrapolations: smooth at both ends
+    positions, velocities, sigmas = path.positions.copy(), path.velocities.copy(), path.sigmas.copy()
+    positions[gaps] = (1 - share) * _fallen(path, before, since) + share * _fallen(path, after, -until)
+    velocities[gaps] = (1 - share) * path.velocities[before] + share * path.velocities[after]
+    nearest = np.minimum(np.abs(since), np.abs(until))
+    nearest = np.where(before == after, np.maximum(np.abs(since), np.abs(until)), nearest)
+    sigmas[gaps] = (LOOSE_SIGMA + LOOSE_GROWTH * nearest)[:, None]
+    return Path(positions, velocities, sigmas)
+
+
+def _fallen(path: Path, rows: NDArray[np.int64], elapsed: Array) -> Array:
+    """(k, 3) m, where the free fall from some moments is after some time, s."""
+    points = path.positions[rows] + elapsed[:, None] * path.velocities[rows]
+    points[:, Z] -= 0.5 * STANDARD_GRAVITY * elapsed**2
+    return points

@@ -1,0 +1,65 @@
+"""One measurement in the window of iSAM2: its factor, and the last answer that its torch batch gave."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Hashable, Sequence
+
+import gtsam
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.factors.batch import FactorBatch, merge
+from ballfg.factors.bridge import Bridge, checked
+
+Array = NDArray[np.float64]
+
+
+class Measurement:
+    """One measurement of a state.
+
+    Args: batch: of one factor on one state, which alone it looks at.
+
+    Attributes:
+        innovation: (dim,) whitened, against the prediction at the moment it came in; NaN where there was none.
+    """
+
+    def __init__(self, batch: FactorBatch) -> None:
+        self.batch = batch
+        self.bridge = Bridge(batch, on_miss="row")
+        self.innovation = np.full(batch.dim, np.nan)
+
+    def factor(self, state: int) -> gtsam.CustomFactor:
+        """The factor on a state of the stream."""
+        return self.bridge.factor(0, [state])
+
+    def corrected(self, state: Array, covariance: Array) -> tuple[Array, Array]:
+        """State (9,) and its covariance (9, 9), moved by the measurement as an extended Kalman filter would.
+
+        A robust loss gets the weight that the innovation gives it. The innovation is kept the first time.
+        """
+        (residual,), (rows,) = self.batch.compute(slice(None), (state[None],))
+        slope, unit = rows[0], np.eye(self.batch.dim)
+        spread = slope @ covariance @ slope.T
+        whitened = np.linalg.solve(np.linalg.cholesky(spread + unit), -residual)
+        if np.isnan(self.innovation).any():
+            self.innovation = whitened
+        (weight,) = self.batch.loss.weight(np.array([np.linalg.norm(whitened)]))
+        gain = np.linalg.solve(spread + unit / weight, slope @ covariance).T
+        return state - gain @ residual, covariance - gain @ slope @ covariance
+
+
+def prepare(measurements: Sequence[Measurement], states: Array) -> None:
+    """Evaluate measurements at their states (k, 9), one call for each sort, and keep the answers for iSAM2's questions.
+
+    Raises: ValueError: if a residual is not finite: a ball is not in front of its camera, for instance.
+    """
+    groups: defaultdict[Hashable, list[int]] = defaultdict(list)
+    for k, measurement in enumerate(measurements):
+        groups[measurement.batch.group].append(k)
+    for members in groups.values():
+        batch = merge([measurements[k].batch for k in members])
+        inputs = (np.ascontiguousarray(states[members]),)
+        residual, (jacobian,) = checked(batch, slice(None), inputs, *batch.compute(slice(None), inputs))
+        for row, k in enumerate(members):
+            measurements[k].bridge.keep(0, (inputs[0][row],), residual[row], (jacobian[row],))

@@ -1,0 +1,39 @@
+"""The picture of an estimate: each component of the state over time, with its uncertainty."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from matplotlib.figure import Figure
+
+from ballfg.estimation.result import Estimate
+
+PARTS: Final = (("position", "m"), ("velocity", "m/s"), ("spin", "rad/s"))
+AXES: Final = ("x", "y", "z")
+COLOURS: Final = ("#c44e52", "#55a868", "#4c72b0")
+
+
+def picture(estimate: Estimate) -> Figure:
+    """Three panels, one for each part of the state; contacts are dashed lines, hits are dotted ones.
+
+    Args: estimate: of one track.
+    """
+    figure = Figure(figsize=(8.0, 7.0), layout="constrained")
+    panels = figure.subplots(3, 1, sharex=True)
+    times, sigmas = estimate.times, estimate.sigmas
+    for k, (part, unit) in enumerate(PARTS):
+        for axis in range(3):
+            column = 3 * k + axis
+            mean, band = estimate.states[:, column], 2.0 * sigmas[:, column]
+            panels[k].plot(times, mean, color=COLOURS[axis], label=AXES[axis], linewidth=1.2)
+            panels[k].fill_between(times, mean - band, mean + band, color=COLOURS[axis], alpha=0.2, linewidth=0.0)
+        for contact in estimate.contacts:
+            panels[k].axvline(contact.time, color="0.5", linestyle="--", linewidth=0.8)
+        for interval in estimate.hits:
+            panels[k].axvline(0.5 * (times[interval] + times[interval + 1]), color="0.5", linestyle=":", linewidth=0.8)
+        panels[k].set_ylabel(f"{part}, {unit}")
+        panels[k].grid(alpha=0.3)
+    panels[0].legend(ncols=3, loc="upper right")
+    panels[0].set_title(f"track {estimate.name}: states with two standard deviations; dashed: contacts")
+    panels[2].set_xlabel("time, s")
+    return figure

@@ -1,0 +1,113 @@
+"""The path of one ball ahead: positions with standard deviations, and the events on the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.prediction.belief import Belief
+from ballfg.prediction.crossing import Crossing, apex, next_contact, plane_crossing
+from ballfg.prediction.propagate import Propagator
+from ballfg.prediction.state import BallState
+from ballfg.state import POSITION
+
+if TYPE_CHECKING:
+    from pandas import DataFrame
+
+Array = NDArray[np.float64]
+
+AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Ahead:
+    """Where a ball will be.
+
+    Attributes:
+        start: the state that the path begins with.
+        horizon: s, how far ahead events are looked for.
+        times: (k,) s, on the clock of the start.
+        states: (k, 9) position m, velocity m/s, spin rad/s.
+        covariances: (k, 9, 9) in the products of those units; no measurement noise in them.
+    """
+
+    start: BallState
+    horizon: float
+    times: Array
+    states: Array
+    covariances: Array
+
+    def __repr__(self) -> str:
+        end, spread = self.positions[-1], self.sigmas[-1]
+        numbers = ", ".join(f"{x:.3f} +- {s:.3f}" for x, s in zip(end, spread, strict=True))
+        return f"Ahead({len(self.times)} times to t = {self.times[-1]:.3f} s, there at ({numbers}) m)"
+
+    @property
+    def positions(self) -> Array:
+        """(k, 3) m."""
+        return self.states[:, POSITION]
+
+    @property
+    def sigmas(self) -> Array:
+        """(k, 3) m, standard deviations of the positions; no measurement noise in them."""
+        return np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2)[:, POSITION])
+
+    @cached_property
+    def next_contact(self) -> Crossing | None:
+        """The state just before the next contact with a surface; None if there is none within the horizon."""
+        return next_contact(*self._carried, self.horizon)
+
+    @cached_property
+    def apex(self) -> Crossing | None:
+        """The next highest point; None if there is none within the horizon."""
+        return apex(*self._carried, self.horizon)
+
+    def crossing(self, *, x: float | None = None, y: float | None = None, z: float | None = None) -> Crossing | None:
+        """Where and when the ball goes through a plane across one axis.
+
+        Args: x, y, z: m, the place of the plane on its axis; exactly one of them.
+        Returns: None if the ball does not get there within the horizon.
+        Raises: ValueError: if not exactly one is given.
+        """
+        given = [(i, place) for i, place in enumerate((x, y, z)) if place is not None]
+        if len(given) != 1:
+            raise ValueError(f"crossing takes exactly one of x, y, z; got {len(given)} of them. Ask for one plane.")
+        (axis, place), normal = given[0], np.zeros(3)
+        normal[axis] = 1.0
+        return plane_crossing(*self._carried, normal, place, self.horizon)
+
+    @property
+    def _carried(self) -> tuple[Propagator, Belief]:
+        return carried_by(self.start)
+
+    def to_frame(self) -> DataFrame:
+        """A pandas table: t, x, y, z and sigma_x, sigma_y, sigma_z, s and m, one row a time.
+
+        Raises: ImportError: without pandas.
+        """
+        import pandas
+
+        columns = {"t": self.times, **dict(zip(AXES, self.positions.T, strict=True))}
+        return pandas.DataFrame(columns | {f"sigma_{a}": s for a, s in zip(AXES, self.sigmas.T, strict=True)})
+
+
+def look_ahead(start: BallState, horizon: float, step: float = 0.01) -> Ahead:
+    """The path of a ball from a state on; arguments and errors as those of `BallState.predict`."""
+    if not (np.isfinite(horizon) and horizon > 0.0 and np.isfinite(step) and step > 0.0):
+        raise ValueError(f"horizon and step must be positive numbers of seconds; got {horizon!r} and {step!r}")
+    propagator, belief = carried_by(start)
+    count = max(int(np.ceil(horizon / step - 1e-9)), 1)
+    times = start.time + np.minimum(step * np.arange(1, count + 1), horizon)
+    path = propagator.rollout(belief, times)
+    return Ahead(start, horizon, times, path.states[0], path.covariances[0])
+
+
+def carried_by(start: BallState) -> tuple[Propagator, Belief]:
+    """What carries a state forward, and the state as a belief."""
+    if start.world is None:
+        raise ValueError("a state must know its model to be predicted; this one does not. Give it one with state.on.")
+    return Propagator(start.world.surfaces, start.world.process), Belief.of(start.world.model, [start])

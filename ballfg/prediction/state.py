@@ -1,0 +1,113 @@
+"""The state of a ball at one time as an estimator knows it: the one type that all estimators hand to prediction."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.factors.noise import ProcessNoise
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+
+if TYPE_CHECKING:
+    from ballfg.prediction.ahead import Ahead
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class World:
+    """All that carries a state forward in time.
+
+    Attributes:
+        model: of the ball.
+        surfaces: that it may bounce on.
+        process: how far the ball strays from its model.
+    """
+
+    model: BallModel
+    surfaces: Surfaces
+    process: ProcessNoise = field(default_factory=ProcessNoise)
+
+
+@dataclass(frozen=True)
+class BallState:
+    """The state of a ball at one time, with the coefficients of its model that were estimated along, and covariance.
+
+    Attributes:
+        time: s.
+        mean: (9 + p,) position m, velocity m/s, spin rad/s, then the coefficients in their own units.
+        joint: (9 + p, 9 + p) covariance of that, in the products of those units.
+        coefficient_names: of the p model parameters.
+        world: carries the state forward; None where nobody named a model.
+        name: of the track.
+    """
+
+    time: float
+    mean: Array
+    joint: Array
+    coefficient_names: tuple[str, ...] = ()
+    world: World | None = None
+    name: str = ""
+
+    def __repr__(self) -> str:
+        rows = (("position", POSITION, "m", 3), ("velocity", VELOCITY, "m/s", 2), ("spin", SPIN, "rad/s", 0))
+        parts = []
+        for label, part, unit, digits in rows:
+            numbers = ", ".join(f"{x:.{digits}f}" for x in self.mean[part])
+            spread = ", ".join(f"{x:.{digits}f}" for x in self.sigmas[part])
+            parts.append(f"{label} ({numbers}) +- ({spread}) {unit}")
+        return f"{type(self).__name__}(t = {self.time:.4f} s, " + ",\n    ".join(parts) + ")"
+
+    @property
+    def state(self) -> Array:
+        """(9,) position m, velocity m/s, spin rad/s."""
+        return self.mean[:STATE_DIM]
+
+    @property
+    def covariance(self) -> Array:
+        """(9, 9) of the state, in the products of m, m/s and rad/s."""
+        return self.joint[:STATE_DIM, :STATE_DIM]
+
+    @property
+    def sigmas(self) -> Array:
+        """(9,) standard deviations of the state, m, m/s and rad/s."""
+        return np.sqrt(np.diagonal(self.covariance))
+
+    @property
+    def position(self) -> Array:
+        """(3,) m."""
+        return self.mean[POSITION]
+
+    @property
+    def velocity(self) -> Array:
+        """(3,) m/s."""
+        return self.mean[VELOCITY]
+
+    @property
+    def spin(self) -> Array:
+        """(3,) rad/s."""
+        return self.mean[SPIN]
+
+    @property
+    def coefficients(self) -> Array:
+        """(p,) model parameters, in their own units."""
+        return self.mean[STATE_DIM:]
+
+    def predict(self, horizon: float, step: float = 0.01) -> Ahead:
+        """The path of the ball from here on.
+
+        Args: horizon: s.  step: s between the times of the path.
+        Raises: ValueError: a horizon or step that is not positive, or a state without a model.
+        """
+        from ballfg.prediction.ahead import look_ahead
+
+        return look_ahead(self, horizon, step)
+
+    def on(self, world: World) -> BallState:
+        """The same state in a world that carries it forward."""
+        return replace(self, world=world)
