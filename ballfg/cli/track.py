@@ -157,13 +157,13 @@ def _from_videos(
 
 def _on_one_clock(tracking: Tracking, model: AnalyticModel, surfaces: Surfaces) -> Tracking:
     """The same candidates once more, each camera with the time offset that the balls tell."""
-    from ballfg.estimation import estimate_time_offsets, sighted_track, uncertain
+    from ballfg.estimation import estimate_time_offsets, sighted_track
     from ballfg.vision.tracking.pipeline import track_detections
     from ballfg.vision.tracking.report import disagreement
 
     pairs = zip(tracking.names, tracking.balls, strict=True)
     tracks = [sighted_track(name, ball.sightings, tracking.cameras) for name, ball in pairs]
-    found = estimate_time_offsets(tracks, model, surfaces, uncertain(model))
+    found = estimate_time_offsets(tracks, model, surfaces, Settings.for_measured(model))
     if not found.settled:
         print("note: the time offsets did not settle and are left as they were", file=sys.stderr)
         return tracking

@@ -11,7 +11,7 @@ from ballfg.estimation.observations.sightings import CameraSightings, in_order, 
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.registry import ESTIMATORS, make_estimator
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.settings import Settings, uncertain
+from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.estimation.smoother.time_offsets import TimeOffsets, estimate_time_offsets
 from ballfg.estimation.track_prediction import TrackPrediction, check_observe, predict_tracks
@@ -41,5 +41,4 @@ __all__ = [
     "predict_tracks",
     "read_sighted",
     "sighted_track",
-    "uncertain",
 ]

@@ -11,7 +11,7 @@ from ballfg.dynamics.trained import Trained
 from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
-from ballfg.estimation.settings import MEASURED, Settings, uncertain
+from ballfg.estimation.settings import MEASURED, Settings
 from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
 from ballfg.tracks import Dataset, DatasetInfo
 
@@ -35,7 +35,7 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
         x, y, z = estimate_position_noise(islice(iter(dataset), TRACKS_FOR_NOISE)).tolist()
         noise = (x, y, z)
     if trained is None:
-        settings = uncertain(model, position_noise=noise)
+        settings = Settings.for_measured(model, position_noise=noise)
     else:
         settings = Settings(
             position_noise=noise,

@@ -7,14 +7,16 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.model_file import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.given import given
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.settings import Settings
 from ballfg.factors.batch import FactorBatch
 from ballfg.prediction.state import World
-from ballfg.tracks import Track
+from ballfg.tracks import Ball, Track
 from ballfg.tracks.checks import check_scale
+from ballfg.tracks.doubts import doubts_about
 
 LEAST_CHECKED = 3
 """Samples from which a track's scale can be told."""
@@ -24,9 +26,9 @@ class Estimator(ABC):
     """Turns a track into states.
 
     Args:
-        model: the ball.
-        surfaces: that it may bounce on.
-        settings: noise and priors.
+        model: the ball; of a `Ball`, its nominal model.
+        surfaces: that it may bounce on; of a number (m), a table of that height with the floor below it.
+        settings: noise and priors; those of measured tracks (`Settings.for_measured`) where None.
 
     Raises: ValueError: if the model has measurement effects and the estimator does not undo them.
     """
@@ -35,7 +37,10 @@ class Estimator(ABC):
     undoes_measurement: ClassVar[bool] = False
     """Whether it takes a model that does not measure plainly."""
 
-    def __init__(self, model: BallModel, surfaces: Surfaces, settings: Settings) -> None:
+    def __init__(self, model: BallModel | Ball, surfaces: Surfaces | float, settings: Settings | None = None) -> None:
+        model = nominal_model(model) if isinstance(model, Ball) else model
+        surfaces = Surfaces.table_tennis(surfaces) if isinstance(surfaces, int | float) else surfaces
+        settings = Settings.for_measured(model) if settings is None else settings
         if not (model.measures_plainly or self.undoes_measurement):
             raise ValueError(
                 f"model must have no measurement effects for the estimator '{self.name}' by itself. "
@@ -75,3 +80,7 @@ class Estimator(ABC):
         if len(track) >= LEAST_CHECKED:
             check_scale(f"track {track.name!r}", track.times, track.positions, track.sigmas, None)
         return track.observed(*given(factors))
+
+    def doubts(self, track: Track) -> tuple[str, ...]:
+        """What does not look like a ball above these surfaces, one sentence each; for `Estimate.notes`."""
+        return doubts_about(track.times, track.positions, self.surfaces.heights(), self.model.radius)

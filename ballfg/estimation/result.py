@@ -67,6 +67,7 @@ class Estimate:
         error: objective at the minimum; NaN for methods without one.
         iterations: linear solutions of a minimisation, 0 for methods without one.
         world: model, surfaces and process noise that the states were estimated with; they carry them forward.
+        notes: doubts about the track: an axis that does not fall, bounces where no surface is declared.
     """
 
     name: str
@@ -88,6 +89,7 @@ class Estimate:
     error: float = np.nan
     iterations: int = 0
     world: World | None = None
+    notes: tuple[str, ...] = ()
 
     def __len__(self) -> int:
         return len(self.times)
@@ -97,7 +99,9 @@ class Estimate:
         status = self.status.name.lower().replace("_", " ")
         return (
             f"Estimate({self.name!r}, {len(self)} states over {self.times[-1] - self.times[0]:.3f} s, {status};\n"
-            f"    {len(self.contacts)} contacts, {len(self.hits)} hits, {speed:.2f} m/s at the start)"
+            f"    {len(self.contacts)} contacts, {len(self.hits)} hits, {speed:.2f} m/s at the start"
+            + "".join(f"\n    note: {note}" for note in self.notes)
+            + ")"
         )
 
     def __getitem__(self, sample: int) -> BallState:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,6 +83,16 @@ class Settings:
             if not (np.isfinite(sigma) and sigma > 0):
                 raise ValueError(f"time_offsets['{name}'] must be a positive standard deviation in s; got {sigma}")
 
+    @classmethod
+    def for_measured(cls, model: BallModel, **changes: Any) -> Settings:
+        """Settings for measured tracks: the model's coefficients are known as well as their priors say.
+
+        Args:
+            model: gives the coefficients and their prior standard deviations.
+            changes: other fields.
+        """
+        return cls(**({"coefficients": coefficient_sigmas(model), "process": MEASURED} | changes))
+
     def spin_label(self, track: Track) -> SpinLabel | None:
         """What is known of a track's first spin: its label, else what its launcher settings say, else None."""
         if track.spin_label is not None:
@@ -92,16 +103,6 @@ class Settings:
 MEASURED = ProcessNoise(contact_tangential=0.2, contact_spin=10.0)
 """Process noise on measured tracks: what friction does in a bounce is known to some 0.2 m/s only. Friction and
 tangential restitution as coefficients of a track would say the same, along a kink that no minimisation likes."""
-
-
-def uncertain(model: BallModel, **changes: object) -> Settings:
-    """Settings for measured tracks: the model's coefficients are known as well as their priors say.
-
-    Args:
-        model: gives the coefficients and their prior standard deviations.
-        changes: other fields of `Settings`.
-    """
-    return Settings(coefficients=coefficient_sigmas(model), process=MEASURED, **changes)  # type: ignore[arg-type]
 
 
 def spin_start(label: SpinLabel | None, settings: Settings) -> tuple[NDArray[np.float64], float]:

@@ -1,13 +1,17 @@
 """A dataset: a folder of tracks, checked once, then streamed as often as one likes."""
 
-from collections.abc import Iterator
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Final
 
 from .checks import Findings, check_scale, tidy
 from .grouping import Index, RowGroup, groups, scan
-from .info import INFO_FILE, DatasetInfo, read_info
+from .info import INFO_FILE, Ball, DatasetInfo, read_info
 from .labels import LABELS_FILE, LabelTable, read_labels
 from .rows import CsvRows, ParquetRows, RowSource
 from .track import FloatArray, Label, Track
@@ -37,13 +41,15 @@ class Dataset:
         self._source = source
         self._index = index
         self._labels = labels
+        self._attached: Callable[[Track], Track] | None = None
 
     def __len__(self) -> int:
         return len(self._index.names)
 
     def __iter__(self) -> Iterator[Track]:
         for group in groups(self._source, self._index):
-            yield _track(group.name, tidy(group, self._source.where), self._labels.of(group.name))
+            track = _track(group.name, tidy(group, self._source.where), self._labels.of(group.name))
+            yield replace(track if self._attached is None else self._attached(track), dataset=self)
 
     def __repr__(self) -> str:
         return f"Dataset({self.info.name!r}, {len(self)} tracks, {str(self.path)!r})"
@@ -62,6 +68,29 @@ class Dataset:
     def has_sigmas(self) -> bool:
         """Whether every sample has its own standard deviations."""
         return len(self._source.columns) > 4
+
+    def __getitem__(self, name: str) -> Track:
+        """One track by its name, as `track` gives it."""
+        return self.track(name)
+
+    @property
+    def ball(self) -> Ball:
+        """The ball that `dataset.yaml` states."""
+        return self.info.ball
+
+    @property
+    def table(self) -> float:
+        """m, height of the table's surface."""
+        return self.info.table_height
+
+    def with_readings(self, attached: Callable[[Track], Track], notes: Sequence[str] = ()) -> Dataset:
+        """The dataset whose tracks come with further observations.
+
+        Args: attached: adds them to a track.  notes: on what was ignored in their files, one sentence each.
+        """
+        other = copy.copy(self)
+        other._attached, other.notes = attached, [*self.notes, *notes]
+        return other
 
     def track(self, name: str) -> Track:
         """One track by its name; reads the file up to it.

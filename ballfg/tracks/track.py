@@ -58,6 +58,9 @@ class Track:
     rough: bool = False
     """Whether the positions were made from the observations. Events are found in them; they measure nothing anew."""
 
+    dataset: Any = None
+    """The dataset that the track was read from: tells its ball, table and noise. It does not travel to processes."""
+
     def __post_init__(self) -> None:
         _check_name(self.name)
         times = _float_array(self.name, "times", self.times)
@@ -78,6 +81,9 @@ class Track:
         object.__setattr__(self, "labels", _checked_labels(self.name, self.labels))
         object.__setattr__(self, "observations", tuple(self.observations))
         _check_observations(self.name, self.observations, self.rough)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "dataset": None}
 
     def __len__(self) -> int:
         return len(self.times)

@@ -14,7 +14,7 @@ from ballfg.dynamics import nominal_model
 from ballfg.estimation import Estimate, Online, Settings, Smoother
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.estimation.observations.sightings import sighted_track
-from ballfg.estimation.settings import uncertain
+from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.time_offsets import TimeOffsets, estimate_time_offsets
 from ballfg.simulation.scene import Flight
 from ballfg.state import POSITION, VELOCITY, VZ
@@ -102,9 +102,9 @@ def clocks(filmed: Filmed) -> TimeOffsets:
 
 def _settings(noise: Array | None) -> Settings:
     if noise is None:
-        return uncertain(nominal_model())
+        return Settings.for_measured(nominal_model())
     x, y, z = noise.tolist()
-    return uncertain(nominal_model(), position_noise=(x, y, z))
+    return Settings.for_measured(nominal_model(), position_noise=(x, y, z))
 
 
 States = tuple[Array, Array]

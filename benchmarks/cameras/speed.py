@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ballfg.benchmarks.cameras.clocks import sighted
 from ballfg.benchmarks.cameras.scenes import Filmed, Scenario, draw
 from ballfg.dynamics import nominal_model
-from ballfg.estimation import Online, uncertain
+from ballfg.estimation import Online
 from ballfg.vision import Camera, Detections, detect_all, track_detections
 
 Array = NDArray[np.float64]
@@ -63,7 +63,7 @@ def _timed(videos: dict[str, Path], cameras: Sequence[Camera]) -> StreamTimes:
 
 def push_times(filmed: Filmed) -> Array:
     """(n,) ms, of each sighting that the online estimator takes in, those of all balls."""
-    settings, taken = uncertain(nominal_model()), []
+    settings, taken = Settings.for_measured(nominal_model()), []
     for track in sighted(filmed):
         online = Online(nominal_model(), filmed.recording.config.ball.surfaces, settings, cameras=track.cameras)
         seen = track.sightings

@@ -11,7 +11,7 @@ import torch
 
 from ballfg.dynamics import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation import Smoother, uncertain
+from ballfg.estimation import Smoother
 from ballfg.estimation import predict_tracks
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
 
@@ -34,7 +34,7 @@ def main() -> None:
     shot = next(iter(simulate(config)))
     track, truth = shot.track, shot.true_states
     model, surfaces = nominal_model(), Surfaces.table_tennis(0.76)
-    smoother = Smoother(model, surfaces, uncertain(model, position_noise=(0.004,) * 3))
+    smoother = Smoother(model, surfaces, Settings.for_measured(model, position_noise=(0.004,) * 3))
     estimate = smoother.estimate(track)
     (prediction,) = predict_tracks(smoother, [track], 1, OBSERVED)
     figure, (side, spread) = plt.subplots(1, 2, figsize=(11, 3.9), width_ratios=(1.7, 1), layout="constrained")

@@ -8,7 +8,7 @@ import pytest
 from ballfg.dynamics import EFFECTS, AnalyticModel, nominal_model
 from ballfg.estimation.configure import dataset_settings, dataset_surfaces
 from ballfg.estimation.segmentation import Quality, Segmentation
-from ballfg.estimation.settings import MEASURED, Settings, sample_sigmas, uncertain
+from ballfg.estimation.settings import MEASURED, Settings, sample_sigmas
 from ballfg.estimation.smoother.problem import QUALITY_SIGMA, effective_sigmas
 from ballfg.tracks import Track, read_dataset
 
@@ -37,7 +37,7 @@ def test_coefficients_have_a_spread(value) -> None:
 
 
 def test_uncertain_takes_the_coefficients_that_vary() -> None:
-    settings = uncertain(nominal_model(), spin_prior=50.0)
+    settings = Settings.for_measured(nominal_model(), spin_prior=50.0)
     assert settings.coefficients == {
         "flight.drag.k": 0.035,
         "contact.restitution.e": 0.02,
@@ -45,7 +45,7 @@ def test_uncertain_takes_the_coefficients_that_vary() -> None:
     }
     assert settings.process == MEASURED
     assert settings.spin_prior == 50.0
-    assert uncertain(AnalyticModel([EFFECTS["gravity"]()])).coefficients == {}
+    assert Settings.for_measured(AnalyticModel([EFFECTS["gravity"]()])).coefficients == {}
 
 
 def test_a_track_s_own_sigmas_come_first_and_are_copied() -> None:

@@ -31,7 +31,7 @@ from ballfg.estimation.smoother.near_contact import widen_near_contacts
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
-from ballfg.tracks import Track
+from ballfg.tracks import Ball, Track
 
 GATE_CHANCE = 1e-6
 """Share of good measurements that are not used."""
@@ -142,16 +142,16 @@ class ExtendedKalmanFilter(Estimator):
 
     def __init__(
         self,
-        model: BallModel,
-        surfaces: Surfaces,
-        settings: Settings,
+        model: BallModel | Ball,
+        surfaces: Surfaces | float,
+        settings: Settings | None = None,
         smooth: bool = False,
         initialise: Literal["prior", "window"] = "prior",
     ) -> None:
         super().__init__(model, surfaces, settings)
         if initialise not in ("prior", "window"):
             raise ValueError(f"initialise must be 'prior' or 'window'; got {initialise!r}")
-        self.ball = trackwise_model(model, settings)
+        self.ball = trackwise_model(self.model, self.settings)
         self.smooth = smooth
         self.initialise = initialise
         if smooth:
@@ -191,6 +191,7 @@ class ExtendedKalmanFilter(Estimator):
             status=_status(run.record.used),
             innovations={"position": whitened, **run.innovations},
             world=self.world,
+            notes=self.doubts(track),
             coefficient_names=tuple(self.settings.coefficients),
             coefficients=mean[-1, STATE_DIM:],
             coefficient_covariance=covariance[-1, STATE_DIM:, STATE_DIM:],

@@ -77,6 +77,7 @@ class SlidingWindow(Estimator):
             status=Status.OK if n > 1 else Status.NO_VELOCITY,
             innovations={"position": np.full((n, 3), np.nan)},
             world=self.world,
+            notes=self.doubts(track),
             cross_covariances=np.zeros((n, STATE_DIM, 0)),
         )
 

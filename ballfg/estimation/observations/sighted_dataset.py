@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from os import PathLike
 from pathlib import Path
 from typing import Final
 
 from ballfg.estimation.observations.sightings import NeverSeenByTwoError, sighted_track
 from ballfg.tracks.detections_file import DETECTIONS_FILE, read_sightings
-from ballfg.tracks.info import INFO_FILE, DatasetInfo, read_info
+from ballfg.tracks.info import INFO_FILE, Ball, DatasetInfo, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.track import Track
@@ -46,7 +47,8 @@ class SightedDataset:
         self._tracks = {}
         for name, sightings in balls.items():
             try:
-                self._tracks[name] = sighted_track(name, sightings, cameras, labels.of(name))
+                track = sighted_track(name, sightings, cameras, labels.of(name))
+                self._tracks[name] = replace(track, dataset=self)
             except NeverSeenByTwoError as error:
                 notes.append(str(error))
 
@@ -58,6 +60,27 @@ class SightedDataset:
 
     def __repr__(self) -> str:
         return f"SightedDataset({self.info.name!r}, {len(self)} tracks, {len(self.cameras)} cameras)"
+
+    def __getitem__(self, name: str) -> Track:
+        """One track by its name.
+
+        Raises: ValueError: if there is no track of that name.
+        """
+        if name not in self._tracks:
+            raise ValueError(
+                f"name must be one of the {len(self)} trajectories of {self.path}; got {name!r}. See names."
+            )
+        return self._tracks[name]
+
+    @property
+    def ball(self) -> Ball:
+        """The ball that `dataset.yaml` states."""
+        return self.info.ball
+
+    @property
+    def table(self) -> float:
+        """m, height of the table's surface."""
+        return self.info.table_height
 
     @property
     def names(self) -> list[str]:

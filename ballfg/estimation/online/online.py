@@ -26,7 +26,7 @@ from ballfg.estimation.smoother.problem import trackwise_model
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import FactorBatch
 from ballfg.prediction.state import BallState
-from ballfg.tracks import Track
+from ballfg.tracks import Ball, Track
 from ballfg.vision.camera import Camera
 
 Array = NDArray[np.float64]
@@ -82,23 +82,23 @@ class Online(Estimator):
 
     def __init__(
         self,
-        model: BallModel,
-        surfaces: Surfaces,
-        settings: Settings,
+        model: BallModel | Ball,
+        surfaces: Surfaces | float,
+        settings: Settings | None = None,
         lag: int = LAG,
         cameras: Sequence[Camera] = (),
     ) -> None:
         super().__init__(model, surfaces, settings)
         if lag < 2:
             raise ValueError(f"lag must be at least 2 states; got {lag}")
-        if settings.time_offsets:
+        if self.settings.time_offsets:
             raise ValueError(
                 "settings.time_offsets must be empty for the estimator 'online': it cannot move stamps that have "
                 "passed. Find the offsets beforehand with estimate_time_offsets and give the cameras that it returns."
             )
         self.cameras = tuple(cameras)
-        self.ball = trackwise_model(model, settings)
-        self.physics = physics_of(model)
+        self.ball = trackwise_model(self.model, self.settings)
+        self.physics = physics_of(self.model)
         self.lag = lag
         self.reset()
 

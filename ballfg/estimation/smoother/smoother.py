@@ -31,7 +31,7 @@ from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum, Search, run
 from ballfg.factors.prior import PriorFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
-from ballfg.tracks import Track
+from ballfg.tracks import Ball, Track
 
 Array = NDArray[np.float64]
 
@@ -89,9 +89,9 @@ class Smoother(Estimator):
 
     def __init__(
         self,
-        model: BallModel,
-        surfaces: Surfaces,
-        settings: Settings,
+        model: BallModel | Ball,
+        surfaces: Surfaces | float,
+        settings: Settings | None = None,
         optimizer: LevenbergMarquardt | None = None,
     ) -> None:
         super().__init__(model, surfaces, settings)
@@ -232,6 +232,7 @@ class Smoother(Estimator):
             error=minimum.error,
             iterations=minimum.iterations,
             world=self.world,
+            notes=self.doubts(track),
         )
 
 

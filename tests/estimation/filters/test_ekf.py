@@ -18,7 +18,7 @@ from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
 from ballfg.estimation.filters.sliding_window import SlidingWindow
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Quality
-from ballfg.estimation.settings import Settings, uncertain
+from ballfg.estimation.settings import Settings
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, STATE_DIM, VELOCITY
@@ -420,7 +420,7 @@ def test_unknown_start_is_refused():
 @pytest.mark.skipif(not DATA.is_dir(), reason=f"no measured tracks at {DATA}; set BALLFG_DATA")
 def test_measured_tracks():
     dataset = read_dataset(DATA / "aimy")
-    settings = uncertain(nominal_model(), position_noise=(0.0015, 0.0007, 0.001))
+    settings = Settings.for_measured(nominal_model(), position_noise=(0.0015, 0.0007, 0.001))
     surfaces = Surfaces.table_tennis(dataset.info.table_height)
     estimator = ExtendedKalmanFilter(nominal_model(), surfaces, settings)
     nis, used = [], []

@@ -14,7 +14,7 @@ from ballfg.estimation.online import isam as online_isam
 from ballfg.estimation.online.events import contact_step
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.result import Status
-from ballfg.estimation.settings import Settings, uncertain
+from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.motion import FLIGHT, Motion
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.bridge import Bridge
@@ -87,7 +87,9 @@ def test_same_answer_as_the_smoother(start, robust, coefficients):
     model = nominal_model()
     track, _ = make_track(start)
     loss = Loss("cauchy", 3.0) if robust else Loss()
-    chosen = uncertain(model, position_noise=(SIGMA,) * 3, loss=loss) if coefficients else settings(loss=loss)
+    chosen = (
+        Settings.for_measured(model, position_noise=(SIGMA,) * 3, loss=loss) if coefficients else settings(loss=loss)
+    )
     expected = Smoother(model, TABLE, chosen).estimate(track)
     online = Online(model, TABLE, chosen)
     last = feed(online, track)[-1]
@@ -252,7 +254,7 @@ def test_long_gap_starts_anew():
     second, truth = make_track(FLYING, n=30, surfaces=NOWHERE, seed=2)
     times = np.concatenate((first.times, second.times + 1.5))
     track = Track("two", times, np.concatenate((first.positions, second.positions)))
-    for chosen in (settings(), uncertain(nominal_model(), position_noise=(SIGMA,) * 3)):
+    for chosen in (settings(), Settings.for_measured(nominal_model(), position_noise=(SIGMA,) * 3)):
         online = Online(nominal_model(), NOWHERE, chosen)
         last = feed(online, track)[-1]
         assert not online._samples[20].motion.linked
@@ -265,7 +267,11 @@ def test_long_gap_starts_anew():
 @pytest.mark.parametrize("coefficients", [False, True])
 def test_a_cut_window_forgets_nothing_that_matters(start, coefficients):
     model = nominal_model()
-    chosen = uncertain(model, position_noise=(SIGMA,) * 3, loss=Loss()) if coefficients else settings(loss=Loss())
+    chosen = (
+        Settings.for_measured(model, position_noise=(SIGMA,) * 3, loss=Loss())
+        if coefficients
+        else settings(loss=Loss())
+    )
     surfaces, allowed = (NOWHERE, LIVE) if start is FLYING else (TABLE, LIVE_BOUNCE)
     track, _ = make_track(start, n=70, surfaces=surfaces)
     expected = Smoother(model, surfaces, chosen).estimate(track)
@@ -294,7 +300,9 @@ def count_objects():
 def test_memory_is_flat_on_an_endless_stream():
     """Shot after shot, half of them after a gap that restarts: nothing grows once the window is full."""
     track, _ = make_track(FLYING, n=30, surfaces=NOWHERE)
-    online = Online(nominal_model(), NOWHERE, uncertain(nominal_model(), position_noise=(SIGMA,) * 3), lag=15)
+    online = Online(
+        nominal_model(), NOWHERE, Settings.for_measured(nominal_model(), position_noise=(SIGMA,) * 3), lag=15
+    )
     sizes, clock = [], 0.0
     for shot in range(12):
         for t, z in zip(track.times, track.positions, strict=True):
@@ -338,7 +346,7 @@ def _one_row(_, values, jacobians):
 def test_rebuilds_after_cut_and_failure():
     track, _ = make_track(BOUNCING, n=60)
     model = nominal_model()
-    chosen = uncertain(model, position_noise=(SIGMA,) * 3)
+    chosen = Settings.for_measured(model, position_noise=(SIGMA,) * 3)
     online = Online(model, TABLE, chosen, lag=15)
     feed(online, track)
     before = online.window.states.copy()

@@ -9,7 +9,7 @@ import pytest
 
 from ballfg.estimation.online.online import Online, OnlineState
 from ballfg.estimation.result import Status
-from ballfg.estimation.settings import Settings, uncertain
+from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from tests.estimation.observations.sighted_rig import RIG, Scene, World, scene, track_of, world
 
@@ -37,7 +37,7 @@ def pushed(online: Online, made: Scene) -> list[OnlineState | None]:
 )
 def test_final_estimate_is_the_smoothers(ball: World, seed: int, phases: tuple[float, ...], tolerance: float) -> None:
     made = scene(seed, ball, phases=phases, duration=0.4)
-    settings = uncertain(ball.model) if seed == 2 else Settings()
+    settings = Settings.for_measured(ball.model) if seed == 2 else Settings()
     track = track_of(made)
     online = Online(ball.model, ball.surfaces, settings, lag=200).estimate(track)
     smoothed = Smoother(ball.model, ball.surfaces, settings).estimate(track)

@@ -15,7 +15,7 @@ import torch
 from ballfg.dynamics import Surfaces, contact_time, nominal_model, rollout
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact
-from ballfg.estimation.settings import Settings, uncertain
+from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.initial import initial_states, move_contacts
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.graph import run
@@ -27,7 +27,7 @@ TABLE = Surfaces.table_tennis(0.0)
 SERVE = [0.0, 0.0, 0.3, 4.0, 0.3, 1.0, 10.0, 60.0, 20.0]
 TIMES = 0.01 * np.arange(80)
 EXACT = Settings(position_noise=(SIGMA,) * 3)
-UNCERTAIN = uncertain(MODEL, position_noise=(SIGMA,) * 3)
+UNCERTAIN = Settings.for_measured(MODEL, position_noise=(SIGMA,) * 3)
 
 
 @pytest.fixture(params=[EXACT, UNCERTAIN], ids=["exact", "uncertain"])

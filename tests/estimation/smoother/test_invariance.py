@@ -15,7 +15,7 @@ import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation.result import Estimate
-from ballfg.estimation.settings import uncertain
+from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import BallGraph, LevenbergMarquardt
@@ -23,7 +23,7 @@ from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
 from ballfg.tracks import Track
 
 MODEL = nominal_model()
-SETTINGS = uncertain(MODEL, position_noise=(0.003,) * 3, spin_label_noise=4.0)
+SETTINGS = Settings.for_measured(MODEL, position_noise=(0.003,) * 3, spin_label_noise=4.0)
 TOLERANCE = 1e-5
 
 
