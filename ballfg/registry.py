@@ -45,7 +45,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         group: of the entry points, for instance "ballfg.estimators".
         base: the class or classes of which each must be a subclass.
         remedy: a sentence that ends messages about classes which cannot be registered.
-        check: refuses a class by an exception that says what is wrong with it.
+        check: refuses a class of somebody else by an exception that says what is wrong with it.
         reserved: classes by name that are not in the registry; their names are taken.
     """
 
@@ -104,7 +104,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         name = getattr(cls, "name", None)
         if not (isinstance(name, str) and name.strip()):
             raise ValueError(f"{cls.__qualname__}.name must be a text; it is missing. {self._remedy}")
-        if self._check is not None:
+        if self._check is not None and not _is_own(cls):
             self._check(cls)
         taken = self._classes.get(name) or self._reserved.get(name)
         if taken is not None and _place(taken) != _place(cls):

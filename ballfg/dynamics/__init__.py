@@ -2,8 +2,7 @@
 
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact
-from ballfg.dynamics.effects.registration import load_effects, register
-from ballfg.dynamics.effects.registry import EFFECTS
+from ballfg.dynamics.effects.registry import EFFECTS, load_effects, register
 from ballfg.dynamics.model import BallModel, substitute
 from ballfg.dynamics.model_file import load_model, model_from_dict, model_to_dict, nominal_model, save_model
 from ballfg.dynamics.motion.contact import contact_time, fly_through, fly_through_jacobian
