@@ -130,15 +130,8 @@ class Registry(Mapping[str, type[T]], Generic[T]):
 
     def source(self, name: str) -> Source:
         """The package from which the class of a name comes, with its version."""
-        module = self[name].__module__
-        if name in self._packages:
-            return self._packages[name]
-        top = module.partition(".")[0]
-        package = PACKAGE if top == PACKAGE else next(iter(packages_distributions().get(top, ())), top)
-        try:
-            return Source(package, version(package))
-        except PackageNotFoundError:
-            return Source(module, None)
+        cls = self[name]
+        return self._packages[name] if name in self._packages else source_of(cls)
 
     def load_entry_points(self) -> None:
         """Register the classes that other installed packages offer; does nothing after the first time.
@@ -181,6 +174,16 @@ class Registry(Mapping[str, type[T]], Generic[T]):
             yield
         finally:
             self._classes = before
+
+
+def source_of(cls: type[Any]) -> Source:
+    """The package in which a class is defined, with its version."""
+    top = cls.__module__.partition(".")[0]
+    package = PACKAGE if top == PACKAGE else next(iter(packages_distributions().get(top, ())), top)
+    try:
+        return Source(package, version(package))
+    except PackageNotFoundError:
+        return Source(cls.__module__, None)
 
 
 def _place(cls: type[Any]) -> str:
