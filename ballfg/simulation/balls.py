@@ -12,7 +12,7 @@ import yaml
 from ballfg.dynamics import AnalyticModel, Surfaces, model_from_dict, model_to_dict, nominal_model
 from ballfg.dynamics.model import THIN_SHELL
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR
-from ballfg.simulation.launcher import TABLE_LAUNCHER, TABLE_LENGTH, TABLE_WIDTH, TENNIS_LAUNCHER, Launcher
+from ballfg.simulation.launcher import TABLE_LAUNCHER, TABLE_LENGTH, TABLE_WIDTH, TENNIS_LAUNCHER, SimulatedLauncher
 from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball
 
 TABLE: Final = Surfaces(TABLE_ABOVE_FLOOR, 0.0, (0.0, TABLE_LENGTH, -TABLE_WIDTH / 2, TABLE_WIDTH / 2))
@@ -39,7 +39,7 @@ class BallKind:
     surfaces: Surfaces
     """Where it bounces; z of the table's or the court's surface in `table_height`, m."""
 
-    launcher: Launcher = field(default=TABLE_LAUNCHER)
+    launcher: SimulatedLauncher = field(default=TABLE_LAUNCHER)
     """Where and how fast it starts, and where its track ends."""
 
 
@@ -83,7 +83,7 @@ def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:
 
     Args:
         content: `radius` (m), `mass` (kg), `flight` and `bounce` as in a model file; optional `name`,
-            `inertia_factor`, `surface` (`table` or `court`) and `launcher` (fields of `Launcher` that differ).
+            `inertia_factor`, `surface` (`table` or `court`) and `launcher` (fields of `SimulatedLauncher` that differ).
         default_name: the name if the content has none.
     Raises: ValueError, TypeError: a missing or unknown key, or a value out of its bounds.
     """
