@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import OwnEffects, default_jobs, open_inputs
+from ballfg.cli.inputs import OwnEffects, check_dataset, default_jobs, open_inputs
 
 if TYPE_CHECKING:
     from ballfg.diagnosis.result import Diagnosis
 
 
 def diagnose(
-    dataset: Annotated[Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.")],
+    dataset: Annotated[
+        Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.", callback=check_dataset)
+    ],
     out: Annotated[Path, typer.Option(help="Folder of the report: new, empty or with an earlier report.")],
     model: Annotated[Path | None, typer.Option(help="Model file; the nominal table-tennis model without it.")] = None,
     effects: OwnEffects = None,

@@ -12,6 +12,7 @@ import typer
 from ballfg.cli.inputs import (
     OwnEffects,
     Source,
+    check_dataset,
     check_out,
     default_jobs,
     open_inputs,
@@ -37,7 +38,10 @@ class Method(enum.StrEnum):
 
 
 def estimate(
-    dataset: Annotated[Path, typer.Argument(help="Folder with dataset.yaml and tracks, or detections and cameras.")],
+    dataset: Annotated[
+        Path,
+        typer.Argument(help="Folder with dataset.yaml and tracks, or detections and cameras.", callback=check_dataset),
+    ],
     out: Annotated[Path, typer.Option(help="Table to write; .csv or .parquet.")],
     method: Annotated[Method, typer.Option(help="The estimator.")] = Method.SMOOTHER,
     model: Annotated[Path | None, typer.Option(help="Model file; the nominal table-tennis model without it.")] = None,

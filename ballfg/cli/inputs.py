@@ -56,6 +56,15 @@ class Inputs(Generic[D]):
         return make_estimator(method, self.model, self.surfaces, self.settings)
 
 
+def check_dataset(folder: Path) -> Path:
+    """Refuses a mistyped path at once: before torch and GTSAM are imported, which takes seconds."""
+    if not folder.is_dir():
+        from ballfg.tracks import read_dataset
+
+        read_dataset(folder)  # raises: there is no such folder
+    return folder
+
+
 def know_effects(files: Iterable[Path] | None) -> None:
     """Registers the effects that files define, so that model files and options can name them."""
     from ballfg.dynamics import load_effects

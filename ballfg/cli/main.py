@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from importlib.metadata import version
+from typing import Annotated
 
 import typer
 
@@ -14,6 +16,7 @@ from ballfg.cli.calibrate_cameras import calibrate_cameras
 from ballfg.cli.diagnose import diagnose
 from ballfg.cli.errors import guarded
 from ballfg.cli.estimate import estimate
+from ballfg.cli.info import info
 from ballfg.cli.predict import predict
 from ballfg.cli.render import render
 from ballfg.cli.simulate import simulate
@@ -34,11 +37,18 @@ app.command()(simulate)
 app.command()(render)
 app.command()(track)
 app.command(name="calibrate-cameras")(calibrate_cameras)
+app.command()(info)
 
 
 @app.callback(invoke_without_command=True)
-def _root(context: typer.Context) -> None:
+def _root(
+    context: typer.Context,
+    show_version: Annotated[bool, typer.Option("--version", help="Version of ballfg.")] = False,
+) -> None:
     """From noisy measurements of a flying, bouncing ball to states, predictions and knowledge."""
+    if show_version:
+        typer.echo(f"ballfg {version('ballfg')}")
+        raise typer.Exit
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ballfg.cli.estimate import Method
-from ballfg.cli.inputs import OwnEffects, check_out, default_jobs, open_inputs, status_lines
+from ballfg.cli.inputs import OwnEffects, check_dataset, check_out, default_jobs, open_inputs, status_lines
 from ballfg.cli.progress import progress
 
 if TYPE_CHECKING:
@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 
 def predict(
-    dataset: Annotated[Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.")],
+    dataset: Annotated[
+        Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.", callback=check_dataset)
+    ],
     observe: Annotated[float, typer.Option(help="Seconds from the start of each track that the estimator sees.")],
     out: Annotated[Path, typer.Option(help="Table to write; .csv or .parquet.")],
     method: Annotated[Method, typer.Option(help="The estimator.")] = Method.SMOOTHER,

@@ -55,7 +55,7 @@ def simulate(
     """
     from ballfg.simulation import (
         MeasurementNoise,
-        ProcessNoise,
+        MotionNoise,
         SimulationConfig,
         parse_effects,
         parse_settings,
@@ -72,7 +72,7 @@ def simulate(
         ball=_ball(ball, model),
         settings=parse_settings(settings) if settings else {},
         noise=MeasurementNoise(noise, dropout, jitter, outliers, outlier_size, spin_noise),
-        process=ProcessNoise(process_noise, spin_process_noise, contact_noise, contact_spin_noise),
+        process=MotionNoise(process_noise, spin_process_noise, contact_noise, contact_spin_noise),
         undeclared=parse_effects(effect or ()),
         spin_labels=spin_labels,
     )

@@ -2,16 +2,16 @@
 
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact
-from ballfg.dynamics.effects.registration import load_effects, register
-from ballfg.dynamics.effects.registry import EFFECTS
+from ballfg.dynamics.effects.registry import EFFECTS, load_effects, register
 from ballfg.dynamics.model import BallModel, substitute
-from ballfg.dynamics.model_file import load_model, model_from_dict, model_to_dict, nominal_model, save_model
+from ballfg.dynamics.model_file import load_model, model_from_dict, model_to_dict, save_model
 from ballfg.dynamics.motion.contact import contact_time, fly_through, fly_through_jacobian
 from ballfg.dynamics.motion.integrate import fly, fly_jacobian
 from ballfg.dynamics.motion.rollout import advance, rollout
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.learned import LearnedModel, build
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.dynamics.nominal import nominal_model, nominal_note
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.dynamics.trained import Trained
 
@@ -42,6 +42,7 @@ __all__ = [
     "model_from_dict",
     "model_to_dict",
     "nominal_model",
+    "nominal_note",
     "register",
     "rollout",
     "save_model",

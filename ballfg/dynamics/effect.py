@@ -165,7 +165,7 @@ class Effect(nn.Module, ABC):
         name: as in a model file.  kind: the section of a model file that takes it.
         sentence: what it is, and what looks exactly the same.
         decide: what to measure to tell it from what it is mistaken for.
-        coefficients: its numbers.
+        coefficients: its numbers; an instance may have priors of its own (`set_sigmas`).
         needs: names of effects that must be in the same model, since this one changes them.
         multiplies_spin: its strength multiplies a spin that nobody may know: without labels it has no slope at absence.
     """
@@ -193,6 +193,16 @@ class Effect(nn.Module, ABC):
                     f"{self.name}.{c.name} must lie in [{c.low:g}, {c.high:g}] {c.unit}; got {value:g}. Check its unit."
                 )
             self.register_parameter(c.name, nn.Parameter(torch.tensor(value, dtype=torch.float64)))
+
+    def set_sigmas(self, **sigmas: float) -> None:
+        """Give coefficients of this one effect other prior standard deviations, in their own units.
+
+        Raises: KeyError: if it has no coefficient of that name.
+        """
+        listed = {c.name: c for c in self.coefficients}
+        for name, sigma in sigmas.items():
+            listed[name] = replace(listed[name], sigma=sigma)
+        self.__dict__["coefficients"] = tuple(listed.values())
 
     @classmethod
     def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:

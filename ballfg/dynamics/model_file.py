@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import os
 from collections.abc import Mapping
-from importlib import resources
 from pathlib import Path
 from typing import Any, Final, cast
 
@@ -21,12 +20,6 @@ from ballfg.files.strict_yaml import read_yaml
 
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
 SECTIONS = (*KINDS, "learned")
-
-
-def nominal_model(radius: float = 0.02) -> AnalyticModel:
-    """The table-tennis model that ships with the package."""
-    text = resources.files("ballfg.dynamics").joinpath("nominal.yaml").read_text(encoding="utf-8")
-    return model_from_dict(yaml.safe_load(text), radius=radius, where="nominal.yaml")
 
 
 def load_model(path: str | Path, *, radius: float = 0.02, inertia_factor: float = THIN_SHELL) -> BallModel:

@@ -1,8 +1,8 @@
 """Synthetic tracks: a launcher, motion with effects that nobody declares, noisy measurements, truth beside them."""
 
 from ballfg.simulation.balls import BallKind, ball_from_mapping, ball_kind, table_tennis, tennis, with_model
-from ballfg.simulation.config import MeasurementNoise, ProcessNoise, SimulationConfig
-from ballfg.simulation.launcher import Launcher
+from ballfg.simulation.config import MeasurementNoise, MotionNoise, SimulationConfig
+from ballfg.simulation.launcher import SimulatedLauncher
 from ballfg.simulation.measure import SimulatedTrack
 from ballfg.simulation.settings import SETTING_LEVELS, all_settings, parse_settings
 from ballfg.simulation.synthetic import dataset_info, simulate
@@ -13,9 +13,9 @@ __all__ = [
     "SETTING_LEVELS",
     "UNDECLARED",
     "BallKind",
-    "Launcher",
     "MeasurementNoise",
-    "ProcessNoise",
+    "MotionNoise",
+    "SimulatedLauncher",
     "SimulatedTrack",
     "SimulationConfig",
     "all_settings",

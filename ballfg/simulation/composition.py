@@ -12,7 +12,7 @@ from torch import Tensor
 from ballfg.dynamics import AnalyticModel, BallModel, Effect
 from ballfg.dynamics.model import Rates
 from ballfg.dynamics.motion.rollout import REST_SPEED
-from ballfg.simulation.config import ProcessNoise
+from ballfg.simulation.config import MotionNoise
 from ballfg.state import SPIN, STATE_DIM, VELOCITY, VZ
 
 
@@ -41,7 +41,7 @@ class KickedModel(BallModel):
     The upward speed after a bounce is reflected at zero if a kick would push the ball into the surface.
     """
 
-    def __init__(self, model: BallModel, noise: ProcessNoise, rng: np.random.Generator) -> None:
+    def __init__(self, model: BallModel, noise: MotionNoise, rng: np.random.Generator) -> None:
         super().__init__(model.radius, model.inertia_factor)
         self.model = model
         self._rng = rng

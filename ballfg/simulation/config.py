@@ -55,7 +55,7 @@ class MeasurementNoise:
 
 
 @dataclass(frozen=True)
-class ProcessNoise:
+class MotionNoise:
     """What the true motion does that no model foresees; continuous-time densities and kicks. Zero: none.
 
     Raises: ValueError, TypeError: a value out of its bounds; the message names it.
@@ -118,7 +118,7 @@ class SimulationConfig:
     noise: MeasurementNoise = field(default_factory=MeasurementNoise)
     """Of the measurement."""
 
-    process: ProcessNoise = field(default_factory=ProcessNoise)
+    process: MotionNoise = field(default_factory=MotionNoise)
     """Of the motion."""
 
     undeclared: tuple[Effect, ...] = ()
@@ -127,8 +127,12 @@ class SimulationConfig:
     spin_labels: bool = True
     """Whether the spin at the first sample is written as a label; the launcher's settings always are."""
 
+    block: int = 256
+    """Tracks that are computed at once; 256 take 4 MB of states. Another number gives another dataset for one seed."""
+
     def __post_init__(self) -> None:
         check_count("tracks", self.tracks, 1, MAX_TRACKS)
+        check_count("block", self.block, 1, MAX_TRACKS)
         check_count("seed", self.seed, 0, MAX_SEED)
         object.__setattr__(self, "rate", check_range("rate", self.rate, 5.0, 10_000.0))
         self.combinations()

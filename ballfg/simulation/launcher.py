@@ -28,7 +28,7 @@ _SPEED_LEVELS: Final = SETTING_LEVELS["speed"]
 
 
 @dataclass(frozen=True)
-class Launcher:
+class SimulatedLauncher:
     """Geometry, scales and shot-to-shot spread of a launcher. It stands at x, y = 0 and shoots along +x.
 
     Raises: ValueError, TypeError: a field that is not a number within its bounds; the message names it.
@@ -91,7 +91,7 @@ class Launcher:
                 f"x must lie between x_low and x_high; got {self.x_low:g}, {self.x:g}, {self.x_high:g} m. Correct them."
             )
 
-    def with_fields(self, changes: Mapping[str, Any]) -> Launcher:
+    def with_fields(self, changes: Mapping[str, Any]) -> SimulatedLauncher:
         """This launcher with some fields changed.
 
         Raises: ValueError, TypeError: changes that are not a mapping, an unknown field or a bad value.
@@ -161,10 +161,10 @@ _BOUNDS: Final[Mapping[str, tuple[float, float]]] = {
     "duration": (0.05, 20.0),
 }
 
-TABLE_LAUNCHER: Final = Launcher()
+TABLE_LAUNCHER: Final = SimulatedLauncher()
 """For table tennis: returns topspin -3 at low levels, turns +-5 sidespin by 45 degrees, bounces once to three times."""
 
-TENNIS_LAUNCHER: Final = Launcher(
+TENNIS_LAUNCHER: Final = SimulatedLauncher(
     height=1.0,
     speed_slow=14.0,
     speed_fast=26.0,

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from ballfg.dynamics import BallModel, Surfaces, advance
 from ballfg.dynamics.motion.rollout import is_resting
-from ballfg.simulation.config import ProcessNoise
-from ballfg.simulation.launcher import Launcher
+from ballfg.simulation.config import MotionNoise
+from ballfg.simulation.launcher import SimulatedLauncher
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
 
 NOISE_STEP = 0.005
@@ -40,8 +40,8 @@ def simulate_motion(
     start: Tensor,
     rate: float,
     surfaces: Surfaces,
-    launcher: Launcher,
-    noise: ProcessNoise,
+    launcher: SimulatedLauncher,
+    noise: MotionNoise,
     rng: np.random.Generator,
 ) -> Motion:
     """Follows shots until they leave the launcher's view or last too long.
@@ -74,7 +74,7 @@ def simulate_motion(
 
 
 def _next_frame(
-    model: BallModel, state: Tensor, dt: float, surfaces: Surfaces, noise: ProcessNoise, rng: np.random.Generator
+    model: BallModel, state: Tensor, dt: float, surfaces: Surfaces, noise: MotionNoise, rng: np.random.Generator
 ) -> Tensor:
     """(n, 9) one frame later."""
     if not noise.in_flight:
@@ -91,7 +91,7 @@ def _next_frame(
     return state
 
 
-def process_noise(count: int, dt: float, noise: ProcessNoise, rng: np.random.Generator) -> Tensor:
+def process_noise(count: int, dt: float, noise: MotionNoise, rng: np.random.Generator) -> Tensor:
     """What white acceleration of density q adds to states over dt, drawn exactly.
 
     Position and velocity are correlated, with covariance q^2 [dt^3/3, dt^2/2; dt^2/2, dt] per axis: with independent

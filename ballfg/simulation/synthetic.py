@@ -14,9 +14,6 @@ from ballfg.simulation.settings import settings_of_shots
 from ballfg.simulation.streams import Purpose, generator
 from ballfg.tracks import DatasetInfo
 
-BLOCK = 256
-"""Tracks that are computed at once: 4 MB of states. Another number would give another dataset for the same seed."""
-
 
 def simulate(config: SimulationConfig) -> Iterator[SimulatedTrack]:
     """Makes the tracks of a simulation, with their truth.
@@ -29,14 +26,14 @@ def simulate(config: SimulationConfig) -> Iterator[SimulatedTrack]:
     Raises: ValueError: at once, if an undeclared effect does not go with the model.
     """
     model = true_model(config.ball.model, config.undeclared)
-    starts = range(0, config.tracks, BLOCK)
+    starts = range(0, config.tracks, config.block)
     return itertools.chain.from_iterable(_block(config, model, block, first) for block, first in enumerate(starts))
 
 
 def _block(config: SimulationConfig, model: AnalyticModel, block: int, first: int) -> list[SimulatedTrack]:
     """The tracks of one block."""
     kind, seed = config.ball, config.seed
-    count = min(BLOCK, config.tracks - first)
+    count = min(config.block, config.tracks - first)
     settings = settings_of_shots(config.combinations(), first, count, seed)
     start = kind.launcher.launch(settings, kind.surfaces.table_height, generator(seed, Purpose.LAUNCH, block))
     moving: BallModel = model

@@ -30,10 +30,8 @@ def own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.chdir(tmp_path)
     code = re.findall(r"```python\n(.*?)```", GUIDE.read_text(encoding="utf-8"), re.DOTALL)[0]
     Path("static_charge.py").write_text(code, encoding="utf-8")
-    known = dict(EFFECTS)
-    yield tmp_path
-    EFFECTS.clear()
-    EFFECTS.update(known)
+    with EFFECTS.restored():
+        yield tmp_path
 
 
 def test_the_guides_commands(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
@@ -47,13 +45,14 @@ def test_the_guides_commands(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
     monkeypatch.setattr(ballfg.diagnosis, "diagnose", diagnose)
     commands = re.findall(r"^ballfg (.*--effects.*)$", GUIDE.read_text(encoding="utf-8"), re.MULTILINE)
     simulate, search, predict = (command.replace("--tracks 50", "--tracks 2").split() for command in commands)
-    assert status(*simulate) == 0
+    with EFFECTS.restored():
+        assert status(*simulate) == 0
     assert "undeclared effects: static_charge" in capsys.readouterr().out
     assert yaml.safe_load(Path("charged/truth.yaml").read_text(encoding="utf-8"))
-    EFFECTS.pop("static_charge")
-    assert status(*search) == 2
+    with EFFECTS.restored():
+        assert status(*search) == 2
     assert asked[0][-1] == "static_charge"
-    EFFECTS.pop("static_charge")
+    assert "static_charge" not in EFFECTS
     model = yaml.safe_load(Path("charged/model.yaml").read_text(encoding="utf-8"))
     model["flight"]["static_charge"] = {"strength": 2.0}
     Path("diagnosis").mkdir()

@@ -48,10 +48,8 @@ def catalogue() -> str:
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """An empty folder; what is registered there is forgotten."""
     monkeypatch.chdir(tmp_path)
-    known = dict(EFFECTS)
-    yield tmp_path
-    EFFECTS.clear()
-    EFFECTS.update(known)
+    with EFFECTS.restored():
+        yield tmp_path
 
 
 def test_catalogue_is_that_of_the_registry() -> None:

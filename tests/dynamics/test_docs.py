@@ -63,11 +63,12 @@ def example(tmp_path, monkeypatch):
     code, use = blocks("add_an_effect.md", "python")
     Path("static_charge.py").write_text(code, encoding="utf-8")
     names = {}
-    exec(compile(use, "add_an_effect.md", "exec"), names)
-    assert model_to_dict(names["model"])["flight"]["static_charge"] == {"strength": 1.0, "reach": 0.1, "surface": 0.76}
-    (text,) = blocks("add_an_effect.md", "yaml")
-    yield model_from_dict(yaml.safe_load(text))
-    del EFFECTS["static_charge"]
+    declared = {"strength": 1.0, "reach": 0.1, "surface": 0.76}
+    with EFFECTS.restored():
+        exec(compile(use, "add_an_effect.md", "exec"), names)
+        assert model_to_dict(names["model"])["flight"]["static_charge"] == declared
+        (text,) = blocks("add_an_effect.md", "yaml")
+        yield model_from_dict(yaml.safe_load(text))
 
 
 def test_example_effect_does_what_it_says(example):

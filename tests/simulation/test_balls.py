@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -10,8 +9,7 @@ import pytest
 
 from ballfg.dynamics import nominal_model
 from ballfg.simulation import SimulationConfig, ball_kind, simulate, tennis, with_model
-from ballfg.simulation.balls import tennis_coefficients
-from ballfg.tracks import TENNIS, Ball
+from ballfg.tracks import TENNIS
 
 SQUASH = """
 name: squash
@@ -22,14 +20,6 @@ flight: {gravity: {}, drag: {k: 0.016}}
 bounce: {restitution: {e: 0.4}, friction: {mu: 0.5}}
 launcher: {duration: 0.5}
 """
-
-
-def test_tennis_coefficients_follow_from_size_and_mass() -> None:
-    drag, magnus = tennis_coefficients(Ball(radius=0.033, mass=0.058))
-    assert drag == pytest.approx(0.0213, rel=0.01)
-    spin, speed, radius = 150.0, 24.75, 0.033  # spin ratio 0.2, where the lift law was made linear
-    lift = 1.2 * math.pi * radius**2 * speed**2 / (2 * 0.058) / (2 + speed / (radius * spin))
-    assert magnus * spin * speed == pytest.approx(lift, rel=1e-12)
 
 
 def test_tennis_balls_bounce_on_the_court_only() -> None:

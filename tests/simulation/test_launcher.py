@@ -5,7 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ballfg.simulation import SETTING_LEVELS, Launcher, SimulationConfig, all_settings, parse_settings, simulate
+from ballfg.simulation import (
+    SETTING_LEVELS,
+    SimulatedLauncher,
+    SimulationConfig,
+    all_settings,
+    parse_settings,
+    simulate,
+)
 from ballfg.simulation.settings import settings_of_shots
 
 
@@ -130,10 +137,10 @@ def test_levels_that_the_launcher_lacks(chosen: dict[str, list[int]], message: s
 
 def test_launcher_refuses_impossible_values() -> None:
     with pytest.raises(ValueError, match=r"speed_slow must be at least 0\.5"):
-        Launcher(speed_slow=-3.0)
+        SimulatedLauncher(speed_slow=-3.0)
     with pytest.raises(TypeError, match="height must be a number; got 'high'"):
-        Launcher(height="high")  # type: ignore[arg-type]
+        SimulatedLauncher(height="high")  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="x must lie between"):
-        Launcher(x=5.0)
+        SimulatedLauncher(x=5.0)
     with pytest.raises(ValueError, match="launcher has no field 'hight'"):
-        Launcher().with_fields({"hight": 0.4})
+        SimulatedLauncher().with_fields({"hight": 0.4})

@@ -8,10 +8,10 @@ import torch
 from scipy import stats
 
 from ballfg.dynamics import model_from_dict, nominal_model
-from ballfg.factors.noise import ProcessNoise as FactorNoise
+from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import (
     MeasurementNoise,
-    ProcessNoise,
+    MotionNoise,
     SimulatedTrack,
     SimulationConfig,
     simulate,
@@ -77,7 +77,7 @@ def test_outliers_are_as_many_and_as_large_as_asked_for() -> None:
 
 
 def test_process_noise_has_the_covariance_of_white_acceleration() -> None:
-    dt, noise, n = 0.02, ProcessNoise(acceleration=0.3, spin=5.0), 40_000
+    dt, noise, n = 0.02, MotionNoise(acceleration=0.3, spin=5.0), 40_000
     steps = [process_noise(n, dt / 4, noise, np.random.default_rng(i)).numpy() for i in range(4)]
     total = np.zeros((n, 9))
     for step in steps:  # four steps must make one of four times the length
@@ -92,7 +92,7 @@ def test_process_noise_has_the_covariance_of_white_acceleration() -> None:
 
 def test_process_noise_of_whole_tracks_matches_the_closed_form() -> None:
     """The same launches with and without process noise, compared in free flight 0.2 s after the launch."""
-    noise = ProcessNoise(acceleration=0.2, spin=3.0)
+    noise = MotionNoise(acceleration=0.2, spin=3.0)
     vacuum = with_model(table_tennis(), model_from_dict({"flight": {"gravity": {}}, "bounce": {}}))  # drag would damp
     pairs = zip(run(400, process=noise, ball=vacuum), run(400, ball=vacuum), strict=True)
     change = np.array([a.true_states[20] - b.true_states[20] for a, b in pairs])
@@ -102,7 +102,7 @@ def test_process_noise_of_whole_tracks_matches_the_closed_form() -> None:
 
 
 def test_contact_kicks() -> None:
-    noise = ProcessNoise(contact_velocity=0.05, contact_spin=4.0)
+    noise = MotionNoise(contact_velocity=0.05, contact_spin=4.0)
     model = nominal_model()
     before = torch.tensor([[0.0, 0.0, 0.0, 3.0, 0.2, -3.0, 20.0, 100.0, 30.0]], dtype=torch.float64).expand(20_000, 9)
     kick = (KickedModel(model, noise, np.random.default_rng(0)).bounce(before) - model.bounce(before)).detach().numpy()
@@ -112,7 +112,7 @@ def test_contact_kicks() -> None:
 
 
 def test_kicked_contacts_leave_upwards_and_change_what_follows_only() -> None:
-    kicked = run(20, process=ProcessNoise(contact_velocity=0.1))
+    kicked = run(20, process=MotionNoise(contact_velocity=0.1))
     for simulated, plain in zip(kicked, run(20), strict=True):
         contact = int(np.flatnonzero(np.diff(plain.true_states[:, 5]) > 0.5)[0])
         np.testing.assert_array_equal(simulated.true_states[: contact + 1], plain.true_states[: contact + 1])
@@ -130,7 +130,7 @@ def test_noise_of_one_kind_leaves_the_rest_as_it_was() -> None:
     [
         (lambda: MeasurementNoise(dropout=1.0), "dropout must be at least 0, at most 0.95; got 1"),
         (lambda: MeasurementNoise(position=float("nan")), "position must be"),
-        (lambda: ProcessNoise(acceleration=-1.0), "acceleration must be at least 0"),
+        (lambda: MotionNoise(acceleration=-1.0), "acceleration must be at least 0"),
         (lambda: SimulationConfig(noise=MeasurementNoise(jitter=0.01)), "jitter must be at most 0.15 frames"),
         (lambda: SimulationConfig(tracks=0), r"tracks must lie in 1 \.\."),
         (lambda: SimulationConfig(seed=-1), "seed must lie in"),
@@ -151,8 +151,8 @@ def test_wrong_types_are_refused_by_name() -> None:
 
 def test_process_noise_is_that_of_the_estimators() -> None:
     """Two rooms discretise the same densities: drawn here, as covariances in the factors. 200,000 draws give 0.5 %."""
-    dt, noise = 0.013, ProcessNoise(acceleration=0.7, spin=3.0)
+    dt, noise = 0.013, MotionNoise(acceleration=0.7, spin=3.0)
     drawn = process_noise(200_000, dt, noise, np.random.default_rng(5)).numpy()
-    declared = FactorNoise(acceleration=0.7, spin=3.0).flight(np.array([dt]))[0]
+    declared = ProcessNoise(acceleration=0.7, spin=3.0).flight(np.array([dt]))[0]
     scale = np.sqrt(np.diagonal(declared))
     np.testing.assert_allclose(np.cov(drawn.T) / np.outer(scale, scale), declared / np.outer(scale, scale), atol=0.02)

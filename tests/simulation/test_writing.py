@@ -16,12 +16,11 @@ from ballfg.dynamics import load_model, nominal_model
 from ballfg.dynamics.model_file import model_to_dict
 from ballfg.simulation import (
     MeasurementNoise,
-    ProcessNoise,
+    MotionNoise,
     SimulatedTrack,
     SimulationConfig,
     parse_effects,
     simulate,
-    synthetic,
     write_simulation,
 )
 from ballfg.state import STATE_NAMES
@@ -31,7 +30,7 @@ EVERYTHING = SimulationConfig(
     tracks=20,
     seed=4,
     noise=MeasurementNoise(dropout=0.1, jitter=0.0005, outliers=0.02),
-    process=ProcessNoise(0.1, 1.0, 0.02, 2.0),
+    process=MotionNoise(0.1, 1.0, 0.02, 2.0),
     undeclared=parse_effects(["wind.x=0.3", "scale.z=0.01"]),
 )
 
@@ -156,12 +155,10 @@ def test_no_spin_labels_on_request(tmp_path: Path) -> None:
     assert dataset.info.spin_noise is None
 
 
-def test_memory_does_not_grow_with_the_number_of_tracks(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(synthetic, "BLOCK", 8)
-
+def test_memory_does_not_grow_with_the_number_of_tracks() -> None:
     def peak(tracks: int) -> int:
         tracemalloc.start()
-        for _ in simulate(SimulationConfig(tracks=tracks, rate=25.0)):
+        for _ in simulate(SimulationConfig(tracks=tracks, rate=25.0, block=8)):
             pass
         size = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Final
 
-from ballfg.dynamics.effect import BounceEffect, Effect, FlightEffect, Kind
+from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.bounce.friction import Friction
 from ballfg.dynamics.effects.bounce.generic import GenericContact
 from ballfg.dynamics.effects.bounce.restitution import Restitution
@@ -12,6 +13,7 @@ from ballfg.dynamics.effects.bounce.restitution_speed import RestitutionSpeed
 from ballfg.dynamics.effects.bounce.table_height import TableHeight
 from ballfg.dynamics.effects.bounce.table_tilt import TableTilt
 from ballfg.dynamics.effects.bounce.tangential_restitution import TangentialRestitution
+from ballfg.dynamics.effects.checks import BASES, REMEDY, check_effect
 from ballfg.dynamics.effects.flight.buoyancy import Buoyancy
 from ballfg.dynamics.effects.flight.drag import Drag
 from ballfg.dynamics.effects.flight.drag_speed import DragSpeed
@@ -34,38 +36,8 @@ from ballfg.dynamics.effects.measurement.spin_label_scale import SpinLabelScale
 from ballfg.dynamics.effects.measurement.time_offset import TimeOffset
 from ballfg.dynamics.effects.measurement.time_scale import TimeScale
 from ballfg.dynamics.effects.measurement.velocity_lag import VelocityLag
-
-EFFECTS: Final[dict[str, type[Effect]]] = {
-    effect.name: effect
-    for effect in (
-        Gravity,
-        Drag,
-        Magnus,
-        SpinDecay,
-        Wind,
-        WindShear,
-        GustRegion,
-        DragSpeed,
-        DragSpin,
-        MagnusSaturation,
-        Buoyancy,
-        Restitution,
-        Friction,
-        TangentialRestitution,
-        TableHeight,
-        RestitutionSpeed,
-        TableTilt,
-        TimeOffset,
-        VelocityLag,
-        FrameTilt,
-        Scale,
-        RadialBias,
-        TimeScale,
-        SpinLabelFrame,
-        SpinLabelScale,
-        SpinLabelOffset,
-    )
-}
+from ballfg.files.python_file import run_file
+from ballfg.registry import Registry
 
 GENERIC: Final[dict[str, type[Effect]]] = {
     effect.name: effect for effect in (GenericFlight, GenericContact, GenericMeasurement)
@@ -73,12 +45,60 @@ GENERIC: Final[dict[str, type[Effect]]] = {
 """Sums of terms that a model file may name too. They describe without explaining, so no search for causes has them."""
 
 
+def _check(effect: type[Effect]) -> None:
+    check_effect(effect)
+    unknown = sorted(name for name in effect.needs if name not in EFFECTS)
+    if unknown:
+        raise ValueError(
+            f"{effect.name}.needs must name known effects; got '{unknown[0]}'. Register that one first, or define it "
+            "above."
+        )
+
+
+EFFECTS: Final = Registry[Effect](
+    "effect", group="ballfg.effects", base=BASES, remedy=REMEDY, check=_check, reserved=GENERIC
+)
+"""Every effect that a search for causes may find, by the name that model files use."""
+
+for _effect in (
+    Gravity,
+    Drag,
+    Magnus,
+    SpinDecay,
+    Wind,
+    WindShear,
+    GustRegion,
+    DragSpeed,
+    DragSpin,
+    MagnusSaturation,
+    Buoyancy,
+    Restitution,
+    Friction,
+    TangentialRestitution,
+    TableHeight,
+    RestitutionSpeed,
+    TableTilt,
+    TimeOffset,
+    VelocityLag,
+    FrameTilt,
+    Scale,
+    RadialBias,
+    TimeScale,
+    SpinLabelFrame,
+    SpinLabelScale,
+    SpinLabelOffset,
+):
+    EFFECTS.register(_effect)
+
+register = EFFECTS.register
+
+
 def effect_class(name: str, kind: Kind) -> type[Effect]:
     """The class of the effect `name` of a kind: `flight`, `bounce` or `measurement`.
 
     Raises: ValueError: if there is no such effect of that kind; the message lists those there are.
     """
-    effect = (EFFECTS | GENERIC).get(name)
+    effect = EFFECTS.get(name) or GENERIC.get(name)
     if effect is None or effect.kind != kind:
         known = ", ".join(n for n, e in EFFECTS.items() if e.kind == kind) or "none"
         own = "One of your own must be registered first: --effects FILE.py, or ballfg.dynamics.register"
@@ -86,4 +106,27 @@ def effect_class(name: str, kind: Kind) -> type[Effect]:
     return effect
 
 
-__all__ = ["EFFECTS", "GENERIC", "BounceEffect", "FlightEffect", "effect_class"]
+def load_effects(path: str | Path) -> tuple[type[Effect], ...]:
+    """Run a Python file and register the effects that it defines; those whose class begins with `_` are left out.
+
+    Args: path: of a file that you trust: all of its code runs.
+    Returns: the classes, in the order in which they stand there.
+    Raises:
+        FileNotFoundError: if there is no such file.
+        ValueError: if it is no Python, does not run, defines no effect, or one that `register` refuses.
+    """
+    path = Path(path).resolve()
+    if not path.is_file():
+        raise FileNotFoundError(f"effects file {path} does not exist; effects of one's own are one Python file.")
+    module = run_file(path, "effects")
+    own = [
+        item
+        for name, item in vars(module).items()
+        if isinstance(item, type) and issubclass(item, Effect) and item.__module__ == module.__name__ and name[0] != "_"
+    ]
+    if not own:
+        raise ValueError(f"{path} must define an effect, a class; it defines none. {REMEDY}")
+    try:
+        return tuple(register(effect) for effect in own)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {error}") from error

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.dynamics import AnalyticModel, Surfaces, advance
-from ballfg.simulation.config import ProcessNoise
+from ballfg.simulation.config import MotionNoise
 from ballfg.simulation.motion import simulate_motion
 from ballfg.simulation.scene.config import SceneConfig, SceneStream, stream
 from ballfg.simulation.settings import settings_of_shots
@@ -81,7 +81,7 @@ def fly_shots(config: SceneConfig) -> list[Flight]:
     settings = settings_of_shots(config.combinations(), 0, config.shots, seed)
     first = kind.launcher.launch(settings, kind.surfaces.table_height, generator(seed, Purpose.LAUNCH, 0))
     motion = simulate_motion(
-        model, first, KNOT_RATE, kind.surfaces, kind.launcher, ProcessNoise(), generator(seed, Purpose.PROCESS, 0)
+        model, first, KNOT_RATE, kind.surfaces, kind.launcher, MotionNoise(), generator(seed, Purpose.PROCESS, 0)
     )
     spread = START_SPREAD * stream(seed, SceneStream.START).random(config.shots)
     starts = BEFORE + config.interval * np.arange(config.shots) + spread

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections import ChainMap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Final
 
 from ballfg.dynamics.effect import Effect
@@ -16,8 +15,23 @@ from ballfg.simulation.undeclared.thick_air import ThickAir
 
 NOWHERE: Final[dict[str, type[Effect]]] = {effect.name: effect for effect in (Pull, ThickAir, SideLean)}
 """Effects that no model file can declare."""
-UNDECLARED: Final[Mapping[str, type[Effect]]] = ChainMap(EFFECTS, NOWHERE)
-"""Every effect by name, also those registered later. What a model file may declare can be left undeclared: an effect
+
+
+class _Undeclared(Mapping[str, type[Effect]]):
+    """Registered effects, those registered later too; behind them those that no model file can declare."""
+
+    def __getitem__(self, name: str) -> type[Effect]:
+        return NOWHERE[name] if name in NOWHERE else EFFECTS[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter({**EFFECTS, **NOWHERE})
+
+    def __len__(self) -> int:
+        return len({**EFFECTS, **NOWHERE})
+
+
+UNDECLARED: Final = _Undeclared()
+"""Every effect by name. What a model file may declare can be left undeclared: an effect
 that the model lacks (wind), or another value of one that it has (restitution.e)."""
 
 
@@ -34,19 +48,14 @@ def parse_effects(texts: Iterable[str]) -> tuple[Effect, ...]:
         if coefficient in given:
             raise ValueError(f"effect must name each coefficient once; got {effect}.{coefficient} twice. Remove one.")
         given[coefficient] = value
-    return tuple(UNDECLARED[name](**values[name]) for name in sorted(values, key=_names().index))
-
-
-def _names() -> list[str]:
-    """Every effect, those that can be declared nowhere last."""
-    return [*EFFECTS, *NOWHERE]
+    return tuple(UNDECLARED[name](**values[name]) for name in sorted(values, key=list(UNDECLARED).index))
 
 
 def _parse(text: str) -> tuple[str, str, float]:
     key, equals, number = text.partition("=")
     name, dot, coefficient = key.strip().partition(".")
     if name not in UNDECLARED:
-        raise ValueError(f"effect must be one that exists; got '{name}'. {_nearest(name, _names())}")
+        raise ValueError(f"effect must be one that exists; got '{name}'. {_nearest(name, UNDECLARED)}")
     known = [c.name for c in UNDECLARED[name].coefficients]
     example = f"{name}.{known[0]}=0.1"
     if not (dot and equals):

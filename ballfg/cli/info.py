@@ -1,0 +1,99 @@
+"""`ballfg info`: what is installed, on which machine, and what is registered."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import platform
+import re
+import textwrap
+from collections.abc import Iterator, Mapping
+from importlib.metadata import PackageNotFoundError, requires, version
+from typing import Any
+
+import typer
+
+from ballfg.cli.inputs import default_jobs
+from ballfg.registry import PACKAGE, Registry, source_of
+
+REGISTRIES = (
+    ("effects", "ballfg.dynamics", "EFFECTS"),
+    ("estimators", "ballfg.estimation", "ESTIMATORS"),
+)
+"""Title, module and attribute of each registry, in the order in which they are shown."""
+WIDTH = 110
+"""Longest line, in characters."""
+
+
+def info() -> None:
+    """Show the installed versions, the machine, and every effect and estimator with the package it comes from.
+
+    Example: ballfg info
+    """
+    typer.echo(f"{PACKAGE} {version(PACKAGE)}, python {platform.python_version()}")
+    for title, lines in (("packages", _packages()), ("extras", _extras()), ("machine", _machine())):
+        _show(title, lines)
+    for title, module, attribute in REGISTRIES:
+        _show(title, _registered(getattr(importlib.import_module(module), attribute)))
+
+
+def _show(title: str, lines: Iterator[str]) -> None:
+    typer.echo(f"\n{title}")
+    for line in lines:
+        typer.echo(textwrap.fill(line, WIDTH, initial_indent="  ", subsequent_indent="      ", break_on_hyphens=False))
+
+
+def _packages() -> Iterator[str]:
+    """The packages that are always needed, with their versions."""
+    for name in _required()[None]:
+        yield _installed(name) or f"{name} is not installed; pip install {name}"
+
+
+def _extras() -> Iterator[str]:
+    """The optional parts of the package: installed, or how to install them."""
+    for extra, names in _required().items():
+        if extra is not None:
+            missing = [name for name in names if _installed(name) is None]
+            remedy = f"lacks {', '.join(missing)}; pip install '{PACKAGE}[{extra}]'"
+            yield f"{extra}: {remedy if missing else ', '.join(str(_installed(name)) for name in names)}"
+
+
+def _required() -> dict[str | None, list[str]]:
+    """Names of the packages that are required always (None), and for each extra."""
+    names: dict[str | None, list[str]] = {None: []}
+    for text in requires(PACKAGE) or ():
+        extra = re.search(r'extra == "([\w-]+)"', text)
+        name = re.split(r"[^\w.-]", text)[0]
+        names.setdefault(extra and extra[1], []).append(name)
+    return names
+
+
+def _installed(name: str) -> str | None:
+    """Name and version of an installed package; None if it is not installed."""
+    try:
+        return f"{name} {version(name)}"
+    except PackageNotFoundError:
+        return None
+
+
+def _machine() -> Iterator[str]:
+    """Operating system, processor cores that this process may use, memory and GPUs."""
+    import torch
+
+    yield f"{platform.platform()}, {platform.machine()}"
+    memory = ""
+    if hasattr(os, "sysconf"):
+        memory = f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.1f} GiB memory"
+    yield f"{default_jobs()} cores{memory}"
+    gpus = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
+    yield f"GPU: {', '.join(gpus) or 'none'}"
+
+
+def _registered(classes: Mapping[str, type[Any]]) -> Iterator[str]:
+    """The names in a registry, one line for each package that they come from."""
+    by_source: dict[str, list[str]] = {}
+    for name, cls in classes.items():
+        source = classes.source(name) if isinstance(classes, Registry) else source_of(cls)
+        by_source.setdefault(str(source), []).append(name)
+    for source_name, names in by_source.items():
+        yield f"{source_name}: {', '.join(names)}"

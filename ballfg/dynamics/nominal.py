@@ -1,0 +1,110 @@
+"""The nominal model of a ball: that of a known ball, else one that is guessed from radius and mass."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from importlib import resources
+from typing import Final, cast
+
+import yaml
+
+from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.dynamics.effect import Effect
+from ballfg.dynamics.model_file import model_from_dict
+from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball
+
+KNOWN_BALLS: Final[Mapping[str, Ball]] = {"table_tennis": TABLE_TENNIS, "tennis": TENNIS}
+"""The balls whose nominal model is a file of that name in `ballfg/dynamics/balls`."""
+SPREADS: Final[Mapping[str, Mapping[str, float]]] = {"table_tennis": {}, "tennis": {"drag": 0.3, "magnus": 0.3}}
+"""Prior standard deviations as shares of the values, for known balls to which those of the effects do not apply."""
+TOLERANCE: Final = 0.15
+"""Relative. A ball whose radius and mass both differ by less from those of a known ball is taken to be one."""
+AIR_DENSITY: Final = 1.2
+"""kg/m^3, dry air at 20 degrees C and 1013 hPa."""
+DRAG_COEFFICIENT: Final = 0.5
+"""Of an unknown ball: rough or smooth spheres have 0.4 to 0.6 below the drag crisis, 0.2 beyond it."""
+SPIN_RATIO: Final = 0.2
+"""R w / v at which the lift is made linear: a tennis ball at 25 m/s with 150 rad/s."""
+GUESSED_BOUNCE: Final = {"restitution": {"e": 0.75}, "friction": {"mu": 0.4}, "tangential_restitution": {"e_t": 0.15}}
+"""Between those of table-tennis, tennis and rubber balls on hard ground."""
+WIDE: Final = {"drag": 0.5, "magnus": 0.6, "restitution": 0.2, "friction": 0.5, "tangential_restitution": 2.0}
+"""Prior standard deviation of a guessed coefficient, as a share of its value."""
+
+
+def nominal_model(ball: Ball | float = TABLE_TENNIS) -> AnalyticModel:
+    """The model to start from when nothing else is known about a ball.
+
+    A ball that is as good as a known one (see `TOLERANCE`) gets that one's model, with the ball's own radius. For any
+    other ball drag and Magnus force are computed from radius and mass, the bounce is guessed, and the priors of all of
+    them are wide; `nominal_note` says so in words. A model file does not hold priors: a guessed model that is saved and
+    loaded has the usual ones.
+
+    Args: ball: radius m and mass kg; a number is the radius in m of a table-tennis ball.
+    Returns: a model of its own, which the caller may change.
+    Raises: ValueError: if the radius is not one of a ball (0.001 to 1 m), or the ball so light that its drag leaves
+        the bounds of the effect.
+    """
+    if not isinstance(ball, Ball):
+        return _known_model("table_tennis", ball)
+    name = _known_name(ball)
+    return _guessed_model(ball) if name is None else _known_model(name, ball.radius)
+
+
+def nominal_note(ball: Ball) -> str | None:
+    """One sentence on the nominal model of a ball that is not known; None for a known ball."""
+    if _known_name(ball) is not None:
+        return None
+    return (
+        f"no nominal model for a ball of {ball.radius:g} m radius and {ball.mass:g} kg: drag and Magnus force follow "
+        "from radius and mass, the bounce is guessed, priors are wide. Fit a model to your tracks or give a model file."
+    )
+
+
+def air_coefficients(ball: Ball, drag_coefficient: float = DRAG_COEFFICIENT) -> tuple[float, float]:
+    """Drag k (1/m) and Magnus k (dimensionless) of a ball, from its size, its mass and a law of lift.
+
+    Drag: a = rho Cd A v^2 / (2 m), so k = rho Cd A / (2 m). Lift: a = rho Cl A v^2 / (2 m) with
+    Cl = 1 / (2 + v / (R w)) = S / (1 + 2 S), S = R w / v; divided by w v that is k = rho A R / (2 m (1 + 2 S)), taken
+    at S = `SPIN_RATIO`. The effect `magnus_saturation` gives what this leaves out.
+
+    Source: A. Stepanek, "The aerodynamics of tennis balls - the topspin lob", American Journal of Physics 56, 1988.
+    """
+    area_over_mass = AIR_DENSITY * math.pi * ball.radius**2 / (2 * ball.mass)
+    return drag_coefficient * area_over_mass, area_over_mass * ball.radius / (1 + 2 * SPIN_RATIO)
+
+
+def _known_name(ball: Ball) -> str | None:
+    """Name of the known ball that is nearest, if it is near."""
+
+    def distance(name: str) -> float:
+        known = KNOWN_BALLS[name]
+        return max(abs(ball.radius / known.radius - 1), abs(ball.mass / known.mass - 1))
+
+    nearest = min(KNOWN_BALLS, key=distance)
+    return nearest if distance(nearest) <= TOLERANCE else None
+
+
+def _known_model(name: str, radius: float) -> AnalyticModel:
+    text = resources.files("ballfg.dynamics").joinpath("balls", f"{name}.yaml").read_text(encoding="utf-8")
+    model = model_from_dict(yaml.safe_load(text), radius=radius, where=f"{name}.yaml")
+    _set_spread(model, SPREADS[name])
+    return model
+
+
+def _guessed_model(ball: Ball) -> AnalyticModel:
+    drag, magnus = air_coefficients(ball)
+    flight = {"gravity": {}, "drag": {"k": drag}, "magnus": {"k": magnus}}
+    bounce = {**GUESSED_BOUNCE, "table_height": {}}
+    model = model_from_dict({"flight": flight, "bounce": bounce}, radius=ball.radius, where="nominal model")
+    _set_spread(model, WIDE)
+    return model
+
+
+def _set_spread(model: AnalyticModel, shares: Mapping[str, float]) -> None:
+    """Give the one coefficient of some effects a prior standard deviation that is a share of its value."""
+    effects = {name: effect for group in (model.flight, model.contact) for name, effect in group.items()}
+    for name, share in shares.items():
+        effect = cast(Effect, effects[name])
+        (coefficient,) = effect.coefficients
+        effect.set_sigmas(**{coefficient.name: share * abs(float(getattr(effect, coefficient.name).detach()))})

@@ -1,0 +1,102 @@
+"""`ballfg info`, `ballfg --version`, and that commands answer before anything heavy is imported."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+import tomllib
+from importlib.metadata import version
+from pathlib import Path
+
+import pytest
+
+from tests.places import DOCS
+
+ROOT = Path(__file__).parents[2]
+GUIDE = (DOCS / "add_an_effect.md").read_text(encoding="utf-8")
+HEAVY = ("torch", "gtsam", "cv2", "scipy", "matplotlib")
+SPY = f"import atexit, sys\natexit.register(lambda: print(set({HEAVY}) & set(sys.modules)))\n"
+"""Prints at the end which heavy modules were imported."""
+
+
+def run(code: str, *folders: Path) -> subprocess.CompletedProcess[str]:
+    """A fresh interpreter that finds packages in these folders too."""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (*folders, ROOT)))}
+    return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
+
+
+def command(*arguments: str) -> str:
+    return f"from ballfg.cli.main import run\nrun({list(arguments)})"
+
+
+@pytest.fixture
+def charged(tmp_path: Path) -> Path:
+    """A folder with the guide's package, installed."""
+    project = tomllib.loads(re.findall(r"```toml\n(.*?)```", GUIDE, re.DOTALL)[0])["project"]
+    name = project["name"].replace("-", "_")
+    (tmp_path / name).mkdir()
+    (tmp_path / name / "__init__.py").touch()
+    code = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)[0]
+    (tmp_path / name / "static_charge.py").write_text(code, encoding="utf-8")
+    info = tmp_path / f"{name}-{project['version']}.dist-info"
+    info.mkdir()
+    metadata = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
+    (info / "METADATA").write_text(metadata, encoding="utf-8")
+    groups = project["entry-points"].items()
+    text = "".join(f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in points.items()) for group, points in groups)
+    (info / "entry_points.txt").write_text(text, encoding="utf-8")
+    return tmp_path
+
+
+def test_version() -> None:
+    assert run(command("--version")).stdout == f"ballfg {version('ballfg')}\n"
+
+
+def test_info_lists_packages_machine_and_what_is_registered(charged: Path) -> None:
+    done = run(command("info"), charged)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith(f"ballfg {version('ballfg')}, python {sys.version.split()[0]}\n")
+    sections = dict(re.findall(r"^(\w+)\n((?:  .*\n)+)", done.stdout, re.MULTILINE))
+    assert list(sections)[:3] == ["packages", "extras", "machine"]
+    assert f"  torch {version('torch')}\n" in sections["packages"]
+    assert "  diffusion: " in sections["extras"]
+    assert "  GPU: " in sections["machine"]
+    assert f"  ballfg {version('ballfg')}: gravity, drag, magnus," in sections["effects"]
+    assert "  charged-balls 1.0: static_charge\n" in sections["effects"]
+    assert "smoother, online, ekf, sliding-window" in sections["estimators"]
+
+
+def test_extras_that_are_not_installed_come_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    from ballfg.cli import info
+
+    monkeypatch.setattr(info, "requires", lambda package: ["numpy>=2.0", 'no-such-package>=1 ; extra == "more"'])
+    assert list(info._packages()) == [f"numpy {version('numpy')}"]
+    assert list(info._extras()) == ["more: lacks no-such-package; pip install 'ballfg[more]'"]
+
+
+def test_commands_use_effects_of_an_installed_package(charged: Path, tmp_path: Path) -> None:
+    out = str(tmp_path / "shots")
+    words = ("simulate", "--out", out, "--tracks", "2", "--effect", "static_charge.strength=2")
+    done = run(command(*words), charged)
+    assert "undeclared effects: static_charge" in done.stdout, done.stderr
+    refused = run(command(*words, "--force"))
+    assert "effect must be one that exists; got 'static_charge'" in refused.stderr
+
+
+@pytest.mark.parametrize("arguments", [("--help",), ("--version",), ("simulate", "--help")])
+def test_help_imports_nothing_heavy(arguments: tuple[str, ...]) -> None:
+    done = run(SPY + command(*arguments))
+    assert done.stdout.endswith("\nset()\n"), done.stderr
+
+
+@pytest.mark.parametrize("name", ["estimate", "predict", "diagnose"])
+def test_a_mistyped_path_is_refused_before_anything_heavy_is_imported(name: str, tmp_path: Path) -> None:
+    code = command(name, "/no/such/folder", "--out", str(tmp_path / "out.csv"))
+    done = run(SPY + code)
+    assert done.returncode == 2
+    assert done.stdout == "set()\n"
+    assert done.stderr == (
+        "ballfg: error: folder must exist; /no/such/folder does not. Give the folder of a dataset.\n"
+    )
