@@ -157,7 +157,7 @@ def _from_videos(
 
 def _on_one_clock(tracking: Tracking, model: AnalyticModel, surfaces: Surfaces) -> Tracking:
     """The same candidates once more, each camera with the time offset that the balls tell."""
-    from ballfg.estimation import estimate_time_offsets, sighted_track
+    from ballfg.estimation import Settings, estimate_time_offsets, sighted_track
     from ballfg.vision.tracking.pipeline import track_detections
     from ballfg.vision.tracking.report import disagreement
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import ClassVar
 
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.model_file import nominal_model
+from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.given import given
 from ballfg.estimation.result import Estimate

@@ -14,7 +14,6 @@ from ballfg.dynamics import nominal_model
 from ballfg.estimation import Estimate, Online, Settings, Smoother
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.estimation.observations.sightings import sighted_track
-from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.time_offsets import TimeOffsets, estimate_time_offsets
 from ballfg.simulation.scene import Flight
 from ballfg.state import POSITION, VELOCITY, VZ

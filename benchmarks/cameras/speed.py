@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from ballfg.benchmarks.cameras.clocks import sighted
 from ballfg.benchmarks.cameras.scenes import Filmed, Scenario, draw
 from ballfg.dynamics import nominal_model
-from ballfg.estimation import Online
+from ballfg.estimation import Online, Settings
+from ballfg.estimation.observations.sightings import sightings_of
 from ballfg.vision import Camera, Detections, detect_all, track_detections
 
 Array = NDArray[np.float64]
@@ -65,10 +66,11 @@ def push_times(filmed: Filmed) -> Array:
     """(n,) ms, of each sighting that the online estimator takes in, those of all balls."""
     settings, taken = Settings.for_measured(nominal_model()), []
     for track in sighted(filmed):
-        online = Online(nominal_model(), filmed.recording.config.ball.surfaces, settings, cameras=track.cameras)
-        seen = track.sightings
-        for camera, at, pixel, covariance in zip(seen.camera, seen.times, seen.pixels, seen.covariances, strict=True):
+        seen = sightings_of(track)
+        online = Online(nominal_model(), filmed.recording.config.ball.surfaces, settings, cameras=seen.cameras)
+        rows = seen.sightings
+        for camera, at, pixel, covariance in zip(rows.camera, rows.times, rows.pixels, rows.covariances, strict=True):
             start = time.perf_counter()
-            online.push_sighting(float(at), seen.cameras[camera], pixel, covariance)
+            online.push_sighting(float(at), rows.cameras[camera], pixel, covariance)
             taken.append(1e3 * (time.perf_counter() - start))
     return np.array(taken)

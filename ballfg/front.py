@@ -1,0 +1,178 @@
+"""The front door: estimate and predict for arrays, tracks, datasets and folders alike."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from os import PathLike
+from pathlib import Path
+from typing import TypeAlias, overload
+
+import numpy as np
+
+from ballfg.diagnosis import Diagnosis
+from ballfg.diagnosis import diagnose as diagnose_dataset
+from ballfg.dynamics import BallModel, Surfaces, load_model, nominal_model
+from ballfg.estimation import (
+    Estimate,
+    Estimator,
+    Settings,
+    SightedDataset,
+    TrackPrediction,
+    dataset_settings,
+    dataset_surfaces,
+    estimate_tracks,
+    make_estimator,
+    predict_tracks,
+    read,
+)
+from ballfg.prediction import Ahead, BallState
+from ballfg.tracks import TABLE_TENNIS, Dataset, Track
+
+Folder: TypeAlias = str | PathLike[str]
+Tracks: TypeAlias = Dataset | SightedDataset
+Model: TypeAlias = BallModel | Folder | None
+
+
+@overload
+def estimate(
+    measured: Track,
+    *,
+    method: str = ...,
+    model: Model = ...,
+    surfaces: Surfaces | float | None = ...,
+    settings: Settings | None = ...,
+    jobs: int = ...,
+) -> Estimate: ...
+@overload
+def estimate(
+    measured: Tracks | Folder,
+    *,
+    method: str = ...,
+    model: Model = ...,
+    surfaces: Surfaces | float | None = ...,
+    settings: Settings | None = ...,
+    jobs: int = ...,
+) -> dict[str, Estimate]: ...
+def estimate(
+    measured: Track | Tracks | Folder,
+    *,
+    method: str = "smoother",
+    model: Model = None,
+    surfaces: Surfaces | float | None = None,
+    settings: Settings | None = None,
+    jobs: int = 1,
+) -> Estimate | dict[str, Estimate]:
+    """Position, velocity and spin of the ball at every stamp, with covariances.
+
+    What is not given comes from the dataset that a track was read from: ball, table and noise. A track of nobody's
+    dataset is a table-tennis ball above a table at z = 0; the notes of its estimate tell where it does not look so.
+
+    Args:
+        measured: a track, or a dataset or its folder for all tracks.
+        method: "smoother", "online", "ekf", "sliding-window", or the name of a registered estimator.
+        model: of the ball, or its file; the nominal model of the ball where None.
+        surfaces: that the ball may bounce on; a number is the height of the table, m.
+        settings: noise and priors; those of measured tracks where None.
+        jobs: processes for a dataset.
+    Returns: the estimate of a track; of a dataset, the estimates of all its tracks by name.
+    Raises:
+        TypeError: for anything else in place of a track.
+        ValueError: an unknown method, or numbers that cannot be metres and seconds.
+        FileNotFoundError: a folder or model file that is not there.
+    """
+    data = _opened(measured)
+    if isinstance(data, Track):
+        return estimator_for(data, method, model, surfaces, settings).estimate(data)
+    estimator = estimator_for(data, method, model, surfaces, settings)
+    return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs)}
+
+
+@overload
+def predict(known: Estimate | BallState | Track, horizon: float = ..., **options: object) -> Ahead: ...
+@overload
+def predict(known: Tracks | Folder, horizon: float = ..., **options: object) -> dict[str, TrackPrediction]: ...
+def predict(
+    known: Estimate | BallState | Track | Tracks | Folder,
+    horizon: float = 0.3,
+    *,
+    observe: float = 0.25,
+    method: str = "smoother",
+    model: Model = None,
+    surfaces: Surfaces | float | None = None,
+    settings: Settings | None = None,
+    jobs: int = 1,
+) -> Ahead | dict[str, TrackPrediction]:
+    """Where the ball will be, with standard deviations.
+
+    Args:
+        known: an estimate or a state; a track, which is estimated first; a dataset or its folder, of which the first
+            `observe` seconds of each track are estimated and what follows is predicted.
+        horizon: s.
+        observe: s from the first stamp of each track of a dataset.
+        method, model, surfaces, settings, jobs: as for `estimate`.
+    Returns: the path ahead; of a dataset, the predicted measurements of each track by name.
+    Raises: ValueError: a horizon that is not positive, or what `estimate` raises.
+    """
+    if isinstance(known, Estimate | BallState):
+        return known.predict(horizon)
+    data = _opened(known)
+    estimator = estimator_for(data, method, model, surfaces, settings)
+    if isinstance(data, Track):
+        return estimator.estimate(data).predict(horizon)
+    found = predict_tracks(estimator, data, len(data), observe, horizon=horizon, jobs=jobs)
+    return {one.name: one for one in found}
+
+
+def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) -> Diagnosis:
+    """What the model of the ball lacks, by what its measured tracks show.
+
+    Args:
+        measured: a dataset or its folder; every second track is searched, the others judge.
+        model: the analytic model that one believes in, or its file; the nominal model of the ball where None.
+        jobs: processes.
+    Raises:
+        TypeError: if the model is a learned one.
+        ValueError: if there are too few tracks, or none with a flight that is long enough.
+        FileNotFoundError: a folder or model file that is not there.
+    """
+    data = read(measured) if isinstance(measured, str | PathLike) else measured
+    if not isinstance(data, Dataset):
+        raise ValueError("measured must have a table of positions; a diagnosis of detections alone is not possible")
+    return diagnose_dataset(data, _model(model, data), jobs=jobs)
+
+
+def estimator_for(
+    data: Track | Tracks,
+    method: str = "smoother",
+    model: Model = None,
+    surfaces: Surfaces | float | None = None,
+    settings: Settings | None = None,
+) -> Estimator:
+    """The estimator that `estimate` uses; arguments and errors as there."""
+    source = data.dataset if isinstance(data, Track) else data
+    ball = _model(model, source)
+    if surfaces is None:
+        surfaces = Surfaces.table_tennis(0.0) if source is None else dataset_surfaces(source)
+    elif isinstance(surfaces, int | float):
+        surfaces = Surfaces.table_tennis(surfaces)
+    if settings is None:
+        settings = Settings.for_measured(ball) if source is None else dataset_settings(source, ball)
+    return make_estimator(method, ball, surfaces, settings)
+
+
+def _model(model: Model, source: Tracks | None) -> BallModel:
+    ball = TABLE_TENNIS if source is None else source.ball
+    if model is None:
+        return nominal_model(ball)
+    return load_model(Path(model), radius=ball.radius) if isinstance(model, str | PathLike) else model
+
+
+def _opened(measured: object) -> Track | Tracks:
+    if isinstance(measured, str | PathLike):
+        return read(measured)
+    if isinstance(measured, Track | Dataset | SightedDataset):
+        return measured
+    hint = "Track(times, positions), (n,) s and (n, 3) m"
+    if isinstance(measured, np.ndarray | Iterable):
+        hint += ", makes a track of arrays"
+    raise TypeError(f"measured must be a Track, a dataset or its folder; got {type(measured).__name__}. {hint}.")
