@@ -55,6 +55,14 @@ class Crossing:
     state: Array
     covariance: Array
 
+    def __repr__(self) -> str:
+        x, y, z = self.state[POSITION].tolist()
+        spread = ", ".join(f"{1e3 * s:.3g}" for s in np.sqrt(np.diagonal(self.covariance))[POSITION])
+        return (
+            f"Crossing(t = {self.time:.4f} s +- {1e3 * self.time_sigma:.3g} ms, at ({x:.3f}, {y:.3f}, {z:.3f}) m "
+            f"+- ({spread}) mm)"
+        )
+
 
 def apex(propagator: Propagator, belief: Belief, horizon: float = 3.0, *, after: float = -math.inf) -> Crossing | None:
     """The next highest point, where the ball turns from up to down.
