@@ -1,4 +1,4 @@
-"""One physical effect a file, the registry that names them, and effects of one's own."""
+"""Physical effects, the registry that names them, and effects of one's own."""
 
 from ballfg.dynamics.effects.registry import EFFECTS, effect_class, load_effects, register
 
