@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from ballfg.cli.progress import progress
+from ballfg.progress import progress
 
 if TYPE_CHECKING:
     from ballfg.dynamics import AnalyticModel, Surfaces
@@ -150,7 +150,7 @@ def _from_videos(
         make,
         stamps=files,
         jobs=jobs or len(rig),
-        watch=lambda frames, total: progress(frames, total, "frames searched"),
+        watch=progress,
     )
     return tracking, [open_video(path, files.get(name)).frames for name, path in videos.items()]
 

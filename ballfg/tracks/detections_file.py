@@ -13,12 +13,12 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 from numpy.typing import NDArray
 
-from . import csv_errors
-from .checks import check_step
-from .hints import did_you_mean
-from .rows import KEY
-from .sightings import Sightings
-from .table import TableWriter
+from ballfg.checks import did_you_mean
+from ballfg.tracks import csv_errors
+from ballfg.tracks.checks import check_step
+from ballfg.tracks.rows import KEY
+from ballfg.tracks.sightings import Sightings
+from ballfg.tracks.table import TableWriter
 
 Array = NDArray[np.float64]
 Rule = tuple[str, Callable[[Array], NDArray[np.bool_]]]

@@ -3,10 +3,10 @@
 from collections.abc import Collection
 from pathlib import Path
 
-from . import csv_errors
-from .hints import did_you_mean
-from .rows import KEY
-from .track import SPIN_LABELS, Label
+from ballfg.checks import did_you_mean
+from ballfg.tracks import csv_errors
+from ballfg.tracks.rows import KEY
+from ballfg.tracks.track import SPIN_LABELS, Label
 
 LABELS_FILE = "labels.csv"
 NUMERIC_LABELS = (*SPIN_LABELS, "topspin", "sidespin", "speed")

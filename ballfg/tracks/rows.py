@@ -11,9 +11,9 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from . import csv_errors
-from .hints import did_you_mean
-from .track import FloatArray
+from ballfg.checks import did_you_mean
+from ballfg.tracks import csv_errors
+from ballfg.tracks.track import FloatArray
 
 KEY = "trajectory"
 VALUES = ("t", "x", "y", "z")

@@ -11,10 +11,10 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 from numpy.typing import NDArray
 
+from ballfg.checks import did_you_mean
 from ballfg.tracks import csv_errors
 from ballfg.tracks.checks import check_step
 from ballfg.tracks.detections_file import CAMERA, NOISE, RULES, SCORE, UNSTATED, check_header, check_values, place
-from ballfg.tracks.hints import did_you_mean
 from ballfg.tracks.rows import KEY
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections

@@ -11,13 +11,14 @@ import numpy as np
 
 from ballfg.files.destination import check_folder, check_replaceable
 from ballfg.files.whole_folder import whole_folder
+from ballfg.progress import Watch, unwatched
 from ballfg.tracks import DatasetInfo, TableWriter, write_dataset
 from ballfg.tracks.detections_file import DETECTIONS_FILE
 from ballfg.tracks.info import INFO_FILE, write_info
 from ballfg.tracks.rows import KEY, SIGMAS, VALUES
 from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
 from ballfg.vision.tracking.contact_sheet import ContactSheet, Extent
-from ballfg.vision.tracking.overlay import Watch, write_overlay
+from ballfg.vision.tracking.overlay import write_overlay
 from ballfg.vision.tracking.pipeline import Tracking
 from ballfg.vision.tracking.playback import Image
 from ballfg.vision.tracking.strobe import tapped
@@ -54,7 +55,7 @@ def write_tracking(
     table: Extent | None = None,
     streams: Streams | None = None,
     overlay: bool = True,
-    watch: Watch | None = None,
+    watch: Watch = unwatched,
 ) -> list[str]:
     """Writes dataset.yaml, tracks.csv, detections.csv, cameras.yaml, contact_sheet.png and overlay.mp4.
 
@@ -68,7 +69,7 @@ def write_tracking(
         table: (x_low, x_high, y_low, y_high) m, drawn in the contact sheet; None where it is not known.
         streams: the videos; None where there are none: then there is no overlay, and the sheet has no pictures.
         overlay: write it.
-        watch: shows how far it is.
+        watch: sees the frames of the overlay that are drawn.
     Returns: the names of the files.
     Raises: OSError: something cannot be written. ValueError: a track that breaks a rule of datasets.
     """
@@ -82,7 +83,7 @@ def write_tracking(
 
 
 def _run_videos(
-    stage: Path, tracking: Tracking, sheet: ContactSheet, streams: Streams, overlay: bool, watch: Watch | None
+    stage: Path, tracking: Tracking, sheet: ContactSheet, streams: Streams, overlay: bool, watch: Watch
 ) -> None:
     """Runs through the videos once more, for both kinds of pictures."""
     pictures = [sheet.pictures_of(i) for i in range(len(streams))]
