@@ -14,7 +14,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.tracks.csv_errors import no_rows
+from ballfg.tracks.csv_files import no_rows
 from ballfg.tracks.rows import Block, RowSource
 from ballfg.tracks.track import FloatArray
 

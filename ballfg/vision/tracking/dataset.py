@@ -8,11 +8,13 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ballfg.files.destination import check_folder, check_replaceable
 from ballfg.files.whole_folder import whole_folder
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import DatasetInfo, TableWriter, write_dataset
+from ballfg.tracks.detection_columns import SCORE, seen_columns
 from ballfg.tracks.detections_file import DETECTIONS_FILE
 from ballfg.tracks.info import INFO_FILE, write_info
 from ballfg.tracks.rows import KEY, SIGMAS, VALUES
@@ -109,21 +111,11 @@ def _write_tables(stage: Path, tracking: Tracking, info: DatasetInfo) -> None:
             detections.write(_detection_columns(tracking, camera))
 
 
-def _detection_columns(tracking: Tracking, camera: int) -> dict[str, np.ndarray | str]:
-    """All candidates of a camera; those that a ball was seen by carry its name, the others none."""
+def _detection_columns(tracking: Tracking, camera: int) -> dict[str, ArrayLike]:
+    """All candidates of a camera. Those of a ball carry its name, the others none."""
     seen = tracking.detections[camera]
     names = np.full(len(seen), "", dtype=object)
     for name, ball in zip(tracking.names, tracking.balls, strict=True):
         names[tracking.rows(ball, camera)] = name
-    sigma_u, sigma_v = (np.sqrt(seen.covariances[:, i, i]) for i in (0, 1))
-    return {
-        KEY: names,
-        "t": seen.times,
-        "camera": seen.camera,
-        "u": seen.pixels[:, 0],
-        "v": seen.pixels[:, 1],
-        "sigma_u": sigma_u,
-        "sigma_v": sigma_v,
-        "rho_uv": seen.covariances[:, 0, 1] / (sigma_u * sigma_v),
-        "score": seen.scores,
-    }
+    columns = seen_columns(seen.times, seen.camera, seen.pixels, seen.covariances)
+    return {KEY: names} | columns | {SCORE: seen.scores}
