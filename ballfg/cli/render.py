@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ballfg.cli.inputs import OwnEffects, know_effects
-from ballfg.cli.progress import progress
+from ballfg.progress import progress
 
 if TYPE_CHECKING:
     from ballfg.simulation.scene import Clock
@@ -77,10 +77,10 @@ def render(
         **look,
     )
     recording = record(config, cameras)
-    total = recording.image_count
-    write_scene(out, recording, images=images, force=force, watch=lambda drawn: progress(drawn, total, "frames drawn"))
+    write_scene(out, recording, images=images, force=force, watch=progress)
     kind = "images" if images else "a video"
-    typer.echo(f"wrote {total} frames to {out}: {kind} and stamps for each of {', '.join(names)}; cameras.yaml")
+    count = recording.image_count
+    typer.echo(f"wrote {count} frames to {out}: {kind} and stamps for each of {', '.join(names)}; cameras.yaml")
     typer.echo(f"wrote the truth to {out}: truth.csv, visible.csv, scene.yaml")
 
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ballfg.cli.inputs import OwnEffects, know_effects
-from ballfg.cli.progress import progress
+from ballfg.progress import progress
 
 if TYPE_CHECKING:
     from ballfg.simulation import BallKind
@@ -76,9 +76,7 @@ def simulate(
         undeclared=parse_effects(effect or ()),
         spin_labels=spin_labels,
     )
-    write_simulation(
-        out, config, file_format, force=force, watch=lambda made: progress(made, tracks, "tracks simulated")
-    )
+    write_simulation(out, config, file_format, force=force, watch=progress)
     names = ", ".join(e.name for e in config.undeclared) or "none"
     typer.echo(f"wrote {tracks} tracks to {out}: tracks.{file_format}, labels.csv, dataset.yaml, model.yaml (declared)")
     typer.echo(f"wrote the truth to {out}: truth.{file_format}, truth.yaml (undeclared effects: {names})")

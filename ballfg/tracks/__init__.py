@@ -1,12 +1,12 @@
 """Tracks and datasets: reading, checking and writing them; docs/tracks.md describes the files."""
 
-from .dataset import Dataset, read_dataset
-from .detections_file import read_sightings, write_sightings
-from .info import TABLE_TENNIS, TENNIS, Ball, DatasetInfo
-from .sightings import Sightings
-from .table import TableWriter
-from .track import SPIN_LABELS, Label, Track
-from .writing import write_dataset
+from ballfg.tracks.dataset import Dataset, read_dataset
+from ballfg.tracks.detections_file import read_sightings, write_sightings
+from ballfg.tracks.info import TABLE_TENNIS, TENNIS, Ball, DatasetInfo
+from ballfg.tracks.sightings import Sightings
+from ballfg.tracks.table import TableWriter
+from ballfg.tracks.track import SPIN_LABELS, Label, Track
+from ballfg.tracks.writing import write_dataset
 
 __all__ = [
     "SPIN_LABELS",
