@@ -10,10 +10,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from ballfg.dynamics import Surfaces
+from ballfg.dynamics import Surfaces, rollout
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import substitute
-from ballfg.dynamics.motion import rollout
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.dynamics.motion.paths import paths
 

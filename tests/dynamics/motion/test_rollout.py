@@ -9,8 +9,7 @@ import pytest
 import torch
 from scipy.integrate import solve_ivp
 
-from ballfg.dynamics import Surfaces, advance, fly, fly_through, substitute
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics import Surfaces, advance, fly, fly_through, rollout, substitute
 from ballfg.dynamics.motion.impact import slip_velocity
 from ballfg.dynamics.motion.rollout import LONGEST_MOTION, MAX_CONTACTS, REST_SPEED, is_resting, place_on, roll
 

@@ -16,12 +16,12 @@ from ballfg.dynamics import (
     fly_through,
     fly_through_jacobian,
     nominal_model,
+    rollout,
     substitute,
 )
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.effect import Coefficient
 from ballfg.dynamics.model import take_rows
-from ballfg.dynamics.motion import rollout
 from ballfg.dynamics.motion.integrate import batch_jacobian, rate_jacobian
 from ballfg.dynamics.networks.learned_parts import HIGHEST_RESTITUTION, START_RESTITUTION
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
