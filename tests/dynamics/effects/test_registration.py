@@ -158,7 +158,7 @@ COEFFICIENT = Coefficient("a", 0.0, 0.1, "m/s^2", -5.0, 5.0)
         ({"coefficients": (dataclasses.replace(COEFFICIENT, absent=None),)}, r"^own_push must have a coefficient that"),
         (
             {"name": "wind"},
-            r"^name of an effect must be its own; got 'wind', that of ballfg\.dynamics\.effects\.wind\.W",
+            r"^name of an effect must be its own; got 'wind', that of ballfg\.dynamics\.effects\.flight\.wind\.W",
         ),
         ({"name": "generic_flight"}, r"^name of an effect must be its own; got 'generic_flight', that of "),
         ({"needs": ("gale",)}, r"^own_push\.needs must name known effects; got 'gale'\. Register that one first"),
