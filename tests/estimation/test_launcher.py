@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from ballfg import simulation as simulate_module
-from ballfg.dynamics import Surfaces, nominal_model
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics import Surfaces, nominal_model, rollout
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.dynamics.trained import Trained
 from ballfg.estimation import ExtendedKalmanFilter, Online, Settings, SlidingWindow, Smoother

@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import nominal_model
+from ballfg.dynamics import nominal_model, rollout
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.motion import rollout
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge, from_gtsam, key_of, nonlinear_graph, to_gtsam

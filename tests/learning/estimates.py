@@ -9,8 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Surfaces
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Surfaces, rollout
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.segmentation import Segmentation

@@ -9,8 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from ballfg.dynamics import BallModel, Surfaces, nominal_model
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics import BallModel, Surfaces, nominal_model, rollout
 from ballfg.estimation.online import isam as online_isam
 from ballfg.estimation.online.events import contact_step
 from ballfg.estimation.online.online import Online

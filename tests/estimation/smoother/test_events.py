@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import Surfaces, contact_time, nominal_model
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics import Surfaces, contact_time, nominal_model, rollout
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact
 from ballfg.estimation.settings import Settings, uncertain

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import Surfaces
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics import Surfaces, rollout
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.learned import LearnedModel, build
 from ballfg.estimation import Smoother
