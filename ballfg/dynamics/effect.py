@@ -194,6 +194,10 @@ class Effect(nn.Module, ABC):
                 )
             self.register_parameter(c.name, nn.Parameter(torch.tensor(value, dtype=torch.float64)))
 
+    def values(self) -> dict[str, float]:
+        """The values of the coefficients by name, each in its own unit."""
+        return {c.name: float(getattr(self, c.name).detach()) for c in self.coefficients}
+
     def set_sigmas(self, **sigmas: float) -> None:
         """Give coefficients of this one effect other prior standard deviations, in their own units.
 

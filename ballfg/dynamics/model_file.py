@@ -102,8 +102,7 @@ def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
     """What a model file says about this model's effects."""
 
     def section(group: Mapping[str, object]) -> dict[str, dict[str, float]]:
-        effects = {name: cast(Effect, effect) for name, effect in group.items()}
-        return {n: {c.name: float(getattr(e, c.name).detach()) for c in e.coefficients} for n, e in effects.items()}
+        return {name: cast(Effect, effect).values() for name, effect in group.items()}
 
     return {
         "flight": section(dict(model.flight.items())),

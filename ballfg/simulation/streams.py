@@ -23,8 +23,14 @@ class Purpose(IntEnum):
     JITTER = 6
     OUTLIER = 7
     LABEL = 8
+    SCENE_START = 100
+    SCENE_DROPOUT = 101
+    SCENE_JITTER = 102
+    SCENE_NOISE = 103
+    SCENE_TEXTURE = 104
+    SCENE_PHASE = 105
 
 
-def generator(seed: int, purpose: Purpose, block: int) -> np.random.Generator:
-    """The generator of one stream; `block` counts blocks of tracks, or passes through the settings."""
-    return np.random.default_rng([seed, int(purpose), block])
+def generator(seed: int, purpose: Purpose, number: int = 0) -> np.random.Generator:
+    """The generator of one stream; `number` counts blocks of tracks, passes through the settings, or cameras."""
+    return np.random.default_rng([seed, int(purpose), number])

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any, Final, Literal, cast
 
 import yaml
-from torch import Tensor
 
 from ballfg.dynamics import Effect, save_model
 from ballfg.files.destination import check_replaceable
@@ -100,9 +99,8 @@ def truth_content(config: SimulationConfig) -> dict[str, Any]:
 
 
 def _effect_content(effect: Effect) -> dict[str, Any]:
-    values = {c.name: float(cast(Tensor, getattr(effect, c.name)).detach()) for c in effect.coefficients}
     units = {c.name: c.unit for c in effect.coefficients}
-    return {"kind": effect.kind, "sentence": effect.sentence, "values": values, "units": units}
+    return {"kind": effect.kind, "sentence": effect.sentence, "values": effect.values(), "units": units}
 
 
 def _with_truth(tracks: Iterable[SimulatedTrack], table: TableWriter, config: SimulationConfig) -> Iterator[Track]:
@@ -112,6 +110,5 @@ def _with_truth(tracks: Iterable[SimulatedTrack], table: TableWriter, config: Si
         columns: dict[str, Any] = {"trajectory": simulated.track.name, "t": simulated.track.times}
         if with_true_times:
             columns["t_true"] = simulated.true_times
-        columns |= {name: simulated.true_states[:, i] for i, name in enumerate(STATE_NAMES)}
-        table.write(columns)
+        table.write(columns | dict(zip(STATE_NAMES, simulated.true_states.T, strict=True)))
         yield simulated.track

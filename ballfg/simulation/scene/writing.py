@@ -7,15 +7,13 @@ import os
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from torch import Tensor
 
-from ballfg.dynamics import Effect
 from ballfg.files.destination import check_replaceable
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.whole_folder import whole_folder
@@ -95,27 +93,13 @@ def scene_content(recording: Recording) -> dict[str, Any]:
     """What `scene.yaml` says: everything that made the recording."""
     config = recording.config
     return {
-        "seed": config.seed,
-        "shots": config.shots,
-        "interval": config.interval,
-        "rate": config.rate,
-        "exposure": config.exposure,
+        **{name: getattr(config, name) for name in ("seed", "shots", "interval", "rate", "exposure")},
         "clocks": {camera.name: asdict(recording.clock(camera.name)) for camera in recording.cameras},
-        "dropout": config.dropout,
-        "jitter": config.jitter,
-        "colour": config.colour,
-        "noise": config.noise,
-        "flicker": config.flicker,
-        "distractors": config.distractors,
+        **{name: getattr(config, name) for name in ("dropout", "jitter", "colour", "noise", "flicker", "distractors")},
         "settings": {name: list(levels) for name, levels in config.settings.items()},
-        "undeclared": {effect.name: _values(effect) for effect in config.undeclared},
+        "undeclared": {effect.name: effect.values() for effect in config.undeclared},
         "flights": {f.name: {"start": f.start, "end": f.end} for f in recording.flights},
     }
-
-
-def _values(effect: Effect) -> dict[str, float]:
-    """The values of an effect's coefficients, by name, in their own units."""
-    return {c.name: float(cast(Tensor, getattr(effect, c.name)).detach()) for c in effect.coefficients}
 
 
 def _all_images(recording: Recording) -> Iterator[Pixels]:
@@ -153,9 +137,8 @@ def _write_truth(path: Path, recording: Recording) -> None:
         for flight in recording.flights:
             count = int(np.floor((flight.end - flight.start) * TRUTH_RATE)) + 1
             times = np.minimum(flight.start + np.arange(count) / TRUTH_RATE, flight.end)
-            states = flight.states(times)
-            columns: dict[str, Any] = {"trajectory": flight.name, "t": times}
-            table.write(columns | {name: states[:, i] for i, name in enumerate(STATE_NAMES)})
+            states = dict(zip(STATE_NAMES, flight.states(times).T, strict=True))
+            table.write({"trajectory": flight.name, "t": times, **states})
 
 
 def _earlier(scene: Path) -> list[str]:

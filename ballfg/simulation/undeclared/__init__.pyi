@@ -1,2 +1,0 @@
-from .registry import UNDECLARED as UNDECLARED
-from .registry import parse_effects as parse_effects
