@@ -9,10 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.simulation.measure import JITTER_LIMIT
 from ballfg.simulation.scene.config import Clock, SceneConfig
 from ballfg.simulation.scene.flights import Flight
-from ballfg.simulation.streams import Purpose, generator
+from ballfg.simulation.streams import Purpose, cut_normal, generator
 from ballfg.state import POSITION
 from ballfg.vision.camera import Camera
 
@@ -80,10 +79,8 @@ def frames_of(config: SceneConfig, camera: Camera, number: int, until: float) ->
     kept = generator(config.seed, Purpose.SCENE_DROPOUT, number).random(count) >= config.dropout
     kept[0] = True
     times = clock.phase + np.arange(count) / config.rate
-    normal = np.clip(
-        generator(config.seed, Purpose.SCENE_JITTER, number).standard_normal(count), -JITTER_LIMIT, JITTER_LIMIT
-    )
-    stamps = times + camera.time_offset + clock.offset + config.jitter * normal
+    jitter = config.jitter * cut_normal(generator(config.seed, Purpose.SCENE_JITTER, number), count)
+    stamps = times + camera.time_offset + clock.offset + jitter
     return Frames(times[kept], stamps[kept])
 
 
