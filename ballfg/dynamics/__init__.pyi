@@ -5,9 +5,12 @@ from .effect import Effect as Effect
 from .effect import Flight as Flight
 from .effect import FlightEffect as FlightEffect
 from .effect import Impact as Impact
+from .effect import length as length
+from .effect import vector as vector
 from .effects.registry import EFFECTS as EFFECTS
 from .effects.registry import load_effects as load_effects
 from .effects.registry import register as register
+from .measurement import MeasurementEffect as MeasurementEffect
 from .model import BallModel as BallModel
 from .model import substitute as substitute
 from .model_file import load_model as load_model
@@ -27,5 +30,6 @@ from .networks.learned import build as build
 from .networks.spin_embedding import SpinEmbedding as SpinEmbedding
 from .nominal import nominal_model as nominal_model
 from .nominal import nominal_note as nominal_note
+from .scene import Scene as Scene
 from .surfaces import Surfaces as Surfaces
 from .trained import Trained as Trained

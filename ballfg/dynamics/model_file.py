@@ -54,7 +54,15 @@ def load_model(path: str | Path, *, radius: float = 0.02, inertia_factor: float 
 def model_from_dict(
     content: Any, *, radius: float = 0.02, inertia_factor: float = THIN_SHELL, where: str = "model"
 ) -> AnalyticModel:
-    """The model that a parsed model file without a learned part describes; `where` stands in error messages."""
+    """The model that a parsed model file without a learned part describes.
+
+    Args:
+        content: the sections `flight`, `bounce` and `measurement` (docs/models.md).
+        radius: m, of the ball.
+        inertia_factor: moment of inertia divided by m R^2.
+        where: begins the error messages.
+    Raises: ValueError: if it names a section, effect or coefficient that does not exist, or a value out of its bounds.
+    """
     if not isinstance(content, Mapping):
         raise ValueError(f"{where}: a model is a mapping with the sections {', '.join(SECTIONS)}; got {content!r}")
     for section in content:

@@ -1,4 +1,4 @@
-"""Synthetic tracks: a launcher, motion with effects that nobody declares, noisy measurements, truth beside them."""
+"""Synthetic tracks: a launcher, motion with undeclared effects, noisy measurements, the truth beside them."""
 
 import lazy_loader
 

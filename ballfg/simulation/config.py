@@ -1,4 +1,4 @@
-"""What a simulation is: how many tracks, of which ball, with which noise, and what nobody declares."""
+"""The configuration of a simulation: number of tracks, ball, noise, and undeclared effects."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LARGEST_JITTER = 0.15
 
 @dataclass(frozen=True)
 class MeasurementNoise:
-    """What happens between the ball and the file. Every value may be zero.
+    """Noise and gaps of the measurement. Every value may be zero.
 
     Raises: ValueError, TypeError: a value out of its bounds; the message names it.
     """
@@ -47,7 +47,7 @@ class MeasurementNoise:
 
 @dataclass(frozen=True)
 class MotionNoise:
-    """What the true motion does that no model foresees; continuous-time densities and kicks. Zero: none.
+    """Random disturbances of the true motion: continuous-time densities and kicks; zero for none.
 
     Raises: ValueError, TypeError: a value out of its bounds; the message names it.
     """
@@ -92,7 +92,7 @@ class SimulationConfig:
     """Hz, frames per second."""
 
     seed: int = bounded(0, 0, MAX_SEED)
-    """Of every random choice."""
+    """Seed of all random numbers."""
 
     ball: BallKind = field(default_factory=table_tennis)
     """The ball, the model declared for it, its surface and its launcher."""
@@ -101,10 +101,10 @@ class SimulationConfig:
     """Levels by launcher setting (topspin, sidespin, speed), for those that are not to run through all levels."""
 
     noise: MeasurementNoise = field(default_factory=MeasurementNoise)
-    """Of the measurement."""
+    """Noise of the measurement."""
 
     process: MotionNoise = field(default_factory=MotionNoise)
-    """Of the motion."""
+    """Noise of the motion."""
 
     undeclared: tuple[Effect, ...] = ()
     """Effects that act although no model file declares them; applied in this order."""
@@ -121,7 +121,7 @@ class SimulationConfig:
         self.combinations()
 
     def combinations(self) -> Settings:
-        """(m, 3) the launcher settings that are shot."""
+        """(m, 3) numbers of the launcher's levels that are shot."""
         return all_settings(self.settings)
 
 

@@ -106,10 +106,10 @@ class SimulatedLauncher:
         """The first states of some shots.
 
         Args:
-            settings: (n, 3) topspin, sidespin, velocity level.
+            settings: (n, 3) numbers of the levels of topspin, sidespin and velocity.
             table_height: m, z of the surface.
             rng: the shot-to-shot spread.
-        Returns: (n, 9) at the muzzle.
+        Returns: (n, 9) states at the muzzle.
         """
         n = len(settings)
         share = (settings[:, 2] - _SPEED_LEVELS[0]) / (_SPEED_LEVELS[-1] - _SPEED_LEVELS[0])
@@ -130,7 +130,7 @@ class SimulatedLauncher:
         return torch.from_numpy(states)
 
     def in_view(self, states: Tensor, surfaces: Surfaces, model: BallModel) -> Tensor:
-        """(...) bool: the ball is still tracked.
+        """(...) bool of states (..., 9): the ball is still tracked.
 
         A ball beside the table leaves the view as it comes down to the table's height: from there on the track of a
         table of unknown extent would show a ball that falls through it.

@@ -1,6 +1,6 @@
-"""What may act although no model declares it: every effect of a model file, and some that no model file can name.
+"""Undeclared effects of a simulation: every effect that a model file can name, and three that none can name.
 
-The latter test whether an analysis says "unexplained" where it lacks the explanation.
+Those three test whether a diagnosis reports an unexplained part where the catalogue lacks the explanation.
 """
 
 from __future__ import annotations

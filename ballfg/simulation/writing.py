@@ -76,7 +76,7 @@ def check_format(name: str) -> FileFormat:
 
 
 def truth_content(config: SimulationConfig) -> dict[str, Any]:
-    """What `truth.yaml` says: everything that made the tracks, undeclared effects with their values and units."""
+    """The content of `truth.yaml`: everything that determines the tracks; undeclared effects have values and units."""
     content = describe(config.ball)
     surfaces = config.ball.surfaces
     return {

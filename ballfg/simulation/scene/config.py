@@ -1,4 +1,4 @@
-"""What a synthetic recording is: which shots, seen by cameras with which clocks, shutter and noise."""
+"""The configuration of a synthetic recording: shots, clocks of the cameras, shutter, noise."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LONGEST_EXPOSURE: Final = 0.95
 
 @dataclass(frozen=True)
 class Clock:
-    """When a camera takes its frames, and what it writes about it.
+    """The times at which a camera takes its frames, and the delay of its stamps.
 
     Raises: ValueError, TypeError: a value out of its bounds; the message names it.
     """
@@ -30,7 +30,7 @@ class Clock:
     """s, true time of the middle of its first exposure."""
 
     offset: float = bounded(0.0, -1.0, 1.0)
-    """s by which its stamps are late beyond what the camera's `time_offset` says: nobody declares it."""
+    """s, undeclared delay of its stamps, on top of the camera's `time_offset`."""
 
     def __post_init__(self) -> None:
         check_bounds(self)
@@ -50,7 +50,7 @@ class SceneConfig:
     """s from one launch to the next, give or take 25 ms. A ball flies for up to 1.32 s: with less, two fly at once."""
 
     seed: int = bounded(0, 0, MAX_SEED)
-    """Of every random choice."""
+    """Seed of all random numbers."""
 
     settings: Mapping[str, Sequence[int]] = field(default_factory=dict)
     """Levels by launcher setting (topspin, sidespin, speed), for those that are not to run through all levels."""
@@ -74,13 +74,13 @@ class SceneConfig:
     """s, standard deviation of the written stamp about the true time; cut off at 3 sigma. At most 0.15 frames."""
 
     colour: Literal["white", "orange"] = "white"
-    """Of the ball."""
+    """Colour of the ball."""
 
     noise: float = bounded(2.0, 0.0, 50.0)
     """Grey levels, standard deviation of a dark pixel; it grows with the light, by sqrt(2) at middle grey."""
 
     flicker: float = bounded(0.03, 0.0, 0.5)
-    """By how much the lamps' light goes up and down with the mains, relative, at 100 Hz."""
+    """Relative amplitude of the lamps' flicker at 100 Hz, from the mains."""
 
     distractors: bool = True
     """Whether things other than the ball move: people in white shirts who swing an arm, a gliding reflection."""
@@ -109,7 +109,7 @@ class SceneConfig:
         return table_tennis()
 
     def combinations(self) -> Settings:
-        """(m, 3) the launcher settings that are shot."""
+        """(m, 3) numbers of the launcher's levels that are shot."""
         return all_settings(self.settings)
 
     def model(self) -> AnalyticModel:

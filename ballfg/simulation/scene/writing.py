@@ -46,10 +46,10 @@ def write_scene(
 
     - `NAME.mp4` (or, with `images`, a folder `NAME` of PNG files, without any loss) and `NAME_stamps.csv` (`t`, one row
       a frame) for each camera;
-    - `cameras.yaml`: the cameras as they are, except for clock offsets that nobody declares;
+    - `cameras.yaml`: the exact cameras, without undeclared delays of their stamps;
     - `truth.csv`: `trajectory,t` and the true state, every millisecond of true time;
-    - `visible.csv`: for each frame and each ball in it, where it is: see `visible.visible_columns`;
-    - `scene.yaml`: what was asked for, with the clocks.
+    - `visible.csv`: the place of each ball in each frame: see `visible.visible_columns`;
+    - `scene.yaml`: all settings, with the clocks.
 
     Args:
         folder: new or empty; its parent must exist.
@@ -90,7 +90,7 @@ def check_scene_folder(folder: Path, *, force: bool) -> None:
 
 
 def scene_content(recording: Recording) -> dict[str, Any]:
-    """What `scene.yaml` says: everything that made the recording."""
+    """The content of `scene.yaml`: everything that determines the recording."""
     config = recording.config
     return {
         **{name: getattr(config, name) for name in ("seed", "shots", "interval", "rate", "exposure")},
