@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -13,10 +12,6 @@ from scipy.stats import norm
 from ballfg.estimation import Estimator, Status, predict_tracks
 from ballfg.estimation.batch import map_tracks
 from ballfg.tracks import Track
-
-T = TypeVar("T")
-Watch = Callable[[Iterable[T], int, str], Iterator[T]]
-"""Hands items through, for instance to show progress: items, how many there will be, what they are."""
 
 NINETY = float(norm.ppf(0.95))
 """Standard deviations to each side of a central 90 % interval."""

@@ -20,7 +20,7 @@ from ballfg.cli.inputs import (
     source_of,
     status_lines,
 )
-from ballfg.cli.progress import progress
+from ballfg.progress import progress
 
 if TYPE_CHECKING:
     import numpy as np

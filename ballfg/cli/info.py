@@ -7,7 +7,7 @@ import os
 import platform
 import re
 import textwrap
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from importlib.metadata import PackageNotFoundError, requires, version
 from typing import Any
 
@@ -31,7 +31,8 @@ def info() -> None:
     Example: ballfg info
     """
     typer.echo(f"{PACKAGE} {version(PACKAGE)}, python {platform.python_version()}")
-    for title, lines in (("packages", _packages()), ("extras", _extras()), ("machine", _machine())):
+    needed = required(requires(PACKAGE) or ())
+    for title, lines in (("packages", packages(needed)), ("extras", extras(needed)), ("machine", _machine())):
         _show(title, lines)
     for title, module, attribute in REGISTRIES:
         _show(title, _registered(getattr(importlib.import_module(module), attribute)))
@@ -43,29 +44,29 @@ def _show(title: str, lines: Iterator[str]) -> None:
         typer.echo(textwrap.fill(line, WIDTH, initial_indent="  ", subsequent_indent="      ", break_on_hyphens=False))
 
 
-def _packages() -> Iterator[str]:
-    """The packages that are always needed, with their versions."""
-    for name in _required()[None]:
-        yield _installed(name) or f"{name} is not installed; pip install {name}"
-
-
-def _extras() -> Iterator[str]:
-    """The optional parts of the package: installed, or how to install them."""
-    for extra, names in _required().items():
-        if extra is not None:
-            missing = [name for name in names if _installed(name) is None]
-            remedy = f"lacks {', '.join(missing)}; pip install '{PACKAGE}[{extra}]'"
-            yield f"{extra}: {remedy if missing else ', '.join(str(_installed(name)) for name in names)}"
-
-
-def _required() -> dict[str | None, list[str]]:
-    """Names of the packages that are required always (None), and for each extra."""
+def required(requirements: Iterable[str]) -> dict[str | None, list[str]]:
+    """Names of the packages that are required always (None), and for each extra, from the metadata of a package."""
     names: dict[str | None, list[str]] = {None: []}
-    for text in requires(PACKAGE) or ():
+    for text in requirements:
         extra = re.search(r'extra == "([\w-]+)"', text)
         name = re.split(r"[^\w.-]", text)[0]
         names.setdefault(extra and extra[1], []).append(name)
     return names
+
+
+def packages(needed: Mapping[str | None, list[str]]) -> Iterator[str]:
+    """The packages that are always needed, with their versions."""
+    for name in needed[None]:
+        yield _installed(name) or f"{name} is not installed; pip install {name}"
+
+
+def extras(needed: Mapping[str | None, list[str]]) -> Iterator[str]:
+    """The optional parts of the package: installed, or how to install them."""
+    for extra, names in needed.items():
+        if extra is not None:
+            missing = [name for name in names if _installed(name) is None]
+            remedy = f"lacks {', '.join(missing)}; pip install '{PACKAGE}[{extra}]'"
+            yield f"{extra}: {remedy if missing else ', '.join(str(_installed(name)) for name in names)}"
 
 
 def _installed(name: str) -> str | None:

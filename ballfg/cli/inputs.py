@@ -22,7 +22,10 @@ if TYPE_CHECKING:
 
 OwnEffects = Annotated[
     list[Path] | None,
-    typer.Option("--effects", help="Python file with effects of your own, to run and know; may be repeated."),
+    typer.Option(
+        "--effects",
+        help="Trusted Python file that defines further effects; may be repeated.",
+    ),
 ]
 """The option of every command that reads or names effects."""
 DATASET_TABLES = ("tracks", "labels", "detections", "truth")

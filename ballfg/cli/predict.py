@@ -10,7 +10,7 @@ import typer
 
 from ballfg.cli.estimate import Method
 from ballfg.cli.inputs import OwnEffects, check_dataset, check_out, default_jobs, open_inputs, status_lines
-from ballfg.cli.progress import progress
+from ballfg.progress import progress
 
 if TYPE_CHECKING:
     import numpy as np

@@ -1,4 +1,4 @@
-"""`ballfg simulate`: synthetic tracks, with or without effects that nobody declares."""
+"""`ballfg simulate`: synthetic tracks, with or without undeclared effects."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ballfg.cli.inputs import OwnEffects, know_effects
-from ballfg.cli.progress import progress
+from ballfg.progress import progress
 
 if TYPE_CHECKING:
     from ballfg.simulation import BallKind
@@ -20,38 +20,38 @@ _noise, _ball_option, _files = (
 
 
 def simulate(
-    out: Annotated[Path, _files(help="Folder of the dataset: new or empty.")],
+    out: Annotated[Path, _files(help="Folder of the new dataset.")],
     tracks: Annotated[int, typer.Option(help="Number of tracks.")] = 717,
-    seed: Annotated[int, typer.Option(help="Seed: the same one gives the same files, to the byte.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of all random numbers; fixes every byte written.")] = 0,
     rate: Annotated[float, typer.Option(help="Frames per second, Hz.")] = 100.0,
-    noise: Annotated[float, _noise(help="Position noise, m.")] = 0.003,
+    noise: Annotated[float, _noise(help="Standard deviation of each measured coordinate, m.")] = 0.003,
     dropout: Annotated[float, _noise(help="Probability of a dropped frame.")] = 0.0,
-    jitter: Annotated[float, _noise(help="Jitter of the stamps, s.")] = 0.0,
+    jitter: Annotated[float, _noise(help="Standard deviation of the stamps' jitter, s.")] = 0.0,
     outliers: Annotated[float, _noise(help="Probability of an outlier.")] = 0.0,
     outlier_size: Annotated[float, _noise(help="Typical distance of an outlier, m.")] = 0.1,
-    spin_noise: Annotated[float, _noise(help="Noise of the spin labels, rad/s.")] = 4.0,
-    spin_labels: Annotated[bool, _noise(help="Write spin labels; the launcher's settings always are.")] = True,
-    process_noise: Annotated[float, _noise(help="White acceleration in flight, m/s^1.5.")] = 0.0,
-    spin_process_noise: Annotated[float, _noise(help="White angular acceleration in flight, rad/s^1.5.")] = 0.0,
-    contact_noise: Annotated[float, _noise(help="Kick to the velocity after a bounce, m/s.")] = 0.0,
-    contact_spin_noise: Annotated[float, _noise(help="Kick to the spin after a bounce, rad/s.")] = 0.0,
-    ball: Annotated[str, _ball_option(help="table-tennis, tennis or a ball file (YAML).")] = "table-tennis",
-    model: Annotated[Path | None, _ball_option(help="Model file; by default the ball's own model.")] = None,
+    spin_noise: Annotated[float, _noise(help="Standard deviation of each component of the spin labels, rad/s.")] = 4.0,
+    spin_labels: Annotated[bool, _noise(help="Spin labels in labels.csv; launcher settings are always there.")] = True,
+    process_noise: Annotated[float, _noise(help="Density of a white acceleration in flight, m/s^1.5.")] = 0.0,
+    spin_process_noise: Annotated[float, _noise(help="Density of a white angular acceleration, rad/s^1.5.")] = 0.0,
+    contact_noise: Annotated[float, _noise(help="Random kick to the velocity after each bounce, m/s.")] = 0.0,
+    contact_spin_noise: Annotated[float, _noise(help="Random kick to the spin after each bounce, rad/s.")] = 0.0,
+    ball: Annotated[str, _ball_option(help="Ball: table-tennis, tennis or a ball file (YAML).")] = "table-tennis",
+    model: Annotated[Path | None, _ball_option(help="Model file that replaces the ball's own model.")] = None,
     settings: Annotated[str, _ball_option(help="Launcher levels, as topspin=-3,sidespin=-5..5,speed=9.")] = "",
     effect: Annotated[
         list[str] | None,
-        _ball_option(help="An effect that nobody declares, as wind.x=0.3; may be repeated."),
+        _ball_option(help="Undeclared effect, in no dataset or model file, as wind.x=0.3; may be repeated."),
     ] = None,
     effects: OwnEffects = None,
-    format: Annotated[str, _files(help="csv or parquet.")] = "csv",
+    format: Annotated[str, _files(help="Format of the tables: csv or parquet.")] = "csv",
     force: Annotated[bool, _files("--force", help="Replace a simulated dataset.")] = False,
 ) -> None:
-    """Write synthetic tracks of a ball launcher as a dataset, with the truth beside them.
+    """Simulate a ball launcher and write its tracks as a dataset, with the truth beside them.
 
     Example: ballfg simulate --out windy --tracks 50 --noise 0.003 --effect wind.x=0.3
 
-    The dataset says what is declared. truth.yaml and truth.csv say what was really done: undeclared effects, and the
-    true state at every stamp. model.yaml is the declared model, for the --model of other commands.
+    The dataset holds the measurements, model.yaml the declared model, for the option --model of other commands.
+    truth.yaml holds the undeclared effects and all settings, truth.csv the true state at every stamp.
     """
     from ballfg.simulation import (
         MeasurementNoise,
@@ -76,9 +76,7 @@ def simulate(
         undeclared=parse_effects(effect or ()),
         spin_labels=spin_labels,
     )
-    write_simulation(
-        out, config, file_format, force=force, watch=lambda made: progress(made, tracks, "tracks simulated")
-    )
+    write_simulation(out, config, file_format, force=force, watch=progress)
     names = ", ".join(e.name for e in config.undeclared) or "none"
     typer.echo(f"wrote {tracks} tracks to {out}: tracks.{file_format}, labels.csv, dataset.yaml, model.yaml (declared)")
     typer.echo(f"wrote the truth to {out}: truth.{file_format}, truth.yaml (undeclared effects: {names})")

@@ -55,7 +55,7 @@ class AnalyticModel(BallModel):
         }
 
     def rates(self, state: Tensor) -> Rates:
-        """Acceleration and angular acceleration in free flight."""
+        """Acceleration (..., 3) m/s^2 and angular acceleration (..., 3) rad/s^2, or None, in free flight."""
         flight = Flight(state, self.radius)
         if self._moving_air:
             flight = self._against_air(flight)
@@ -87,7 +87,7 @@ class AnalyticModel(BallModel):
         return flight if total is None else flight.against(total)
 
     def bounce(self, state: Tensor) -> Tensor:
-        """(..., 9) state just after an impact on a surface; the position does not change."""
+        """(..., 9) state just after an impact on a surface, from the state (..., 9) before it."""
         velocity, spin = state[..., VELOCITY], state[..., SPIN]
         slope = self.surface_slope(state)
         if slope is not None:
@@ -119,7 +119,7 @@ class AnalyticModel(BallModel):
         return per_row(total) + self.radius * ((1.0 + slope.square().sum(-1)).sqrt() - 1.0)
 
     def surface_slope(self, state: Tensor) -> Tensor | None:
-        """(2,) or (..., 2) slope of the surfaces along x and y under the ball; None: they are horizontal."""
+        """(2,) or (..., 2) dimensionless slope of the surfaces along x and y under the ball; None: horizontal."""
         total: Tensor | None = None
         for name in self._sloping:
             slope = cast(BounceEffect, self.contact[name]).surface_slope(state[..., POSITION])
@@ -145,13 +145,13 @@ class AnalyticModel(BallModel):
         return stamps
 
     def stamps(self, times: Tensor) -> Tensor:
-        """(...) s as written since the first stamp of a track, from the true time since then; undoes `true_stamps`."""
+        """(...) s as written since the first stamp of a track, from true times (...) s; undoes `true_stamps`."""
         for effect in self._measuring():
             times = effect.stamps(times)
         return times
 
     def labelled(self, spin: Tensor) -> Tensor:
-        """(..., 3) rad/s as a label says, before noise, from the true spin; affine in it."""
+        """(..., 3) rad/s as a label says, before noise, from the true spin (..., 3) rad/s; affine in it."""
         for effect in self._measuring():
             spin = effect.label(spin)
         return spin

@@ -47,14 +47,14 @@ TINY_LENGTH = 1e-12
 
 
 def length(vector: Tensor) -> Tensor:
-    """(..., 1) lengths of vectors (..., k), twice differentiable at zero; the gradient there is zero."""
+    """(..., 1) lengths of vectors (..., k), each in the vector's unit; twice differentiable, at zero too."""
     if torch.is_grad_enabled():  # the norm's own second derivative is NaN at zero
         return vector.square().sum(-1, keepdim=True).clamp_min(TINY_LENGTH**2).sqrt()
     return torch.linalg.vector_norm(vector, dim=-1, keepdim=True)
 
 
 def vector(*coefficients: Tensor) -> Tensor:
-    """(k,) or (..., k) vectors from k coefficients, each of shape () or (..., 1)."""
+    """(k,) or (..., k) vectors from k coefficients, each of shape () or (..., 1), all in one unit."""
     return torch.cat(torch.broadcast_tensors(*(c if c.dim() else c.unsqueeze(-1) for c in coefficients)), dim=-1)
 
 
@@ -68,6 +68,8 @@ Kind = Literal["flight", "bounce", "measurement"]
 
 class Flight:
     """A batch of free-flight states, with the quantities that several effects share computed once.
+
+    Args: state: (..., 9) of the ball.  radius: m, of the ball.
 
     Attributes:
         position: (..., 3) m.  spin: (..., 3) rad/s.
@@ -98,7 +100,7 @@ class Flight:
 
     @property
     def spin_ratio(self) -> Tensor:
-        """(..., 1) R |w| / |v|, finite at rest: times the speed it is R |w| to autograd."""
+        """(..., 1) ratio R |w| / |v|, finite at rest: times the speed it is R |w| to autograd."""
         return self.radius * length(self.spin) / self.speed.clamp_min(TINY_LENGTH)
 
     def against(self, air: Tensor) -> Flight:
@@ -135,8 +137,9 @@ class Impact:
     Attributes:
         velocity: (..., 3) m/s before the impact.  spin: (..., 3) rad/s before it.
         restitution: (..., 1) or scalar, ratio of the normal speeds after and before.
-        friction: (..., 1) or scalar, Coulomb coefficient.
-        tangential_restitution: (..., 1) or scalar, 0: slip ends at zero when the ball grips; 1: it is reversed.
+        friction: (..., 1) or scalar, Coulomb coefficient, dimensionless.
+        tangential_restitution: (..., 1) or scalar, dimensionless: share of the slip that is reversed when the ball
+            grips; 0: slip ends at zero.
     """
 
     velocity: Tensor
@@ -151,7 +154,7 @@ class Impact:
         return -self.velocity[..., 2:]
 
     def with_(self, **changes: Tensor) -> Impact:
-        """This impact with some coefficients replaced."""
+        """This impact with changes (..., 1) of some coefficients, dimensionless, or of the motion: as in `Impact`."""
         return replace(self, **changes)
 
 
@@ -168,6 +171,8 @@ class Effect(nn.Module, ABC):
         coefficients: its numbers; an instance may have priors of its own (`set_sigmas`).
         needs: names of effects that must be in the same model, since this one changes them.
         multiplies_spin: its strength multiplies a spin that nobody may know: without labels it has no slope at absence.
+
+    Raises: ValueError: if a value is given for an unknown coefficient, or lies out of its bounds.
     """
 
     name: ClassVar[str]
@@ -193,6 +198,10 @@ class Effect(nn.Module, ABC):
                     f"{self.name}.{c.name} must lie in [{c.low:g}, {c.high:g}] {c.unit}; got {value:g}. Check its unit."
                 )
             self.register_parameter(c.name, nn.Parameter(torch.tensor(value, dtype=torch.float64)))
+
+    def values(self) -> dict[str, float]:
+        """The values of the coefficients by name, each in its own unit."""
+        return {c.name: float(getattr(self, c.name).detach()) for c in self.coefficients}
 
     def set_sigmas(self, **sigmas: float) -> None:
         """Give coefficients of this one effect other prior standard deviations, in their own units.
@@ -250,12 +259,12 @@ class BounceEffect(Effect):
         return impact
 
     def surface_offset(self, position: Tensor) -> Tensor | None:
-        """(..., 1) or scalar m by which this effect lifts the surfaces under a ball at (..., 3) m, or None."""
+        """(..., 1) or scalar m by which this effect lifts the surfaces under a position (..., 3) m, or None."""
         return None
 
     def surface_slope(self, position: Tensor) -> Tensor | None:
-        """(2,) or (..., 2) derivative of `surface_offset` by x and y, or None where it is the same everywhere.
+        """(2,) or (..., 2) slope of the surfaces under a position (..., 3) m, or None for none; dimensionless.
 
-        It tilts the plane of the impact.
+        It is the derivative of `surface_offset` by x and y, and tilts the plane of the impact.
         """
         return None

@@ -42,9 +42,9 @@ class MeasurementEffect(Effect):
         return stamps
 
     def stamps(self, times: Tensor) -> Tensor:
-        """(...) s as written since the first stamp of a track, from the true time since then; undoes `true_stamps`."""
+        """(...) s as written since the first stamp of a track, from true times (...) s; undoes `true_stamps`."""
         return times
 
     def label(self, spin: Tensor) -> Tensor:
-        """(..., 3) rad/s as a label says, from the true spin; affine in it."""
+        """(..., 3) rad/s as a label says, from the true spin (..., 3) rad/s; affine in it."""
         return spin

@@ -47,6 +47,8 @@ class BallModel(nn.Module, ABC):
         radius: m.
         inertia_factor: moment of inertia divided by m R^2.
         trained: the noise and the launcher that were learned together with the model; None where nothing was.
+
+    Raises: ValueError: if the radius is not within 0.001 to 1 m, or the inertia factor not within 0 to 1.
     """
 
     def __init__(self, radius: float, inertia_factor: float = THIN_SHELL) -> None:
@@ -75,22 +77,22 @@ class BallModel(nn.Module, ABC):
 
     @abstractmethod
     def rates(self, state: Tensor) -> Rates:
-        """Acceleration and angular acceleration in free flight."""
+        """Acceleration (..., 3) m/s^2 and angular acceleration (..., 3) rad/s^2, or None, of states (..., 9)."""
 
     @abstractmethod
     def bounce(self, state: Tensor) -> Tensor:
-        """(..., 9) state just after an impact on a surface; the position does not change."""
+        """State (..., 9) just after an impact on a surface, from the state (..., 9) before it; the position stays."""
 
     def surface_offset(self, state: Tensor) -> Tensor | float:
         """(...) m by which surfaces lie above the heights declared for them; none, unless a model says so."""
         return 0.0
 
     def surface_slope(self, state: Tensor) -> Tensor | None:
-        """(2,) or (..., 2) slope of the surfaces along x and y under the ball; None: they are horizontal."""
+        """(2,) or (..., 2) dimensionless slope of the surfaces along x and y under states; None: horizontal."""
         return None
 
     def gap(self, state: Tensor, height: Tensor | float) -> Tensor:
-        """(...) m between the ball's lowest point and a surface declared at `height`; negative below it."""
+        """(...) m from a surface declared at height (...) m up to the ball's lowest point; negative below it."""
         return state[..., Z] - height - self.surface_offset(state) - self.radius
 
     def gap_rate(self, state: Tensor) -> Tensor:
@@ -124,17 +126,17 @@ class BallModel(nn.Module, ABC):
         return stamps
 
     def stamps(self, times: Tensor) -> Tensor:
-        """(...) s as written since the first stamp of a track, from the true time since then; undoes `true_stamps`."""
+        """(...) s as written since the first stamp of a track, from true times (...) s; undoes `true_stamps`."""
         return times
 
     def labelled(self, spin: Tensor) -> Tensor:
-        """(..., 3) rad/s as a label says, before noise, from the true spin; affine in it."""
+        """(..., 3) rad/s as a label says, before noise, from the true spin (..., 3) rad/s; affine in it."""
         return spin
 
     def roll(self, state: Tensor) -> Rates:
-        """Rates of a ball that rests on a surface: air forces in the plane, friction until it rolls, resistance.
+        """Rates of a ball that rests on a surface: (..., 3) m/s^2, vertically zero, and (..., 3) rad/s^2.
 
-        The vertical acceleration is zero.
+        The air's forces act in the plane; friction acts until the ball rolls, and rolling resistance slows it.
         """
         air, air_torque = self.rates(state)
         velocity, spin = state[..., VELOCITY], state[..., SPIN]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, cast
@@ -17,6 +16,7 @@ from ballfg.dynamics.model import THIN_SHELL, BallModel
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.networks.learned_file import has_learned_part, read_learned, remove_others, write_learned
 from ballfg.files.strict_yaml import read_yaml
+from ballfg.files.whole_file import write_text
 
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
 SECTIONS = (*KINDS, "learned")
@@ -54,7 +54,15 @@ def load_model(path: str | Path, *, radius: float = 0.02, inertia_factor: float 
 def model_from_dict(
     content: Any, *, radius: float = 0.02, inertia_factor: float = THIN_SHELL, where: str = "model"
 ) -> AnalyticModel:
-    """The model that a parsed model file without a learned part describes; `where` stands in error messages."""
+    """The model that a parsed model file without a learned part describes.
+
+    Args:
+        content: the sections `flight`, `bounce` and `measurement` (docs/models.md).
+        radius: m, of the ball.
+        inertia_factor: moment of inertia divided by m R^2.
+        where: begins the error messages.
+    Raises: ValueError: if it names a section, effect or coefficient that does not exist, or a value out of its bounds.
+    """
     if not isinstance(content, Mapping):
         raise ValueError(f"{where}: a model is a mapping with the sections {', '.join(SECTIONS)}; got {content!r}")
     for section in content:
@@ -102,8 +110,7 @@ def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
     """What a model file says about this model's effects."""
 
     def section(group: Mapping[str, object]) -> dict[str, dict[str, float]]:
-        effects = {name: cast(Effect, effect) for name, effect in group.items()}
-        return {n: {c.name: float(getattr(e, c.name).detach()) for c in e.coefficients} for n, e in effects.items()}
+        return {name: cast(Effect, effect).values() for name, effect in group.items()}
 
     return {
         "flight": section(dict(model.flight.items())),
@@ -124,9 +131,7 @@ def save_model(model: BallModel, path: str | Path) -> None:
     content = model_to_dict(_analytic_part(model))
     if has_learned_part(model):
         content["learned"] = write_learned(model, path.parent, path.stem)
-    part = path.with_name(path.name + ".part")
-    part.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    os.replace(part, path)
+    write_text(path, yaml.safe_dump(content, sort_keys=False))
     remove_others(path.parent, path.stem, keep=content["learned"])
 
 

@@ -24,6 +24,8 @@ class Surfaces:
         floor_height: m, z of the floor; None where there is no floor below (a court is its own floor).
         extent: (x_low, x_high, y_low, y_high) m of the table; None where it is not known: then the table is taken to
             lie under every ball whose centre is above its surface.
+
+    Raises: ValueError: if a height is not finite, the floor not below the table, or the extent not in order.
     """
 
     table_height: float = 0.0
@@ -50,7 +52,7 @@ class Surfaces:
         return (self.table_height,) if self.floor_height is None else (self.table_height, self.floor_height)
 
     def over_table(self, state: Tensor) -> Tensor:
-        """(...) bool: the ball's x, y lie within the table's extent."""
+        """(...) bool of states (..., 9): the ball's x, y lie within the table's extent."""
         if self.extent is None:
             return torch.ones(state.shape[:-1], dtype=torch.bool)
         x, y = state[..., 0], state[..., 1]
@@ -58,7 +60,7 @@ class Surfaces:
         return (x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)
 
     def height_below(self, state: Tensor) -> Tensor:
-        """(...) m, height of the surface that a ball falling straight down would meet; -inf where there is none.
+        """(...) m, height of the surface below a ball in states (..., 9), straight down; -inf where there is none.
 
         A ball whose centre is below the table's surface is beside the table.
         """
@@ -66,7 +68,7 @@ class Surfaces:
         return torch.where(on_table, state.new_tensor(self.table_height), state.new_tensor(self.lowest()))
 
     def level_below(self, state: Tensor) -> Tensor:
-        """(...) m, height of the surface whose level a falling ball reaches next, over the table or beside it."""
+        """(...) m, height of the surface whose level a ball in states (..., 9) falls to, on the table or beside it."""
         above = state[..., Z] > self.table_height
         return torch.where(above, state.new_tensor(self.table_height), state.new_tensor(self.lowest()))
 

@@ -1,4 +1,4 @@
-"""The true ball: the declared model, what nobody declares, and kicks at contacts."""
+"""The true ball: the declared model with the undeclared effects, and kicks at contacts."""
 
 from __future__ import annotations
 

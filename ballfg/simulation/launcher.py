@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from ballfg.dynamics import BallModel, Surfaces
-from ballfg.simulation.checks import check_range
+from ballfg.simulation.bounded import bounded, check_bounds
 from ballfg.simulation.settings import SETTING_LEVELS, Settings
 from ballfg.state import STATE_DIM
 
@@ -34,58 +34,56 @@ class SimulatedLauncher:
     Raises: ValueError, TypeError: a field that is not a number within its bounds; the message names it.
     """
 
-    x: float = 0.0
+    x: float = bounded(0.0, -100.0, 100.0)
     """m, muzzle; x = 0 is the launcher's end of the table."""
 
-    height: float = 0.56
+    height: float = bounded(0.56, 0.05, 10.0)
     """m, muzzle above the surface."""
 
-    speed_slow: float = 3.4
+    speed_slow: float = bounded(3.4, 0.5, 100.0)
     """m/s at velocity level 8; levels between are linear."""
 
-    speed_fast: float = 4.1
+    speed_fast: float = bounded(4.1, 0.5, 100.0)
     """m/s at velocity level 14."""
 
-    elevation_slow: float = 1.24
+    elevation_slow: float = bounded(1.24, -1.5, 1.5)
     """rad above the horizontal at velocity level 8; the head is lowered as the speed goes up."""
 
-    elevation_fast: float = -0.18
+    elevation_fast: float = bounded(-0.18, -1.5, 1.5)
     """rad above the horizontal at velocity level 14."""
 
-    topspin_scale: float = 58.0
+    topspin_scale: float = bounded(58.0, 0.0, 1000.0)
     """rad/s per level of topspin."""
 
-    sidespin_scale: float = 48.0
+    sidespin_scale: float = bounded(48.0, 0.0, 1000.0)
     """rad/s per level of sidespin."""
 
-    position_spread: float = 0.003
+    position_spread: float = bounded(0.003, 0.0, 0.5)
     """m, standard deviation of each coordinate of the muzzle from shot to shot."""
 
-    speed_spread: float = 0.005
+    speed_spread: float = bounded(0.005, 0.0, 0.2)
     """Standard deviation of the speed from shot to shot, relative."""
 
-    aim_spread: float = 0.005
+    aim_spread: float = bounded(0.005, 0.0, 0.5)
     """rad, standard deviation of azimuth and elevation from shot to shot."""
 
-    spin_spread: float = 3.0
+    spin_spread: float = bounded(3.0, 0.0, 500.0)
     """rad/s, standard deviation of each component of the spin from shot to shot."""
 
-    x_low: float = -0.4
+    x_low: float = bounded(-0.4, -200.0, 200.0)
     """m, a track ends where the ball comes back behind this."""
 
-    x_high: float = 3.2
+    x_high: float = bounded(3.2, -200.0, 200.0)
     """m, a track ends where the ball goes beyond this."""
 
-    y_far: float = 1.2
+    y_far: float = bounded(1.2, 0.01, 200.0)
     """m, a track ends where the ball is farther than this from the x axis."""
 
-    duration: float = 1.32
+    duration: float = bounded(1.32, 0.05, 20.0)
     """s, longest track."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            low, high = _BOUNDS[field.name]
-            object.__setattr__(self, field.name, check_range(field.name, getattr(self, field.name), low, high))
+        check_bounds(self)
         if not self.x_low < self.x < self.x_high:
             raise ValueError(
                 f"x must lie between x_low and x_high; got {self.x_low:g}, {self.x:g}, {self.x_high:g} m. Correct them."
@@ -98,19 +96,20 @@ class SimulatedLauncher:
         """
         if not isinstance(changes, Mapping):
             raise TypeError(f"launcher must map fields to numbers; got {changes!r}. Write launcher: {{height: 0.4}}.")
+        known = [field.name for field in fields(self)]
         for key in changes:
-            if key not in _BOUNDS:
-                raise ValueError(f"launcher has no field '{key}'; it has {', '.join(_BOUNDS)}. Rename it.")
+            if key not in known:
+                raise ValueError(f"launcher has no field '{key}'; it has {', '.join(known)}. Rename it.")
         return replace(self, **changes)
 
     def launch(self, settings: Settings, table_height: float, rng: np.random.Generator) -> Tensor:
         """The first states of some shots.
 
         Args:
-            settings: (n, 3) topspin, sidespin, velocity level.
+            settings: (n, 3) numbers of the levels of topspin, sidespin and velocity.
             table_height: m, z of the surface.
             rng: the shot-to-shot spread.
-        Returns: (n, 9) at the muzzle.
+        Returns: (n, 9) states at the muzzle.
         """
         n = len(settings)
         share = (settings[:, 2] - _SPEED_LEVELS[0]) / (_SPEED_LEVELS[-1] - _SPEED_LEVELS[0])
@@ -131,7 +130,7 @@ class SimulatedLauncher:
         return torch.from_numpy(states)
 
     def in_view(self, states: Tensor, surfaces: Surfaces, model: BallModel) -> Tensor:
-        """(...) bool: the ball is still tracked.
+        """(...) bool of states (..., 9): the ball is still tracked.
 
         A ball beside the table leaves the view as it comes down to the table's height: from there on the track of a
         table of unknown extent would show a ball that falls through it.
@@ -141,25 +140,6 @@ class SimulatedLauncher:
         above = model.gap(states, surfaces.table_height) > 0
         return inside & (surfaces.over_table(states) | above)
 
-
-_BOUNDS: Final[Mapping[str, tuple[float, float]]] = {
-    "x": (-100.0, 100.0),
-    "height": (0.05, 10.0),
-    "speed_slow": (0.5, 100.0),
-    "speed_fast": (0.5, 100.0),
-    "elevation_slow": (-1.5, 1.5),
-    "elevation_fast": (-1.5, 1.5),
-    "topspin_scale": (0.0, 1000.0),
-    "sidespin_scale": (0.0, 1000.0),
-    "position_spread": (0.0, 0.5),
-    "speed_spread": (0.0, 0.2),
-    "aim_spread": (0.0, 0.5),
-    "spin_spread": (0.0, 500.0),
-    "x_low": (-200.0, 200.0),
-    "x_high": (-200.0, 200.0),
-    "y_far": (0.01, 200.0),
-    "duration": (0.05, 20.0),
-}
 
 TABLE_LAUNCHER: Final = SimulatedLauncher()
 """For table tennis: returns topspin -3 at low levels, turns +-5 sidespin by 45 degrees, bounces once to three times."""

@@ -13,14 +13,12 @@ from ballfg.dynamics import BallModel, advance
 from ballfg.simulation.config import MeasurementNoise, SimulationConfig
 from ballfg.simulation.motion import Motion
 from ballfg.simulation.settings import SETTING_LEVELS, Settings
-from ballfg.simulation.streams import Purpose, generator
+from ballfg.simulation.streams import Purpose, cut_normal, generator
 from ballfg.state import POSITION, SPIN
 from ballfg.tracks import SPIN_LABELS, Track
 
 LEAST_SAMPLES = 2
 """A track of fewer samples is refused by every reader."""
-JITTER_LIMIT = 3.0
-"""Sigmas at which jitter is cut off: at the largest sigma allowed, 0.15 frames, stamps stay 0.1 frames apart."""
 
 FloatArray = NDArray[np.float64]
 
@@ -39,6 +37,7 @@ class SimulatedTrack:
     """(n, 9) the ball's state at those times."""
 
 
+@torch.no_grad()
 def measure(
     config: SimulationConfig, model: BallModel, motion: Motion, settings: Settings, block: int, first: int
 ) -> list[SimulatedTrack]:
@@ -57,11 +56,10 @@ def measure(
     exists = frames < motion.lengths[:, None]
     kept = exists & _kept_frames(noise, config.seed, block, motion.lengths, shape)
     true_times = frames / config.rate
-    jitter = noise.jitter * _cut_normal(generator(config.seed, Purpose.JITTER, block), shape)
-    stamps = _written(model, true_times) + jitter
-    positions = _apparent_positions(config, model, motion.states, exists) + _position_noise(
-        noise, config.seed, block, shape
-    )
+    jitter = noise.jitter * cut_normal(generator(config.seed, Purpose.JITTER, block), shape)
+    stamps = model.stamps(torch.from_numpy(true_times)).numpy() + jitter
+    positions = _apparent_positions(config, model, motion.states, exists)
+    positions += _position_noise(noise, config.seed, block, shape)
     label_noise = noise.spin * generator(config.seed, Purpose.LABEL, block).standard_normal((shape[0], 3))
     width = max(3, len(str(config.tracks - 1)))
     tracks = []
@@ -69,7 +67,7 @@ def measure(
         states = motion.states[i, keep]
         labels = dict(zip(SETTING_LEVELS, settings[i].astype(float).tolist(), strict=True))
         if config.spin_labels:
-            spin = _labelled(model, states[0, SPIN]) + label_noise[i]
+            spin = model.labelled(torch.from_numpy(states[0, SPIN])).numpy() + label_noise[i]
             labels = dict(zip(SPIN_LABELS, spin.tolist(), strict=True)) | labels
         track = Track(f"{first + i:0{width}d}", stamps[i, keep], positions[i, keep], labels=labels)
         tracks.append(SimulatedTrack(track, true_times[keep], states))
@@ -88,11 +86,6 @@ def _kept_frames(
     return kept
 
 
-def _cut_normal(rng: np.random.Generator, shape: tuple[int, ...]) -> FloatArray:
-    """Standard normals, those beyond `JITTER_LIMIT` set to it."""
-    return np.clip(rng.standard_normal(shape), -JITTER_LIMIT, JITTER_LIMIT)
-
-
 def _position_noise(noise: MeasurementNoise, seed: int, block: int, shape: tuple[int, ...]) -> FloatArray:
     """(n, k, 3) m, Gaussian noise and outliers."""
     added = noise.position * generator(seed, Purpose.POSITION, block).standard_normal((*shape, 3))
@@ -104,29 +97,14 @@ def _position_noise(noise: MeasurementNoise, seed: int, block: int, shape: tuple
     return added + np.where(is_outlier, distance, 0.0)[..., None] * direction
 
 
-@torch.no_grad()
-def _written(model: BallModel, times: FloatArray) -> FloatArray:
-    """(k,) s, the stamps of frames taken at some times since the launch, before jitter."""
-    return times if model.measures_plainly else model.stamps(torch.from_numpy(times)).numpy()
-
-
-@torch.no_grad()
-def _labelled(model: BallModel, spin: FloatArray) -> FloatArray:
-    """(3,) rad/s, the label of a spin before noise."""
-    return spin if model.measures_plainly else model.labelled(torch.from_numpy(spin)).numpy()
-
-
-@torch.no_grad()
 def _apparent_positions(
     config: SimulationConfig, model: BallModel, states: FloatArray, exists: NDArray[np.bool_]
 ) -> FloatArray:
     """(n, k, 3) m, where the ball seems to be before noise."""
-    apparent = states[..., POSITION].copy()
-    if not model.measures_plainly:
-        flat = torch.from_numpy(states[exists])
+    apparent, flat = states[..., POSITION].copy(), torch.from_numpy(states[exists])
 
-        def later(delay: Tensor) -> Tensor:
-            return advance(model, flat, delay.expand(len(flat)), config.ball.surfaces)
+    def later(delay: Tensor) -> Tensor:
+        return advance(model, flat, delay.expand(len(flat)), config.ball.surfaces)
 
-        apparent[exists] = model.measured(flat, later).numpy()
+    apparent[exists] = model.measured(flat, later).numpy()
     return apparent

@@ -19,7 +19,7 @@ Settings = NDArray[np.int64]
 
 
 def all_settings(chosen: Mapping[str, Sequence[int]] | None = None) -> Settings:
-    """Every combination of levels, (m, 3).
+    """Every combination of levels, (m, 3) numbers of topspin, sidespin and velocity levels.
 
     Args: chosen: levels by setting, for those settings that are not to run through all of theirs.
     Raises: ValueError: an unknown setting, a level that the launcher does not have, or no level at all.

@@ -9,6 +9,10 @@ from __future__ import annotations
 from enum import IntEnum
 
 import numpy as np
+from numpy.typing import NDArray
+
+JITTER_LIMIT = 3.0
+"""Sigmas at which jitter is cut off: at the largest sigma allowed, 0.15 frames, stamps stay 0.1 frames apart."""
 
 
 class Purpose(IntEnum):
@@ -23,8 +27,19 @@ class Purpose(IntEnum):
     JITTER = 6
     OUTLIER = 7
     LABEL = 8
+    SCENE_START = 100
+    SCENE_DROPOUT = 101
+    SCENE_JITTER = 102
+    SCENE_NOISE = 103
+    SCENE_TEXTURE = 104
+    SCENE_PHASE = 105
 
 
-def generator(seed: int, purpose: Purpose, block: int) -> np.random.Generator:
-    """The generator of one stream; `block` counts blocks of tracks, or passes through the settings."""
-    return np.random.default_rng([seed, int(purpose), block])
+def generator(seed: int, purpose: Purpose, number: int = 0) -> np.random.Generator:
+    """The generator of one stream; `number` counts blocks of tracks, passes through the settings, or cameras."""
+    return np.random.default_rng([seed, int(purpose), number])
+
+
+def cut_normal(rng: np.random.Generator, shape: int | tuple[int, ...]) -> NDArray[np.float64]:
+    """Standard normals of some shape; those beyond `JITTER_LIMIT` are set to it."""
+    return np.clip(rng.standard_normal(shape), -JITTER_LIMIT, JITTER_LIMIT)

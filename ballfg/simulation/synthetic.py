@@ -16,7 +16,7 @@ from ballfg.tracks import DatasetInfo
 
 
 def simulate(config: SimulationConfig) -> Iterator[SimulatedTrack]:
-    """Makes the tracks of a simulation, with their truth.
+    """Simulates tracks, with their truth.
 
     Memory is that of one block, whatever the number of tracks.
 
@@ -52,7 +52,7 @@ def _block(config: SimulationConfig, model: AnalyticModel, block: int, first: in
 
 
 def dataset_info(config: SimulationConfig) -> DatasetInfo:
-    """What the dataset says about itself: the declared noise, and nothing of effects that nobody declares."""
+    """The content of `dataset.yaml`: the declared noise, and nothing of undeclared effects."""
     noise = config.noise
     return DatasetInfo(
         name=f"simulated {config.ball.name}",

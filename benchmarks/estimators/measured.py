@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from ballfg.benchmarks.metrics import Statistic, bootstrap, inside, pooled_mean, quantile, square_norms
 from ballfg.benchmarks.results import CURVE_MARK, Results
-from ballfg.cli.progress import progress
 from ballfg.dynamics import BallModel, nominal_model
 from ballfg.estimation import (
     ESTIMATORS,
@@ -25,6 +24,7 @@ from ballfg.estimation import (
     predict_tracks,
 )
 from ballfg.estimation.segmentation import Quality
+from ballfg.progress import progress
 from ballfg.tracks import Dataset
 
 Array = NDArray[np.float64]

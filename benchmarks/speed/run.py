@@ -17,7 +17,6 @@ from ballfg.benchmarks.speed.gradient_cost import time_gradients
 from ballfg.benchmarks.speed.network import fitted_network, parameter_count
 from ballfg.benchmarks.synthetic import gaussian_settings
 from ballfg.benchmarks.timing import Stopwatch, quartiles
-from ballfg.cli.progress import progress
 from ballfg.dynamics import AnalyticModel, BallModel, Surfaces, fly_jacobian, model_from_dict, nominal_model, rollout
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.networks.architecture import Architecture
@@ -31,6 +30,7 @@ from ballfg.factors.covariance import marginal_covariances
 from ballfg.factors.graph import BallGraph
 from ballfg.learning.end_to_end.pretrain import pretrain
 from ballfg.prediction import Belief, Propagator
+from ballfg.progress import progress
 from ballfg.state import POSITION
 from ballfg.tracks import SPIN_LABELS, Dataset, Track
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +19,9 @@ from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_sett
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
 from ballfg.learning.calibration.population import Evidence, Population, evidence, fit_population
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.evaluation import TrackScore, Watch, judge_tracks
+from ballfg.learning.evaluation import TrackScore, judge_tracks
 from ballfg.learning.split import Split, split_tracks, tracks_of
+from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Dataset
 
 Array = NDArray[np.float64]
@@ -115,7 +115,7 @@ def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs
     )
 
 
-def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch[Any] | None = None) -> Iterator[Step]:
+def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unwatched) -> Iterator[Step]:
     """The steps that are still to do, each as soon as it is done; none if the calibration has ended already.
 
     Args:
@@ -126,7 +126,6 @@ def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch[Any] 
     Raises: TooManyFailures: more estimates of fitted tracks failed than the config allows.
     """
     steps = list(done)
-    watch = watch or _pass_on
     if not steps:
         steps.append(
             Step(number=0, mean=_plain(problem.chosen.start), scores=score(problem, problem.chosen.start, watch))
@@ -148,7 +147,7 @@ def has_ended(config: CalibrationConfig, step: Step) -> bool:
 
 
 def score(
-    problem: Problem, values: Array, watch: Watch[Any] | None = None, settings: Settings | None = None
+    problem: Problem, values: Array, watch: Watch = unwatched, settings: Settings | None = None
 ) -> tuple[TrackScore | None, ...]:
     """Scores of the judging tracks, in order.
 
@@ -164,7 +163,7 @@ def score(
     scores = judge_tracks(
         estimator, tracks_of(problem.dataset, names), config.observe, horizon, problem.jobs, len(names)
     )
-    return tuple((watch or _pass_on)(scores, len(names), "tracks judged"))
+    return tuple(watch(scores, len(names), "tracks judged"))
 
 
 def population_settings(problem: Problem, step: Step) -> Settings:
@@ -173,7 +172,7 @@ def population_settings(problem: Problem, step: Step) -> Settings:
     return replace(problem.settings, coefficients={**problem.settings.coefficients, **learned})
 
 
-def _advance(problem: Problem, last: Step, watch: Watch[Any]) -> Step:
+def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
     """Linearise the fitted tracks about the last mean, and find the population anew."""
     chosen, about = problem.chosen, np.array(last.mean)
     fits, evidences, skipped = _fit_tracks(problem, about, watch)
@@ -192,7 +191,7 @@ def _advance(problem: Problem, last: Step, watch: Watch[Any]) -> Step:
 
 
 def _fit_tracks(
-    problem: Problem, about: Array, watch: Watch[Any]
+    problem: Problem, about: Array, watch: Watch
 ) -> tuple[list[TrackFit], list[Evidence], list[tuple[str, str]]]:
     """What each fitted track says, and which were skipped.
 
@@ -244,7 +243,3 @@ def _move(population: Population, about: Array) -> float:
 
 def _plain(values: Array) -> tuple[float, ...]:
     return tuple(values.tolist())
-
-
-def _pass_on(items: Iterable[Any], total: int, what: str) -> Iterator[Any]:
-    return iter(items)

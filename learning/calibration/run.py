@@ -6,7 +6,6 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -18,12 +17,13 @@ from ballfg.learning.calibration.coefficients import analytic_model, with_values
 from ballfg.learning.calibration.picture import draw
 from ballfg.learning.calibration.report import compare, report, table
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.evaluation import Watch, summary
+from ballfg.learning.evaluation import summary
 from ballfg.learning.run import run_folder as files
+from ballfg.progress import Watch
 from ballfg.tracks import read_dataset
 
 
-def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jobs: int, watch: Watch[Any]) -> None:
+def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jobs: int, watch: Watch) -> None:
     """Calibrate, or continue to, and write a folder.
 
     Args:
@@ -58,7 +58,7 @@ def _pose(config: CalibrationConfig, jobs: int) -> Problem:
     return pose(dataset, analytic_model(config.model, dataset.info.ball.radius), config, config.jobs or jobs)
 
 
-def _steps(problem: Problem, steps: list[Step], folder: Path, watch: Watch[Any]) -> None:
+def _steps(problem: Problem, steps: list[Step], folder: Path, watch: Watch) -> None:
     """Take the steps that are left; a checkpoint and a line after each."""
     begun = time.monotonic()
     for step in calibrate(problem, tuple(steps), watch=watch):
@@ -86,7 +86,7 @@ def _line(problem: Problem, step: Step, left: float) -> str:
     return "; ".join(parts)
 
 
-def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch[Any]) -> None:
+def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch) -> None:
     """Judge once more with the spread as the prior, write the results and say where they are."""
     last = steps[-1]
     mean = np.array(last.mean)

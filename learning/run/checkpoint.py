@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,9 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
+
+from ballfg.files.strict_yaml import YamlError, read_yaml
+from ballfg.files.whole_folder import recover, replaced_folder
 
 NAME = "checkpoint"
 STATE = "state.yaml"
@@ -62,22 +63,13 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 
     Args: folder: of the run.
     """
-    part, old = folder / f".{NAME}.part", folder / f".{NAME}.old"
-    if part.exists():
-        shutil.rmtree(part)
-    part.mkdir()
-    for name in TENSORS:
-        tensors: dict[str, Tensor] = getattr(checkpoint, name)
-        save_file({key: tensor.detach().contiguous().clone() for key, tensor in tensors.items()}, _tensors(part, name))
-    text = yaml.safe_dump(checkpoint.standing.model_dump(), sort_keys=False)
-    (part / STATE).write_text(text, encoding="utf-8")
-    for path in part.iterdir():
-        _flush(path)
-    _recover(folder)
-    if (folder / NAME).exists():
-        os.replace(folder / NAME, old)
-    os.replace(part, folder / NAME)
-    _recover(folder)
+    with replaced_folder(folder / NAME) as part:
+        for name in TENSORS:
+            tensors: dict[str, Tensor] = getattr(checkpoint, name)
+            owned = {key: tensor.detach().contiguous().clone() for key, tensor in tensors.items()}
+            save_file(owned, _tensors(part, name))
+        text = yaml.safe_dump(checkpoint.standing.model_dump(), sort_keys=False)
+        (part / STATE).write_text(text, encoding="utf-8")
 
 
 def read_checkpoint(folder: Path) -> Checkpoint | None:
@@ -85,40 +77,20 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
 
     Raises: ValueError: if it is damaged.
     """
-    _recover(folder)
     path = folder / NAME
+    recover(path)
     if not path.exists():
         return None
     try:
-        content: Any = yaml.safe_load((path / STATE).read_text(encoding="utf-8"))
+        content: Any = read_yaml(path / STATE)
         tensors = {name: load_file(_tensors(path, name)) for name in TENSORS}
         return Checkpoint(Standing.model_validate(content), **tensors)
     except ValidationError as error:
         reason = f"{STATE}: {error.errors()[0]['msg']}"
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, SafetensorError) as error:
+    except (OSError, YamlError, SafetensorError) as error:
         reason = " ".join(str(error).split())
     raise ValueError(f"{path}: not a whole checkpoint ({reason}). Start a new run.")
 
 
-def _recover(folder: Path) -> None:
-    """Clear the old checkpoint away; take it back where a crash came between the two steps of a replacement."""
-    current, old = folder / NAME, folder / f".{NAME}.old"
-    if not old.exists():
-        return
-    if current.exists():
-        shutil.rmtree(old)
-    else:
-        os.replace(old, current)
-
-
 def _tensors(folder: Path, name: str) -> Path:
     return folder / f"{name}.safetensors"
-
-
-def _flush(path: Path) -> None:
-    """Bring a file to the disk, so that a power cut does not leave a name without content."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

@@ -24,7 +24,7 @@ from ballfg.learning.run.ranks import Ranks, SharedMemory
 from ballfg.learning.trainee import BatchLoss, Trainee
 
 if TYPE_CHECKING:
-    from ballfg.learning.evaluation import Watch
+    from ballfg.progress import Watch
 
 
 class TrainingStoppedError(ValueError):
@@ -48,7 +48,7 @@ class Task:
     validation: tuple[int, ...]
     config: TrainConfig
     ranks: Ranks
-    watch: Watch[list[int]]
+    watch: Watch
 
 
 @dataclass

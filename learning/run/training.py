@@ -22,7 +22,7 @@ from ballfg.learning.run.tensorboard import Events
 from ballfg.learning.trainee import Trainee
 
 if TYPE_CHECKING:
-    from ballfg.learning.evaluation import Watch
+    from ballfg.progress import Watch
 
 Build = Callable[[TrainConfig], tuple[Trainee, Sequence[int], Sequence[int]]]
 """From a config to a model with its data, the numbers of the tracks that train, and of those that validate."""
@@ -30,9 +30,7 @@ Export = Callable[[Trainee, Path], Path]
 """Writes the model of a trainee into a folder; returns the file for `--model` of other commands."""
 
 
-def run_training(
-    config: TrainConfig, folder: Path, resume: bool, build: Build, export: Export, watch: Watch[list[int]]
-) -> None:
+def run_training(config: TrainConfig, folder: Path, resume: bool, build: Build, export: Export, watch: Watch) -> None:
     """Train, or continue to, and write a folder. Every process of a group calls it; the first one writes and prints.
 
     Raises:

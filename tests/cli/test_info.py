@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 
+from ballfg.cli.info import extras, packages, required
 from tests.places import DOCS
 
 ROOT = Path(__file__).parents[2]
@@ -68,12 +69,13 @@ def test_info_lists_packages_machine_and_what_is_registered(charged: Path) -> No
     assert "smoother, online, ekf, sliding-window" in sections["estimators"]
 
 
-def test_extras_that_are_not_installed_come_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    from ballfg.cli import info
-
-    monkeypatch.setattr(info, "requires", lambda package: ["numpy>=2.0", 'no-such-package>=1 ; extra == "more"'])
-    assert list(info._packages()) == [f"numpy {version('numpy')}"]
-    assert list(info._extras()) == ["more: lacks no-such-package; pip install 'ballfg[more]'"]
+def test_extras_that_are_not_installed_come_with_a_remedy() -> None:
+    needed = required(["numpy>=2.0", "absent-one", 'no-such-package>=1 ; extra == "more"'])
+    assert list(packages(needed)) == [
+        f"numpy {version('numpy')}",
+        "absent-one is not installed; pip install absent-one",
+    ]
+    assert list(extras(needed)) == ["more: lacks no-such-package; pip install 'ballfg[more]'"]
 
 
 def test_commands_use_effects_of_an_installed_package(charged: Path, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from ballfg.diagnosis.fit.fit import fit
 from ballfg.diagnosis.fit.problem import LABEL_CAUCHY, Fit, linearise
 from ballfg.diagnosis.search.hypothesis import Hypothesis
-from ballfg.dynamics.effects.measurement.spin_label_frame import signed_permutations
+from ballfg.dynamics.effects.measurement.spin_labels import signed_permutations
 from ballfg.state import SPIN
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.response import Along, ArcResponse, along, responses, weighted
-from ballfg.dynamics.effects.flight.generic import flight_axes
+from ballfg.dynamics.effects.generic import flight_axes
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 PLAUSIBLE = {"flight": 1.0, "contact": 0.2, "measurement": 0.01}

@@ -28,7 +28,7 @@ from ballfg.diagnosis.search.evaluation import HeldOut, held_out
 from ballfg.diagnosis.search.hypothesis import Hypothesis, declared_free, has_effect, hypotheses, with_effects
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.effect import Effect
-from ballfg.dynamics.effects.measurement.spin_label_frame import SpinLabelFrame
+from ballfg.dynamics.effects.measurement.spin_labels import SpinLabelFrame
 
 MOST_EFFECTS = 4
 """Effects that are added before the search ends; further ones would be found in what earlier wrong ones left."""

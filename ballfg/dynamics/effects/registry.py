@@ -6,36 +6,19 @@ from pathlib import Path
 from typing import Final
 
 from ballfg.dynamics.effect import Effect, Kind
-from ballfg.dynamics.effects.bounce.friction import Friction
-from ballfg.dynamics.effects.bounce.generic import GenericContact
-from ballfg.dynamics.effects.bounce.restitution import Restitution
-from ballfg.dynamics.effects.bounce.restitution_speed import RestitutionSpeed
-from ballfg.dynamics.effects.bounce.table_height import TableHeight
-from ballfg.dynamics.effects.bounce.table_tilt import TableTilt
-from ballfg.dynamics.effects.bounce.tangential_restitution import TangentialRestitution
+from ballfg.dynamics.effects.bounce.friction import Friction, TangentialRestitution
+from ballfg.dynamics.effects.bounce.restitution import Restitution, RestitutionSpeed
+from ballfg.dynamics.effects.bounce.table import TableHeight, TableTilt
 from ballfg.dynamics.effects.checks import BASES, REMEDY, check_effect
-from ballfg.dynamics.effects.flight.buoyancy import Buoyancy
-from ballfg.dynamics.effects.flight.drag import Drag
-from ballfg.dynamics.effects.flight.drag_speed import DragSpeed
-from ballfg.dynamics.effects.flight.drag_spin import DragSpin
-from ballfg.dynamics.effects.flight.generic import GenericFlight
-from ballfg.dynamics.effects.flight.gravity import Gravity
-from ballfg.dynamics.effects.flight.gust_region import GustRegion
-from ballfg.dynamics.effects.flight.magnus import Magnus
-from ballfg.dynamics.effects.flight.magnus_saturation import MagnusSaturation
+from ballfg.dynamics.effects.flight.drag import Drag, DragSpeed, DragSpin
+from ballfg.dynamics.effects.flight.gravity import Buoyancy, Gravity
+from ballfg.dynamics.effects.flight.magnus import Magnus, MagnusSaturation
 from ballfg.dynamics.effects.flight.spin_decay import SpinDecay
-from ballfg.dynamics.effects.flight.wind import Wind
-from ballfg.dynamics.effects.flight.wind_shear import WindShear
-from ballfg.dynamics.effects.measurement.frame_tilt import FrameTilt
-from ballfg.dynamics.effects.measurement.generic import GenericMeasurement
-from ballfg.dynamics.effects.measurement.radial_bias import RadialBias
-from ballfg.dynamics.effects.measurement.scale import Scale
-from ballfg.dynamics.effects.measurement.spin_label_frame import SpinLabelFrame
-from ballfg.dynamics.effects.measurement.spin_label_offset import SpinLabelOffset
-from ballfg.dynamics.effects.measurement.spin_label_scale import SpinLabelScale
-from ballfg.dynamics.effects.measurement.time_offset import TimeOffset
-from ballfg.dynamics.effects.measurement.time_scale import TimeScale
-from ballfg.dynamics.effects.measurement.velocity_lag import VelocityLag
+from ballfg.dynamics.effects.flight.wind import GustRegion, Wind, WindShear
+from ballfg.dynamics.effects.generic import GenericContact, GenericFlight, GenericMeasurement
+from ballfg.dynamics.effects.measurement.clock import TimeOffset, TimeScale, VelocityLag
+from ballfg.dynamics.effects.measurement.frame import FrameTilt, RadialBias, Scale
+from ballfg.dynamics.effects.measurement.spin_labels import SpinLabelFrame, SpinLabelOffset, SpinLabelScale
 from ballfg.files.python_file import run_file
 from ballfg.registry import Registry
 

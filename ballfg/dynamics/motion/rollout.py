@@ -155,7 +155,7 @@ def rollout(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) 
         state: (n, 9) at time 0.
         times: (k,) or (n, k) s since then, not decreasing, not negative.
         surfaces: table and floor.
-    Returns: (n, k, 9).
+    Returns: (n, k, 9) states.
     Raises: ValueError: if the times are negative or decrease.
     """
     times = times.expand(state.shape[0], -1) if times.dim() == 1 else times

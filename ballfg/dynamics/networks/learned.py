@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.dynamics.effect import Coefficient, per_row
-from ballfg.dynamics.effects.bounce.table_height import TableHeight
+from ballfg.dynamics.effects.bounce.table import TableHeight
 from ballfg.dynamics.measurement import Later
 from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
 from ballfg.dynamics.networks.architecture import Architecture
@@ -39,6 +39,8 @@ class LearnedModel(BallModel):
         flight: network of the rates.  contact: network of the bounce.
         base: the model that is corrected, or None.
         offset: () m by which surfaces lie above their declared heights; the base's where there is one.
+
+    Raises: ValueError: if a base is given without a residual architecture, or lacks, or has another radius.
     """
 
     def __init__(
@@ -89,7 +91,7 @@ class LearnedModel(BallModel):
         return {_BASE + name: c for name, c in self.base.declared_coefficients().items()}
 
     def rates(self, state: Tensor) -> Rates:
-        """Acceleration and angular acceleration in free flight."""
+        """Acceleration (..., 3) m/s^2 and angular acceleration (..., 3) rad/s^2, or None, in free flight."""
         acceleration, spin_rate = self.flight(state)
         if self.base is None:
             return acceleration, spin_rate
@@ -99,7 +101,7 @@ class LearnedModel(BallModel):
         return base_acceleration + acceleration, base_spin_rate if spin_rate is None else spin_rate
 
     def bounce(self, state: Tensor) -> Tensor:
-        """(..., 9) state just after an impact on a horizontal plane; the position does not change."""
+        """(..., 9) state just after an impact on a horizontal plane, from the state (..., 9) before it."""
         guess = _vertical_bounce(state) if self.base is None else self.base.bounce(state)
         after: Tensor = self.contact(state, guess)
         return after
@@ -111,7 +113,7 @@ class LearnedModel(BallModel):
         return per_row(self.offset)
 
     def surface_slope(self, state: Tensor) -> Tensor | None:
-        """(2,) or (..., 2) slope of the surfaces: the base's."""
+        """(2,) or (..., 2) dimensionless slope of the surfaces: the base's."""
         return None if self.base is None else self.base.surface_slope(state)
 
     @property
@@ -128,11 +130,11 @@ class LearnedModel(BallModel):
         return stamps if self.base is None else self.base.true_stamps(stamps)
 
     def stamps(self, times: Tensor) -> Tensor:
-        """(...) s, as the base."""
+        """(...) s as written, from true times (...) s: as the base."""
         return times if self.base is None else self.base.stamps(times)
 
     def labelled(self, spin: Tensor) -> Tensor:
-        """(..., 3) rad/s, as the base."""
+        """(..., 3) rad/s as labelled, from the true spin (..., 3) rad/s: as the base."""
         return spin if self.base is None else self.base.labelled(spin)
 
     def extra_repr(self) -> str:

@@ -33,6 +33,9 @@ class SpinEmbedding(nn.Module):
     Attributes:
         names: one for each setting: `topspin`, `group=backspin`.
         weight: (3, k), in units of `SPIN_UNIT`.
+
+    Raises: ValueError: if labels or the values of a category repeat, a category has no label, or `initial` has another
+        shape.
     """
 
     def __init__(
@@ -60,7 +63,7 @@ class SpinEmbedding(nn.Module):
         return (label,) if values is None else tuple(f"{label}={value}" for value in values)
 
     def settings(self, labels: Mapping[str, object]) -> Tensor | None:
-        """(k,) the settings of a track with these labels; None where one is missing or of an unknown category.
+        """(k,) the settings of a track with these labels, each in its own unit; None where one is missing or unknown.
 
         Raises: ValueError: if a label that must be a number is not one.
         """
@@ -84,7 +87,7 @@ class SpinEmbedding(nn.Module):
     def spin(self, settings: Tensor, velocity: Tensor) -> Tensor:
         """(..., 3) rad/s in the world.
 
-        Args: settings: (..., k).  velocity: (..., 3) m/s at the launch.
+        Args: settings: (..., k), each in its own unit.  velocity: (..., 3) m/s at the launch.
         """
         forward, across, up = self.local(settings).unbind(-1)
         x, y = velocity[..., 0], velocity[..., 1]

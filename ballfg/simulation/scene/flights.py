@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 from ballfg.dynamics import AnalyticModel, Surfaces, advance
 from ballfg.simulation.config import MotionNoise
 from ballfg.simulation.motion import simulate_motion
-from ballfg.simulation.scene.config import SceneConfig, SceneStream, stream
+from ballfg.simulation.scene.config import SceneConfig
 from ballfg.simulation.settings import settings_of_shots
 from ballfg.simulation.streams import Purpose, generator
 from ballfg.state import STATE_DIM
@@ -83,7 +83,7 @@ def fly_shots(config: SceneConfig) -> list[Flight]:
     motion = simulate_motion(
         model, first, KNOT_RATE, kind.surfaces, kind.launcher, MotionNoise(), generator(seed, Purpose.PROCESS, 0)
     )
-    spread = START_SPREAD * stream(seed, SceneStream.START).random(config.shots)
+    spread = START_SPREAD * generator(seed, Purpose.SCENE_START).random(config.shots)
     starts = BEFORE + config.interval * np.arange(config.shots) + spread
     width = max(3, len(str(config.shots - 1)))
     return [

@@ -39,7 +39,7 @@ class Recording:
         return self.config.clocks.get(name, Clock())
 
     def images(self, number: int) -> Iterator[NDArray[np.uint8]]:
-        """The images (h, w, 3), blue green red, of the camera with this number, in the order of its frames."""
+        """Images (h, w, 3) in grey levels, blue green red, of the camera with this number, frame by frame."""
         renderer = Renderer(self.config, self.cameras[number], number)
         return renderer.frames(self.frames[number], self.passages[number])
 

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from ballfg.simulation.scene.backdrop import backdrop
 from ballfg.simulation.scene.ball_image import ball_image
-from ballfg.simulation.scene.config import SceneConfig, SceneStream, stream
+from ballfg.simulation.scene.config import SceneConfig
 from ballfg.simulation.scene.movers import draw, movers
 from ballfg.simulation.scene.room import Colour
 from ballfg.simulation.scene.shutter import Frames, Passage
 from ballfg.simulation.scene.view import Rect, grown
+from ballfg.simulation.streams import Purpose, generator
 from ballfg.vision.camera import Camera
 
 Array = NDArray[np.float64]
@@ -51,7 +52,7 @@ class Renderer:
     def __init__(self, config: SceneConfig, camera: Camera, number: int) -> None:
         self._config = config
         self._camera = camera
-        still = backdrop(camera, config.ball, stream(config.seed, SceneStream.TEXTURE))
+        still = backdrop(camera, config.ball, generator(config.seed, Purpose.SCENE_TEXTURE))
         self._distance = still.distance
         self._still_sharp = still.image
         self._still = _blurred(still.image)
@@ -59,7 +60,7 @@ class Renderer:
         self._sharp, self._image = self._still_sharp.copy(), self._still.copy()
         self._sigma = self._still_noise.copy()
         self._grain = np.zeros_like(self._still)
-        self._rng = stream(config.seed, SceneStream.NOISE, number)
+        self._rng = generator(config.seed, Purpose.SCENE_NOISE, number)
         shape = (camera.size[1] + NOISE_MARGIN, camera.size[0] + NOISE_MARGIN, 3)
         self._field = self._rng.standard_normal(shape, dtype=np.float32)
 

@@ -9,9 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.simulation.measure import JITTER_LIMIT
-from ballfg.simulation.scene.config import Clock, SceneConfig, SceneStream, stream
+from ballfg.simulation.scene.config import Clock, SceneConfig
 from ballfg.simulation.scene.flights import Flight
+from ballfg.simulation.streams import Purpose, cut_normal, generator
 from ballfg.state import POSITION
 from ballfg.vision.camera import Camera
 
@@ -60,7 +60,7 @@ def free_running(names: Sequence[str], rate: float, seed: int) -> dict[str, Cloc
         rate: Hz.
         seed: draws which camera comes when, each within the middle half of a share of the interval of its own.
     """
-    rng = stream(seed, SceneStream.PHASE)
+    rng = generator(seed, Purpose.SCENE_PHASE)
     place = rng.permutation(len(names)) + rng.uniform(0.25, 0.75, len(names))
     return {name: Clock(phase=float(p / len(names) / rate)) for name, p in zip(names, place, strict=True)}
 
@@ -76,13 +76,11 @@ def frames_of(config: SceneConfig, camera: Camera, number: int, until: float) ->
     """
     clock = config.clocks.get(camera.name, Clock())
     count = int(np.floor((until - clock.phase) * config.rate)) + 1
-    kept = stream(config.seed, SceneStream.DROPOUT, number).random(count) >= config.dropout
+    kept = generator(config.seed, Purpose.SCENE_DROPOUT, number).random(count) >= config.dropout
     kept[0] = True
     times = clock.phase + np.arange(count) / config.rate
-    normal = np.clip(
-        stream(config.seed, SceneStream.JITTER, number).standard_normal(count), -JITTER_LIMIT, JITTER_LIMIT
-    )
-    stamps = times + camera.time_offset + clock.offset + config.jitter * normal
+    jitter = config.jitter * cut_normal(generator(config.seed, Purpose.SCENE_JITTER, number), count)
+    stamps = times + camera.time_offset + clock.offset + jitter
     return Frames(times[kept], stamps[kept])
 
 

@@ -2,31 +2,30 @@
 
 from __future__ import annotations
 
+import glob
 import os
-import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import cv2
 import numpy as np
 import yaml
 from numpy.typing import NDArray
-from torch import Tensor
 
-from ballfg.dynamics import Effect
+from ballfg.files.destination import check_replaceable
+from ballfg.files.strict_yaml import read_yaml
+from ballfg.files.whole_folder import whole_folder
+from ballfg.progress import Watch, unwatched
 from ballfg.simulation.scene.recording import Recording
 from ballfg.simulation.scene.visible import visible_columns
-from ballfg.simulation.writing import check_folder
 from ballfg.state import STATE_NAMES
 from ballfg.tracks import TableWriter
-from ballfg.tracks.writing import staging
 from ballfg.vision.camera import Camera
 from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
 
 Pixels = NDArray[np.uint8]
-Watch = Callable[[Iterable[Pixels]], Iterator[Pixels]]
 
 SCENE_FILE: Final = "scene.yaml"
 TRUTH_RATE: Final = 1000.0
@@ -41,23 +40,23 @@ def write_scene(
     *,
     images: bool = False,
     force: bool = False,
-    watch: Watch = iter,
+    watch: Watch = unwatched,
 ) -> None:
     """Renders a recording and writes it; all files appear together at the end, or none.
 
     - `NAME.mp4` (or, with `images`, a folder `NAME` of PNG files, without any loss) and `NAME_stamps.csv` (`t`, one row
       a frame) for each camera;
-    - `cameras.yaml`: the cameras as they are, except for clock offsets that nobody declares;
+    - `cameras.yaml`: the exact cameras, without undeclared delays of their stamps;
     - `truth.csv`: `trajectory,t` and the true state, every millisecond of true time;
-    - `visible.csv`: for each frame and each ball in it, where it is: see `visible.visible_columns`;
-    - `scene.yaml`: what was asked for, with the clocks.
+    - `visible.csv`: the place of each ball in each frame: see `visible.visible_columns`;
+    - `scene.yaml`: all settings, with the clocks.
 
     Args:
         folder: new or empty; its parent must exist.
         recording: what to draw.
         images: PNG files in place of videos.
         force: replace a scene that is there already.
-        watch: hands the images through, `Recording.image_count` of them, for instance to show progress.
+        watch: sees the images that are drawn.
     Raises:
         ValueError: the folder holds something else, or a camera cannot be a file's name.
         FileNotFoundError: the folder's parent does not exist.
@@ -68,8 +67,8 @@ def write_scene(
     for camera in recording.cameras:
         if camera.name != Path(camera.name).name or camera.name.startswith("."):
             raise ValueError(f"camera names must be good as file names; got {camera.name!r}. Rename it.")
-    with staging(path) as stage:
-        drawn = watch(_all_images(recording))
+    with whole_folder(path, earlier=_earlier(path / SCENE_FILE), last=SCENE_FILE) as stage:
+        drawn = watch(_all_images(recording), recording.image_count, "frames drawn")
         for number, camera in enumerate(recording.cameras):
             _write_images(
                 stage, camera, recording.config.rate, drawn, len(recording.frames[number].times), images=images
@@ -81,39 +80,26 @@ def write_scene(
         with TableWriter(stage / "visible.csv") as table:
             for number in range(len(recording.cameras)):
                 table.write(visible_columns(recording, number))
-        _publish(stage, path, scene_content(recording))
+        content = scene_content(recording) | {"files": sorted(entry.name for entry in stage.iterdir())}
+        (stage / SCENE_FILE).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
 
 def check_scene_folder(folder: Path, *, force: bool) -> None:
-    """Refuses a folder as `ballfg.simulation.writing.check_folder` does; what may be replaced is a rendered scene."""
-    check_folder(folder, force=force, mark=SCENE_FILE, what="rendered scene")
+    """Refuses a folder that holds other files, or a rendered scene and no `force`; see `check_replaceable`."""
+    check_replaceable(folder, mark=SCENE_FILE, what="a rendered scene", force=force)
 
 
 def scene_content(recording: Recording) -> dict[str, Any]:
-    """What `scene.yaml` says: everything that made the recording."""
+    """The content of `scene.yaml`: everything that determines the recording."""
     config = recording.config
     return {
-        "seed": config.seed,
-        "shots": config.shots,
-        "interval": config.interval,
-        "rate": config.rate,
-        "exposure": config.exposure,
+        **{name: getattr(config, name) for name in ("seed", "shots", "interval", "rate", "exposure")},
         "clocks": {camera.name: asdict(recording.clock(camera.name)) for camera in recording.cameras},
-        "dropout": config.dropout,
-        "jitter": config.jitter,
-        "colour": config.colour,
-        "noise": config.noise,
-        "flicker": config.flicker,
-        "distractors": config.distractors,
+        **{name: getattr(config, name) for name in ("dropout", "jitter", "colour", "noise", "flicker", "distractors")},
         "settings": {name: list(levels) for name, levels in config.settings.items()},
-        "undeclared": {effect.name: _values(effect) for effect in config.undeclared},
+        "undeclared": {effect.name: effect.values() for effect in config.undeclared},
         "flights": {f.name: {"start": f.start, "end": f.end} for f in recording.flights},
     }
-
-
-def _values(effect: Effect) -> dict[str, float]:
-    """The values of an effect's coefficients, by name, in their own units."""
-    return {c.name: float(cast(Tensor, getattr(effect, c.name)).detach()) for c in effect.coefficients}
 
 
 def _all_images(recording: Recording) -> Iterator[Pixels]:
@@ -151,28 +137,10 @@ def _write_truth(path: Path, recording: Recording) -> None:
         for flight in recording.flights:
             count = int(np.floor((flight.end - flight.start) * TRUTH_RATE)) + 1
             times = np.minimum(flight.start + np.arange(count) / TRUTH_RATE, flight.end)
-            states = flight.states(times)
-            columns: dict[str, Any] = {"trajectory": flight.name, "t": times}
-            table.write(columns | {name: states[:, i] for i, name in enumerate(STATE_NAMES)})
+            states = dict(zip(STATE_NAMES, flight.states(times).T, strict=True))
+            table.write({"trajectory": flight.name, "t": times, **states})
 
 
-def _publish(stage: Path, folder: Path, content: dict[str, Any]) -> None:
-    """Moves the complete files to their names; what an older scene leaves over is removed. `scene.yaml` comes last."""
-    new = sorted(entry.name for entry in stage.iterdir())
-    old = folder / SCENE_FILE
-    if old.is_file():
-        for name in yaml.safe_load(old.read_text(encoding="utf-8"))["files"]:
-            _remove(folder / Path(name).name)
-    for name in new:
-        _remove(folder / name)
-        os.replace(stage / name, folder / name)
-    part = stage / SCENE_FILE
-    part.write_text(yaml.safe_dump(content | {"files": new}, sort_keys=False), encoding="utf-8")
-    os.replace(part, old)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+def _earlier(scene: Path) -> list[str]:
+    """Patterns of the names of an earlier scene's files."""
+    return [glob.escape(name) for name in read_yaml(scene)["files"]] if scene.is_file() else []

@@ -21,9 +21,9 @@ from ballfg.diagnosis.search.signatures import Signatures
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effects.bounce.restitution import Restitution
 from ballfg.dynamics.effects.flight.drag import Drag
-from ballfg.dynamics.effects.flight.generic import GenericFlight
 from ballfg.dynamics.effects.flight.gravity import Gravity
 from ballfg.dynamics.effects.flight.magnus import Magnus
+from ballfg.dynamics.effects.generic import GenericFlight
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # torch's own
 PULL = -0.6

@@ -17,10 +17,10 @@ from ballfg.diagnosis.remains.residuals import ACCELERATION, BIN, residuals_of, 
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.dynamics import EFFECTS, AnalyticModel
 from ballfg.dynamics.effect import Flight
-from ballfg.dynamics.effects.bounce.generic import GenericContact
-from ballfg.dynamics.effects.flight.generic import (
+from ballfg.dynamics.effects.generic import (
     MOTION_TERMS,
     PLACE_TERMS,
+    GenericContact,
     GenericFlight,
     flight_axes,
     motion_terms,

@@ -15,9 +15,9 @@ from ballfg.diagnosis.search.calibrated import values_of
 from ballfg.dynamics import AnalyticModel, model_from_dict, model_to_dict
 from ballfg.dynamics.effects.bounce.restitution import Restitution
 from ballfg.dynamics.effects.flight.drag import Drag
-from ballfg.dynamics.effects.flight.generic import GenericFlight
 from ballfg.dynamics.effects.flight.gravity import Gravity
 from ballfg.dynamics.effects.flight.magnus import Magnus
+from ballfg.dynamics.effects.generic import GenericFlight
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # torch's own
 FORCE = {"y_one": 0.5, "x_x": -0.6}

@@ -12,7 +12,6 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from ballfg.cli.progress import progress
 from ballfg.learning.config.config_file import read_config
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.run.checkpoint import read_checkpoint
@@ -20,6 +19,7 @@ from ballfg.learning.run.launch import launch
 from ballfg.learning.run.metrics import read_metrics
 from ballfg.learning.run.ranks import Ranks, SharedMemory, Trouble
 from ballfg.learning.run.training import run_training
+from ballfg.progress import progress
 from tests.learning.run import falling_ball
 from tests.learning.run.talking_ranks import die, talk
 

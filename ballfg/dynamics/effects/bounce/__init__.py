@@ -1,1 +1,1 @@
-"""Effects on the bounce, one a file."""
+"""Effects on the impact and on the place of the surfaces."""

@@ -1,4 +1,4 @@
-"""Coulomb friction between ball and surface during a bounce."""
+"""Friction between ball and surface, and the tangential restitution of a ball that grips."""
 
 from __future__ import annotations
 
@@ -21,3 +21,20 @@ class Friction(BounceEffect):
     def adjust(self, impact: Impact) -> Impact:
         """The impact with mu as its friction coefficient."""
         return impact.with_(friction=self.mu)
+
+
+class TangentialRestitution(BounceEffect):
+    """A ball that grips leaves with the fraction e_t of its slip reversed, instead of rolling (e_t = 0).
+
+    Source: R. Cross, "Grip-slip behavior of a bouncing ball", American Journal of Physics 70, 2002.
+    """
+
+    name = "tangential_restitution"
+    sentence = "Tangential compliance of the contact: slip is partly reversed when the ball grips."
+    decide = "Shoot slowly with much spin, so that the ball grips in the bounce, and measure the spin after it."
+    coefficients = (Coefficient("e_t", 0.15, 0.1, "1", -1.0, 1.0),)
+    e_t: Tensor
+
+    def adjust(self, impact: Impact) -> Impact:
+        """The impact with e_t as its tangential restitution."""
+        return impact.with_(tangential_restitution=self.e_t)

@@ -1,1 +1,1 @@
-"""Effects on the flight, one a file."""
+"""Effects on the free ball."""

@@ -1,1 +1,1 @@
-"""Effects on what is written down, one a file."""
+"""Effects on what is written down."""

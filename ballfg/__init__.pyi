@@ -1,0 +1,30 @@
+from . import benchmarks as benchmarks
+from . import diagnosis as diagnosis
+from . import dynamics as dynamics
+from . import estimation as estimation
+from . import factors as factors
+from . import learning as learning
+from . import prediction as prediction
+from . import simulation as simulation
+from . import tracks as tracks
+from . import vision as vision
+from .diagnosis import Diagnosis as Diagnosis
+from .diagnosis import diagnose as diagnose
+from .dynamics import AnalyticModel as AnalyticModel
+from .dynamics import Surfaces as Surfaces
+from .dynamics import load_model as load_model
+from .dynamics import nominal_model as nominal_model
+from .dynamics import register as register
+from .dynamics import save_model as save_model
+from .estimation import Estimate as Estimate
+from .estimation import ExtendedKalmanFilter as ExtendedKalmanFilter
+from .estimation import Online as Online
+from .estimation import Settings as Settings
+from .estimation import Smoother as Smoother
+from .estimation import Status as Status
+from .simulation import simulate as simulate
+from .tracks import Ball as Ball
+from .tracks import Dataset as Dataset
+from .tracks import Track as Track
+
+__version__: str

@@ -1,0 +1,196 @@
+"""Generic effects: sums of terms in place, velocity and spin, for what nobody can name; one for each kind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact, vector
+from ballfg.dynamics.measurement import Later, MeasurementEffect
+from ballfg.state import POSITION, VELOCITY
+
+WORLD_AXES: Final = ("x", "y", "z")
+FLIGHT_AXES: Final = ("along", "across", "lift")
+PLACE_TERMS: Final = {
+    "one": (0.5, "m/s^2"),
+    "x": (0.5, "1/s^2"),
+    "y": (0.5, "1/s^2"),
+    "z": (0.5, "1/s^2"),
+    "xx": (0.5, "1/(m s^2)"),
+    "yy": (0.5, "1/(m s^2)"),
+    "zz": (0.5, "1/(m s^2)"),
+    "xy": (0.5, "1/(m s^2)"),
+    "xz": (0.5, "1/(m s^2)"),
+    "yz": (0.5, "1/(m s^2)"),
+}
+"""Terms along the world's axes, in x, y, z from the centre: standard deviation of the prior and unit. Priors of all
+terms are such that each is worth about 0.5 m/s^2 at 1 m, 5 m/s and 100 rad/s."""
+MOTION_TERMS: Final = {
+    "one": (0.5, "m/s^2"),
+    "v": (0.1, "1/s"),
+    "vz": (0.2, "1/s"),
+    "vv": (0.02, "1/m"),
+    "vvx": (0.02, "1/m^2"),
+    "vvy": (0.02, "1/m^2"),
+    "vvz": (0.02, "1/m^2"),
+    "vsa": (0.001, "1"),
+    "vsc": (0.001, "1"),
+    "vsl": (0.001, "1"),
+    "vs": (0.001, "1"),
+}
+"""Terms along the flight, across it to the left, and along the lift: speed less its reference (v), its square (vv),
+that times x, y, z from the centre, vertical velocity, speed times the spin about each of these axes, and times all."""
+CONTACT_TERMS: Final = {
+    "one": (0.1, "m/s"),
+    "vx": (0.03, "1"),
+    "vy": (0.03, "1"),
+    "vz": (0.03, "1"),
+    "wx": (0.001, "m"),
+    "wy": (0.001, "m"),
+    "wz": (0.001, "m"),
+}
+"""Terms in the incoming velocity and spin: standard deviation of the prior and unit; each worth about 0.1 m/s."""
+MEASUREMENT_TERMS: Final = {
+    "x": (0.005, "1"),
+    "y": (0.005, "1"),
+    "z": (0.005, "1"),
+    "xx": (0.005, "1/m"),
+    "yy": (0.005, "1/m"),
+    "zz": (0.005, "1/m"),
+    "xy": (0.005, "1/m"),
+    "xz": (0.005, "1/m"),
+    "yz": (0.005, "1/m"),
+    "vx": (0.001, "s"),
+    "vy": (0.001, "s"),
+    "vz": (0.001, "s"),
+}
+"""Terms in the place from the centre and the velocity: standard deviation of the prior and unit; each is worth 5 mm."""
+SOFT_SPEED: Final = 0.1
+"""m/s. Below it the directions of flight fade, so that a ball at rest has none."""
+SOFT_SPIN: Final = 1.0
+"""rad/s. Below it the total spin is smooth at zero."""
+BOUND: Final = 1e3
+"""Of each coefficient, in units of its prior's standard deviation."""
+MEASUREMENT_BOUND: Final = 100.0
+"""The same for an error of a measurement: it is small."""
+
+Terms = Mapping[str, tuple[float, str]]
+
+
+def _coefficients(axes: Iterable[str], terms: Terms, bound: float = BOUND) -> tuple[Coefficient, ...]:
+    """One coefficient for each axis and term, named after both."""
+    return tuple(
+        Coefficient(f"{axis}_{term}", 0.0, sigma, unit, -bound * sigma, bound * sigma)
+        for axis in axes
+        for term, (sigma, unit) in terms.items()
+    )
+
+
+def _center() -> tuple[Coefficient, ...]:
+    """The place from which terms in the place are counted."""
+    middle = {"center_x": 1.4, "center_y": 0.0, "center_z": 1.0}
+    return tuple(Coefficient(name, m, 0.0, "m", -100.0, 100.0, absent=None) for name, m in middle.items())
+
+
+def _strengths(effect: Effect) -> Tensor:
+    """(k,) or (..., k) values of the coefficients of all terms, in their order."""
+    return vector(*(getattr(effect, c.name) for c in effect.coefficients if c.absent is not None))
+
+
+class GenericFlight(FlightEffect):
+    """sum of c_{axis,term} term(state) axis, over the world's axes and those of the flight.
+
+    The flight's axes are a = v / |v|, c = z x v / |z x v|, l = a x c. Every coefficient is a number by itself: x_xz is
+    the acceleration along x for a unit of x z; along_vvx is a drag that grows with x.
+    """
+
+    name = "generic_flight"
+    sentence = "An acceleration that depends on place, velocity and spin, written as a sum of terms; it names no cause."
+    decide = "Look where it acts and on what it depends, and measure there with that alone varied."
+    coefficients = (
+        *_coefficients(WORLD_AXES, PLACE_TERMS),
+        *_coefficients(FLIGHT_AXES, MOTION_TERMS),
+        *_center(),
+        Coefficient("speed", 5.0, 0.0, "m/s", 0.0, 100.0, absent=None),
+    )
+    center_x: Tensor
+    center_y: Tensor
+    center_z: Tensor
+    speed: Tensor
+
+    def acceleration(self, flight: Flight) -> Tensor:
+        """(..., 3) m/s^2."""
+        place = flight.position - vector(self.center_x, self.center_y, self.center_z)
+        world, own = _strengths(self).split((3 * len(PLACE_TERMS), 3 * len(MOTION_TERMS)), dim=-1)
+        axes = flight_axes(flight.velocity)
+        by_place = (world.unflatten(-1, (3, -1)) * place_terms(place).unsqueeze(-2)).sum(-1)
+        by_motion = (own.unflatten(-1, (3, -1)) * motion_terms(flight, axes, place, self.speed).unsqueeze(-2)).sum(-1)
+        return by_place + (axes * by_motion.unsqueeze(-1)).sum(-2)
+
+
+class GenericContact(BounceEffect):
+    """v + sum of c_{axis,term} term axis in place of the incoming velocity v, in the axes of the surface.
+
+    What comes out changes by the impulse's derivative: by -e c vertically, by c less what friction takes horizontally.
+    """
+
+    name = "generic_contact"
+    sentence = "A change of the bounce that is linear in the incoming velocity and spin; it names no cause."
+    decide = "Let the ball bounce with one component of velocity or spin varied at a time."
+    coefficients = _coefficients(WORLD_AXES, CONTACT_TERMS)
+
+    def adjust(self, impact: Impact) -> Impact:
+        """The impact with another incoming velocity."""
+        strengths = _strengths(self).unflatten(-1, (3, -1))
+        one = torch.ones_like(impact.velocity[..., :1])
+        terms = torch.cat((one, impact.velocity, impact.spin), dim=-1)
+        return impact.with_(velocity=impact.velocity + (strengths * terms.unsqueeze(-2)).sum(-1))
+
+
+class GenericMeasurement(MeasurementEffect):
+    """p + sum of c_{axis,term} term axis in place of the position p."""
+
+    name = "generic_measurement"
+    sentence = (
+        "An error of the measured positions, linear and quadratic in place and linear in velocity; it names no cause."
+    )
+    decide = "Measure a ball that hangs still at known places, then one that moves slowly and fast on a known path."
+    coefficients = (*_coefficients(WORLD_AXES, MEASUREMENT_TERMS, MEASUREMENT_BOUND), *_center())
+    rank = 2
+    center_x: Tensor
+    center_y: Tensor
+    center_z: Tensor
+
+    def positions(self, states: Tensor, later: Later) -> Tensor:
+        """(..., 3) m, with the error."""
+        place = states[..., POSITION] - vector(self.center_x, self.center_y, self.center_z)
+        x, y, z = place.split(1, dim=-1)
+        terms = torch.cat((place, x * x, y * y, z * z, x * y, x * z, y * z, states[..., VELOCITY]), dim=-1)
+        return states[..., POSITION] + (_strengths(self).unflatten(-1, (3, -1)) * terms.unsqueeze(-2)).sum(-1)
+
+
+def flight_axes(velocity: Tensor) -> Tensor:
+    """(..., 3, 3) rows along the flight, across it (z x v), and along the lift; each fades at rest."""
+    x, y, z = velocity.split(1, dim=-1)
+    along = velocity / (velocity.square().sum(-1, keepdim=True) + SOFT_SPEED**2).sqrt()
+    across = torch.cat((-y, x, torch.zeros_like(z)), dim=-1) / (x.square() + y.square() + SOFT_SPEED**2).sqrt()
+    return torch.stack((along, across, torch.linalg.cross(along, across, dim=-1)), dim=-2)
+
+
+def place_terms(place: Tensor) -> Tensor:
+    """(..., 10) `PLACE_TERMS` at a place (..., 3) m from the centre."""
+    x, y, z = place.split(1, dim=-1)
+    return torch.cat((torch.ones_like(x), x, y, z, x * x, y * y, z * z, x * y, x * z, y * z), dim=-1)
+
+
+def motion_terms(flight: Flight, axes: Tensor, place: Tensor, reference: Tensor) -> Tensor:
+    """(..., 11) `MOTION_TERMS` of a flight with its axes (..., 3, 3), at a place (..., 3) m from the centre."""
+    squared = flight.velocity.square().sum(-1, keepdim=True) + SOFT_SPEED**2
+    speed, one = squared.sqrt(), torch.ones_like(squared)
+    about = speed * (axes * flight.spin.unsqueeze(-2)).sum(-1)
+    spin = speed * (flight.spin.square().sum(-1, keepdim=True) + SOFT_SPIN**2).sqrt()
+    slow = (speed - reference, flight.velocity[..., 2:], squared - reference.square())
+    return torch.cat((one, *slow, squared * place, about, spin), dim=-1)

@@ -1,0 +1,165 @@
+"""CSV files: their header, their columns, and where and why one cannot be read.
+
+The fast reader says that a block is bad, not which line of the file. A slow second look runs only when there is an
+error to report, so that it can afford to read the file cell by cell.
+"""
+
+import csv
+import math
+import re
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+
+from ballfg.checks import did_you_mean
+
+_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
+_NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|infinity)\s*", re.IGNORECASE)
+_HEADER_LIMIT = 1 << 16  # bytes
+
+
+def is_number(cell: str) -> bool:
+    """Whether a cell holds a finite decimal number with a point, such as 0.02 or 2e-2."""
+    return _NUMBER.fullmatch(cell) is not None and math.isfinite(float(cell))
+
+
+def one_line(error: object) -> str:
+    """The text of an error on one line, without its full stop."""
+    return " ".join(str(error).split()).rstrip(".")
+
+
+def read_header(path: Path) -> list[str]:
+    """The column names of a CSV file.
+
+    Raises: ValueError: an empty file, or one that is not UTF-8 text.
+    """
+    with path.open("rb") as file:
+        first = re.split(rb"[\r\n]", file.read(_HEADER_LIMIT), maxsplit=1)[0]
+    if not first.strip():
+        raise ValueError(f"{path}: must begin with a line of column names; got an empty file or line. Add the header.")
+    try:
+        text = first.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        raise _not_utf8(path, 1) from None
+    if "\0" in text:
+        raise _not_utf8(path, 1)
+    return next(csv.reader([text]))
+
+
+def check_header(path: Path, header: Sequence[str], required: Sequence[str], known: Collection[str]) -> None:
+    """Refuses a header without a needed column or with a known one twice.
+
+    Args: path: of the table.  header: its columns.  required: those needed.  known: those that mean something.
+    Raises: ValueError: naming the column.
+    """
+    text = ",".join(header)
+    shown = repr(text if len(text) <= 120 else text[:117] + "...")
+    for name in required:
+        if name not in header:
+            expected = f"expected {','.join(required)}, " if len(required) > 1 else ""
+            hint = did_you_mean(name, [other for other in header if other not in known])
+            if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
+                hint += " Cells must be separated by commas."
+            raise ValueError(
+                f"{path}: column {name!r} is missing; {expected}got {shown}. Add or rename the column.{hint}"
+            )
+    for name in known:
+        if list(header).count(name) > 1:
+            raise ValueError(f"{path}: column {name!r} must appear once; got {shown}. Rename one of them.")
+
+
+def convert_options(texts: Sequence[str], numbers: Sequence[str]) -> pa_csv.ConvertOptions:
+    """Makes the fast reader read these columns, in this order, and take no cell for a missing value."""
+    return pa_csv.ConvertOptions(
+        column_types={**dict.fromkeys(texts, pa.string()), **dict.fromkeys(numbers, pa.float64())},
+        include_columns=[*texts, *numbers],
+        null_values=[],
+    )
+
+
+def records(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """The rows of data with the number of the line on which each begins; empty lines are skipped.
+
+    Raises: ValueError: text that is not UTF-8, or a quote that is never closed.
+    """
+    with path.open(encoding="utf-8-sig", errors="surrogateescape", newline="") as file:
+        reader = csv.reader(file, strict=True)
+        line = 1
+        try:
+            next(reader, None)
+            while True:
+                line = reader.line_num + 1
+                cells = next(reader)
+                if any(not cell.isascii() and _has_surrogate(cell) for cell in cells):
+                    raise _not_utf8(path, line)
+                if cells:
+                    yield line, cells
+        except StopIteration:
+            return
+        except csv.Error as error:
+            raise ValueError(
+                f"{path}, line {line}: must be a row of comma-separated cells; {one_line(error)}. Check its quotes."
+            ) from None
+
+
+def lines_of_rows(path: Path, rows: Sequence[int]) -> list[int]:
+    """The line numbers, from 1, of rows of data counted from 0."""
+    wanted = dict.fromkeys(rows, 0)
+    last = max(rows)
+    for row, (line, _) in enumerate(records(path)):
+        if row in wanted:
+            wanted[row] = line
+        if row == last:
+            break
+    return [wanted[row] for row in rows]
+
+
+def explain(path: Path, numeric: Sequence[str], reason: str) -> ValueError:
+    """The error that names the first bad row of a file that the fast reader refused.
+
+    Args:
+        path: the file.
+        numeric: the columns that must hold numbers.
+        reason: the fast reader's own words, used if the second look finds nothing.
+    """
+    header = read_header(path)
+    line = 1
+    try:
+        for line, cells in records(path):
+            problem = _row_problem(header, numeric, cells)
+            if problem:
+                return ValueError(f"{path}, line {line}{problem}")
+    except ValueError as error:
+        return error
+    if line == 1:
+        return no_rows(path)
+    return ValueError(f"{path}: must be a CSV table; {one_line(reason)}. Check quotes and separators.")
+
+
+def no_rows(path: Path) -> ValueError:
+    """The error for a table that has only a header."""
+    return ValueError(f"{path}: must hold tracks; got a header without rows. Add the measurements.")
+
+
+def _row_problem(header: list[str], numeric: Sequence[str], cells: list[str]) -> str | None:
+    if len(cells) != len(header):
+        return (
+            f": must have {len(header)} cells, one for each column of the header; got {len(cells)}. "
+            "Complete the line or delete it."
+        )
+    for name in numeric:
+        cell = cells[header.index(name)]
+        if not _NUMBER.fullmatch(cell) and not _NOT_FINITE.fullmatch(cell):
+            got = f"got {cell!r}" if cell.strip() else "got an empty cell"
+            return f", column {name!r}: must be a number with a decimal point; {got}. Correct it or delete the line."
+    return None
+
+
+def _has_surrogate(cell: str) -> bool:
+    return any("\udc80" <= letter <= "\udcff" for letter in cell)
+
+
+def _not_utf8(path: Path, line: int) -> ValueError:
+    return ValueError(f"{path}, line {line}: must be UTF-8 text; got bytes of another encoding. Save it as UTF-8.")
