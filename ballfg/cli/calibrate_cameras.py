@@ -15,7 +15,8 @@ import typer
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
-    from ballfg.vision.calibration.boards import Board, Image
+    from ballfg.vision.arrays import Image
+    from ballfg.vision.calibration.boards import Board
     from ballfg.vision.calibration.intrinsics import Intrinsics
     from ballfg.vision.calibration.report import Calibration
     from ballfg.vision.calibration.table_points import TableFile
@@ -114,17 +115,14 @@ def _check_same(
 ) -> None:
     """Refuses a camera that is named in one place only."""
     cameras = set(cameras)
+    listed = ", ".join(sorted(cameras))
     for name in sorted(set(shown) - cameras):
-        raise ValueError(f"--view names camera {name!r}, which {where} does not ({_listed(cameras)}). Rename it.")
+        raise ValueError(f"--view names camera {name!r}, which {where} does not ({listed}). Rename it.")
     if marked is None:
         return
     for name in sorted(cameras ^ set(marked.cameras)):
         here, there = (where, table) if name in cameras else (table, where)
         raise ValueError(f"{here} names camera {name!r}, which {there} does not. Add it there, or leave it out.")
-
-
-def _listed(names: Iterable[str]) -> str:
-    return ", ".join(sorted(names))
 
 
 def _board(kind: BoardKind, squares: str, square: float, marker: float, dictionary: str, legacy: bool) -> Board:

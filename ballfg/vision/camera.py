@@ -8,9 +8,9 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from ballfg.vision.arrays import Array, Flags
 
 DISTORTIONS: Final = (0, 4, 5, 8, 12, 14)
 """Lengths of distortion vectors in OpenCV: none; k1 k2 p1 p2; k3; k4 k5 k6; thin prism s1-s4; tilt tau_x tau_y."""
@@ -157,7 +157,7 @@ class Camera:
         directions = np.concatenate((plane, np.ones((*plane.shape[:-1], 1))), axis=-1) @ self.rotation
         return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
-    def in_view(self, points: ArrayLike) -> NDArray[np.bool_]:
+    def in_view(self, points: ArrayLike) -> Flags:
         """(...) whether points (..., 3) m lie in front of the camera and within its image."""
         pixels = np.nan_to_num(self.project(points), nan=-1e9)
         return np.asarray(((pixels >= -0.5) & (pixels < np.array(self.size) - 0.5)).all(axis=-1))

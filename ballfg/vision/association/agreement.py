@@ -8,20 +8,18 @@ cameras are needed: of two that disagree either may be wrong.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from ballfg.vision.arrays import Array
 from ballfg.vision.association.paths import path
 from ballfg.vision.association.seen_ball import SeenBall
 from ballfg.vision.association.triangulate import triangulate
 from ballfg.vision.camera import Camera
-
-Array = NDArray[np.float64]
 
 LEAST_MISFIT: Final = 3.0
 """Squared error, relative to that of noise, up to which cameras agree: half a pixel where centres are good to 0.3."""
@@ -151,9 +149,8 @@ def _views(balls: Sequence[SeenBall], cameras: list[Camera]) -> tuple[Array, Arr
 def _scene(cameras: list[Camera], pixels: Array, covariances: Array) -> _Scene:
     seen = np.asarray(np.isfinite(pixels).all(axis=-1))
     rows = np.flatnonzero(seen.sum(axis=1) >= 3)
-    rows = (
-        rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_POINTS)).astype(int))] if len(rows) else rows
-    )
+    if len(rows):
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_POINTS)).astype(int))]
     loose = np.broadcast_to(_LOOSE**2 * np.eye(2), covariances[rows].shape)
     points = triangulate(cameras, pixels[rows], loose).points if len(cameras) > 1 else np.zeros((0, 3))
     rows, points = rows[np.isfinite(points).all(axis=1)], points[np.isfinite(points).all(axis=1)]
@@ -198,7 +195,8 @@ def _refined(scene: _Scene, cameras: list[Camera], points: Array, nudged: int | 
                 _trust(scene, errors), weight, slopes[nudged], errors[:, nudged], mixed, removed, gradient, pose - start
             )
             points = points - removed @ change
-            cameras[nudged] = _posed(cameras[nudged], pose + change)
+            pose = pose + change
+            cameras[nudged] = replace(cameras[nudged], rvec=pose[:3], tvec=pose[3:])
     return points, cameras
 
 
@@ -241,10 +239,6 @@ def _slopes(camera: Camera, points: Array) -> Array:
     """(n, 2, 6) derivatives of the projection by rvec and tvec."""
     _, jacobian = cv2.projectPoints(points, camera.rvec, camera.tvec, camera.matrix, camera.distortion)
     return np.asarray(jacobian[:, :6], dtype=np.float64).reshape(-1, 2, 6)
-
-
-def _posed(camera: Camera, pose: Array) -> Camera:
-    return Camera(camera.name, camera.size, camera.matrix, camera.distortion, pose[:3], pose[3:], camera.time_offset)
 
 
 def _against_others(scene: _Scene, cameras: list[Camera], k: int) -> float:

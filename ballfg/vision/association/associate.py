@@ -11,20 +11,18 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ballfg.tracks.sightings import Sightings
+from ballfg.vision.arrays import Rows
 from ballfg.vision.association.clock import shared_stamps
 from ballfg.vision.association.completing import complete
 from ballfg.vision.association.flights import is_ball, successions
-from ballfg.vision.association.gathering import SAME_SHUTTER, Footage, Gathered, Rows, gather
+from ballfg.vision.association.gathering import SAME_SHUTTER, Footage, Gathered, gather
 from ballfg.vision.association.matching import Piece, match
 from ballfg.vision.association.seen_ball import SeenBall
 from ballfg.vision.association.tracklets import find_tracklets
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
-
-Array = NDArray[np.float64]
 
 _DISPUTED: Final = 2
 """Most frames in which two parts of one flight both have a candidate: one of the two candidates is wrong then."""

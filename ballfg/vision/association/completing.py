@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ballfg.vision.association.gathering import Footage, Gathered, Rows, gather
+from ballfg.vision.arrays import Array, Flags, Rows
+from ballfg.vision.association.gathering import Footage, Gathered, gather
 from ballfg.vision.camera import Camera
-
-Array = NDArray[np.float64]
 
 _GATE: Final = 16.0
 """Largest squared distance from the prediction, whitened: 4 sigma."""
@@ -54,7 +52,7 @@ def complete(footage: Footage, balls: Sequence[Gathered]) -> list[Gathered]:
     return done
 
 
-def _wanted(footage: Footage, ball: Gathered, taken: Sequence[NDArray[np.bool_]]) -> list[Rows]:
+def _wanted(footage: Footage, ball: Gathered, taken: Sequence[Flags]) -> list[Rows]:
     """For each camera the unassigned candidates near the ball's predicted track."""
     wanted = []
     for number, camera in enumerate(footage.cameras):

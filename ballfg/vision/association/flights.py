@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.state import STANDARD_GRAVITY
+from ballfg.vision.arrays import Array
 from ballfg.vision.association.paths import Path
-
-Array = NDArray[np.float64]
 
 LONGEST_GAP: Final = 0.3
 """s. A ball that reappears after a longer gap is a new one."""

@@ -6,12 +6,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ballfg.checks import check_array
 from ballfg.tracks.sightings import are_covariances
-
-Array = NDArray[np.float64]
+from ballfg.vision.arrays import Array, Flags, Image, Rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +61,7 @@ class Candidates:
         )
 
 
-Detector = Callable[[NDArray[np.uint8]], Candidates]
+Detector = Callable[[Image], Candidates]
 """Any callable from an image (h, w, 3) in BGR to its candidates. It may remember earlier frames: it is called once a
 frame, in their order, and serves one camera only."""
 
@@ -81,7 +80,7 @@ class Detections:
     frames: Array
     """(f,) s, stamps of all frames, strictly increasing, as the camera writes them."""
 
-    frame: NDArray[np.int64]
+    frame: Rows
     """(n,) number of the frame in which each candidate was seen, not decreasing."""
 
     pixels: Array
@@ -127,7 +126,7 @@ class Detections:
         rows = slice(*np.searchsorted(self.frame, (number, number + 1)))
         return Candidates(self.pixels[rows], self.covariances[rows], self.scores[rows], self.streaks[rows])
 
-    def select(self, keep: NDArray[np.bool_]) -> Detections:
+    def select(self, keep: Flags) -> Detections:
         """Those candidates of which keep (n,) is true; all frames stay."""
         return Detections(
             self.camera,
@@ -194,6 +193,6 @@ def _check_fields(owner: Candidates | Detections, what: str) -> None:
     _refuse((owner.scores < 0.0) | (owner.scores > 1.0), what, "scores", "lie in [0, 1]")
 
 
-def _refuse(wrong: NDArray[np.bool_], what: str, field: str, rule: str) -> None:
+def _refuse(wrong: Flags, what: str, field: str, rule: str) -> None:
     if wrong.any():
         raise ValueError(f"{what}: {field} must {rule}; those of candidate {int(np.argmax(wrong))} do not.")

@@ -8,7 +8,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from ballfg.vision.detection.background import Array, Background, Image
+from ballfg.vision.arrays import Array, Image
+from ballfg.vision.detection.background import Background
 from ballfg.vision.detection.detections import Candidates
 from ballfg.vision.detection.regions import Region, find_regions
 from ballfg.vision.detection.scoring import score
