@@ -122,12 +122,20 @@ class Detections:
         return np.asarray(self.frames[self.frame])
 
     def in_frame(self, number: int) -> Candidates:
-        """The candidates of one frame."""
+        """The candidates of one frame.
+
+        Args: number: of the frame.
+        Returns: its candidates, k >= 0.
+        """
         rows = slice(*np.searchsorted(self.frame, (number, number + 1)))
         return Candidates(self.pixels[rows], self.covariances[rows], self.scores[rows], self.streaks[rows])
 
     def select(self, keep: Flags) -> Detections:
-        """Those candidates of which keep (n,) is true; all frames stay."""
+        """Some of the candidates.
+
+        Args: keep: (n,) bool, whether a candidate stays.
+        Returns: the detections with these candidates and all frames.
+        """
         return Detections(
             self.camera,
             self.frames,
@@ -139,12 +147,21 @@ class Detections:
         )
 
     def best_scores(self, count: int = 3) -> Array:
-        """The highest scores, best first; at most `count`, fewer where there are fewer candidates."""
+        """The highest scores.
+
+        Args: count: of scores.
+        Returns: (k,) dimensionless, best first, with k at most `count`.
+        """
         return np.sort(self.scores)[::-1][:count].copy()
 
     @classmethod
     def of_frames(cls, camera: str, seen: Iterable[tuple[float, Candidates]]) -> Detections:
-        """Joins the candidates of frames, given with the frames' stamps (s) in their order."""
+        """Joins the candidates of frames.
+
+        Args: camera: name of the camera.  seen: stamp (s) and candidates of each frame, in order.
+        Returns: the detections of the recording.
+        Raises: ValueError: stamps that do not increase.
+        """
         stamps: list[float] = []
         found = [Candidates.none()]
         for stamp, candidates in seen:

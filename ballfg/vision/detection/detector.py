@@ -74,7 +74,13 @@ class BallDetector:
 
     @classmethod
     def learn(cls, images: Sequence[Image], settings: DetectorSettings | None = None) -> BallDetector:
-        """From frames spread over the recording, see `Background`."""
+        """A detector with the background that frames of the recording show.
+
+        Args: images: at least three, (h, w, 3) uint8 each, spread over the recording; see `Background`.
+            settings: what is known about the ball; the default ones if None.
+        Returns: the detector of that camera.
+        Raises: ValueError: too few images, or of several sizes.
+        """
         return cls(Background(images), settings)
 
     def __call__(self, image: Image) -> Candidates:

@@ -75,7 +75,11 @@ class Video(ABC):
 
     @abstractmethod
     def sample(self, count: int) -> list[Image]:
-        """At most `count` images spread over the recording."""
+        """Images spread over the recording.
+
+        Args: count: the most images.
+        Returns: images (h, w, 3) uint8, at most `count`.
+        """
 
     @abstractmethod
     def _decoded(self) -> Iterator[tuple[float, Image]]:

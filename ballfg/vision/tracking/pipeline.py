@@ -77,13 +77,21 @@ class Tracking:
         return float(f"{1.0 / step:.6g}")
 
     def seen(self, ball: SeenBall, camera: int) -> Seen:
-        """The frames in which a camera, by its number, saw a ball, and where."""
+        """The frames in which a camera saw a ball, and where.
+
+        Args: ball: one of `balls`.  camera: number of the camera.
+        Returns: numbers of the frames, and pixels.
+        """
         rows = ball.sightings.camera == camera
         frames = np.searchsorted(self.detections[camera].frames, ball.sightings.times[rows])
         return Seen(frames.astype(np.int64), ball.sightings.pixels[rows])
 
     def rows(self, ball: SeenBall, camera: int) -> Rows:
-        """(m,) which of a camera's candidates a ball was seen by."""
+        """The candidates of a camera that are sightings of a ball.
+
+        Args: ball: one of `balls`.  camera: number of the camera.
+        Returns: (m,) numbers of the candidates.
+        """
         detections, seen = self.detections[camera], self.seen(ball, camera)
         first, end = (np.searchsorted(detections.frame, seen.frames, side) for side in ("left", "right"))
         found = [
