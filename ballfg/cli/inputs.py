@@ -20,14 +20,35 @@ if TYPE_CHECKING:
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.tracks import Dataset
 
+
+MOST_DOUBTS = 3
+"""Tracks whose doubts are printed, before the others are counted."""
+
+
+def default_jobs() -> int:
+    """One process per core that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 OwnEffects = Annotated[
     list[Path] | None,
-    typer.Option(
-        "--effects",
-        help="Trusted Python file that defines further effects; may be repeated.",
-    ),
+    typer.Option("--effects", help="Trusted Python file that defines custom effects; may be repeated."),
 ]
 """The option of every command that reads or names effects."""
+MethodName = Annotated[
+    str,
+    typer.Option(
+        "--method",
+        help="Estimator: smoother, online, ekf, sliding-window, or one that an installed package registers.",
+    ),
+]
+ModelFile = Annotated[
+    Path | None, typer.Option("--model", help="Model file; by default the nominal model of the ball.")
+]
+CORES = default_jobs()
+Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Number of processes.", show_default="one per core")]
+OutTable = Annotated[Path, typer.Option("--out", help="Output table, .csv or .parquet.")]
+Seed = Annotated[int, typer.Option("--seed", help="Random seed.")]
 DATASET_TABLES = ("tracks", "labels", "detections", "truth")
 """Names, without their endings, of the tables that a dataset's folder holds."""
 
@@ -76,26 +97,18 @@ def know_effects(files: Iterable[Path] | None) -> None:
         load_effects(file)
 
 
-def source_of(dataset: Path) -> Source:
-    """Positions where the folder has a table of tracks, or no detections either; else detections."""
-    from ballfg.tracks.dataset import TRACK_FILES
-    from ballfg.tracks.detections_file import DETECTIONS_FILE
-
-    tracks = any((dataset / name).is_file() for name in TRACK_FILES)
-    return Source.POSITIONS if tracks or not (dataset / DETECTIONS_FILE).is_file() else Source.DETECTIONS
-
-
 def open_inputs(dataset: Path, model: Path | None, effects: Iterable[Path] | None = None) -> Inputs[Dataset]:
     """Open and check everything before any work starts; what was repaired is said on stderr."""
+    from ballfg.estimation import with_readings
     from ballfg.tracks import read_dataset
 
     know_effects(effects)
-    return _inputs(read_dataset(dataset), model)
+    return _inputs(with_readings(read_dataset(dataset)), model)
 
 
 def open_sighted(dataset: Path, model: Path | None, effects: Iterable[Path] | None = None) -> Inputs[SightedDataset]:
     """`open_inputs` for what cameras saw."""
-    from ballfg.estimation.observations.sighted_dataset import read_sighted
+    from ballfg.estimation import read_sighted
 
     know_effects(effects)
     return _inputs(read_sighted(dataset), model)
@@ -104,14 +117,14 @@ def open_sighted(dataset: Path, model: Path | None, effects: Iterable[Path] | No
 def _inputs(data: Opened, model: Path | None) -> Inputs[Opened]:
     import torch
 
-    from ballfg.dynamics import load_model, nominal_model
+    from ballfg.dynamics import load_model, nominal_model, nominal_note
     from ballfg.estimation import dataset_settings, dataset_surfaces
 
     torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
-    for note in data.notes:
+    unknown = nominal_note(data.ball) if model is None else None
+    for note in [*data.notes, *([unknown] if unknown else [])]:
         print(f"note: {note}", file=sys.stderr)
-    radius = data.info.ball.radius
-    ball = nominal_model(radius) if model is None else load_model(model, radius=radius)
+    ball = nominal_model(data.ball) if model is None else load_model(model, radius=data.ball.radius)
     return Inputs(data, ball, dataset_surfaces(data), dataset_settings(data, ball))
 
 
@@ -130,6 +143,9 @@ def status_lines(statuses: Counter[str]) -> Iterator[str]:
         yield f"  {number} track{'s' if number > 1 else ''}: {text}"
 
 
-def default_jobs() -> int:
-    """One process per core that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+def print_doubts(doubts: list[str]) -> None:
+    """Prints what does not look like a ball in the declared frame, on stderr; of many tracks the first few."""
+    for doubt in doubts[:MOST_DOUBTS]:
+        print(f"note: {doubt}", file=sys.stderr)
+    if len(doubts) > MOST_DOUBTS:
+        print(f"note: the same doubts about {len(doubts) - MOST_DOUBTS} more tracks", file=sys.stderr)

@@ -8,8 +8,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.estimate import Method
-from ballfg.cli.inputs import OwnEffects, check_dataset, check_out, default_jobs, open_inputs, status_lines
+from ballfg.cli.inputs import (
+    CORES,
+    Jobs,
+    MethodName,
+    ModelFile,
+    OutTable,
+    OwnEffects,
+    check_dataset,
+    check_out,
+    open_inputs,
+    print_doubts,
+    status_lines,
+)
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
@@ -22,16 +33,16 @@ def predict(
     dataset: Annotated[
         Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.", callback=check_dataset)
     ],
-    observe: Annotated[float, typer.Option(help="Seconds from the start of each track that the estimator sees.")],
-    out: Annotated[Path, typer.Option(help="Table to write; .csv or .parquet.")],
-    method: Annotated[Method, typer.Option(help="The estimator.")] = Method.SMOOTHER,
-    model: Annotated[Path | None, typer.Option(help="Model file; the nominal table-tennis model without it.")] = None,
+    observe: Annotated[float, typer.Option(help="Observed time from the start of each track, s.")],
+    out: OutTable,
+    method: MethodName = "smoother",
+    model: ModelFile = None,
     effects: OwnEffects = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes.", show_default="one per core")] = default_jobs(),
+    jobs: Jobs = CORES,
 ) -> None:
     """Positions at every stamp after the observed part, with the standard deviation of a measurement there.
 
-    They are those that will be measured, with all measurement effects that the model file holds.
+    These are the positions that will be measured: measurement effects of the model file are included.
 
     Example: ballfg predict data/ballgun --observe 0.25 --out predictions.csv
     """
@@ -39,22 +50,25 @@ def predict(
     from ballfg.tracks import TableWriter
 
     statuses: Counter[str] = Counter()
+    doubts: list[str] = []
     rows, squares, ended = 0, 0.0, 0
     with TableWriter(out) as table:
         check_out(out, dataset)
         check_observe(observe)
         inputs = open_inputs(dataset, model, effects)
         count = len(inputs.dataset)
-        predictions = predict_tracks(inputs.estimator(method.value), inputs.dataset, count, observe, jobs=jobs)
+        predictions = predict_tracks(inputs.estimator(method), inputs.dataset, count, observe, jobs=jobs)
         for result in progress(predictions, count, "tracks predicted"):
             table.write(_columns(result))
             statuses[result.status.value] += 1
+            doubts += [f"track {result.name!r}: {note}" for note in result.estimate.notes]
             rows += len(result.times)
             ended += len(result.times) == 0
             squares += float(((result.positions - result.measured) ** 2).sum())
-    print(f"{out}: {rows} positions of {count} tracks, from the first {observe:g} s of each by {method.value}")
+    print(f"{out}: {rows} positions of {count} tracks, from the first {observe:g} s of each by {method}")
     for line in status_lines(statuses):
         print(line)
+    print_doubts(doubts)
     if rows:
         print(f"  RMSE against what was measured there: {1e3 * (squares / rows) ** 0.5:.1f} mm over all stamps")
     if ended:

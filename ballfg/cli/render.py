@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ballfg.cli.inputs import OwnEffects, know_effects
+from ballfg.cli.inputs import OwnEffects, Seed, know_effects
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ _cameras, _picture, _balls, _files = (
 
 def render(
     out: Annotated[Path, _files(help="Folder of the new scene.")],
-    seed: Annotated[int, typer.Option(help="Seed of all random numbers; fixes every byte written.")] = 0,
+    seed: Seed = 0,
     shots: Annotated[int, _balls(help="Number of balls, launched one after the other.")] = 6,
     interval: Annotated[float, _balls(help="Time from launch to launch, s; below 1.3 s two balls fly at once.")] = 2.0,
     settings: Annotated[str, _balls(help="Launcher levels, as topspin=-3,sidespin=-5..5,speed=9.")] = "",

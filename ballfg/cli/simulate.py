@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import OwnEffects, know_effects
+from ballfg.cli.inputs import OwnEffects, Seed, know_effects
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
@@ -22,7 +22,7 @@ _noise, _ball_option, _files = (
 def simulate(
     out: Annotated[Path, _files(help="Folder of the new dataset.")],
     tracks: Annotated[int, typer.Option(help="Number of tracks.")] = 717,
-    seed: Annotated[int, typer.Option(help="Seed of all random numbers; fixes every byte written.")] = 0,
+    seed: Seed = 0,
     rate: Annotated[float, typer.Option(help="Frames per second, Hz.")] = 100.0,
     noise: Annotated[float, _noise(help="Standard deviation of each measured coordinate, m.")] = 0.003,
     dropout: Annotated[float, _noise(help="Probability of a dropped frame.")] = 0.0,

@@ -19,7 +19,9 @@ from .observations.sightings import CameraSightings as CameraSightings
 from .observations.sightings import in_order as in_order
 from .observations.sightings import sighted_track as sighted_track
 from .online.online import Online as Online
+from .reading import has_positions as has_positions
 from .reading import read as read
+from .reading import with_readings as with_readings
 from .registry import ESTIMATORS as ESTIMATORS
 from .registry import make_estimator as make_estimator
 from .registry import register_estimator as register_estimator

@@ -145,6 +145,7 @@ def check_scale(
     """
     steps = np.diff(times)
     step = float(np.median(steps))
+    misses_rate = rate is not None and not 1 / MAX_RATE_RATIO <= step * rate <= MAX_RATE_RATIO
     low, high = positions.min(axis=0), positions.max(axis=0)
     farthest = float(max(high.max(), -low.min()))
     extent = float(np.linalg.norm(high - low))
@@ -158,7 +159,7 @@ def check_scale(
             f"{label}: x, y, z must be in m and within {MAX_COORDINATE:g} m of the origin; got {farthest:.4g}. "
             "The unit is probably mm (divide by 1000), or the origin is far away (move it to the table)."
         )
-    if step > MAX_STEP or step < MIN_STEP or _misses_rate(step, rate):
+    if step > MAX_STEP or step < MIN_STEP or misses_rate:
         expected = f"{MIN_STEP:g} to {MAX_STEP:g} s apart" + (f", near 1/{rate:g} s (rate)" if rate else "")
         raise ValueError(
             f"{label}: t must be in s, its stamps {expected}; got a median step of {step:.4g}. "
@@ -201,10 +202,6 @@ def _one_per_stamp(group: RowGroup, where: Where, findings: Findings) -> FloatAr
         findings.merged.append(f"{group.name!r} at t={same[0, 0]}")
         findings.merged_distance = max(findings.merged_distance, float(distances[farthest]))
     return kept
-
-
-def _misses_rate(step: float, rate: float | None) -> bool:
-    return rate is not None and not 1 / MAX_RATE_RATIO <= step * rate <= MAX_RATE_RATIO
 
 
 def _time_remedy(step: float, rate: float | None) -> str:

@@ -95,6 +95,8 @@ class Dataset:
     def track(self, name: str) -> Track:
         """One track by its name; reads the file up to it.
 
+        Args: name: of the trajectory.
+        Returns: the track.
         Raises: ValueError: if there is no track of that name.
         """
         if name in self._index.names:

@@ -8,9 +8,9 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from ballfg.vision.arrays import Array, Flags
 
 DISTORTIONS: Final = (0, 4, 5, 8, 12, 14)
 """Lengths of distortion vectors in OpenCV: none; k1 k2 p1 p2; k3; k4 k5 k6; thin prism s1-s4; tilt tau_x tau_y."""
@@ -127,7 +127,11 @@ class Camera:
         return float(r[back[0]]) if len(back) else np.inf
 
     def project(self, points: ArrayLike) -> Array:
-        """(..., 2) pixels of points (..., 3) m; NaN for those that are behind the camera or beyond its lens."""
+        """Where points are seen.
+
+        Args: points: (..., 3) m, world.
+        Returns: (..., 2) px; NaN for points behind the camera or beyond its lens.
+        """
         points = np.asarray(points, dtype=np.float64)
         flat = np.ascontiguousarray(points.reshape(-1, 3))
         if len(flat) == 0:
@@ -139,11 +143,19 @@ class Camera:
         return pixels.reshape(*points.shape[:-1], 2)
 
     def depth(self, points: ArrayLike) -> Array:
-        """(...) m, distance of points (..., 3) along the viewing direction; negative behind the camera."""
+        """Distance along the viewing direction.
+
+        Args: points: (..., 3) m, world.
+        Returns: (...) m; negative behind the camera.
+        """
         return np.asarray(points @ self.rotation[2] + self.tvec[2])
 
     def normalized(self, pixels: ArrayLike) -> Array:
-        """(..., 2) x/z and y/z in the camera's frame that are seen at pixels (..., 2): distortion undone."""
+        """Directions in the camera's frame, with the distortion undone.
+
+        Args: pixels: (..., 2) px.
+        Returns: (..., 2) x/z and y/z, dimensionless, of what is seen there.
+        """
         pixels = np.asarray(pixels, dtype=np.float64)
         flat = np.ascontiguousarray(pixels.reshape(-1, 1, 2))
         if len(flat) == 0:
@@ -152,12 +164,20 @@ class Camera:
         return np.asarray(plane, dtype=np.float64).reshape(pixels.shape)
 
     def rays(self, pixels: ArrayLike) -> Array:
-        """(..., 3) unit vectors, in the world, from the camera's centre towards what is seen at pixels (..., 2)."""
+        """Rays from the camera's centre towards what is seen.
+
+        Args: pixels: (..., 2) px.
+        Returns: (..., 3) unit vectors, dimensionless, in the world.
+        """
         plane = self.normalized(pixels)
         directions = np.concatenate((plane, np.ones((*plane.shape[:-1], 1))), axis=-1) @ self.rotation
         return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
-    def in_view(self, points: ArrayLike) -> NDArray[np.bool_]:
-        """(...) whether points (..., 3) m lie in front of the camera and within its image."""
+    def in_view(self, points: ArrayLike) -> Flags:
+        """Whether points lie in front of the camera and within its image.
+
+        Args: points: (..., 3) m, world.
+        Returns: (...) bool.
+        """
         pixels = np.nan_to_num(self.project(points), nan=-1e9)
         return np.asarray(((pixels >= -0.5) & (pixels < np.array(self.size) - 0.5)).all(axis=-1))

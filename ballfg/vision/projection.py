@@ -54,7 +54,11 @@ class CameraBank:
         return bent * self._focal[camera] + self._principal[camera]
 
     def jacobian(self, points: Tensor, camera: Tensor) -> tuple[Tensor, Tensor]:
-        """Pixels (n, 2) and their derivatives (n, 2, 3) by the points, px/m; arguments as those of `project`."""
+        """Pixels of points and their derivatives by the points.
+
+        Args: points: (n, 3) m.  camera: (n,) int64, numbers of cameras.
+        Returns: (n, 2) px; (n, 2, 3) px/m.
+        """
         points = points.detach().requires_grad_()
         with torch.enable_grad():
             pixels = self.project(points, camera)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.observations.registry import OBSERVATIONS
-from ballfg.tracks import TableWriter, Track, csv_errors
+from ballfg.tracks import TableWriter, Track, csv_files
 from ballfg.tracks.rows import KEY
 
 Array = NDArray[np.float64]
@@ -79,7 +79,7 @@ def write_readings(folder: str | PathLike[str], tracks: Iterable[Track]) -> list
 
 def _read(path: Path, sort: type[Observation], known: set[str], notes: list[str]) -> dict[str, Array]:
     """Rows of each trajectory of one table."""
-    header = csv_errors.read_header(path)
+    header = csv_files.read_header(path)
     wanted = ("t", *sort.columns, "sigma")
     for name in (KEY, *wanted):
         if header.count(name) != 1:
@@ -90,7 +90,7 @@ def _read(path: Path, sort: type[Observation], known: set[str], notes: list[str]
     notes += [f"{path.name}: column {name!r} ignored" for name in header if name not in (KEY, *wanted)]
     places, key = [header.index(name) for name in wanted], header.index(KEY)
     rows: defaultdict[str, list[list[float]]] = defaultdict(list)
-    for line, cells in csv_errors.records(path):
+    for line, cells in csv_files.records(path):
         if len(cells) != len(header):
             raise ValueError(
                 f"{path}, line {line}: must have {len(header)} cells; got {len(cells)}. Complete the line."
@@ -101,7 +101,7 @@ def _read(path: Path, sort: type[Observation], known: set[str], notes: list[str]
                 "Names are compared as text, zeros included."
             )
         for place in places:
-            if not csv_errors.is_number(cells[place]) or (header[place] == "sigma" and not float(cells[place]) > 0.0):
+            if not csv_files.is_number(cells[place]) or (header[place] == "sigma" and not float(cells[place]) > 0.0):
                 rule = "a positive number" if header[place] == "sigma" else "a number"
                 raise ValueError(
                     f"{path}, line {line}, column {header[place]!r}: must be {rule}; got {cells[place]!r}. "

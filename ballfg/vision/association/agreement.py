@@ -1,41 +1,39 @@
-"""Do the cameras agree? If not: is there one that, had it been nudged since its calibration, would explain everything?
+"""Whether the cameras agree; if not, the camera that has moved since its calibration.
 
 Each camera in turn is turned and moved (six numbers) together with all points until the reprojection error is least,
-the other cameras held. A nudged camera then explains the disagreement, and no other one does. Three cameras are needed:
-of two that disagree either may be wrong.
+while the other cameras are fixed. The camera that moved then explains the disagreement, and no other one does. Three
+cameras are needed: of two that disagree either may be wrong.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from ballfg.vision.arrays import Array
 from ballfg.vision.association.paths import path
 from ballfg.vision.association.seen_ball import SeenBall
 from ballfg.vision.association.triangulate import triangulate
 from ballfg.vision.camera import Camera
-
-Array = NDArray[np.float64]
 
 LEAST_MISFIT: Final = 3.0
 """Squared error, relative to that of noise, up to which cameras agree: half a pixel where centres are good to 0.3."""
 LEAST_EXPLAINED: Final = 0.8
 """Share of what is beyond noise that a culprit must explain."""
 CLEARLY: Final = 4.0
-"""How many times as much every other camera must leave unexplained: correcting the wrong one of three cameras may halve
-the disagreement or do better, but never ends it."""
+"""Least ratio of the error that another camera leaves unexplained: correcting the wrong one of three cameras may halve
+the disagreement, but never ends it."""
 CLEARLY_WORSE: Final = 1.5
-"""And how many times the squared error must be left, noise included."""
+"""Least ratio of the squared errors, noise included."""
 LEAST_POINTS: Final = 20
-"""Seen by three cameras or more, to say anything: six numbers are fitted to them."""
+"""Fewest points, each seen by three cameras or more: six numbers are fitted to them."""
 MOST_POINTS: Final = 600
-"""That are used, evenly spread over those there are: more do not change the answer."""
+"""Most points that are used, evenly spread: more do not change the answer."""
 _LOOSE: Final = 20.0
 """px, noise with which points are made of views that may be wrong."""
 _UNSEEN: Final = 1e4
@@ -52,7 +50,7 @@ _MOVED: Final = 0.3
 
 @dataclass(frozen=True)
 class CameraAgreement:
-    """What the other cameras say about one."""
+    """One camera compared with the others."""
 
     residual: float
     """px, median distance of its sightings from the points of the others; NaN if fewer than two others saw them."""
@@ -102,7 +100,7 @@ class _Scene:
 
 
 def check_agreement(balls: Sequence[SeenBall], cameras: Sequence[Camera]) -> Agreement:
-    """Says whether the cameras agree and, if not, which one has moved.
+    """Whether the cameras agree and, if not, which one has moved.
 
     Args: balls: as `associate` gives them, for the same cameras.
     Source: docs/associate.md.
@@ -151,9 +149,8 @@ def _views(balls: Sequence[SeenBall], cameras: list[Camera]) -> tuple[Array, Arr
 def _scene(cameras: list[Camera], pixels: Array, covariances: Array) -> _Scene:
     seen = np.asarray(np.isfinite(pixels).all(axis=-1))
     rows = np.flatnonzero(seen.sum(axis=1) >= 3)
-    rows = (
-        rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_POINTS)).astype(int))] if len(rows) else rows
-    )
+    if len(rows):
+        rows = rows[np.unique(np.linspace(0, len(rows) - 1, min(len(rows), MOST_POINTS)).astype(int))]
     loose = np.broadcast_to(_LOOSE**2 * np.eye(2), covariances[rows].shape)
     points = triangulate(cameras, pixels[rows], loose).points if len(cameras) > 1 else np.zeros((0, 3))
     rows, points = rows[np.isfinite(points).all(axis=1)], points[np.isfinite(points).all(axis=1)]
@@ -198,7 +195,8 @@ def _refined(scene: _Scene, cameras: list[Camera], points: Array, nudged: int | 
                 _trust(scene, errors), weight, slopes[nudged], errors[:, nudged], mixed, removed, gradient, pose - start
             )
             points = points - removed @ change
-            cameras[nudged] = _posed(cameras[nudged], pose + change)
+            pose = pose + change
+            cameras[nudged] = replace(cameras[nudged], rvec=pose[:3], tvec=pose[3:])
     return points, cameras
 
 
@@ -241,10 +239,6 @@ def _slopes(camera: Camera, points: Array) -> Array:
     """(n, 2, 6) derivatives of the projection by rvec and tvec."""
     _, jacobian = cv2.projectPoints(points, camera.rvec, camera.tvec, camera.matrix, camera.distortion)
     return np.asarray(jacobian[:, :6], dtype=np.float64).reshape(-1, 2, 6)
-
-
-def _posed(camera: Camera, pose: Array) -> Camera:
-    return Camera(camera.name, camera.size, camera.matrix, camera.distortion, pose[:3], pose[3:], camera.time_offset)
 
 
 def _against_others(scene: _Scene, cameras: list[Camera], k: int) -> float:

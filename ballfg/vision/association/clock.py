@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ballfg.vision.arrays import Array
 
 
 def nearest(stamps: Array, times: Array) -> NDArray[np.intp]:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.vision.arrays import Array
 from ballfg.vision.camera import Camera
-
-Array = NDArray[np.float64]
 
 NEAREST = 0.1
 """m, least distance from either camera at which two rays may meet."""

@@ -7,15 +7,12 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.vision.arrays import Array, Rows
 from ballfg.vision.association.paths import Path, path
 from ballfg.vision.association.triangulate import triangulate
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
-
-Array = NDArray[np.float64]
-Rows = NDArray[np.int64]
 
 SAME_SHUTTER: Final = 2e-4
 """s, stamps of different cameras that are closer belong to one shutter: at 15 m/s the ball moves 3 mm."""
@@ -53,7 +50,7 @@ class Gathered:
     """Its points in space over true time, with the covariances that noise gives them."""
     covariances: Array
     """(n, 3, 3) m^2, the calibration's error included."""
-    views: NDArray[np.int64]
+    views: Rows
     """(n,) cameras that made each point."""
 
 

@@ -13,13 +13,11 @@ from itertools import combinations
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.vision.arrays import Array, Rows
 from ballfg.vision.association.epipolar import epipolar_miss
 from ballfg.vision.association.paths import Path
 from ballfg.vision.camera import Camera
-
-Array = NDArray[np.float64]
 
 WORST_OFFSET: Final = 5.0
 """px, standard deviation of a calibration's error, as long as the recording has not said otherwise."""
@@ -50,7 +48,7 @@ class Piece:
     camera: int
     """Number of the camera."""
 
-    rows: NDArray[np.int64]
+    rows: Rows
     """(k,) its candidates."""
 
     path: Path

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-Array = NDArray[np.float64]
+from ballfg.vision.arrays import Array, Flags, Rows
+
 Index = NDArray[np.intp]
 
 MAX_GAP: Final = 0.06
@@ -48,7 +49,7 @@ class Path:
     covariances: Array
     """(n, d, d)"""
 
-    parts: NDArray[np.int64]
+    parts: Rows
     """(n,) number of the smooth part that a sample belongs to, from 0, rising by at most one."""
 
     def at(self, times: Array) -> tuple[Array, Array]:
@@ -74,7 +75,7 @@ class Path:
         side = np.full(len(times), len(self.times) - 1 if last else 0)
         return self._fitted(times, side, _ASIDE)
 
-    def _side(self, times: Array, right: Index, kinked: NDArray[np.bool_]) -> Index:
+    def _side(self, times: Array, right: Index, kinked: Flags) -> Index:
         """The sample, before or after a kink, on whose side of the kink each time lies; (k,)."""
         side = right.copy()
         which = np.flatnonzero(kinked)
@@ -138,7 +139,8 @@ class Path:
 def path(times: Array, values: Array, covariances: Array) -> Path:
     """A path cut at its kinks and long gaps. Shapes as in `Path`."""
     cut = np.diff(times) > MAX_GAP
-    for start, stop in _runs(cut, len(times)):
+    edges = [0, *(np.flatnonzero(cut) + 1).tolist(), len(times)]
+    for start, stop in pairwise(edges):
         cut[start : stop - 1] |= _kinks(times[start:stop], values[start:stop], covariances[start:stop])
     return Path(times, values, covariances, np.concatenate(([0], np.cumsum(cut))).astype(np.int64)[: len(times)])
 
@@ -149,12 +151,7 @@ def _least_squares(design: Array) -> Array:
     return np.asarray(np.linalg.solve(transposed @ design, transposed))
 
 
-def _runs(cut: NDArray[np.bool_], count: int) -> list[tuple[int, int]]:
-    edges = [0, *(np.flatnonzero(cut) + 1).tolist(), count]
-    return list(pairwise(edges))
-
-
-def _kinks(times: Array, values: Array, covariances: Array) -> NDArray[np.bool_]:
+def _kinks(times: Array, values: Array, covariances: Array) -> Flags:
     """(n - 1) whether the path bends sharply in an interval: one cubic does not fit three samples on either side.
 
     A kink spoils the fits of the neighbouring intervals too; the worst of five marks it. Where the path as a whole is

@@ -4,12 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ballfg.tracks.sightings import Sightings
-
-Array = NDArray[np.float64]
+from ballfg.vision.arrays import Array, Rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +24,7 @@ class SeenBall:
     sightings: Sightings
     """What the points come from, each at its own camera's stamp."""
 
-    views: NDArray[np.int64]
+    views: Rows
     """(n,) how many cameras made each point."""
 
     def __len__(self) -> int:

@@ -13,12 +13,10 @@ from itertools import product
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.vision.arrays import Rows
 from ballfg.vision.association.paths import RATE_OF_CHANGE
 from ballfg.vision.detection.detections import Detections
-
-Rows = NDArray[np.int64]
 
 MAX_MISSED: Final = 3
 """Frames in a row that a piece may miss."""

@@ -11,10 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
+from ballfg.vision.arrays import Array, Flags
 from ballfg.vision.camera import Camera
-
-Array = NDArray[np.float64]
-Flags = NDArray[np.bool_]
 
 MISSED: Final = 1e-6
 """Share of right candidates that the tests may refuse: a wrong one that close to the truth does no harm."""
@@ -98,7 +96,7 @@ def triangulate(cameras: Sequence[Camera], pixels: ArrayLike, covariances: Array
     views = _views(cameras, pixels, covariances)
     points, used = _consensus(views)
     points, spread = _refined(views, points, used)
-    found = np.asarray(np.isfinite(points).all(axis=1) & (_in_front(views, points) | ~used).all(axis=1))
+    found = np.asarray(np.isfinite(points).all(axis=1) & ((views.project(points)[2] > 0.0) | ~used).all(axis=1))
     found[found] &= np.linalg.eigvalsh(spread[found])[:, -1] <= MAX_SIGMA**2
     points[~found], spread[~found], used[~found] = np.nan, np.nan, False
     residuals = np.full(pixels.shape, np.nan)
@@ -228,7 +226,3 @@ def _refined(views: _Views, points: Array, used: Flags) -> tuple[Array, Array]:
         spread[solvable] = np.linalg.inv(information[solvable])
         points[solvable] -= np.einsum("nij,nj->ni", spread[solvable], gradient[solvable])
     return points, spread
-
-
-def _in_front(views: _Views, points: Array) -> Flags:
-    return views.project(points)[2] > 0.0

@@ -13,10 +13,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
+from ballfg.vision.arrays import Array, Image
+from ballfg.vision.detection.video import IMAGE_ENDINGS
 
-IMAGE_ENDINGS: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm")
 MIN_CORNERS: Final = 8
 """Corners that a view must show: a homography needs 4, and twice as many tell when one of them is wrong."""
 DICTIONARIES: Final = tuple(sorted(n.removeprefix("DICT_") for n in dir(cv2.aruco) if n.startswith("DICT_")))

@@ -7,12 +7,10 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.vision.arrays import Array
 from ballfg.vision.calibration.table_points import Marked
 from ballfg.vision.camera import Camera
-
-Array = NDArray[np.float64]
 
 MIN_POINTS: Final = 4
 """Three points have up to four poses."""

@@ -9,13 +9,11 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.vision.arrays import Array
 from ballfg.vision.calibration.boards import View
 from ballfg.vision.calibration.lens_covariance import covariance_of_lens, pixel_grid, sigma_of_rays
 from ballfg.vision.camera import DISTORTIONS, Camera
-
-Array = NDArray[np.float64]
 
 MIN_VIEWS: Final = 8
 """A view tells two numbers about the lens (Zhang 2000, section 2.3); eight are enough to tell errors from the lens."""

@@ -7,11 +7,10 @@ from typing import Final, TypeAlias
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.vision.arrays import Array
 from ballfg.vision.camera import Camera
 
-Array = NDArray[np.float64]
 PosedBoard: TypeAlias = tuple[Array, Array, Array, Array]
 """Points (n, 3) m of a board, its rvec (3,) and tvec (3,), and the residuals (n, 2) px of its corners."""
 

@@ -9,16 +9,13 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
 
-from ballfg.vision.calibration.boards import Image
+from ballfg.vision.arrays import Array, Image
 from ballfg.vision.calibration.extrinsics import Extrinsics
-from ballfg.vision.calibration.intrinsics import CELLS, Intrinsics
+from ballfg.vision.calibration.intrinsics import CELLS
 from ballfg.vision.calibration.report import Calibration
 from ballfg.vision.calibration.table_points import TABLE_HEIGHT, table_outline
 from ballfg.vision.camera import Camera
-
-Array = NDArray[np.float64]
 
 BLUE, VERMILION, GREY = "#0072b2", "#d55e00", "#8c8c8c"
 OUTLINED: Final = withStroke(linewidth=1.5, foreground="white")
@@ -92,11 +89,8 @@ def _views(axes: Axes, found: Calibration) -> None:
         axes.set_yscale("log")
     axes.set_xticks(places, [one.view.name for one in fitted], rotation=90, size=6)
     axes.set_ylabel("RMS, px")
-    axes.set_title(f"{found.camera.name}: error of each view{_orange(lens)}", size=9)
-
-
-def _orange(lens: Intrinsics) -> str:
-    return "; orange: left out" if lens.left_out else ""
+    orange = "; orange: left out" if lens.left_out else ""
+    axes.set_title(f"{found.camera.name}: error of each view{orange}", size=9)
 
 
 def _table(axes: Axes, found: Calibration, image: Image | None, table_height: float) -> None:

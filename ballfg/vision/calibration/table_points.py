@@ -10,13 +10,11 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ballfg.checks import check_keys, did_you_mean, is_number
 from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.tracks.info import MAX_HEIGHT
-
-Array = NDArray[np.float64]
+from ballfg.vision.arrays import Array
 
 TABLE_LENGTH: Final = 2.74
 TABLE_WIDTH: Final = 1.525

@@ -9,9 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
-Image = NDArray[np.uint8]
+from ballfg.vision.arrays import Array, Array32, Image
 
 SHRINK: Final = 4
 """Pixels of the image per pixel of the small picture in which candidates are looked for."""
@@ -111,7 +109,9 @@ class Background:
         covered = cv2.dilate(found, np.ones((3, 3), dtype=np.uint8))
         top, bottom = rows.start * found.shape[0] // height, -(-rows.stop * found.shape[0] // height)
         here = cv2.resize(covered[top:bottom], (width, rows.stop - rows.start), interpolation=cv2.INTER_NEAREST)
-        _absorb(self.full[rows], _lit(image[rows], 1.0 / self.gains, cv2.CV_32F), np.asarray(here, dtype=np.uint8))
+        level, behind = _lit(image[rows], 1.0 / self.gains, cv2.CV_32F), self.full[rows]
+        cv2.accumulateWeighted(level, behind, WEIGHT, cv2.bitwise_not(here))
+        cv2.accumulateWeighted(level, behind, COVERED_WEIGHT, here)
         self.small[top:bottom] = shrunk(self.full[top * SHRINK : bottom * SHRINK])[: bottom - top]
 
 
@@ -127,11 +127,6 @@ def shrunk(image: Image | Array32) -> NDArray:
 def _lit(image: NDArray, gains: Array, depth: int) -> NDArray:
     """An image (h, w, 3) in a light that is brighter by gains (3,), in OpenCV's depth."""
     return cv2.multiply(image, np.append(gains, 0.0), dtype=depth)
-
-
-def _absorb(background: Array32, level: NDArray, covered: Image) -> None:
-    cv2.accumulateWeighted(level, background, WEIGHT, cv2.bitwise_not(covered))
-    cv2.accumulateWeighted(level, background, COVERED_WEIGHT, covered)
 
 
 def _grid(small: NDArray) -> Array32:

@@ -31,7 +31,12 @@ SEARCHED: Final = "frames searched"
 
 
 def learn_detector(video: Video, settings: DetectorSettings | None = None) -> BallDetector:
-    """The detector of a video's camera: its background learned from frames spread over the recording."""
+    """The detector of a video's camera: its background learned from frames spread over the recording.
+
+    Args: video: of the camera.  settings: what is known about the ball; the default ones if None.
+    Returns: the detector.
+    Raises: ValueError: fewer than three frames.
+    """
     images = video.sample(SAMPLE)
     if len(images) < FEWEST:
         raise ValueError(

@@ -6,12 +6,11 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ballfg.checks import check_array
 from ballfg.tracks.sightings import are_covariances
-
-Array = NDArray[np.float64]
+from ballfg.vision.arrays import Array, Flags, Image, Rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +61,7 @@ class Candidates:
         )
 
 
-Detector = Callable[[NDArray[np.uint8]], Candidates]
+Detector = Callable[[Image], Candidates]
 """Any callable from an image (h, w, 3) in BGR to its candidates. It may remember earlier frames: it is called once a
 frame, in their order, and serves one camera only."""
 
@@ -81,7 +80,7 @@ class Detections:
     frames: Array
     """(f,) s, stamps of all frames, strictly increasing, as the camera writes them."""
 
-    frame: NDArray[np.int64]
+    frame: Rows
     """(n,) number of the frame in which each candidate was seen, not decreasing."""
 
     pixels: Array
@@ -123,12 +122,20 @@ class Detections:
         return np.asarray(self.frames[self.frame])
 
     def in_frame(self, number: int) -> Candidates:
-        """The candidates of one frame."""
+        """The candidates of one frame.
+
+        Args: number: of the frame.
+        Returns: its candidates, k >= 0.
+        """
         rows = slice(*np.searchsorted(self.frame, (number, number + 1)))
         return Candidates(self.pixels[rows], self.covariances[rows], self.scores[rows], self.streaks[rows])
 
-    def select(self, keep: NDArray[np.bool_]) -> Detections:
-        """Those candidates of which keep (n,) is true; all frames stay."""
+    def select(self, keep: Flags) -> Detections:
+        """Some of the candidates.
+
+        Args: keep: (n,) bool, whether a candidate stays.
+        Returns: the detections with these candidates and all frames.
+        """
         return Detections(
             self.camera,
             self.frames,
@@ -140,12 +147,21 @@ class Detections:
         )
 
     def best_scores(self, count: int = 3) -> Array:
-        """The highest scores, best first; at most `count`, fewer where there are fewer candidates."""
+        """The highest scores.
+
+        Args: count: of scores.
+        Returns: (k,) dimensionless, best first, with k at most `count`.
+        """
         return np.sort(self.scores)[::-1][:count].copy()
 
     @classmethod
     def of_frames(cls, camera: str, seen: Iterable[tuple[float, Candidates]]) -> Detections:
-        """Joins the candidates of frames, given with the frames' stamps (s) in their order."""
+        """Joins the candidates of frames.
+
+        Args: camera: name of the camera.  seen: stamp (s) and candidates of each frame, in order.
+        Returns: the detections of the recording.
+        Raises: ValueError: stamps that do not increase.
+        """
         stamps: list[float] = []
         found = [Candidates.none()]
         for stamp, candidates in seen:
@@ -194,6 +210,6 @@ def _check_fields(owner: Candidates | Detections, what: str) -> None:
     _refuse((owner.scores < 0.0) | (owner.scores > 1.0), what, "scores", "lie in [0, 1]")
 
 
-def _refuse(wrong: NDArray[np.bool_], what: str, field: str, rule: str) -> None:
+def _refuse(wrong: Flags, what: str, field: str, rule: str) -> None:
     if wrong.any():
         raise ValueError(f"{what}: {field} must {rule}; those of candidate {int(np.argmax(wrong))} do not.")

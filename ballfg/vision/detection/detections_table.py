@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ballfg.tracks.checks import check_step
 from ballfg.tracks.detection_columns import (
@@ -24,6 +23,7 @@ from ballfg.tracks.detection_columns import (
     read_columns,
 )
 from ballfg.tracks.rows import KEY
+from ballfg.vision.arrays import Flags
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 
@@ -90,7 +90,7 @@ def _check_all_seen(path: Path, names: Texts, cameras: Sequence[Camera]) -> None
         )
 
 
-def _of_camera(name: str, rows: NDArray[np.bool_], values: dict[str, Array]) -> Detections:
+def _of_camera(name: str, rows: Flags, values: dict[str, Array]) -> Detections:
     mine = {column: numbers[rows] for column, numbers in values.items()}
     frames, frame = np.unique(mine["t"], return_inverse=True)
     order = np.argsort(frame, kind="stable")

@@ -8,7 +8,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from ballfg.vision.detection.background import Array, Background, Image
+from ballfg.vision.arrays import Array, Image
+from ballfg.vision.detection.background import Background
 from ballfg.vision.detection.detections import Candidates
 from ballfg.vision.detection.regions import Region, find_regions
 from ballfg.vision.detection.scoring import score
@@ -73,7 +74,13 @@ class BallDetector:
 
     @classmethod
     def learn(cls, images: Sequence[Image], settings: DetectorSettings | None = None) -> BallDetector:
-        """From frames spread over the recording, see `Background`."""
+        """A detector with the background that frames of the recording show.
+
+        Args: images: at least three, (h, w, 3) uint8 each, spread over the recording; see `Background`.
+            settings: what is known about the ball; the default ones if None.
+        Returns: the detector of that camera.
+        Raises: ValueError: too few images, or of several sizes.
+        """
         return cls(Background(images), settings)
 
     def __call__(self, image: Image) -> Candidates:

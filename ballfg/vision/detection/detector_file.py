@@ -6,11 +6,9 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-from numpy.typing import NDArray
-
 from ballfg.checks import did_you_mean
 from ballfg.files.python_file import blamed, run_file
+from ballfg.vision.arrays import Image
 from ballfg.vision.detection.detections import Candidates, Detector
 from ballfg.vision.detection.video import Video
 
@@ -57,7 +55,7 @@ class _Watched:
         self.detector, self.path, self.video = detector, path, video
         self.frame = 0
 
-    def __call__(self, image: NDArray[np.uint8]) -> Candidates:
+    def __call__(self, image: Image) -> Candidates:
         """The candidates of the next frame."""
         with blamed(self.path, f"frame {self.frame} of {self.video}"):
             found = self.detector(image)

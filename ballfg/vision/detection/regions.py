@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.vision.detection.background import SHRINK, Background, Image, shrunk
+from ballfg.vision.arrays import Flags, Image
+from ballfg.vision.detection.background import SHRINK, Background, shrunk
 
 MARGIN: Final = 6
 """px of background kept around a region: the mask misses up to a small pixel of the rim, and the fit needs some."""
@@ -30,7 +31,7 @@ class Region:
 
     rows: slice
     columns: slice
-    free: NDArray[np.bool_] | None
+    free: Flags | None
     mass: float
 
     def free_of(self, values: NDArray[np.float32]) -> NDArray[np.float32]:

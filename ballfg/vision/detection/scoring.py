@@ -6,7 +6,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from ballfg.vision.detection.streak import Array, Array32, Patch, StreakFit, swept
+from ballfg.vision.arrays import Array, Array32
+from ballfg.vision.detection.streak import Patch, StreakFit, swept
 
 UNEXPLAINED: Final = 0.06
 """Share of the change that a swept disc leaves over at which the mark for shape is 1/e. Balls: 0.001 to 0.02; hands and

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.tracks import csv_files
 from ballfg.tracks.checks import check_step
-
-Array = NDArray[np.float64]
+from ballfg.vision.arrays import Array
 
 
 def read_stamps(path: Path) -> Array:
@@ -21,37 +19,26 @@ def read_stamps(path: Path) -> Array:
     """
     if not path.is_file():
         raise FileNotFoundError(f"file of stamps {path} does not exist. Check the path.")
+    names = [name.strip() for name in csv_files.read_header(path)]
+    if "t" not in names:
+        raise ValueError(f"{path} must have a column t (s); got {', '.join(names)}. Name it in line 1.")
     stamps: list[float] = []
-    with path.open(encoding="utf-8-sig", newline="") as file:
-        rows = csv.DictReader(file, skipinitialspace=True)
-        names = rows.fieldnames or []
-        if "t" not in names:
+    for line, cells in csv_files.records(path):
+        where = f"{path}, line {line}"
+        row = dict(zip(names, (cell.strip() for cell in cells), strict=False))
+        if "frame" in names and row.get("frame") != str(len(stamps)):
             raise ValueError(
-                f"{path} must have a column t (s); got {', '.join(names) or 'no header'}. Name it in line 1."
+                f"{where}: frame must count from 0; got {row.get('frame')!r} for {len(stamps)}. Sort the rows."
             )
-        for row in rows:
-            where = f"{path}, line {rows.line_num}"
-            if "frame" in names and row["frame"] != str(len(stamps)):
-                raise ValueError(
-                    f"{where}: frame must count from 0; got {row['frame']!r} for {len(stamps)}. Sort the rows."
-                )
-            stamps.append(_number(where, row["t"]))
-            if len(stamps) > 1 and not stamps[-1] > stamps[-2]:
-                raise ValueError(
-                    f"{where}: t must increase; frame {len(stamps) - 1} has {stamps[-1]!r} s after {stamps[-2]!r} s. "
-                    "Sort the rows or correct the stamps."
-                )
+        if not csv_files.is_number(row.get("t", "")):
+            raise ValueError(f"{where}: t must be a finite number of seconds; got {row.get('t')!r}. Correct it.")
+        stamps.append(float(row["t"]))
+        if len(stamps) > 1 and not stamps[-1] > stamps[-2]:
+            raise ValueError(
+                f"{where}: t must increase; frame {len(stamps) - 1} has {stamps[-1]!r} s after {stamps[-2]!r} s. "
+                "Sort the rows or correct the stamps."
+            )
     if not stamps:
         raise ValueError(f"{path} must have one row a frame; got none.")
     check_step(str(path), np.array(stamps))
     return np.array(stamps)
-
-
-def _number(where: str, text: str | None) -> float:
-    try:
-        value = float(text or "")
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise ValueError(f"{where}: t must be a finite number of seconds; got {text!r}. Correct it.")
-    return value

@@ -15,8 +15,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Array32 = NDArray[np.float32]
+from ballfg.vision.arrays import Array, Array32
 
 LONGEST_HALF: Final = 15.0
 """px, prior sigma of half a streak. It only matters below a pixel, where the length hardly shows in the image."""

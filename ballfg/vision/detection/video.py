@@ -11,13 +11,11 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from ballfg.vision.detection.stamps import Array, read_stamps
+from ballfg.vision.arrays import Array, Image
+from ballfg.vision.detection.stamps import read_stamps
 
-Image = NDArray[np.uint8]
-
-IMAGES: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
+IMAGE_ENDINGS: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """Endings of what counts as an image in a folder; other files are left alone."""
 SHORT: Final = (3, 0.02)
 """Frames, and share of them, that may be missing at the end of what the container announces: it often estimates."""
@@ -77,7 +75,11 @@ class Video(ABC):
 
     @abstractmethod
     def sample(self, count: int) -> list[Image]:
-        """At most `count` images spread over the recording."""
+        """Images spread over the recording.
+
+        Args: count: the most images.
+        Returns: images (h, w, 3) uint8, at most `count`.
+        """
 
     @abstractmethod
     def _decoded(self) -> Iterator[tuple[float, Image]]:
@@ -124,9 +126,9 @@ class ImageFolder(Video):
     """Frames of a folder of images, in the natural order of their names (2 before 10). See `open_video`."""
 
     def __init__(self, path: Path, stamps: Array) -> None:
-        self._files = sorted((file for file in path.iterdir() if file.suffix.lower() in IMAGES), key=_natural)
+        self._files = sorted((file for file in path.iterdir() if file.suffix.lower() in IMAGE_ENDINGS), key=_natural)
         if not self._files:
-            raise ValueError(f"folder {path} must hold images ({', '.join(IMAGES)}); got none. Check the path.")
+            raise ValueError(f"folder {path} must hold images ({', '.join(IMAGE_ENDINGS)}); got none. Check the path.")
         image = _read(self._files[0])
         super().__init__(path, (image.shape[1], image.shape[0]), len(self._files), stamps)
         self._check_count(len(self._files))

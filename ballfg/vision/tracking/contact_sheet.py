@@ -9,13 +9,12 @@ from typing import Final
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from numpy.typing import NDArray
 
+from ballfg.vision.arrays import Array
 from ballfg.vision.tracking.palette import hexadecimal
 from ballfg.vision.tracking.pipeline import Tracking
 from ballfg.vision.tracking.strobe import EXPOSURES, HEIGHT, WIDTH, ZOOM, AllCandidates, Picture, Strobe
 
-Array = NDArray[np.float64]
 Extent = tuple[float, float, float, float]
 
 MOST_TRACKS: Final = 12

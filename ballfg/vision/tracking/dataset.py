@@ -18,11 +18,11 @@ from ballfg.tracks.detection_columns import SCORE, seen_columns
 from ballfg.tracks.detections_file import DETECTIONS_FILE
 from ballfg.tracks.info import INFO_FILE, write_info
 from ballfg.tracks.rows import KEY, SIGMAS, VALUES
+from ballfg.vision.arrays import Image
 from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
 from ballfg.vision.tracking.contact_sheet import ContactSheet, Extent
 from ballfg.vision.tracking.overlay import write_overlay
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.playback import Image
 from ballfg.vision.tracking.strobe import tapped
 
 Streams = Sequence[Callable[[], Iterator[tuple[float, Image]]]]

@@ -11,9 +11,10 @@ import cv2
 import numpy as np
 
 from ballfg.progress import Watch, unwatched
+from ballfg.vision.arrays import Image
 from ballfg.vision.tracking.palette import bgr
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.playback import Image, Schedule, play, schedule
+from ballfg.vision.tracking.playback import Schedule, play, schedule
 from ballfg.vision.tracking.view_painter import ViewPainter, write
 
 """Hands items through and shows how far it is: (items, how many, what they are)."""

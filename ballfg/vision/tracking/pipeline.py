@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Track
+from ballfg.vision.arrays import Array, Rows
 from ballfg.vision.association.agreement import Agreement, check_agreement
 from ballfg.vision.association.associate import AssociationSettings, associate
 from ballfg.vision.association.seen_ball import SeenBall
@@ -20,8 +20,6 @@ from ballfg.vision.detection.detect import detect_all, learn_detector
 from ballfg.vision.detection.detections import Detections, Detector
 from ballfg.vision.detection.video import Video, open_video
 from ballfg.vision.tracking.recordings import check_sizes
-
-Array = NDArray[np.float64]
 
 FEWEST: Final = 2
 """Cameras: one alone does not see how far away a ball is."""
@@ -33,7 +31,7 @@ DIGITS: Final = 3
 class Seen:
     """One ball in one camera."""
 
-    frames: NDArray[np.int64]
+    frames: Rows
     """(m,) numbers of the camera's frames, increasing."""
 
     pixels: Array
@@ -79,13 +77,21 @@ class Tracking:
         return float(f"{1.0 / step:.6g}")
 
     def seen(self, ball: SeenBall, camera: int) -> Seen:
-        """The frames in which a camera, by its number, saw a ball, and where."""
+        """The frames in which a camera saw a ball, and where.
+
+        Args: ball: one of `balls`.  camera: number of the camera.
+        Returns: numbers of the frames, and pixels.
+        """
         rows = ball.sightings.camera == camera
         frames = np.searchsorted(self.detections[camera].frames, ball.sightings.times[rows])
         return Seen(frames.astype(np.int64), ball.sightings.pixels[rows])
 
-    def rows(self, ball: SeenBall, camera: int) -> NDArray[np.int64]:
-        """(m,) which of a camera's candidates a ball was seen by."""
+    def rows(self, ball: SeenBall, camera: int) -> Rows:
+        """The candidates of a camera that are sightings of a ball.
+
+        Args: ball: one of `balls`.  camera: number of the camera.
+        Returns: (m,) numbers of the candidates.
+        """
         detections, seen = self.detections[camera], self.seen(ball, camera)
         first, end = (np.searchsorted(detections.frame, seen.frames, side) for side in ("left", "right"))
         found = [
@@ -162,13 +168,10 @@ def check_overlap(detections: Sequence[Detections], cameras: Sequence[Camera]) -
         if len(seen.frames):
             spans[camera.name] = (seen.frames[0] - camera.time_offset, seen.frames[-1] - camera.time_offset)
     for name, (start, end) in spans.items():
-        if len(spans) > 1 and not any(start <= last and first <= end for first, last in _others(spans, name)):
+        others = [span for other, span in spans.items() if other != name]
+        if others and not any(start <= last and first <= end for first, last in others):
             when = "; ".join(f"{other!r} {first:g} to {last:g} s" for other, (first, last) in spans.items())
             raise ValueError(
                 f"videos must overlap in time; camera {name!r} overlaps with no other: {when} (true time). "
                 "Check stamps and time_offset, or that the files are of one recording."
             )
-
-
-def _others(spans: Mapping[str, tuple[float, float]], name: str) -> list[tuple[float, float]]:
-    return [span for other, span in spans.items() if other != name]

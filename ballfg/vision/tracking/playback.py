@@ -7,14 +7,11 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.vision.arrays import Array, Image, Rows
 from ballfg.vision.association.clock import nearest
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
-
-Array = NDArray[np.float64]
-Image = NDArray[np.uint8]
 
 HELD: Final = 0.1
 """s that a camera's frame stays on show where its next ones are missing: long enough to bridge dropped frames, short
@@ -28,7 +25,7 @@ class Schedule:
     times: Array
     """(k,) s, true time of each moment, increasing."""
 
-    frames: NDArray[np.int64]
+    frames: Rows
     """(k, c) number of the frame of each camera; -1 where it has none within `HELD`."""
 
 
@@ -49,7 +46,7 @@ def schedule(detections: Sequence[Detections], cameras: Sequence[Camera]) -> Sch
     return Schedule(times, np.column_stack([shown(clock, times) for clock in clocks]))
 
 
-def shown(clock: Array, times: Array) -> NDArray[np.int64]:
+def shown(clock: Array, times: Array) -> Rows:
     """(k,) index into `clock` (f,), increasing, of the stamp nearest to each of `times` (k,); -1 beyond `HELD`."""
     if len(clock) == 0:
         return np.full(len(times), -1, dtype=np.int64)

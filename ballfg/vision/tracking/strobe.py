@@ -7,14 +7,11 @@ from typing import Final, Protocol
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.vision.arrays import Array, Image
 from ballfg.vision.tracking.palette import bgr
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.playback import Image
 from ballfg.vision.tracking.view_painter import by_score, polyline, ring, uncover, write
-
-Array = NDArray[np.float64]
 
 WIDTH: Final = 480
 """px of the picture."""

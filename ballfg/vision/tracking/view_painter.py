@@ -7,13 +7,11 @@ from typing import Final
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.vision.arrays import Array, Image
 from ballfg.vision.tracking.palette import bgr
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.playback import Image
 
-Array = NDArray[np.float64]
 Colour = tuple[int, int, int]
 
 TRAIL: Final = 0.4
@@ -75,7 +73,7 @@ class ViewPainter:
         self._paint_candidates(view, frame)
         for track, pixel in used:
             uncover(view, clean, self._scaled(pixel), RING)
-            self._ring(view, pixel, RING, bgr(track), 2)
+            ring(view, self._scaled(pixel), RING, bgr(track), 2)
             write(view, self._names[track], self._scaled(pixel) + np.array(BESIDE), bgr(track))
         caption(view, f"{self._camera.name}   frame {frame}   stamp {self._detections.frames[frame]:.4f} s")
         return view
@@ -92,10 +90,7 @@ class ViewPainter:
         balls = [pixel for _, pixel in self._used.get(frame, ())]
         for pixel, score in zip(candidates.pixels, candidates.scores, strict=True):
             if not any(np.array_equal(pixel, ball) for ball in balls):
-                self._ring(view, pixel, CANDIDATE, by_score(score), 1)
-
-    def _ring(self, view: Image, pixel: Array, radius: float, colour: Colour, thickness: int) -> None:
-        ring(view, self._scaled(pixel), radius, colour, thickness)
+                ring(view, self._scaled(pixel), CANDIDATE, by_score(score))
 
     def _scaled(self, pixels: Array) -> Array:
         """Places on the drawn view of places in the image: both count from the centre of the top left pixel."""

@@ -1,0 +1,14 @@
+"""Types of arrays that cameras' code shares; shapes and units stand where they are used."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Array32 = NDArray[np.float32]
+Image = NDArray[np.uint8]
+"""(h, w, 3) blue, green, red, or (h, w) grey."""
+Flags = NDArray[np.bool_]
+Rows = NDArray[np.int64]
+"""Numbers of rows of other arrays."""
