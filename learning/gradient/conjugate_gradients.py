@@ -10,12 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import gtsam
 import numpy as np
 import torch
 from torch import Tensor
 
 from ballfg.factors.batch import Array
+from ballfg.factors.covariance import SquareRootInformation
 from ballfg.state import STATE_DIM
 
 Product = Callable[[Tensor], Tensor]
@@ -33,65 +33,17 @@ class NotAMinimum(ValueError):  # noqa: N818 - says what it is
         self.tracks = tuple(tracks)
 
 
-class GaussNewtonFactors:
-    """The factorisations R^T R of the Gauss-Newton matrices of several tracks, ready to solve all of them at once.
-
-    Args:
-        bayes_nets: GTSAM's, one a track, states in order, then coefficients.
-        lengths: number of states of each track.
-        coefficients: number p of coefficients of each.
-
-    Attributes:
-        inverse: (t, n, 9, 9) inverses of R's diagonal blocks; identities beyond a track's end.
-        following: (t, n, 9, 9) R's blocks that couple a state to the next one.
-        shared: (t, n, 9, p) those that couple it to the coefficients.
-        last: (t, p, p) inverses of the coefficients' own blocks.
-    """
-
-    def __init__(self, bayes_nets: Sequence[gtsam.GaussianBayesNet], lengths: Sequence[int], coefficients: int) -> None:
-        self.tracks, self._p = len(bayes_nets), coefficients
-        self._lengths = np.array(lengths)
-        t, n = self.tracks, max(lengths)
-        root = np.zeros((t, n, STATE_DIM, STATE_DIM))
-        root[:] = np.eye(STATE_DIM)  # shorter tracks are filled up with variables that nothing depends on
-        self.following = np.zeros((t, n, STATE_DIM, STATE_DIM))
-        self.shared = np.zeros((t, n, STATE_DIM, coefficients))
-        last = np.zeros((t, coefficients, coefficients))
-        for k, (net, length) in enumerate(zip(bayes_nets, lengths, strict=True)):
-            for i in range(length):
-                conditional = net.at(i)
-                root[k, i] = conditional.R()
-                self._read_parents(k, i, length, conditional)
-            if coefficients:
-                last[k] = net.at(length).R()
-        self.inverse, self.last = np.linalg.inv(root), np.linalg.inv(last)
-
-    def _read_parents(self, track: int, state: int, length: int, conditional: gtsam.GaussianConditional) -> None:
-        column, coupling = 0, conditional.S()
-        for key in conditional.keys()[1:]:
-            if key == length:
-                self.shared[track, state] = coupling[:, column : column + self._p]
-                column += self._p
-            else:
-                self.following[track, state] = coupling[:, column : column + STATE_DIM]
-                column += STATE_DIM
-
-    def log_determinants(self) -> Array:
-        """(t,) log det R."""
-        blocks = (
-            np.abs(np.diagonal(self.inverse, axis1=-2, axis2=-1)),
-            np.abs(np.diagonal(self.last, axis1=-2, axis2=-1)),
-        )
-        return np.asarray(-np.log(blocks[0]).sum((1, 2)) - np.log(blocks[1]).sum(1))
+class GaussNewtonFactors(SquareRootInformation):
+    """The factorisations R^T R of the Gauss-Newton matrices of several tracks, which solves all of them at once."""
 
     def solve(self, vector: Tensor) -> Tensor:
         """R^-1 R^-T times a vector that is packed as `Layout` says."""
         given = vector.detach().numpy()
-        split = self._lengths.sum() * STATE_DIM
-        inside = np.arange(self.inverse.shape[1]) < self._lengths[:, None]
+        split = self.lengths.sum() * STATE_DIM
+        inside = np.arange(self.inverse.shape[1]) < self.lengths[:, None]
         states = np.zeros((*inside.shape, STATE_DIM))
         states[inside] = given[:split].reshape(-1, STATE_DIM)
-        shared = given[split:].reshape(self.tracks, self._p).copy()
+        shared = given[split:].reshape(self.tracks, self.coefficients).copy()
         self._solve_transposed(states, shared)
         self._solve(states, shared)
         return torch.from_numpy(np.concatenate((states[inside].reshape(-1), shared.reshape(-1))))
@@ -103,13 +55,13 @@ class GaussNewtonFactors:
             carried = self.inverse[:, i].mT @ (states[:, i, :, None] - carried)
             states[:, i] = carried[..., 0]
             carried = self.following[:, i].mT @ carried
-        if self._p:
+        if self.coefficients:
             shared -= np.einsum("tnip,tni->tp", self.shared, states)
             shared[:] = (self.last.mT @ shared[..., None])[..., 0]
 
     def _solve(self, states: Array, shared: Array) -> None:
         """R x = y in place: the coefficients, then backwards along the tracks."""
-        if self._p:
+        if self.coefficients:
             shared[:] = (self.last @ shared[..., None])[..., 0]
             states -= np.einsum("tnip,tp->tni", self.shared, shared)
         later = np.zeros((self.tracks, STATE_DIM, 1))

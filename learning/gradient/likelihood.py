@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 
 from ballfg.factors.batch import Array, FactorBatch, Noise, Rows, Values
+from ballfg.factors.covariance import NeighbourCovariances
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.linear import weighted
 from ballfg.factors.search import linearize_together
 from ballfg.learning.gradient.conjugate_gradients import GaussNewtonFactors
-from ballfg.learning.gradient.posterior import Posterior, posterior_of
 
 
 def negative_log_likelihood(
@@ -36,7 +36,7 @@ def negative_log_likelihood(
         factors: their Gauss-Newton factorisations there.
         noise: relative to what the graphs were built with, which it must be equal to.
     """
-    posterior = posterior_of(factors)
+    posterior = factors.covariances()
     log_roots = factors.log_determinants()
     totals = []
     for track, rows in enumerate(linearize_together(list(zip(graphs, minima, strict=True)))):
@@ -51,7 +51,7 @@ def negative_log_likelihood(
     return torch.stack(totals)
 
 
-def _expected(kind: FactorBatch, rows: Rows, posterior: Posterior, track: int, change: Tensor) -> Tensor:
+def _expected(kind: FactorBatch, rows: Rows, posterior: NeighbourCovariances, track: int, change: Tensor) -> Tensor:
     """Expected negative log density of a kind's factors, as a function of what rewhitens them."""
     square = torch.from_numpy(_mean_square(rows, posterior, track))
     if change.dim():
@@ -60,7 +60,7 @@ def _expected(kind: FactorBatch, rows: Rows, posterior: Posterior, track: int, c
     return 0.5 * change.square() * torch.einsum("nii->", square) - len(kind) * kind.dim * change.log()
 
 
-def _mean_square(rows: Rows, posterior: Posterior, track: int) -> Array:
+def _mean_square(rows: Rows, posterior: NeighbourCovariances, track: int) -> Array:
     """(m, r, r) r r^T + J C J^T of each factor; residuals and Jacobians with the weights that C was made with."""
     weight = rows.loss.weight(np.linalg.norm(rows.residual, axis=-1))
     total = weight[:, None, None] * rows.residual[:, :, None] * rows.residual[:, None, :]

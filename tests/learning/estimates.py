@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Surfaces
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics.motion.rollout import rollout
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.segmentation import Segmentation

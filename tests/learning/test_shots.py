@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ballfg.dynamics import Surfaces, nominal_model
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics.motion.rollout import rollout
 from ballfg.estimation import Settings, Smoother
 from ballfg.estimation.segmentation import Quality
 from ballfg.estimation.smoother.problem import QUALITY_SIGMA, effective_sigmas

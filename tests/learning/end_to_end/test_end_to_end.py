@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ballfg.dynamics import Surfaces
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics.motion.rollout import rollout
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.learned import LearnedModel, build
 from ballfg.estimation import Smoother
