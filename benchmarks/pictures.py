@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -16,6 +15,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ballfg.benchmarks.estimators.measured import HORIZON, OBSERVE, Measured
 from ballfg.benchmarks.results import CURVE_MARK, Row
+from ballfg.files.whole_file import whole_file
 from ballfg.prediction import TrackPrediction
 
 matplotlib.use("Agg")
@@ -42,10 +42,9 @@ NINETY = 1.645
 
 def save(figure: Figure, path: Path) -> Path:
     """Write a PNG; the name appears once the file is whole."""
-    part = path.with_name(f".{path.name}.part")
-    figure.savefig(part, dpi=DPI, format="png")
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=DPI, format="png")
     plt.close(figure)
-    os.replace(part, path)
     return path
 
 

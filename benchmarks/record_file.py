@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
+
+from ballfg.files.whole_file import write_text
 
 R = TypeVar("R")
 
 
 def write_record(path: Path, content: Mapping[str, Any]) -> None:
     """Write the file; its name appears once it is whole. Raises: ValueError: if a number is not finite."""
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8")
-    os.replace(part, path)
+    write_text(path, json.dumps(content, allow_nan=False) + "\n")
 
 
 def read_record_file(path: Path, digest: str, build: Callable[[dict[str, Any]], R], what: str) -> R | None:

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from ballfg.benchmarks.metrics import Figure
+from ballfg.files.whole_file import write_text
 
 PACKAGES = ("ballfg", "gtsam", "torch", "numpy", "scipy", "filterpy")
 RESULTS_FILE = "results.json"
@@ -86,9 +87,8 @@ class Results:
     def write(self, folder: Path) -> Path:
         """Write `results.json`; the name appears once the file is whole."""
         folder.mkdir(parents=True, exist_ok=True)
-        path, part = folder / RESULTS_FILE, folder / f".{RESULTS_FILE}.part"
-        part.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(part, path)
+        path = folder / RESULTS_FILE
+        write_text(path, json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
         return path
 
 

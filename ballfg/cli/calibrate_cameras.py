@@ -66,13 +66,13 @@ def calibrate_cameras(
     Beside the file two others say how well the cameras are known: OUT_calibration.json and .png. Without --table only
     the lenses are written, for a later --intrinsics.
     """
-    from ballfg.files.whole_file import check_writable
+    from ballfg.files.destination import check_file
     from ballfg.vision.calibration.boards import read_grey
     from ballfg.vision.calibration.table_points import read_table
 
     if out.suffix.lower() not in (*OURS, *THEIRS):
         raise ValueError(f"out must end in {', '.join((*OURS, *THEIRS))}; got {out}. Choose the format by the ending.")
-    check_writable(out)
+    check_file(out)
     if (intrinsics is None) == (images is None):
         raise ValueError("either --images or --intrinsics must be given, and not both. Lenses come from one of them.")
     if intrinsics is not None and table is None:
@@ -163,7 +163,7 @@ def _placed(camera: Camera, lens: Intrinsics | None, marked: TableFile | None) -
 
 
 def _write(out: Path, found: list[Calibration], shown: Mapping[str, Image], marked: TableFile | None) -> None:
-    from ballfg.files.whole_file import whole_file
+    from ballfg.files.whole_file import whole_file, write_text
     from ballfg.vision.calibration.picture import calibration_picture
     from ballfg.vision.calibration.report import content, summary
     from ballfg.vision.calibration.table_points import TABLE_HEIGHT
@@ -172,9 +172,8 @@ def _write(out: Path, found: list[Calibration], shown: Mapping[str, Image], mark
 
     figure = calibration_picture(found, shown, TABLE_HEIGHT if marked is None else marked.table_height)
     report, picture = (out.with_name(f"{out.stem}_calibration{ending}") for ending in (".json", ".png"))
-    with whole_file(report) as temporary:
-        text = json.dumps([content(one) for one in found], indent=2, allow_nan=False, ensure_ascii=False)
-        temporary.write_text(text + "\n", encoding="utf-8")
+    text = json.dumps([content(one) for one in found], indent=2, allow_nan=False, ensure_ascii=False)
+    write_text(report, text + "\n")
     with whole_file(picture) as temporary:
         figure.savefig(temporary)
     write = write_cameras if out.suffix.lower() in OURS else write_opencv

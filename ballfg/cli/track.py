@@ -67,17 +67,17 @@ def track(
     overlay.mp4 shows the views with what was found, contact_sheet.png each track.
     """
     _quiet_codecs()
+    from ballfg.files.whole_folder import staging
     from ballfg.simulation.balls import ball_kind
     from ballfg.tracks import DatasetInfo
-    from ballfg.tracks.writing import staging
     from ballfg.vision.camera_file import read_cameras
-    from ballfg.vision.tracking.dataset import check_folder, write_tracking
+    from ballfg.vision.tracking.dataset import check_result_folder, write_tracking
     from ballfg.vision.tracking.recordings import without as others
     from ballfg.vision.tracking.report import blind_cameras, disagreement, no_ball, summary
 
     kind = ball_kind(ball)
     height = kind.surfaces.table_height if table_height is None else table_height
-    check_folder(out, [cameras, *(Path(text) for text in recordings)], force=force)
+    check_result_folder(out, [cameras, *(Path(text) for text in recordings)], force=force)
     with staging(out):  # what cannot be written to is better known before the search
         pass
     files = " ".join(Path(text).name for text in recordings)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import os
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -18,6 +17,7 @@ from ballfg.dynamics.model import THIN_SHELL, BallModel
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.networks.learned_file import has_learned_part, read_learned, remove_others, write_learned
 from ballfg.files.strict_yaml import read_yaml
+from ballfg.files.whole_file import write_text
 
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
 SECTIONS = (*KINDS, "learned")
@@ -131,9 +131,7 @@ def save_model(model: BallModel, path: str | Path) -> None:
     content = model_to_dict(_analytic_part(model))
     if has_learned_part(model):
         content["learned"] = write_learned(model, path.parent, path.stem)
-    part = path.with_name(path.name + ".part")
-    part.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    os.replace(part, path)
+    write_text(path, yaml.safe_dump(content, sort_keys=False))
     remove_others(path.parent, path.stem, keep=content["learned"])
 
 

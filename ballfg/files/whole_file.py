@@ -8,27 +8,38 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from ballfg.files.destination import check_file
+
 
 @contextmanager
-def whole_file(path: Path) -> Iterator[Path]:
+def whole_file(path: Path, argument: str = "out") -> Iterator[Path]:
     """A hidden path beside `path`, with its ending, to write to; it takes the name when the block ends well.
 
     After an exception or Ctrl-C what was there before is untouched.
 
+    Args: path: of the file.  argument: its name in a message.
     Raises: FileNotFoundError: the folder of the path does not exist. ValueError: the path is a folder.
     """
-    check_writable(path)
+    check_file(path, argument)
     temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{path.suffix}")
     try:
         yield temporary
+        flush(temporary)
         os.replace(temporary, path)
     finally:
         temporary.unlink(missing_ok=True)
 
 
-def check_writable(path: Path) -> None:
-    """Refuses a path to which no file can be written; errors as those of `whole_file`."""
-    if not path.absolute().parent.is_dir():
-        raise FileNotFoundError(f"out must be in an existing folder; {path.parent} is none. Create it first.")
-    if path.is_dir():
-        raise ValueError(f"out must be a file; {path} is a folder. Give the name of a file in it.")
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file in UTF-8 as a whole. Raises: as `whole_file`."""
+    with whole_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def flush(path: Path) -> None:
+    """Brings a file to the disk, so that a power cut does not leave a name without content."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

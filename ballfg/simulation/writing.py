@@ -12,12 +12,15 @@ import yaml
 from torch import Tensor
 
 from ballfg.dynamics import Effect, save_model
+from ballfg.files.destination import check_replaceable
+from ballfg.files.whole_folder import whole_folder
 from ballfg.simulation.balls import describe
 from ballfg.simulation.config import SimulationConfig
 from ballfg.simulation.measure import SimulatedTrack
 from ballfg.simulation.synthetic import dataset_info, simulate
 from ballfg.state import STATE_NAMES
 from ballfg.tracks import TableWriter, Track, write_dataset
+from ballfg.tracks.writing import DATASET_FILES
 
 FileFormat = Literal["csv", "parquet"]
 Watch = Callable[[Iterable[SimulatedTrack]], Iterator[SimulatedTrack]]
@@ -52,24 +55,15 @@ def write_simulation(
     """
     path = Path(folder)
     check_format(file_format)
-    check_folder(path, force=force)
-    tracks = watch(simulate(config))
-    made = not path.exists()
-    if not path.parent.is_dir():
-        raise FileNotFoundError(f"out must be in an existing folder; {path.parent} is none. Create it first.")
-    path.mkdir(exist_ok=True)
-    try:
-        table = path / f"truth.{file_format}"
-        with TableWriter(table) as truth:
-            write_dataset(path, dataset_info(config), _with_truth(tracks, truth, config), file_format)
-        for other in TRUTH_TABLES:
-            if other != table.name:
-                (path / other).unlink(missing_ok=True)
-        save_model(config.ball.model, path / MODEL_FILE)
-        _write_yaml(path / TRUTH_FILE, truth_content(config))
-    finally:
-        if made and not any(path.iterdir()):
-            path.rmdir()
+    check_replaceable(path, mark=TRUTH_FILE, what="a simulated dataset", force=force)
+    earlier = (*DATASET_FILES, *TRUTH_TABLES, f"{Path(MODEL_FILE).stem}.learned-*")
+    with whole_folder(path, earlier=earlier, last=TRUTH_FILE) as stage:
+        with TableWriter(stage / f"truth.{file_format}") as truth:
+            tracks = _with_truth(watch(simulate(config)), truth, config)
+            write_dataset(stage, dataset_info(config), tracks, file_format)
+        save_model(config.ball.model, stage / MODEL_FILE)
+        text = yaml.safe_dump(truth_content(config), sort_keys=False)
+        (stage / TRUTH_FILE).write_text(text, encoding="utf-8")
 
 
 def check_format(name: str) -> FileFormat:
@@ -80,24 +74,6 @@ def check_format(name: str) -> FileFormat:
     if name not in ("csv", "parquet"):
         raise ValueError(f"format must be 'csv' or 'parquet'; got {name!r}. Choose one of them.")
     return cast(FileFormat, name)
-
-
-def check_folder(folder: Path, *, force: bool, mark: str = TRUTH_FILE, what: str = "simulated dataset") -> None:
-    """Refuses a folder that holds something that must not be lost.
-
-    Args: folder: to write to.  force: an earlier result may be replaced.  mark: file that tells one.  what: one is.
-    Raises: ValueError: a file, or a folder with other content than such a result, or with one and no `force`.
-    """
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise ValueError(f"out must be a folder; {folder} is a file. Choose another name.")
-    if not any(folder.iterdir()):
-        return
-    if not (folder / mark).is_file():
-        raise ValueError(f"out must be new, empty or a {what}; {folder} holds other files. Choose another.")
-    if not force:
-        raise ValueError(f"out must be new or empty; {folder} holds a {what}. Replace it with --force.")
 
 
 def truth_content(config: SimulationConfig) -> dict[str, Any]:
@@ -139,9 +115,3 @@ def _with_truth(tracks: Iterable[SimulatedTrack], table: TableWriter, config: Si
         columns |= {name: simulated.true_states[:, i] for i, name in enumerate(STATE_NAMES)}
         table.write(columns)
         yield simulated.track
-
-
-def _write_yaml(path: Path, content: dict[str, Any]) -> None:
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
-    os.replace(part, path)

@@ -3,8 +3,8 @@
 import csv
 import io
 import os
-import uuid
 from collections.abc import Mapping
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO
@@ -15,6 +15,9 @@ import pyarrow.compute as pc
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 from numpy.typing import ArrayLike
+
+from ballfg.files.destination import check_file
+from ballfg.files.whole_file import whole_file
 
 ENDINGS = (".csv", ".parquet")
 _BLOCK_ROWS = 1 << 16  # rows held back before they are written; also the row group of a Parquet file
@@ -40,11 +43,8 @@ class TableWriter:
             raise ValueError(
                 f"path must end in {' or '.join(ENDINGS)}; got {str(path)!r}. Choose the format by the ending."
             )
-        if not self.path.parent.is_dir():
-            raise FileNotFoundError(f"path must be in an existing folder; {self.path.parent} is none. Create it first.")
-        if self.path.is_dir():
-            raise ValueError(f"path must be a file; {self.path} is a folder. Give the name of a file in it.")
-        self._temporary = self.path.with_name(f".{self.path.name}.{uuid.uuid4().hex[:8]}.tmp")
+        check_file(self.path, "path")
+        self._stack = ExitStack()
         self._file: BinaryIO | None = None
         self._parquet: pq.ParquetWriter | None = None
         self._has_header = False
@@ -53,17 +53,18 @@ class TableWriter:
         self._pending_rows = 0
 
     def __enter__(self) -> "TableWriter":
-        self._file = self._temporary.open("xb")
+        with ExitStack() as stack:
+            temporary = stack.enter_context(whole_file(self.path, "path"))
+            self._file = stack.enter_context(temporary.open("xb"))
+            stack.push(self._finish)
+            self._stack = stack.pop_all()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        try:
-            if kind is None:
-                self._finish()
-        finally:
-            self._discard()
+        """Writes the rest and closes the file, which then takes its name; after an exception it is removed."""
+        self._stack.__exit__(kind, error, trace)
 
     def write(self, columns: Mapping[str, ArrayLike]) -> None:
         """Appends a block of rows.
@@ -106,32 +107,20 @@ class TableWriter:
         style = "needed" if _needs_quotes(table) else "none"
         pa_csv.write_csv(table, file, pa_csv.WriteOptions(include_header=False, quoting_style=style))
 
-    def _finish(self) -> None:
-        if self._schema is None:
-            raise ValueError(f"{self.path}: a table must have columns; nothing was written. Write at least one block.")
-        self._flush()
-        assert self._file is not None
-        if self._parquet is not None:
-            self._parquet.close()
-            self._parquet = None
-        self._file.flush()
-        os.fsync(self._file.fileno())
-        self._file.close()
-        os.replace(self._temporary, self.path)
-
-    def _discard(self) -> None:
-        """Closes everything and removes the temporary file if it is still there."""
+    def _finish(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         try:
-            if self._parquet is not None:
-                self._parquet.close()
+            if kind is None:
+                if self._schema is None:
+                    raise ValueError(
+                        f"{self.path}: a table must have columns; nothing was written. Write at least one block."
+                    )
+                self._flush()
         finally:
-            self._parquet, self._pending = None, []
-            file, self._file = self._file, None
-            try:
-                if file is not None:
-                    file.close()  # on a full disk this raises too
-            finally:
-                self._temporary.unlink(missing_ok=True)
+            parquet, self._parquet, self._file, self._pending = self._parquet, None, None, []
+            if parquet is not None:
+                parquet.close()
 
 
 def _batch(columns: Mapping[str, ArrayLike]) -> pa.RecordBatch:

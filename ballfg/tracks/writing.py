@@ -2,14 +2,12 @@
 
 import csv
 import json
-import os
-import shutil
-import uuid
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
 from typing import Literal, TextIO
+
+from ballfg.files.whole_folder import whole_folder
 
 from .checks import check_scale
 from .dataset import TRACK_FILES
@@ -19,6 +17,9 @@ from .labels import LABELS_FILE
 from .rows import KEY, SIGMAS, VALUES
 from .table import TableWriter
 from .track import FloatArray, Track
+
+DATASET_FILES = (INFO_FILE, *TRACK_FILES, LABELS_FILE)
+"""All names that the files of a dataset can have."""
 
 _SPOOL = "labels.jsonl"
 
@@ -31,9 +32,9 @@ def write_dataset(
 ) -> None:
     """Writes `dataset.yaml`, the table of tracks and, if any track carries labels, `labels.csv`.
 
-    The files are written in a hidden folder inside `folder` and moved to their names when all are complete; after
-    an exception or Ctrl-C, what was there before is untouched. A dataset that is there already is replaced, other
-    files stay. Tracks are consumed one by one. What is written can be read: the rules of `read_dataset` hold here.
+    The files are written in a hidden folder and moved to their names when all are complete; after an exception or
+    Ctrl-C, what was there before is untouched. A dataset that is there already is replaced, other files stay. Tracks
+    are consumed one by one. What is written can be read: the rules of `read_dataset` hold here.
 
     Args:
         folder: made if it does not exist; its parent must.
@@ -47,42 +48,13 @@ def write_dataset(
     if file_format not in ("csv", "parquet"):
         raise ValueError(f"file_format must be 'csv' or 'parquet'; got {file_format!r}. Choose one of them.")
     path = Path(folder)
-    with staging(path) as stage:
+    with whole_folder(path, earlier=DATASET_FILES, argument="folder") as stage:
         write_info(stage / INFO_FILE, info)
         with (stage / _SPOOL).open("x", encoding="utf-8") as spool:
             label_names = _write_tracks(stage / f"tracks.{file_format}", info, tracks, spool)
         if label_names:
             _write_labels(stage / LABELS_FILE, stage / _SPOOL, label_names)
         (stage / _SPOOL).unlink()
-        _publish(stage, path)
-
-
-@contextmanager
-def staging(folder: Path) -> Iterator[Path]:
-    """A hidden folder inside `folder`; gone afterwards, as is `folder` itself if it was made here for nothing."""
-    if not folder.parent.is_dir():
-        raise FileNotFoundError(f"folder must be in an existing folder; {folder.parent} is none. Create it first.")
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"folder must be a folder; {folder} is a file. Choose another name.")
-    made = not folder.exists()
-    stage = folder / f".writing-{uuid.uuid4().hex[:8]}"
-    try:
-        stage.mkdir(parents=True)
-        yield stage
-    finally:
-        shutil.rmtree(stage, ignore_errors=True)
-        if made and folder.is_dir() and not any(folder.iterdir()):
-            folder.rmdir()
-
-
-def _publish(stage: Path, folder: Path) -> None:
-    """Moves the complete files to their names; what an older dataset leaves over is removed."""
-    new = {entry.name for entry in stage.iterdir()}
-    for name in (*TRACK_FILES, LABELS_FILE):
-        if name not in new:
-            (folder / name).unlink(missing_ok=True)
-    for name in sorted(new):
-        os.replace(stage / name, folder / name)
 
 
 def _write_tracks(path: Path, info: DatasetInfo, tracks: Iterable[Track], spool: TextIO) -> list[str]:

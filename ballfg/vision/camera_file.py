@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
-from ballfg.files.whole_file import whole_file
+from ballfg.files.whole_file import write_text
 from ballfg.vision.camera import Camera
 from ballfg.vision.camera_storage import check_names, is_storage, read_storage
 from ballfg.vision.strict_yaml import check_keys, mapping, read_mapping
@@ -59,8 +59,7 @@ def write_cameras(path: str | PathLike[str], cameras: Iterable[Camera], *, posed
     fields = FIELDS if posed else (*LENS, "time_offset")
     content = {"cameras": {camera.name: _plain(camera, fields) for camera in cameras}}
     text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
-    with whole_file(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    write_text(path, text)
 
 
 def _plain(camera: Camera, fields: Sequence[str]) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import matplotlib
@@ -10,6 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
+from ballfg.files.whole_file import whole_file
 from ballfg.learning.calibration.calibrate import Problem, Step
 from ballfg.learning.calibration.report import Comparison
 
@@ -34,10 +34,9 @@ def draw(problem: Problem, last: Step, comparison: Comparison, path: Path) -> No
     figure.suptitle(
         f"{problem.dataset.info.name}: {len(last.fits)} tracks fitted, {len(comparison.pairs)} judge", size=11
     )
-    part = path.with_name(f".{path.name}.part")
-    figure.savefig(part, dpi=DPI, format="png")
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=DPI, format="png")
     plt.close(figure)
-    os.replace(part, path)
 
 
 def _coefficient(axes: Axes, problem: Problem, last: Step, k: int) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,8 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
+
+from ballfg.files.whole_folder import recover, replaced_folder
 
 NAME = "checkpoint"
 STATE = "state.yaml"
@@ -62,22 +62,13 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 
     Args: folder: of the run.
     """
-    part, old = folder / f".{NAME}.part", folder / f".{NAME}.old"
-    if part.exists():
-        shutil.rmtree(part)
-    part.mkdir()
-    for name in TENSORS:
-        tensors: dict[str, Tensor] = getattr(checkpoint, name)
-        save_file({key: tensor.detach().contiguous().clone() for key, tensor in tensors.items()}, _tensors(part, name))
-    text = yaml.safe_dump(checkpoint.standing.model_dump(), sort_keys=False)
-    (part / STATE).write_text(text, encoding="utf-8")
-    for path in part.iterdir():
-        _flush(path)
-    _recover(folder)
-    if (folder / NAME).exists():
-        os.replace(folder / NAME, old)
-    os.replace(part, folder / NAME)
-    _recover(folder)
+    with replaced_folder(folder / NAME) as part:
+        for name in TENSORS:
+            tensors: dict[str, Tensor] = getattr(checkpoint, name)
+            owned = {key: tensor.detach().contiguous().clone() for key, tensor in tensors.items()}
+            save_file(owned, _tensors(part, name))
+        text = yaml.safe_dump(checkpoint.standing.model_dump(), sort_keys=False)
+        (part / STATE).write_text(text, encoding="utf-8")
 
 
 def read_checkpoint(folder: Path) -> Checkpoint | None:
@@ -85,8 +76,8 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
 
     Raises: ValueError: if it is damaged.
     """
-    _recover(folder)
     path = folder / NAME
+    recover(path)
     if not path.exists():
         return None
     try:
@@ -100,25 +91,5 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
     raise ValueError(f"{path}: not a whole checkpoint ({reason}). Start a new run.")
 
 
-def _recover(folder: Path) -> None:
-    """Clear the old checkpoint away; take it back where a crash came between the two steps of a replacement."""
-    current, old = folder / NAME, folder / f".{NAME}.old"
-    if not old.exists():
-        return
-    if current.exists():
-        shutil.rmtree(old)
-    else:
-        os.replace(old, current)
-
-
 def _tensors(folder: Path, name: str) -> Path:
     return folder / f"{name}.safetensors"
-
-
-def _flush(path: Path) -> None:
-    """Bring a file to the disk, so that a power cut does not leave a name without content."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)

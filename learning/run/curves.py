@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from operator import itemgetter
 from pathlib import Path
@@ -12,6 +11,7 @@ import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from ballfg.files.whole_file import whole_file
 from ballfg.learning.run.metrics import Epoch
 
 matplotlib.use("Agg")
@@ -37,10 +37,9 @@ def draw_curves(epochs: Sequence[Epoch], title: str, path: Path) -> None:
     _finish(left, "loss per track", losses)
     _finish(right, "RMSE of predicted positions, mm", trained + judged)
     figure.suptitle(title, size=11)
-    part = path.with_name(f".{path.name}.part")
-    figure.savefig(part, dpi=DPI, format="png")
+    with whole_file(path) as temporary:
+        figure.savefig(temporary, dpi=DPI, format="png")
     plt.close(figure)
-    os.replace(part, path)
 
 
 def _curve(axes: Axes, points: Points, colour: str, label: str) -> None:

@@ -9,7 +9,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from ballfg.learning.run.run_folder import write_text
+from ballfg.files.whole_file import write_text
 
 
 @dataclass(frozen=True)

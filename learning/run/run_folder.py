@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import platform
 from collections.abc import Mapping
 from importlib import metadata
@@ -12,6 +11,7 @@ from typing import Any
 
 import yaml
 
+from ballfg.files.whole_file import write_text
 from ballfg.learning.config.config_file import Config, read_config
 
 CONFIG, VERSIONS, MODEL = "config.yaml", "versions.json", "model.yaml"
@@ -80,10 +80,3 @@ def start(folder: Path, config: Config) -> None:
 def write_json(path: Path, content: Any) -> None:
     """Write JSON; floats read back bit for bit."""
     write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file; the final name appears only once the file is whole."""
-    part = path.with_name(f".{path.name}.part")
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)

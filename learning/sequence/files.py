@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,6 +11,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
+
+from ballfg.files.whole_folder import whole_folder
 
 CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
 
@@ -37,14 +38,11 @@ def write_folder(folder: Path, config: Mapping[str, Any], weights: Mapping[str, 
     """Write both files beside their place, then move them there at once. Raises: ValueError: if the folder exists."""
     if folder.exists():
         raise ValueError(f"folder must be new; {folder} exists. Choose another name or delete it.")
-    part = folder.with_name(f".{folder.name}.part")
-    if part.exists():
-        shutil.rmtree(part)
-    part.mkdir(parents=True)
-    text = yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True)
-    (part / CONFIG).write_text(text, encoding="utf-8")
-    save_file({name: value.contiguous() for name, value in weights.items()}, part / WEIGHTS)
-    part.rename(folder)
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with whole_folder(folder) as part:
+        text = yaml.safe_dump(dict(config), sort_keys=False, allow_unicode=True)
+        (part / CONFIG).write_text(text, encoding="utf-8")
+        save_file({name: value.contiguous() for name, value in weights.items()}, part / WEIGHTS)
 
 
 def read_folder(folder: Path) -> tuple[FolderConfig, dict[str, Tensor]]:

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-import shutil
-import tempfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -14,6 +12,8 @@ from typing import Any, Final
 from ballfg.diagnosis.report.page import page
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Fallback, Finding, GenericTest, Value
 from ballfg.dynamics import save_model
+from ballfg.files.destination import check_replaceable
+from ballfg.files.whole_folder import whole_folder
 
 REPORT: Final = "report.json"
 """Written last: where it is, the others are whole."""
@@ -24,7 +24,7 @@ MODEL: Final = "model.yaml"
 def write_report(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> None:
     """Write `report.json`, `report.html` and `model.yaml` into a folder.
 
-    Everything is made in a folder beside it and moved at the end: a new folder appears at once, an earlier report is
+    Everything is made in a hidden folder and moved at the end: a new folder appears at once, an earlier report is
     replaced file by file. Other files of the folder stay.
 
     Args: out: new, empty or with an earlier report; its parent must exist.
@@ -34,11 +34,11 @@ def write_report(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> None:
     """
     check_report_folder(Path(out))
     folder = Path(out).resolve()
-    with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent) as temporary:
-        made = Path(temporary) / "report"
-        made.mkdir()
-        _write_all(diagnosis, made)
-        _move(made, folder)
+    with whole_folder(folder, earlier=(f"{Path(MODEL).stem}.learned-*",), last=REPORT) as made:
+        save_model(diagnosis.model, made / MODEL)
+        (made / PAGE).write_text(page(diagnosis), encoding="utf-8")
+        text = json.dumps(content(diagnosis), indent=2, allow_nan=False, ensure_ascii=False)
+        (made / REPORT).write_text(text + "\n", encoding="utf-8")
 
 
 def check_report_folder(folder: Path) -> None:
@@ -48,35 +48,7 @@ def check_report_folder(folder: Path) -> None:
         ValueError: if it is a file or a folder with other content than an earlier report.
         FileNotFoundError: if its parent does not exist.
     """
-    if folder.exists() and not folder.is_dir():
-        raise ValueError(f"out must be a folder; {folder} is a file. Choose another name.")
-    if folder.is_dir() and any(folder.iterdir()) and not (folder / REPORT).is_file():
-        raise ValueError(
-            f"out must be new, empty or hold an earlier report; {folder} holds other files. Choose another name."
-        )
-    if not folder.absolute().parent.is_dir():
-        raise FileNotFoundError(f"out must be in an existing folder; {folder.parent} is none. Create it first.")
-
-
-def _write_all(diagnosis: Diagnosis, folder: Path) -> None:
-    save_model(diagnosis.model, folder / MODEL)
-    (folder / PAGE).write_text(page(diagnosis), encoding="utf-8")
-    text = json.dumps(content(diagnosis), indent=2, allow_nan=False, ensure_ascii=False)
-    (folder / REPORT).write_text(text + "\n", encoding="utf-8")
-
-
-def _move(made: Path, folder: Path) -> None:
-    """Give a folder its final name; where it is there already, replace its files, `report.json` last."""
-    if not folder.exists():
-        os.rename(made, folder)
-        return
-    new = {path.name: path for path in made.iterdir()}
-    for name in sorted(new, key=lambda name: (name == REPORT, new[name].is_file())):
-        if not (folder / name).is_dir():  # a folder's name holds a digest of its content: the same one may stay
-            os.replace(new[name], folder / name)
-    for path in folder.glob(f"{Path(MODEL).stem}.learned-*"):
-        if path.name not in new:
-            shutil.rmtree(path)
+    check_replaceable(folder, mark=REPORT, what="an earlier report")
 
 
 def content(diagnosis: Diagnosis) -> dict[str, Any]:

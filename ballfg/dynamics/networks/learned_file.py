@@ -7,7 +7,6 @@ saving again never changes one that a file names.
 from __future__ import annotations
 
 import hashlib
-import os
 import shutil
 from pathlib import Path
 from typing import Annotated, Any
@@ -26,6 +25,7 @@ from ballfg.dynamics.networks.learned import LearnedModel, build
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.dynamics.trained import Trained
 from ballfg.files.strict_yaml import read_yaml
+from ballfg.files.whole_folder import whole_folder
 
 CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
 _MODEL, _LAUNCHER, _BASE = "model.", "launcher.", "base."
@@ -71,12 +71,9 @@ def write_learned(model: BallModel, parent: Path, stem: str) -> str:
     weights = safetensors.torch.save({name: t.detach().contiguous() for name, t in _tensors(model).items()})
     folder = parent / f"{stem}.learned-{hashlib.sha256(config + weights).hexdigest()[:12]}"
     if not folder.exists():
-        part = folder.with_name(f".{folder.name}.part")
-        shutil.rmtree(part, ignore_errors=True)
-        part.mkdir()
-        (part / CONFIG).write_bytes(config)
-        (part / WEIGHTS).write_bytes(weights)
-        os.rename(part, folder)
+        with whole_folder(folder) as part:
+            (part / CONFIG).write_bytes(config)
+            (part / WEIGHTS).write_bytes(weights)
     return folder.name
 
 

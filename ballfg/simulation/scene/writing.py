@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import glob
 import os
-import shutil
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ballfg.dynamics import Effect
+from ballfg.files.destination import check_replaceable
+from ballfg.files.strict_yaml import read_yaml
+from ballfg.files.whole_folder import whole_folder
 from ballfg.simulation.scene.recording import Recording
 from ballfg.simulation.scene.visible import visible_columns
-from ballfg.simulation.writing import check_folder
 from ballfg.state import STATE_NAMES
 from ballfg.tracks import TableWriter
-from ballfg.tracks.writing import staging
 from ballfg.vision.camera import Camera
 from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
 
@@ -68,7 +69,7 @@ def write_scene(
     for camera in recording.cameras:
         if camera.name != Path(camera.name).name or camera.name.startswith("."):
             raise ValueError(f"camera names must be good as file names; got {camera.name!r}. Rename it.")
-    with staging(path) as stage:
+    with whole_folder(path, earlier=_earlier(path / SCENE_FILE), last=SCENE_FILE) as stage:
         drawn = watch(_all_images(recording))
         for number, camera in enumerate(recording.cameras):
             _write_images(
@@ -81,12 +82,13 @@ def write_scene(
         with TableWriter(stage / "visible.csv") as table:
             for number in range(len(recording.cameras)):
                 table.write(visible_columns(recording, number))
-        _publish(stage, path, scene_content(recording))
+        content = scene_content(recording) | {"files": sorted(entry.name for entry in stage.iterdir())}
+        (stage / SCENE_FILE).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
 
 def check_scene_folder(folder: Path, *, force: bool) -> None:
-    """Refuses a folder as `ballfg.simulation.writing.check_folder` does; what may be replaced is a rendered scene."""
-    check_folder(folder, force=force, mark=SCENE_FILE, what="rendered scene")
+    """Refuses a folder that holds other files, or a rendered scene and no `force`; see `check_replaceable`."""
+    check_replaceable(folder, mark=SCENE_FILE, what="a rendered scene", force=force)
 
 
 def scene_content(recording: Recording) -> dict[str, Any]:
@@ -156,23 +158,6 @@ def _write_truth(path: Path, recording: Recording) -> None:
             table.write(columns | {name: states[:, i] for i, name in enumerate(STATE_NAMES)})
 
 
-def _publish(stage: Path, folder: Path, content: dict[str, Any]) -> None:
-    """Moves the complete files to their names; what an older scene leaves over is removed. `scene.yaml` comes last."""
-    new = sorted(entry.name for entry in stage.iterdir())
-    old = folder / SCENE_FILE
-    if old.is_file():
-        for name in yaml.safe_load(old.read_text(encoding="utf-8"))["files"]:
-            _remove(folder / Path(name).name)
-    for name in new:
-        _remove(folder / name)
-        os.replace(stage / name, folder / name)
-    part = stage / SCENE_FILE
-    part.write_text(yaml.safe_dump(content | {"files": new}, sort_keys=False), encoding="utf-8")
-    os.replace(part, old)
-
-
-def _remove(path: Path) -> None:
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+def _earlier(scene: Path) -> list[str]:
+    """Patterns of the names of an earlier scene's files."""
+    return [glob.escape(name) for name in read_yaml(scene)["files"]] if scene.is_file() else []

@@ -3,18 +3,18 @@
 from __future__ import annotations
 
 import itertools
-import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from ballfg.files.destination import check_folder, check_replaceable
+from ballfg.files.whole_folder import whole_folder
 from ballfg.tracks import DatasetInfo, TableWriter, write_dataset
 from ballfg.tracks.detections_file import DETECTIONS_FILE
 from ballfg.tracks.info import INFO_FILE, write_info
 from ballfg.tracks.rows import KEY, SIGMAS, VALUES
-from ballfg.tracks.writing import staging
 from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
 from ballfg.vision.tracking.contact_sheet import ContactSheet, Extent
 from ballfg.vision.tracking.overlay import Watch, write_overlay
@@ -32,29 +32,18 @@ FILES: Final = (INFO_FILE, TRACKS, DETECTIONS_FILE, CAMERAS_FILE, OVERLAY, SHEET
 """All that is written."""
 
 
-def check_folder(folder: Path, inputs: Sequence[Path], *, force: bool) -> None:
+def check_result_folder(folder: Path, inputs: Sequence[Path], *, force: bool) -> None:
     """Refuses a folder in which something would be lost.
 
     Args: folder: for the dataset.  inputs: files that are read.  force: an earlier result may be replaced.
     Raises: ValueError: a file; an input that lies in it; other files; an earlier result and no `force`.
         FileNotFoundError: its parent does not exist.
     """
-    if not folder.parent.is_dir():
-        raise FileNotFoundError(f"out must be in an existing folder; {folder.parent} is none. Create it first.")
-    if not folder.exists():
-        return
-    if not folder.is_dir():
-        raise ValueError(f"out must be a folder; {folder} is a file. Choose another name.")
+    check_folder(folder)
     for path in inputs:
         if path.resolve().parent == folder.resolve():
             raise ValueError(f"out must not hold what is read; {path} lies in {folder}. Choose another folder.")
-    present = {entry.name for entry in folder.iterdir()}
-    if not present:
-        return
-    if not present <= set(FILES) or INFO_FILE not in present:
-        raise ValueError(f"out must be new, empty or an earlier result; {folder} holds other files. Choose another.")
-    if not force:
-        raise ValueError(f"out must be new or empty; {folder} holds an earlier result. Replace it with --force.")
+    check_replaceable(folder, mark=INFO_FILE, what="an earlier result", only=FILES, force=force)
 
 
 def write_tracking(
@@ -69,11 +58,11 @@ def write_tracking(
 ) -> list[str]:
     """Writes dataset.yaml, tracks.csv, detections.csv, cameras.yaml, contact_sheet.png and overlay.mp4.
 
-    A recording without a ball gives a tracks.csv without rows. The files are written in a hidden folder inside
-    `folder` and moved to their names when all are complete.
+    A recording without a ball gives a tracks.csv without rows. The files are written in a hidden folder and moved to
+    their names when all are complete.
 
     Args:
-        folder: as `check_folder` allows.
+        folder: as `check_result_folder` allows.
         tracking: what was found.
         info: the content of dataset.yaml.
         table: (x_low, x_high, y_low, y_high) m, drawn in the contact sheet; None where it is not known.
@@ -83,19 +72,13 @@ def write_tracking(
     Returns: the names of the files.
     Raises: OSError: something cannot be written. ValueError: a track that breaks a rule of datasets.
     """
-    with staging(folder) as stage:
+    with whole_folder(folder, earlier=FILES) as stage:
         _write_tables(stage, tracking, info)
         sheet = ContactSheet(tracking, info.ball.radius, info.table_height, table)
         if streams is not None:
             _run_videos(stage, tracking, sheet, streams, overlay, watch)
         sheet.write(stage / SHEET)
-        written = [name for name in FILES if (stage / name).is_file()]
-        for name in FILES:
-            if name in written:
-                os.replace(stage / name, folder / name)
-            else:
-                (folder / name).unlink(missing_ok=True)
-    return written
+        return [name for name in FILES if (stage / name).is_file()]
 
 
 def _run_videos(

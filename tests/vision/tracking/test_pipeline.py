@@ -21,7 +21,7 @@ from ballfg.vision.detection.detections import Candidates, Detections
 from ballfg.vision.detection.detections_table import read_detections
 from ballfg.vision.detection.detector_file import load_detector
 from ballfg.vision.detection.video import Video, open_video
-from ballfg.vision.tracking.dataset import FILES, check_folder, write_tracking
+from ballfg.vision.tracking.dataset import FILES, check_result_folder, write_tracking
 from ballfg.vision.tracking.pipeline import Tracking, track_detections
 from ballfg.vision.tracking.playback import Image
 from ballfg.vision.tracking.report import no_ball, summary
@@ -177,24 +177,24 @@ def test_an_earlier_result_is_replaced_as_a_whole(tracking: Tracking, empty: Tra
     write_tracking(out, tracking, INFO)
     (out / "overlay.mp4").write_bytes(b"old")
     with pytest.raises(ValueError, match=r"holds an earlier result\. Replace it with --force"):
-        check_folder(out, [], force=False)
-    check_folder(out, [], force=True)
+        check_result_folder(out, [], force=False)
+    check_result_folder(out, [], force=True)
     write_tracking(out, empty, INFO)
     assert {path.name for path in out.iterdir()} == set(FILES) - {"overlay.mp4"}
 
 
 def test_a_folder_in_which_something_would_be_lost_is_refused(tmp_path: Path) -> None:
-    check_folder(tmp_path / "new", [], force=False)
+    check_result_folder(tmp_path / "new", [], force=False)
     with pytest.raises(FileNotFoundError, match="must be in an existing folder"):
-        check_folder(tmp_path / "no" / "new", [], force=False)
+        check_result_folder(tmp_path / "no" / "new", [], force=False)
     read = tmp_path / "detections.csv"
     read.write_text("")
     with pytest.raises(ValueError, match="must be a folder"):
-        check_folder(read, [], force=True)
+        check_result_folder(read, [], force=True)
     with pytest.raises(ValueError, match="must not hold what is read"):
-        check_folder(tmp_path, [read], force=True)
+        check_result_folder(tmp_path, [read], force=True)
     with pytest.raises(ValueError, match="holds other files"):
-        check_folder(tmp_path, [], force=True)
+        check_result_folder(tmp_path, [], force=True)
 
 
 def test_the_example_of_the_docs_runs(tracking: Tracking, capsys: pytest.CaptureFixture[str]) -> None:
