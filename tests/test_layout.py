@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LEVELS = (
-    ("state", "files"),
+    ("state", "files", "registry"),
     ("tracks",),
     ("vision",),
     ("dynamics",),

@@ -1,0 +1,196 @@
+"""Registries: classes by name, those of this package, of the user and of other installed packages.
+
+A package of one's own takes part by an entry point in its pyproject.toml:
+
+    [project.entry-points."ballfg.effects"]
+    static_charge = "my_package.charge:StaticCharge"
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, packages_distributions, version
+from types import ModuleType
+from typing import Any, Generic, TypeVar, cast
+
+T = TypeVar("T")
+C = TypeVar("C", bound=type[Any])
+PACKAGE = "ballfg"
+
+
+@dataclass(frozen=True)
+class Source:
+    """The package that a registered class comes from."""
+
+    package: str
+    """Name of the installed package; the name of the module where no installed package holds it."""
+
+    version: str | None
+    """None where no installed package holds the class."""
+
+    def __str__(self) -> str:
+        return self.package if self.version is None else f"{self.package} {self.version}"
+
+
+class Registry(Mapping[str, type[T]], Generic[T]):
+    """Classes of one sort by their `name`.
+
+    Classes of this package come first, in the order of their registration; the others follow by name. Entry points of
+    installed packages are loaded at the first iteration or missed lookup, never at import.
+
+    Args:
+        sort: the word for one of the classes in messages, for instance "estimator".
+        group: of the entry points, for instance "ballfg.estimators".
+        base: the class or classes of which each must be a subclass.
+        remedy: a sentence that ends messages about classes which cannot be registered.
+        check: refuses a class by an exception that says what is wrong with it.
+        reserved: classes by name that are not in the registry; their names are taken.
+    """
+
+    def __init__(
+        self,
+        sort: str,
+        *,
+        group: str,
+        base: type[Any] | tuple[type[Any], ...],
+        remedy: str,
+        check: Callable[[type[T]], None] | None = None,
+        reserved: Mapping[str, type[T]] | None = None,
+    ) -> None:
+        self.sort = sort
+        self.group = group
+        self._bases = base if isinstance(base, tuple) else (base,)
+        self._remedy = remedy
+        self._check = check
+        self._reserved = dict(reserved or {})
+        self._classes: dict[str, type[T]] = {}
+        self._packages: dict[str, Source] = {}
+        self._loaded = False
+
+    def __getitem__(self, name: str) -> type[T]:
+        if name not in self._classes:
+            self.load_entry_points()
+        return self._classes[name]
+
+    def __iter__(self) -> Iterator[str]:
+        self.load_entry_points()
+        own = [name for name, cls in self._classes.items() if _is_own(cls)]
+        return iter([*own, *sorted(set(self._classes) - set(own))])
+
+    def __len__(self) -> int:
+        self.load_entry_points()
+        return len(self._classes)
+
+    def __repr__(self) -> str:
+        return f"Registry of {self.sort}s: {', '.join(self)}"
+
+    def register(self, cls: C) -> C:
+        """Let a class be named wherever those of the package are; may decorate the class.
+
+        A class that is defined anew, as when a cell of a notebook runs again, takes the place of the one before.
+
+        Args: cls: a subclass of the registry's base, with a class attribute `name`.
+        Returns: the same class.
+        Raises:
+            TypeError: if it is no such class.
+            ValueError: if its name is missing or taken, or if the registry's own check refuses it.
+        """
+        if not (isinstance(cls, type) and issubclass(cls, self._bases)):
+            names = [base.__name__ for base in self._bases]
+            bases = " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
+            raise TypeError(f"{self.sort} must be a subclass of {bases}; got {cls!r}. {self._remedy}")
+        name = getattr(cls, "name", None)
+        if not (isinstance(name, str) and name.strip()):
+            raise ValueError(f"{cls.__qualname__}.name must be a text; it is missing. {self._remedy}")
+        if self._check is not None:
+            self._check(cls)
+        taken = self._classes.get(name) or self._reserved.get(name)
+        if taken is not None and _place(taken) != _place(cls):
+            article = "an" if self.sort[0] in "aeiou" else "a"
+            raise ValueError(
+                f"name of {article} {self.sort} must be its own; got '{name}', that of {_place(taken)}, "
+                f"for {_place(cls)}. Rename one."
+            )
+        self._classes[name] = cls
+        return cls
+
+    def lookup(self, name: str) -> type[T]:
+        """The class of a name.
+
+        Raises: ValueError: if there is none; the message lists the names there are.
+        """
+        if name in self:
+            return self[name]
+        raise ValueError(
+            f"there is no {self.sort} '{name}'; known ones: {', '.join(self) or 'none'}. One of your own must be "
+            f"registered first, or its package installed with an entry point '{self.group}'."
+        )
+
+    def source(self, name: str) -> Source:
+        """The package from which the class of a name comes, with its version."""
+        module = self[name].__module__
+        if name in self._packages:
+            return self._packages[name]
+        top = module.partition(".")[0]
+        package = PACKAGE if top == PACKAGE else next(iter(packages_distributions().get(top, ())), top)
+        try:
+            return Source(package, version(package))
+        except PackageNotFoundError:
+            return Source(module, None)
+
+    def load_entry_points(self) -> None:
+        """Register the classes that other installed packages offer; does nothing after the first time.
+
+        Raises: ValueError: if an entry point cannot be used; the message names it and its package.
+        """
+        if self._loaded:
+            return
+        self._loaded = True
+        try:
+            for point in sorted(entry_points(group=self.group), key=lambda point: (str(_package(point)), point.name)):
+                self._load(point)
+        except BaseException:
+            self._loaded = False
+            raise
+
+    def _load(self, point: EntryPoint) -> None:
+        """Register the class that an entry point names; a module registers its classes, a function is called."""
+        before = dict(self._classes)
+        try:
+            offered = point.load()
+            if isinstance(offered, type):
+                self.register(offered)
+                before.pop(cast("Any", offered).name, None)  # its module may have registered it already
+            elif not isinstance(offered, ModuleType):
+                offered()
+        except Exception as error:
+            raise ValueError(
+                f"entry point '{point.name}' = '{point.value}' of package {_package(point)} (group {self.group}) "
+                f"cannot be used ({type(error).__name__}: {error}). Mend or uninstall that package."
+            ) from error
+        new = {name for name, cls in self._classes.items() if before.get(name) is not cls}
+        self._packages |= dict.fromkeys(new, _package(point))
+
+    @contextmanager
+    def restored(self) -> Iterator[None]:
+        """A block after which everything that was registered in it is forgotten, for tests."""
+        before = dict(self._classes)
+        try:
+            yield
+        finally:
+            self._classes = before
+
+
+def _place(cls: type[Any]) -> str:
+    """Module and name of a class: two classes of one place are one class, defined anew."""
+    return f"{cls.__module__}.{cls.__qualname__}"
+
+
+def _is_own(cls: type[Any]) -> bool:
+    return cls.__module__.partition(".")[0] == PACKAGE
+
+
+def _package(point: EntryPoint) -> Source:
+    return Source("of unknown name", None) if point.dist is None else Source(point.dist.name, point.dist.version)
