@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ballfg.benchmarks.estimators.step_noise import StepNoise
 from ballfg.dynamics import BallModel, Surfaces, contact_time, nominal_model
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics.motion.rollout import rollout
 from ballfg.estimation import Settings
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise

@@ -1,7 +1,5 @@
 """Find what a model lacks: residuals, candidate effects, tests, the loop and its report."""
 
-from ballfg.diagnosis.diagnosis import diagnose
-from ballfg.diagnosis.report.report import write_report
-from ballfg.diagnosis.result import Diagnosis, Finding, Verdict
+import lazy_loader
 
-__all__ = ["Diagnosis", "Finding", "Verdict", "diagnose", "write_report"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

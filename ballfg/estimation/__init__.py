@@ -1,41 +1,5 @@
 """Estimators: one a file, one interface, one result type."""
 
-from ballfg.estimation.batch import estimate_tracks
-from ballfg.estimation.configure import dataset_settings, dataset_surfaces
-from ballfg.estimation.estimator import Estimator
-from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
-from ballfg.estimation.filters.sliding_window import SlidingWindow
-from ballfg.estimation.launcher import Launcher
-from ballfg.estimation.observations.sighted import SightedTrack, in_order, sighted_track
-from ballfg.estimation.observations.sighted_dataset import SightedDataset, read_sighted
-from ballfg.estimation.online.online import Online
-from ballfg.estimation.registry import ESTIMATORS, make_estimator
-from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.settings import Settings, uncertain
-from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.estimation.smoother.time_offsets import TimeOffsets, estimate_time_offsets
+import lazy_loader
 
-__all__ = [
-    "ESTIMATORS",
-    "Estimate",
-    "Estimator",
-    "ExtendedKalmanFilter",
-    "Launcher",
-    "Online",
-    "Settings",
-    "SightedDataset",
-    "SightedTrack",
-    "SlidingWindow",
-    "Smoother",
-    "Status",
-    "TimeOffsets",
-    "dataset_settings",
-    "dataset_surfaces",
-    "estimate_time_offsets",
-    "estimate_tracks",
-    "in_order",
-    "make_estimator",
-    "read_sighted",
-    "sighted_track",
-    "uncertain",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

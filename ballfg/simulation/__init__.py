@@ -1,32 +1,5 @@
 """Synthetic tracks: a launcher, motion with effects that nobody declares, noisy measurements, truth beside them."""
 
-from ballfg.simulation.balls import BallKind, ball_from_mapping, ball_kind, table_tennis, tennis, with_model
-from ballfg.simulation.config import MeasurementNoise, ProcessNoise, SimulationConfig
-from ballfg.simulation.launcher import Launcher
-from ballfg.simulation.measure import SimulatedTrack
-from ballfg.simulation.settings import SETTING_LEVELS, all_settings, parse_settings
-from ballfg.simulation.synthetic import dataset_info, simulate
-from ballfg.simulation.undeclared import UNDECLARED, parse_effects
-from ballfg.simulation.writing import write_simulation
+import lazy_loader
 
-__all__ = [
-    "SETTING_LEVELS",
-    "UNDECLARED",
-    "BallKind",
-    "Launcher",
-    "MeasurementNoise",
-    "ProcessNoise",
-    "SimulatedTrack",
-    "SimulationConfig",
-    "all_settings",
-    "ball_from_mapping",
-    "ball_kind",
-    "dataset_info",
-    "parse_effects",
-    "parse_settings",
-    "simulate",
-    "table_tennis",
-    "tennis",
-    "with_model",
-    "write_simulation",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -20,7 +20,7 @@ from ballfg.benchmarks.timing import Stopwatch, quartiles
 from ballfg.cli.progress import progress
 from ballfg.dynamics import AnalyticModel, BallModel, Surfaces, fly_jacobian, model_from_dict, nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics.motion.rollout import rollout
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.learned import build
 from ballfg.estimation import Estimator, Online, Settings, Smoother, dataset_settings, dataset_surfaces

@@ -1,8 +1,5 @@
 """Baselines that map observations straight to the rest of a track: an LSTM and a conditional diffusion model."""
 
-from ballfg.learning.sequence.architecture import SequenceArchitecture
-from ballfg.learning.sequence.launcher import LauncherSettings
-from ballfg.learning.sequence.predictor import SequencePredictor
-from ballfg.learning.sequence.trainee import SequenceTrainee
+import lazy_loader
 
-__all__ = ["LauncherSettings", "SequenceArchitecture", "SequencePredictor", "SequenceTrainee"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

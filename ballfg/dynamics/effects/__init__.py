@@ -1,6 +1,5 @@
 """One physical effect a file, the registry that names them, and effects of one's own."""
 
-from ballfg.dynamics.effects.registration import load_effects, register
-from ballfg.dynamics.effects.registry import EFFECTS, effect_class
+import lazy_loader
 
-__all__ = ["EFFECTS", "effect_class", "load_effects", "register"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

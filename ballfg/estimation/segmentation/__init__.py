@@ -4,24 +4,6 @@
 docs/derivations/segmentation.md.
 """
 
-from ballfg.estimation.segmentation.batch import segment
-from ballfg.estimation.segmentation.events import Event, EventKind
-from ballfg.estimation.segmentation.physics import SegmentationPhysics, physics_of
-from ballfg.estimation.segmentation.result import Contact, Quality, Rest, Segmentation
-from ballfg.estimation.segmentation.segmenter import Decision, Segmenter
-from ballfg.estimation.segmentation.settings import SegmentationSettings
+import lazy_loader
 
-__all__ = [
-    "Contact",
-    "Decision",
-    "Event",
-    "EventKind",
-    "Quality",
-    "Rest",
-    "Segmentation",
-    "SegmentationPhysics",
-    "SegmentationSettings",
-    "Segmenter",
-    "physics_of",
-    "segment",
-]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -3,6 +3,6 @@
 The latter test whether an analysis says "unexplained" where it lacks the explanation.
 """
 
-from ballfg.simulation.undeclared.registry import UNDECLARED, parse_effects
+import lazy_loader
 
-__all__ = ["UNDECLARED", "parse_effects"]
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,0 +1,12 @@
+from .batch import segment as segment
+from .events import Event as Event
+from .events import EventKind as EventKind
+from .physics import SegmentationPhysics as SegmentationPhysics
+from .physics import physics_of as physics_of
+from .result import Contact as Contact
+from .result import Quality as Quality
+from .result import Rest as Rest
+from .result import Segmentation as Segmentation
+from .segmenter import Decision as Decision
+from .segmenter import Segmenter as Segmenter
+from .settings import SegmentationSettings as SegmentationSettings

@@ -1,0 +1,11 @@
+from .belief import Belief as Belief
+from .crossing import Crossing as Crossing
+from .crossing import apex as apex
+from .crossing import next_contact as next_contact
+from .crossing import next_crossing as next_crossing
+from .crossing import plane_crossing as plane_crossing
+from .propagate import Prediction as Prediction
+from .propagate import Propagator as Propagator
+from .tracks import TrackPrediction as TrackPrediction
+from .tracks import check_observe as check_observe
+from .tracks import predict_tracks as predict_tracks

@@ -1,0 +1,11 @@
+from .config import Clock as Clock
+from .config import SceneConfig as SceneConfig
+from .flights import Flight as Flight
+from .flights import fly_shots as fly_shots
+from .recording import Recording as Recording
+from .recording import record as record
+from .renderer import Renderer as Renderer
+from .shutter import Frames as Frames
+from .shutter import Passage as Passage
+from .shutter import free_running as free_running
+from .writing import write_scene as write_scene
