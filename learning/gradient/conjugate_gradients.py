@@ -1,9 +1,9 @@
 """Solving with the exact Hessian: conjugate gradients, preconditioned with GTSAM's Gauss-Newton factorisation.
 
-The Hessian of a batch of tracks is block diagonal, one block a track. All blocks are solved in lockstep: one product
-with the whole Hessian serves all of them, step lengths are each track's own. The Gauss-Newton matrix R^T R, which GTSAM
-has factorised on the way to the minimum, differs from a block by the curvature of the residuals alone: a few steps are
-enough.
+The Hessian of a batch of tracks is block diagonal, one block per track. All blocks are solved in lockstep: one product
+with the whole Hessian serves all of them, while each track has its own step lengths. The Gauss-Newton matrix R^T R,
+which GTSAM has factorised on the way to the minimum, differs from a block only by the curvature of the residuals, so
+that a few steps are enough.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from ballfg.state import STATE_DIM
 Product = Callable[[Tensor], Tensor]
 
 
-class NotAMinimum(ValueError):  # noqa: N818 - says what it is
+class NotAMinimum(ValueError):  # noqa: N818 - the name is the statement
     """The objective is not at a minimum that a gradient could pass through.
 
     Attributes:
-        tracks: numbers, within the batch, of those that are not.
+        tracks: numbers within the batch of the tracks without a minimum.
     """
 
     def __init__(self, message: str, tracks: Sequence[int]) -> None:
@@ -37,7 +37,7 @@ class GaussNewtonFactors(SquareRootInformation):
     """The factorisations R^T R of the Gauss-Newton matrices of several tracks, which solves all of them at once."""
 
     def solve(self, vector: Tensor) -> Tensor:
-        """R^-1 R^-T times a vector that is packed as `Layout` says."""
+        """R^-1 R^-T times a vector in the order of `Layout`."""
         given = vector.detach().numpy()
         split = self.lengths.sum() * STATE_DIM
         inside = np.arange(self.inverse.shape[1]) < self.lengths[:, None]
@@ -75,9 +75,9 @@ class ConjugateGradients:
 
     Args:
         factors: the preconditioner.
-        owners: (n,) the block that each number of a vector belongs to.
-        tolerance: stop when each block's residual is this small against the right side, in the preconditioner's metric.
-        max_iterations: products with the Hessian.
+        owners: (n,) block number of each entry of a vector.
+        tolerance: largest residual of a block relative to the right side, in the metric of the preconditioner.
+        max_iterations: largest number of products with the Hessian.
     """
 
     def __init__(
@@ -88,17 +88,17 @@ class ConjugateGradients:
         self.tolerance = tolerance
         self.max_iterations = max_iterations
         self.iterations = 0
-        """Products that the last solution took."""
+        """Products with the Hessian in the last solution."""
 
     def precondition(self, vector: Tensor) -> Tensor:
         """The Gauss-Newton solution."""
         return self.factors.solve(vector)
 
     def __call__(self, product: Product, right: Tensor) -> Tensor:
-        """X with H x = right.
+        """The solution x of H x = right.
 
         Args: product: H times a vector (n,).  right: (n,).
-        Raises: NotAMinimum: H bends downwards somewhere, or the iteration does not arrive.
+        Raises: NotAMinimum: H has a direction of negative curvature, or the iteration does not converge.
         """
         solution = torch.zeros_like(right)
         residual = right.clone()

@@ -1,4 +1,4 @@
-"""What the launcher was told, as numbers beside the observations."""
+"""The launcher's settings as numbers."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ballfg.tracks import Track
 
 @dataclass(frozen=True)
 class LauncherSettings:
-    """Which labels of a track are its launcher's settings; none: a model sees observations only.
+    """The labels of a track that are its launcher's settings; none: a model sees observations only.
 
     Attributes:
         labels: names; those in `categories` are text, one-hot over their values, the others are numbers.
@@ -26,7 +26,7 @@ class LauncherSettings:
 
     @property
     def size(self) -> int:
-        """How many numbers they are."""
+        """Number of numbers."""
         return len(self._reader().names) if self.labels else 0
 
     def of(self, track: Track) -> Tensor:
@@ -46,5 +46,5 @@ class LauncherSettings:
         return settings
 
     def _reader(self) -> SpinEmbedding:
-        """Reads labels by the same rules as the dynamics models; its weights play no part."""
+        """Reads labels by the rules of the dynamics models; its weights are not used."""
         return SpinEmbedding(self.labels, self.categories)

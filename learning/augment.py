@@ -1,4 +1,4 @@
-"""Augmentation: the same shot seen from another place, by a turn about the vertical and a horizontal shift."""
+"""Augmentation: the same shot in another place, by a rotation about the vertical and a horizontal shift."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 SHIFT = 1.0
-"""m, largest shift along x and along y: of the size of a table, so that no place in the room stays special."""
+"""m, largest shift along x and along y: the size of a table, so that no place in the room is special."""
 
 
 def augmentation(seed: int, epoch: int, track: int) -> tuple[Tensor, Tensor]:
-    """The turn and shift of one track in one epoch; they depend on nothing else, whatever the batch or the process.
+    """The rotation and shift of one track in one epoch, independent of batch and process.
 
-    Height is never shifted: the table stays where it is.
+    Height is never shifted, since the table has one.
 
     Args:
         seed: of the run, >= 0.
@@ -34,7 +34,7 @@ def augmentation(seed: int, epoch: int, track: int) -> tuple[Tensor, Tensor]:
 
 
 def apply(positions: Tensor, angle: Tensor, shift: Tensor) -> Tensor:
-    """Positions turned about the world's z axis, then shifted.
+    """Positions rotated about the world's z axis, then shifted.
 
     Args:
         positions: (..., 3) m.
@@ -47,7 +47,7 @@ def apply(positions: Tensor, angle: Tensor, shift: Tensor) -> Tensor:
 
 
 def rotate(vectors: Tensor, angle: Tensor) -> Tensor:
-    """Vectors - velocity, spin, acceleration - turned about the vertical; a shift does not touch them.
+    """Vectors - velocity, spin, acceleration - rotated about the vertical; a shift does not change them.
 
     Args:
         vectors: (..., 3), any unit.
@@ -64,7 +64,7 @@ def undo(positions: Tensor, angle: Tensor, shift: Tensor) -> Tensor:
     """The inverse of `apply`.
 
     Args:
-        positions: (..., 3) m, seen from the other place.
+        positions: (..., 3) m, rotated and shifted.
         angle: (...) rad, as in `apply`.
         shift: (..., 2) m, likewise.
 
