@@ -106,7 +106,7 @@ class SquareRootInformation:
             column += width
 
     def log_determinants(self) -> Array:
-        """(t,) log det R."""
+        """(t,) log det R, dimensionless."""
         diagonals = (np.abs(np.diagonal(inverse, axis1=-2, axis2=-1)) for inverse in (self.inverse, self.last))
         states, coefficients = (np.log(diagonal) for diagonal in diagonals)
         return np.asarray(-states.sum((1, 2)) - coefficients.sum(1))

@@ -17,7 +17,7 @@ class BatchLoss:
     """The loss of a batch of tracks. All numbers are sums over tracks, so that those of parts of a batch add up.
 
     Attributes:
-        total: () differentiable sum of the tracks' losses; 0 without a graph where every track failed.
+        total: () dimensionless, differentiable sum of the tracks' losses; 0 without a graph where every track failed.
         tracks: number of tracks in it.
         squared_error: m^2, summed over `points` positions (three coordinates each).
         points: number of positions.
@@ -68,12 +68,13 @@ class Trainee(ABC):
         """Bring parameters back into their bounds after an optimizer's step; none by default."""
 
     def memory(self) -> dict[str, Tensor]:
-        """State beside the parameters that lasts from one epoch to the next, such as warm starts, by name."""
+        """State beside the parameters that lasts from one epoch to the next, by name: tensors (...) of any unit."""
         return {}
 
     def remember(self, memory: dict[str, Tensor]) -> None:
         """Restore the state that `memory` gave.
 
+        Args: memory: tensors of any shape (...) and unit, by name.
         Raises: ValueError: if it is another run's.
         """
         if memory:

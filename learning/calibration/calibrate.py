@@ -21,7 +21,7 @@ from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_sett
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
 from ballfg.learning.calibration.population import Evidence, Population, evidence, fit_population
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.evaluation import TrackScore, Watch, judge_tracks
+from ballfg.learning.evaluation import TrackScore, Watch, judge_tracks, pass_on
 from ballfg.learning.split import Split, split_tracks, tracks_of
 from ballfg.tracks import Dataset
 
@@ -113,7 +113,7 @@ def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs
     )
 
 
-def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch[Any] | None = None) -> Iterator[Step]:
+def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch[Any] = pass_on) -> Iterator[Step]:
     """The remaining steps, each as soon as it is finished; none if the calibration has ended.
 
     Args:
@@ -124,7 +124,6 @@ def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch[Any] 
     Raises: TooManyFailures: more estimates of fitted tracks failed than the config allows.
     """
     steps = list(done)
-    watch = watch or _pass_on
     if not steps:
         steps.append(
             Step(number=0, mean=_plain(problem.chosen.start), scores=score(problem, problem.chosen.start, watch))
@@ -146,7 +145,7 @@ def has_ended(config: CalibrationConfig, step: Step) -> bool:
 
 
 def score(
-    problem: Problem, values: Array, watch: Watch[Any] | None = None, settings: Settings | None = None
+    problem: Problem, values: Array, watch: Watch[Any] = pass_on, settings: Settings | None = None
 ) -> tuple[TrackScore | None, ...]:
     """Scores of the judging tracks, in order.
 
@@ -162,7 +161,7 @@ def score(
     scores = judge_tracks(
         estimator, tracks_of(problem.dataset, names), config.observe, horizon, problem.jobs, len(names)
     )
-    return tuple((watch or _pass_on)(scores, len(names), "tracks judged"))
+    return tuple(watch(scores, len(names), "tracks judged"))
 
 
 def population_settings(problem: Problem, step: Step) -> Settings:
@@ -242,7 +241,3 @@ def _move(population: Population, about: Array) -> float:
 
 def _plain(values: Array) -> tuple[float, ...]:
     return tuple(values.tolist())
-
-
-def _pass_on(items: Iterable[Any], total: int, what: str) -> Iterator[Any]:
-    return iter(items)

@@ -37,7 +37,7 @@ class GaussNewtonFactors(SquareRootInformation):
     """The factorisations R^T R of the Gauss-Newton matrices of several tracks, which solves all of them at once."""
 
     def solve(self, vector: Tensor) -> Tensor:
-        """R^-1 R^-T times a vector in the order of `Layout`."""
+        """R^-1 R^-T times a vector (n,) in the order of `Layout`: the solution (n,), in SI units."""
         given = vector.detach().numpy()
         split = self.lengths.sum() * STATE_DIM
         inside = np.arange(self.inverse.shape[1]) < self.lengths[:, None]
@@ -91,13 +91,16 @@ class ConjugateGradients:
         """Products with the Hessian in the last solution."""
 
     def precondition(self, vector: Tensor) -> Tensor:
-        """The Gauss-Newton solution."""
+        """The Gauss-Newton solution (n,), in SI units, of a right side `vector` (n,) in those of the gradient."""
         return self.factors.solve(vector)
 
     def __call__(self, product: Product, right: Tensor) -> Tensor:
         """The solution x of H x = right.
 
-        Args: product: H times a vector (n,).  right: (n,).
+        Args:
+            product: H times a vector (n,).
+            right: (n,) in the units of the gradient.
+        Returns: (n,) in SI units of the states and coefficients.
         Raises: NotAMinimum: H has a direction of negative curvature, or the iteration does not converge.
         """
         solution = torch.zeros_like(right)

@@ -93,7 +93,7 @@ class UnrolledGradient(GradientMethod):
     def __call__(
         self, solve: Solve, stationarity: Stationarity, linear_solver: LinearSolver, parameters: Sequence[Tensor]
     ) -> Tensor:
-        """The solution (n,), differentiable in the parameters through the iterations."""
+        """The solution (n,), in the units of `solve`, differentiable in the parameters through the iterations."""
         point = solve().detach().requires_grad_(True)
         for _ in range(self.iterations):
             point = point - _Preconditioned.apply(stationarity(point), linear_solver)

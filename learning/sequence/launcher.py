@@ -30,7 +30,7 @@ class LauncherSettings:
         return len(self._reader().names) if self.labels else 0
 
     def of(self, track: Track) -> Tensor:
-        """(k,) the settings of a track.
+        """(k,) the settings of a track, in the units of their labels.
 
         Raises: ValueError: if a label is missing, or is not a number or one of the known categories.
         """

@@ -83,7 +83,14 @@ class SequencePredictor:
     def predict_many(
         self, tracks: Sequence[Track], observed: Sequence[int], times: Sequence[ArrayLike]
     ) -> list[NDArray[np.float64]]:
-        """The same for many tracks: one entry of `observed` and `times` each.
+        """Positions of many tracks, as `predict` gives them.
+
+        Args:
+            tracks: as for `predict`.
+            observed: one number per track.
+            times: (k,) s, one array per track.
+
+        Returns: (k, 3) m, one array per track.
 
         Raises: ValueError: as `predict`.
         """
