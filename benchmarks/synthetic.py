@@ -10,8 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from ballfg.benchmarks.estimators.step_noise import StepNoise
-from ballfg.dynamics import BallModel, Surfaces, contact_time, nominal_model
-from ballfg.dynamics.motion.rollout import rollout
+from ballfg.dynamics import BallModel, Surfaces, contact_time, nominal_model, rollout
 from ballfg.estimation import Settings
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise

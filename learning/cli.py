@@ -14,7 +14,7 @@ import typer
 
 from ballfg.cli.errors import guarded
 from ballfg.cli.inputs import default_jobs
-from ballfg.cli.progress import progress
+from ballfg.progress import progress
 
 if TYPE_CHECKING:
     from ballfg.learning.config.training import TrainConfig

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from typing import TypeVar
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
@@ -15,17 +14,8 @@ from ballfg.estimation.batch import map_tracks
 from ballfg.prediction import predict_tracks
 from ballfg.tracks import Track
 
-T = TypeVar("T")
-Watch = Callable[[Iterable[T], int, str], Iterator[T]]
-"""Passes items on, for instance to show progress: the items, their number, a word for them."""
-
 NINETY = float(norm.ppf(0.95))
 """Standard deviations to each side of a central 90 % interval."""
-
-
-def pass_on(items: Iterable[T], _total: int, _what: str) -> Iterator[T]:
-    """The `Watch` that shows nothing."""
-    return iter(items)
 
 
 class TrackScore(BaseModel):

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
-from ballfg.cli.progress import progress
+from ballfg.progress import progress
 
 if TYPE_CHECKING:
     from ballfg.vision.calibration.boards import Board, Image
@@ -38,33 +38,33 @@ class BoardKind(enum.StrEnum):
 
 
 def calibrate_cameras(
-    out: Annotated[Path, typer.Option(help="File to write: .yaml, or .xml or .json as OpenCV writes them.")],
+    out: Annotated[Path, typer.Option(help="Output camera file: .yaml, or .xml or .json for OpenCV.")],
     images: Annotated[
         list[str] | None,
-        _lens_option(help="NAME=PLACE: camera and folder, pattern or file of its images; may be repeated."),
+        _lens_option(help="Board images of a camera, NAME=PLACE: a folder, pattern or file; may be repeated."),
     ] = None,
-    board: Annotated[BoardKind, _lens_option(help="The board.")] = BoardKind.CHESSBOARD,
-    squares: Annotated[str, _lens_option(help="Squares in a row x rows, the outermost ones too, as 10x7.")] = "",
+    board: Annotated[BoardKind, _lens_option(help="Kind of board.")] = BoardKind.CHESSBOARD,
+    squares: Annotated[str, _lens_option(help="Number of squares, columns x rows, with the outermost: 10x7.")] = "",
     square: Annotated[float, _lens_option(help="Side of a square, m.")] = 0.0,
     marker: Annotated[float, _lens_option(help="Side of a ChArUco marker, m.")] = 0.0,
     dictionary: Annotated[str, _lens_option(help="ArUco dictionary of the markers.")] = "4X4_100",
-    legacy: Annotated[bool, _lens_option("--legacy", help="The board was printed by OpenCV before 4.6.")] = False,
-    distortion: Annotated[int, _lens_option(help="Coefficients: 0, 4, 5, 8, 12 or 14.")] = 5,
+    legacy: Annotated[bool, _lens_option("--legacy", help="Board printed by OpenCV before 4.6.")] = False,
+    distortion: Annotated[int, _lens_option(help="Number of distortion coefficients: 0, 4, 5, 8, 12 or 14.")] = 5,
     intrinsics: Annotated[
-        Path | None, typer.Option(help="File of cameras whose lenses are known, instead of images.")
+        Path | None, typer.Option(help="Camera file with known lenses, in place of --images.")
     ] = None,
-    table: Annotated[Path | None, _place_option(help="File with the pixels of the table's corners.")] = None,
+    table: Annotated[Path | None, _place_option(help="File with pixels of the table's corners by camera.")] = None,
     view: Annotated[
-        list[str] | None, _place_option(help="NAME=IMAGE: what the table is drawn into; may be repeated.")
+        list[str] | None, _place_option(help="Image of a camera for the drawn table, NAME=IMAGE; may be repeated.")
     ] = None,
 ) -> None:
-    """Find each camera's lens from images of a board, and its place from the corners of the table.
+    """Calibrate each camera's lens from images of a board, and its pose from the corners of the table.
 
     Example: ballfg calibrate-cameras --squares 10x7 --square 0.025 --images left=calib/left --images
     right=calib/right --table table.yaml --out cameras.yaml
 
-    Beside the file two others say how well the cameras are known: OUT_calibration.json and .png. Without --table only
-    the lenses are written, for a later --intrinsics.
+    OUT_calibration.json and .png show how accurate the calibration is. Without --table only the lenses are written, for
+    a later --intrinsics.
     """
     from ballfg.files.destination import check_file
     from ballfg.vision.calibration.boards import read_grey

@@ -10,16 +10,19 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ballfg.cli.inputs import (
+    CORES,
+    Jobs,
+    ModelFile,
+    OutTable,
     OwnEffects,
     Source,
     check_out,
-    default_jobs,
     open_inputs,
     open_sighted,
     source_of,
     status_lines,
 )
-from ballfg.cli.progress import progress
+from ballfg.progress import progress
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,26 +41,27 @@ class Method(enum.StrEnum):
 
 def estimate(
     dataset: Annotated[Path, typer.Argument(help="Folder with dataset.yaml and tracks, or detections and cameras.")],
-    out: Annotated[Path, typer.Option(help="Table to write; .csv or .parquet.")],
-    method: Annotated[Method, typer.Option(help="The estimator.")] = Method.SMOOTHER,
-    model: Annotated[Path | None, typer.Option(help="Model file; the nominal table-tennis model without it.")] = None,
+    out: OutTable,
+    method: Annotated[Method, typer.Option(help="Estimator.")] = Method.SMOOTHER,
+    model: ModelFile = None,
     source: Annotated[
         Source | None,
         typer.Option(
             "--from",
-            help="Positions of tracks, or detections of cameras: detections.csv with cameras.yaml.",
+            help="Input: positions of tracks, or camera detections (detections.csv with cameras.yaml).",
             show_default="positions where there is a table of tracks",
         ),
     ] = None,
     effects: OwnEffects = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes.", show_default="one per core")] = default_jobs(),
+    jobs: Jobs = CORES,
 ) -> None:
     """Position, velocity and spin with standard deviations, one row per stamp.
 
-    They are the true ones where the model file holds measurement effects; the stamps stay as they are written.
+    Measurement effects of the model file are removed from the states; the stamps stay as they are written.
 
-    From detections, smoother and online rest on every camera's pixels at its own stamp, and stamps are true times: less
-    the cameras' time offsets. The others use positions that are roughly triangulated.
+    From detections, the smoother and the online estimator use every camera's pixels at its own stamp; the stamps of the
+    table are then true times, with the cameras' time offsets subtracted. The other methods use roughly triangulated
+    positions.
 
     Example: ballfg estimate data/aimy --method smoother --out states.csv
     """

@@ -20,11 +20,24 @@ if TYPE_CHECKING:
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.tracks import Dataset
 
+
+def default_jobs() -> int:
+    """One process per core that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 OwnEffects = Annotated[
     list[Path] | None,
-    typer.Option("--effects", help="Python file with effects of your own, to run and know; may be repeated."),
+    typer.Option("--effects", help="Python file that defines custom effects; may be repeated."),
 ]
 """The option of every command that reads or names effects."""
+ModelFile = Annotated[
+    Path | None, typer.Option("--model", help="Model file; by default the nominal table-tennis model.")
+]
+CORES = default_jobs()
+Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Number of processes.", show_default="one per core")]
+OutTable = Annotated[Path, typer.Option("--out", help="Output table, .csv or .parquet.")]
+Seed = Annotated[int, typer.Option("--seed", help="Random seed.")]
 DATASET_TABLES = ("tracks", "labels", "detections", "truth")
 """Names, without their endings, of the tables that a dataset's folder holds."""
 
@@ -116,8 +129,3 @@ def status_lines(statuses: Counter[str]) -> Iterator[str]:
     """How many tracks ended how, most first."""
     for text, number in statuses.most_common():
         yield f"  {number} track{'s' if number > 1 else ''}: {text}"
-
-
-def default_jobs() -> int:
-    """One process per core that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

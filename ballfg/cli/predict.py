@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ballfg.cli.estimate import Method
-from ballfg.cli.inputs import OwnEffects, check_out, default_jobs, open_inputs, status_lines
-from ballfg.cli.progress import progress
+from ballfg.cli.inputs import CORES, Jobs, ModelFile, OutTable, OwnEffects, check_out, open_inputs, status_lines
+from ballfg.progress import progress
 
 if TYPE_CHECKING:
     import numpy as np
@@ -20,16 +20,16 @@ if TYPE_CHECKING:
 
 def predict(
     dataset: Annotated[Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.")],
-    observe: Annotated[float, typer.Option(help="Seconds from the start of each track that the estimator sees.")],
-    out: Annotated[Path, typer.Option(help="Table to write; .csv or .parquet.")],
-    method: Annotated[Method, typer.Option(help="The estimator.")] = Method.SMOOTHER,
-    model: Annotated[Path | None, typer.Option(help="Model file; the nominal table-tennis model without it.")] = None,
+    observe: Annotated[float, typer.Option(help="Observed time from the start of each track, s.")],
+    out: OutTable,
+    method: Annotated[Method, typer.Option(help="Estimator.")] = Method.SMOOTHER,
+    model: ModelFile = None,
     effects: OwnEffects = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes.", show_default="one per core")] = default_jobs(),
+    jobs: Jobs = CORES,
 ) -> None:
     """Positions at every stamp after the observed part, with the standard deviation of a measurement there.
 
-    They are those that will be measured, with all measurement effects that the model file holds.
+    These are the positions that will be measured: measurement effects of the model file are included.
 
     Example: ballfg predict data/ballgun --observe 0.25 --out predictions.csv
     """

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ballfg.cli.inputs import OwnEffects, know_effects
-from ballfg.cli.progress import progress
+from ballfg.cli.inputs import OwnEffects, Seed, know_effects
+from ballfg.progress import progress
 
 if TYPE_CHECKING:
     from ballfg.simulation.scene import Clock
@@ -20,38 +20,37 @@ _cameras, _picture, _balls, _files = (
 
 
 def render(
-    out: Annotated[Path, _files(help="Folder of the scene: new or empty.")],
-    seed: Annotated[int, typer.Option(help="Seed: the same one gives the same files, to the byte.")] = 0,
-    shots: Annotated[int, _balls(help="Balls, launched one after the other.")] = 6,
-    interval: Annotated[float, _balls(help="From launch to launch, s; below 1.3 two balls fly at once.")] = 2.0,
-    settings: Annotated[str, _balls(help="Launcher levels, as topspin=-3,sidespin=-5..5,speed=9.")] = "",
-    effect: Annotated[
-        list[str] | None, _balls(help="An effect that nobody declares, as wind.x=0.3; may be repeated.")
-    ] = None,
+    out: Annotated[Path, _files(help="Output folder: new or empty.")],
+    seed: Seed = 0,
+    shots: Annotated[int, _balls(help="Number of balls, launched one after the other.")] = 6,
+    interval: Annotated[float, _balls(help="Time between launches, s; below 1.3 two balls fly at once.")] = 2.0,
+    settings: Annotated[str, _balls(help="Launcher settings, as topspin=-3,sidespin=-5..5,speed=9.")] = "",
+    effect: Annotated[list[str] | None, _balls(help="Undeclared effect, as wind.x=0.3; may be repeated.")] = None,
     effects: OwnEffects = None,
-    rate: Annotated[float, _cameras(help="Frames per second, Hz.")] = 120.0,
-    exposure: Annotated[float, _cameras(help="How long the shutter is open, s.")] = 0.002,
-    unsynchronised: Annotated[bool, _cameras("--unsynchronised", help="Cameras expose at different moments.")] = False,
+    rate: Annotated[float, _cameras(help="Frame rate, Hz.")] = 120.0,
+    exposure: Annotated[float, _cameras(help="Exposure time, s.")] = 0.002,
+    unsynchronised: Annotated[bool, _cameras("--unsynchronised", help="Cameras with independent shutters.")] = False,
     offset: Annotated[
-        list[str] | None, _cameras(help="A camera whose stamps are late by so many s, as left=0.004; may be repeated.")
+        list[str] | None, _cameras(help="Delay of a camera's stamps, s, as left=0.004; may be repeated.")
     ] = None,
     dropout: Annotated[float, _cameras(help="Probability of a dropped frame.")] = 0.0,
     jitter: Annotated[float, _cameras(help="Jitter of the stamps, s.")] = 0.0,
-    size: Annotated[str, _cameras(help="Width and height of the images, pixels.")] = "1280x720",
-    distance: Annotated[float, _cameras(help="From each camera to the middle of the flights, m.")] = 3.0,
-    colour: Annotated[str, _picture(help="Of the ball: white or orange.")] = "white",
+    size: Annotated[str, _cameras(help="Image size, pixels.")] = "1280x720",
+    distance: Annotated[float, _cameras(help="Distance of each camera from the middle of the flights, m.")] = 3.0,
+    colour: Annotated[str, _picture(help="Ball colour: white or orange.")] = "white",
     noise: Annotated[float, _picture(help="Noise of a dark pixel, grey levels.")] = 2.0,
-    flicker: Annotated[float, _picture(help="How much the lamps flicker, relative.")] = 0.03,
-    distractors: Annotated[bool, _picture(help="Whether other things than the ball move.")] = True,
-    images: Annotated[bool, _files("--images", help="Write PNG images in place of videos: nothing is lost.")] = False,
-    force: Annotated[bool, _files("--force", help="Replace a rendered scene.")] = False,
+    flicker: Annotated[float, _picture(help="Relative flicker of the lamps.")] = 0.03,
+    distractors: Annotated[bool, _picture(help="Other moving things in the scene.")] = True,
+    images: Annotated[bool, _files("--images", help="Lossless PNG images in place of videos.")] = False,
+    force: Annotated[bool, _files("--force", help="Replace an earlier scene.")] = False,
 ) -> None:
     """Write videos of simulated balls over a table as three cameras see them, with the truth beside them.
 
     Example: ballfg render --out scene --shots 6 --rate 120 --exposure 0.002 --unsynchronised
 
     The cameras are in cameras.yaml, the frames' stamps in NAME_stamps.csv. truth.csv has the true states over time,
-    visible.csv where each ball truly is in each frame, scene.yaml everything that was asked for.
+    visible.csv the true place of each ball in each frame, scene.yaml the whole configuration. The same seed gives the
+    same files, to the byte.
     """
     from ballfg.simulation import parse_effects, parse_settings
     from ballfg.simulation.cameras import table_rig
@@ -77,10 +76,10 @@ def render(
         **look,
     )
     recording = record(config, cameras)
-    total = recording.image_count
-    write_scene(out, recording, images=images, force=force, watch=lambda drawn: progress(drawn, total, "frames drawn"))
+    write_scene(out, recording, images=images, force=force, watch=progress)
     kind = "images" if images else "a video"
-    typer.echo(f"wrote {total} frames to {out}: {kind} and stamps for each of {', '.join(names)}; cameras.yaml")
+    count = recording.image_count
+    typer.echo(f"wrote {count} frames to {out}: {kind} and stamps for each of {', '.join(names)}; cameras.yaml")
     typer.echo(f"wrote the truth to {out}: truth.csv, visible.csv, scene.yaml")
 
 

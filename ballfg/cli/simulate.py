@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import OwnEffects, know_effects
-from ballfg.cli.progress import progress
+from ballfg.cli.inputs import OwnEffects, Seed, know_effects
+from ballfg.progress import progress
 
 if TYPE_CHECKING:
     from ballfg.simulation import BallKind
@@ -20,38 +20,39 @@ _noise, _ball_option, _files = (
 
 
 def simulate(
-    out: Annotated[Path, _files(help="Folder of the dataset: new or empty.")],
+    out: Annotated[Path, _files(help="Output folder of the dataset: new or empty.")],
     tracks: Annotated[int, typer.Option(help="Number of tracks.")] = 717,
-    seed: Annotated[int, typer.Option(help="Seed: the same one gives the same files, to the byte.")] = 0,
-    rate: Annotated[float, typer.Option(help="Frames per second, Hz.")] = 100.0,
+    seed: Seed = 0,
+    rate: Annotated[float, typer.Option(help="Sampling rate, Hz.")] = 100.0,
     noise: Annotated[float, _noise(help="Position noise, m.")] = 0.003,
     dropout: Annotated[float, _noise(help="Probability of a dropped frame.")] = 0.0,
     jitter: Annotated[float, _noise(help="Jitter of the stamps, s.")] = 0.0,
     outliers: Annotated[float, _noise(help="Probability of an outlier.")] = 0.0,
     outlier_size: Annotated[float, _noise(help="Typical distance of an outlier, m.")] = 0.1,
     spin_noise: Annotated[float, _noise(help="Noise of the spin labels, rad/s.")] = 4.0,
-    spin_labels: Annotated[bool, _noise(help="Write spin labels; the launcher's settings always are.")] = True,
+    spin_labels: Annotated[bool, _noise(help="Spin labels; launcher settings are always written.")] = True,
     process_noise: Annotated[float, _noise(help="White acceleration in flight, m/s^1.5.")] = 0.0,
     spin_process_noise: Annotated[float, _noise(help="White angular acceleration in flight, rad/s^1.5.")] = 0.0,
     contact_noise: Annotated[float, _noise(help="Kick to the velocity after a bounce, m/s.")] = 0.0,
     contact_spin_noise: Annotated[float, _noise(help="Kick to the spin after a bounce, rad/s.")] = 0.0,
-    ball: Annotated[str, _ball_option(help="table-tennis, tennis or a ball file (YAML).")] = "table-tennis",
+    ball: Annotated[str, _ball_option(help="Ball: table-tennis, tennis, or a ball file (YAML).")] = "table-tennis",
     model: Annotated[Path | None, _ball_option(help="Model file; by default the ball's own model.")] = None,
-    settings: Annotated[str, _ball_option(help="Launcher levels, as topspin=-3,sidespin=-5..5,speed=9.")] = "",
+    settings: Annotated[str, _ball_option(help="Launcher settings, as topspin=-3,sidespin=-5..5,speed=9.")] = "",
     effect: Annotated[
         list[str] | None,
-        _ball_option(help="An effect that nobody declares, as wind.x=0.3; may be repeated."),
+        _ball_option(help="Undeclared effect, as wind.x=0.3; may be repeated."),
     ] = None,
     effects: OwnEffects = None,
-    format: Annotated[str, _files(help="csv or parquet.")] = "csv",
-    force: Annotated[bool, _files("--force", help="Replace a simulated dataset.")] = False,
+    format: Annotated[str, _files(help="File format: csv or parquet.")] = "csv",
+    force: Annotated[bool, _files("--force", help="Replace an earlier simulated dataset.")] = False,
 ) -> None:
     """Write synthetic tracks of a ball launcher as a dataset, with the truth beside them.
 
     Example: ballfg simulate --out windy --tracks 50 --noise 0.003 --effect wind.x=0.3
 
-    The dataset says what is declared. truth.yaml and truth.csv say what was really done: undeclared effects, and the
-    true state at every stamp. model.yaml is the declared model, for the --model of other commands.
+    dataset.yaml and model.yaml hold the declared model, for the --model of other commands. truth.yaml holds the whole
+    configuration with the undeclared effects, truth.csv the true state at every stamp. The same seed gives the same
+    files, to the byte.
     """
     from ballfg.simulation import (
         MeasurementNoise,
@@ -76,9 +77,7 @@ def simulate(
         undeclared=parse_effects(effect or ()),
         spin_labels=spin_labels,
     )
-    write_simulation(
-        out, config, file_format, force=force, watch=lambda made: progress(made, tracks, "tracks simulated")
-    )
+    write_simulation(out, config, file_format, force=force, watch=progress)
     names = ", ".join(e.name for e in config.undeclared) or "none"
     typer.echo(f"wrote {tracks} tracks to {out}: tracks.{file_format}, labels.csv, dataset.yaml, model.yaml (declared)")
     typer.echo(f"wrote the truth to {out}: truth.{file_format}, truth.yaml (undeclared effects: {names})")

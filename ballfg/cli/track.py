@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
-from ballfg.cli.progress import progress
+from ballfg.progress import progress
 
 if TYPE_CHECKING:
     from ballfg.dynamics import AnalyticModel, Surfaces
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 
 class Colour(enum.StrEnum):
-    """Of the ball."""
+    """Colours of the ball, by the name of the option."""
 
     WHITE = "white"
     ORANGE = "orange"
@@ -38,28 +38,28 @@ def track(
             help="Videos or folders of images, each named as its camera or as NAME=PATH; or one detections.csv.",
         ),
     ],
-    cameras: Annotated[Path, typer.Option(help="File of the calibrated cameras.")],
-    out: Annotated[Path, typer.Option(help="Folder of the dataset: new or empty.")],
+    cameras: Annotated[Path, typer.Option(help="File of the calibrated cameras (cameras.yaml).")],
+    out: Annotated[Path, typer.Option(help="Output folder of the dataset: new or empty.")],
     stamps: Annotated[
         list[str] | None,
-        typer.Option(help="NAME=FILE.csv, a camera's stamps (column t), instead of its video's; may be repeated."),
+        typer.Option(help="Frame stamps of a camera, NAME=FILE.csv with a column t; may be repeated."),
     ] = None,
-    without: Annotated[list[str] | None, typer.Option(help="Leave a camera out; may be repeated.")] = None,
+    without: Annotated[list[str] | None, typer.Option(help="Camera to leave out; may be repeated.")] = None,
     time_offsets: Annotated[
-        bool, typer.Option("--time-offsets", help="Find by how much cameras' stamps are late against the first one's.")
+        bool, typer.Option("--time-offsets", help="Estimate each camera's time offset from the first camera.")
     ] = False,
-    colour: Annotated[Colour | None, typer.Option(help="Of the ball; any without it.")] = None,
-    detector: Annotated[str | None, typer.Option(help="FILE.py:NAME, a detector of your own, to run.")] = None,
-    ball: Annotated[str, typer.Option(help="table-tennis, tennis or a ball file (YAML).")] = "table-tennis",
+    colour: Annotated[Colour | None, typer.Option(help="Ball colour; by default any.")] = None,
+    detector: Annotated[str | None, typer.Option(help="Custom detector, FILE.py:NAME.")] = None,
+    ball: Annotated[str, typer.Option(help="Ball: table-tennis, tennis, or a ball file (YAML).")] = "table-tennis",
     table_height: Annotated[
-        float | None, typer.Option(help="z of the table's surface, m.", show_default="that of the ball's table")
+        float | None, typer.Option(help="Height of the table's surface, m.", show_default="that of the ball's table")
     ] = None,
-    name: Annotated[str | None, typer.Option(help="Name of the dataset.", show_default="the folder's")] = None,
-    overlay: Annotated[bool, typer.Option(help="Write the overlay video.")] = True,
+    name: Annotated[str | None, typer.Option(help="Dataset name.", show_default="the folder's")] = None,
+    overlay: Annotated[bool, typer.Option(help="Overlay video.")] = True,
     force: Annotated[bool, typer.Option("--force", help="Replace an earlier result.")] = False,
-    jobs: Annotated[int | None, typer.Option(min=1, help="Processes.", show_default="one per camera")] = None,
+    jobs: Annotated[int | None, typer.Option(min=1, help="Number of processes.", show_default="one per camera")] = None,
 ) -> None:
-    """From the videos of calibrated cameras to a dataset of tracks, with pictures to check them by.
+    """Turn videos of calibrated cameras into a dataset of tracks, with pictures to check them.
 
     Example: ballfg track left.mp4 middle.mp4 right.mp4 --cameras cameras.yaml --out shots
 
@@ -150,7 +150,7 @@ def _from_videos(
         make,
         stamps=files,
         jobs=jobs or len(rig),
-        watch=lambda frames, total: progress(frames, total, "frames searched"),
+        watch=progress,
     )
     return tracking, [open_video(path, files.get(name)).frames for name, path in videos.items()]
 

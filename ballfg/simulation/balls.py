@@ -8,11 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, Literal
 
-import yaml
-
+from ballfg.checks import check_number
 from ballfg.dynamics import AnalyticModel, Surfaces, model_from_dict, model_to_dict, nominal_model
 from ballfg.dynamics.model import THIN_SHELL
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR
+from ballfg.files.strict_yaml import read_yaml
 from ballfg.simulation.launcher import TABLE_LAUNCHER, TABLE_LENGTH, TABLE_WIDTH, TENNIS_LAUNCHER, Launcher
 from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball
 
@@ -102,10 +102,7 @@ def ball_kind(name: str) -> BallKind:
         raise FileNotFoundError(
             f"ball must be {' or '.join(BALLS)} or a YAML file that exists; got '{name}'. See docs/simulate.md."
         )
-    try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not readable as YAML ({' '.join(str(error).split())})") from error
+    content = read_yaml(path)
     try:
         return ball_from_mapping(content, default_name=path.stem)
     except (ValueError, TypeError) as error:
@@ -133,7 +130,7 @@ def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:
     model = model_from_dict(
         {"flight": content["flight"], "bounce": content["bounce"]},
         radius=ball.radius,
-        inertia_factor=_inertia_factor(content.get("inertia_factor", THIN_SHELL)),
+        inertia_factor=check_number("inertia_factor", content.get("inertia_factor", THIN_SHELL)),
         where="ball",
     )
     surface = _surface(content.get("surface", "table"))
@@ -145,12 +142,6 @@ def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:
         TABLE if surface == "table" else COURT,
         launcher.with_fields(content.get("launcher", {})),
     )
-
-
-def _inertia_factor(value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise TypeError(f"inertia_factor must be a number; got {value!r}. A thin shell has 0.6667, a solid ball 0.4.")
-    return float(value)
 
 
 def _surface(value: Any) -> Literal["table", "court"]:

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
+from ballfg.checks import check_count, check_range
 from ballfg.dynamics import Effect
 from ballfg.simulation.balls import BallKind, table_tennis
-from ballfg.simulation.checks import check_count, check_range
 from ballfg.simulation.settings import Settings, all_settings
 
 MAX_TRACKS = 10_000_000

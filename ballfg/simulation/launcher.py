@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ballfg.checks import check_range
 from ballfg.dynamics import BallModel, Surfaces
-from ballfg.simulation.checks import check_range
 from ballfg.simulation.settings import SETTING_LEVELS, Settings
 from ballfg.state import STATE_DIM
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, Literal, cast
@@ -14,6 +14,7 @@ from torch import Tensor
 from ballfg.dynamics import Effect, save_model
 from ballfg.files.destination import check_replaceable
 from ballfg.files.whole_folder import whole_folder
+from ballfg.progress import Watch, unwatched
 from ballfg.simulation.balls import describe
 from ballfg.simulation.config import SimulationConfig
 from ballfg.simulation.measure import SimulatedTrack
@@ -23,7 +24,6 @@ from ballfg.tracks import TableWriter, Track, write_dataset
 from ballfg.tracks.writing import DATASET_FILES
 
 FileFormat = Literal["csv", "parquet"]
-Watch = Callable[[Iterable[SimulatedTrack]], Iterator[SimulatedTrack]]
 TRUTH_FILE: Final = "truth.yaml"
 MODEL_FILE: Final = "model.yaml"
 TRUTH_TABLES: Final = ("truth.csv", "truth.parquet")
@@ -35,7 +35,7 @@ def write_simulation(
     file_format: FileFormat = "csv",
     *,
     force: bool = False,
-    watch: Watch = iter,
+    watch: Watch = unwatched,
 ) -> None:
     """Simulates tracks and writes them as a dataset, with their truth.
 
@@ -48,7 +48,7 @@ def write_simulation(
         config: the simulation.
         file_format: "csv" or "parquet", for tracks and truth.
         force: replace a simulated dataset that is there already.
-        watch: hands the tracks through, for instance to show progress.
+        watch: sees the tracks that are simulated.
     Raises:
         ValueError: the folder holds something else, an unknown format, or effects that do not go with the model.
         FileNotFoundError: the folder's parent does not exist.
@@ -59,7 +59,7 @@ def write_simulation(
     earlier = (*DATASET_FILES, *TRUTH_TABLES, f"{Path(MODEL_FILE).stem}.learned-*")
     with whole_folder(path, earlier=earlier, last=TRUTH_FILE) as stage:
         with TableWriter(stage / f"truth.{file_format}") as truth:
-            tracks = _with_truth(watch(simulate(config)), truth, config)
+            tracks = _with_truth(watch(simulate(config), config.tracks, "tracks simulated"), truth, config)
             write_dataset(stage, dataset_info(config), tracks, file_format)
         save_model(config.ball.model, stage / MODEL_FILE)
         text = yaml.safe_dump(truth_content(config), sort_keys=False)

@@ -9,8 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from .grouping import RowGroup
-from .track import FloatArray
+from ballfg.tracks.grouping import RowGroup
+from ballfg.tracks.track import FloatArray
 
 MERGE_DISTANCE = 0.1
 """m: two rows at one stamp farther apart than this are refused; one frame of a ball at 15 m/s and 150 Hz."""

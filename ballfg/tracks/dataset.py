@@ -4,12 +4,12 @@ from collections.abc import Iterator
 from os import PathLike
 from pathlib import Path
 
-from .checks import Findings, check_scale, tidy
-from .grouping import Index, RowGroup, groups, scan
-from .info import INFO_FILE, DatasetInfo, read_info
-from .labels import LABELS_FILE, LabelTable, read_labels
-from .rows import CsvRows, ParquetRows, RowSource
-from .track import FloatArray, Label, Track
+from ballfg.tracks.checks import Findings, check_scale, tidy
+from ballfg.tracks.grouping import Index, RowGroup, groups, scan
+from ballfg.tracks.info import INFO_FILE, DatasetInfo, read_info
+from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
+from ballfg.tracks.rows import CsvRows, ParquetRows, RowSource
+from ballfg.tracks.track import FloatArray, Label, Track
 
 TRACK_FILES = ("tracks.csv", "tracks.parquet")
 

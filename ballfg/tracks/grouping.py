@@ -14,9 +14,9 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
-from .csv_errors import no_rows
-from .rows import Block, RowSource
-from .track import FloatArray
+from ballfg.tracks.csv_files import no_rows
+from ballfg.tracks.rows import Block, RowSource
+from ballfg.tracks.track import FloatArray
 
 LARGEST = 1e100
 """Any number beyond this is refused at once, so that no later step overflows."""

@@ -1,5 +1,6 @@
 """What a dataset says about itself: `dataset.yaml`, checked."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -7,8 +8,8 @@ from typing import Any
 
 import yaml
 
-from .fields import check_text, kind, set_number
-from .hints import did_you_mean, nearest
+from ballfg.checks import check_number, check_text, did_you_mean, nearest, type_name
+from ballfg.files.strict_yaml import YamlError, read_yaml
 
 INFO_FILE = "dataset.yaml"
 _REQUIRED = ("name", "frame", "ball")
@@ -36,8 +37,10 @@ class Ball:
     """kg"""
 
     def __post_init__(self) -> None:
-        set_number(self, "radius", "ball.radius", "m", above=0.0, limit=_MAX_RADIUS, instead="mm")
-        set_number(self, "mass", "ball.mass", "kg", above=0.0, limit=_MAX_MASS, instead="g")
+        radius = check_number("ball.radius", self.radius, "m", above=0.0, limit=_MAX_RADIUS, instead="mm")
+        mass = check_number("ball.mass", self.mass, "kg", above=0.0, limit=_MAX_MASS, instead="g")
+        object.__setattr__(self, "radius", radius)
+        object.__setattr__(self, "mass", mass)
 
 
 TABLE_TENNIS = Ball(radius=0.02, mass=0.0027)
@@ -83,15 +86,16 @@ class DatasetInfo:
             check_text(key, getattr(self, key), optional=key != "name")
         if not isinstance(self.ball, Ball):
             raise TypeError(f"ball must be a Ball; got {type(self.ball).__name__}. Pass Ball(radius, mass).")
-        set_number(self, "table_height", "frame.table_height", "m", limit=MAX_HEIGHT, instead="mm")
-        if self.rate is not None:
-            set_number(self, "rate", "rate", "Hz", above=0.0)
-        if self.position_noise is not None:
-            set_number(
-                self, "position_noise", "position_noise", "m", above=0.0, limit=_MAX_POSITION_NOISE, instead="mm"
-            )
-        if self.spin_noise is not None:
-            set_number(self, "spin_noise", "spin_noise", "rad/s", above=0.0)
+        height = check_number("frame.table_height", self.table_height, "m", limit=MAX_HEIGHT, instead="mm")
+        object.__setattr__(self, "table_height", height)
+        for key, unit, limit, instead in (
+            ("rate", "Hz", math.inf, ""),
+            ("position_noise", "m", _MAX_POSITION_NOISE, "mm"),
+            ("spin_noise", "rad/s", math.inf, ""),
+        ):
+            value = getattr(self, key)
+            if value is not None:
+                object.__setattr__(self, key, check_number(key, value, unit, above=0.0, limit=limit, instead=instead))
 
     @classmethod
     def from_mapping(cls, content: Mapping[str, Any]) -> "DatasetInfo":
@@ -135,16 +139,13 @@ def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:
     Raises: ValueError: not readable as YAML, or a bad field; the message names file and field.
     """
     try:
-        content = yaml.safe_load(path.read_text(encoding="utf-8-sig"))
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: must be UTF-8 text; {error.reason}. Save it as UTF-8.") from None
-    except yaml.YAMLError as error:
-        raise ValueError(
-            f"{path}{_yaml_place(error)}: must be valid YAML; {_yaml_problem(error)}. Correct it."
-        ) from None
+        content = read_yaml(path)
+    except YamlError as error:
+        place = "" if error.line is None else f", line {error.line}"
+        raise ValueError(f"{path}{place}: must be valid YAML; {error.problem}. Correct it.") from None
     if not isinstance(content, dict):
         raise ValueError(
-            f"{path}: must hold fields such as 'name: my_shots'; got {kind(content)}. "
+            f"{path}: must hold fields such as 'name: my_shots'; got {type_name(content)}. "
             f"Give at least {', '.join(_REQUIRED)}."
         )
     content = {str(key): value for key, value in content.items()}
@@ -187,13 +188,3 @@ def _need(content: Mapping[str, Any], key: str, prefix: str) -> None:
     found = nearest(key, [name for name in present if name not in _KNOWN])
     remedy = f"Add it, or rename {found!r}." if found else "Add it."
     raise ValueError(f"{prefix}{key} is required; got {', '.join(present) or 'nothing'}. {remedy}")
-
-
-def _yaml_place(error: yaml.YAMLError) -> str:
-    mark = getattr(error, "problem_mark", None)
-    return "" if mark is None else f", line {mark.line + 1}"
-
-
-def _yaml_problem(error: yaml.YAMLError) -> str:
-    problem = getattr(error, "problem", None) or getattr(error, "reason", None) or str(error)
-    return " ".join(str(problem).split())

@@ -3,10 +3,10 @@
 from collections.abc import Collection
 from pathlib import Path
 
-from . import csv_errors
-from .hints import did_you_mean
-from .rows import KEY
-from .track import SPIN_LABELS, Label
+from ballfg.checks import did_you_mean
+from ballfg.tracks import csv_files
+from ballfg.tracks.rows import KEY
+from ballfg.tracks.track import SPIN_LABELS, Label
 
 LABELS_FILE = "labels.csv"
 NUMERIC_LABELS = (*SPIN_LABELS, "topspin", "sidespin", "speed")
@@ -50,26 +50,18 @@ def read_labels(path: Path, trajectories: Collection[str]) -> LabelTable:
     Raises: ValueError: a missing or repeated column, a ragged line, a row without a track, a second row for a
         track, or a cell that must be a number and is not; the message names line and column.
     """
-    header = csv_errors.read_header(path)
-    _check_header(path, header)
+    header = csv_files.read_header(path)
+    csv_files.check_header(path, header, (KEY,), (KEY,))
+    if not all(name.strip() and name.isprintable() for name in header):
+        raise ValueError(
+            f"{path}: each column must have a printable name; got {','.join(header)!r}. Name it or delete it."
+        )
+    csv_files.check_header(path, header, (), header)
     rows, lines, cells = _read_rows(path, header, set(trajectories))
     columns = {
         name: _column(path, name, [row[i] for row in cells], lines) for i, name in enumerate(header) if name != KEY
     }
     return LabelTable(columns, rows)
-
-
-def _check_header(path: Path, header: list[str]) -> None:
-    shown = repr(",".join(header))
-    if KEY not in header:
-        raise ValueError(
-            f"{path}: column {KEY!r} is missing; got {shown}. Add or rename the column.{did_you_mean(KEY, header)}"
-        )
-    for name in header:
-        if not name.strip() or not name.isprintable():
-            raise ValueError(f"{path}: each column must have a printable name; got {shown}. Name it or delete it.")
-        if header.count(name) > 1:
-            raise ValueError(f"{path}: column {name!r} must appear once; got {shown}. Rename one of them.")
 
 
 def _read_rows(
@@ -80,7 +72,7 @@ def _read_rows(
     rows: dict[str, int] = {}
     lines: list[int] = []
     cells: list[list[str]] = []
-    for line, row in csv_errors.records(path):
+    for line, row in csv_files.records(path):
         if len(row) != len(header):
             raise ValueError(
                 f"{path}, line {line}: must have {len(header)} cells, one for each column of the header; "
@@ -108,7 +100,7 @@ def _column(path: Path, name: str, cells: list[str], lines: list[int]) -> list[L
     if name in TEXT_LABELS:
         return text
     for cell, line in zip(cells, lines, strict=True):
-        if cell.strip() and not csv_errors.is_number(cell):
+        if cell.strip() and not csv_files.is_number(cell):
             if name not in NUMERIC_LABELS:
                 return text
             raise ValueError(

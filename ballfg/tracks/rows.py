@@ -11,9 +11,8 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from . import csv_errors
-from .hints import did_you_mean
-from .track import FloatArray
+from ballfg.tracks import csv_files
+from ballfg.tracks.track import FloatArray
 
 KEY = "trajectory"
 VALUES = ("t", "x", "y", "z")
@@ -67,15 +66,11 @@ class CsvRows(RowSource):
     """`tracks.csv`. Empty lines are skipped."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, csv_errors.read_header(path))
+        super().__init__(path, csv_files.read_header(path))
 
     def blocks(self) -> Iterator[Block]:
         """Reads the file from its start; see RowSource."""
-        convert = pa_csv.ConvertOptions(
-            column_types={KEY: pa.string(), **dict.fromkeys(self.columns, pa.float64())},
-            include_columns=[KEY, *self.columns],
-            null_values=[],
-        )
+        convert = csv_files.convert_options([KEY], self.columns)
         options = pa_csv.ReadOptions(block_size=_CSV_BLOCK, use_threads=False)
         start = 0
         try:
@@ -84,11 +79,11 @@ class CsvRows(RowSource):
                     yield _block(batch, start)
                     start += batch.num_rows
         except pa.ArrowInvalid as error:
-            raise csv_errors.explain(self.path, self.columns, str(error)) from None
+            raise csv_files.explain(self.path, self.columns, str(error)) from None
 
     def where(self, *rows: int) -> str:
         """The file and the line numbers of these rows, counted from 1 with the header; see RowSource."""
-        lines = csv_errors.lines_of_rows(self.path, rows)
+        lines = csv_files.lines_of_rows(self.path, rows)
         return f"{self.path}, {_counted('line', lines)}"
 
 
@@ -99,7 +94,7 @@ class ParquetRows(RowSource):
         try:
             schema = pq.read_schema(path)
         except (pa.ArrowException, OSError) as error:
-            raise ValueError(f"{path}: must be a Parquet file; {csv_errors.one_line(error)}. Write it again.") from None
+            raise ValueError(f"{path}: must be a Parquet file; {csv_files.one_line(error)}. Write it again.") from None
         super().__init__(path, schema.names)
         for name in self.columns:
             kind = schema.field(name).type
@@ -120,7 +115,7 @@ class ParquetRows(RowSource):
                     start += batch.num_rows
         except (pa.ArrowException, OSError) as error:
             raise ValueError(
-                f"{self.path}: cannot be read as a table of tracks; {csv_errors.one_line(error)}. Write it again."
+                f"{self.path}: cannot be read as a table of tracks; {csv_files.one_line(error)}. Write it again."
             ) from None
 
     def where(self, *rows: int) -> str:
@@ -134,21 +129,12 @@ def check_columns(path: Path, header: Sequence[str]) -> list[str]:
     Returns: t, x, y, z and, if the file has them, sigma_x, sigma_y, sigma_z.
     Raises: ValueError: a missing or repeated column.
     """
-    for name in (KEY, *VALUES):
-        if name not in header:
-            others = [other for other in header if other not in (KEY, *VALUES, *SIGMAS)]
-            raise ValueError(
-                f"{path}: column {name!r} is missing; expected {','.join((KEY, *VALUES))}, got {_shown(header)}. "
-                f"Add or rename the column.{did_you_mean(name, others)}{_separator_hint(header)}"
-            )
-    for name in (KEY, *VALUES, *SIGMAS):
-        if list(header).count(name) > 1:
-            raise ValueError(f"{path}: column {name!r} must appear once; got {_shown(header)}. Rename one of them.")
+    csv_files.check_header(path, header, (KEY, *VALUES), (KEY, *VALUES, *SIGMAS))
     present = [name for name in SIGMAS if name in header]
     if present and len(present) < len(SIGMAS):
         absent = ", ".join(name for name in SIGMAS if name not in present)
         raise ValueError(
-            f"{path}: sigma columns must be all three or none; {absent} missing, got {_shown(header)}. "
+            f"{path}: sigma columns must be all three or none; {absent} missing, got {', '.join(present)}. "
             "Add the missing ones or drop the others."
         )
     return [*VALUES, *present]
@@ -163,17 +149,6 @@ def _block(batch: pa.RecordBatch, start: int) -> Block:
         codes=keys.indices.to_numpy(zero_copy_only=False),
         values=np.stack(columns, axis=1) if batch.num_rows else np.empty((0, len(columns))),
     )
-
-
-def _shown(header: Sequence[str]) -> str:
-    text = ",".join(header)
-    return repr(text if len(text) <= 120 else text[:117] + "...")
-
-
-def _separator_hint(header: Sequence[str]) -> str:
-    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-        return " Cells must be separated by commas."
-    return ""
 
 
 def _counted(word: str, numbers: Sequence[int]) -> str:

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ballfg.checks import check_array
+
 Array = NDArray[np.float64]
 
 ROUNDING = 1e-6
@@ -86,22 +88,22 @@ class Sightings:
 
 
 def _floats(field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{field} must be an array of numbers; {error}. Pass one row per sighting.") from None
-    if array.shape != shape:
-        raise ValueError(f"{field} must have shape {shape}; got {array.shape}. Pass one row per sighting.")
+    array = check_array(field, value, shape, "Pass one row per sighting.")
     if not np.isfinite(array).all():
         row = int(np.argwhere(~np.isfinite(array))[0][0])
         raise ValueError(f"{field} must be finite; {field}[{row}]={array[row].tolist()}. Drop that sighting.")
     return array
 
 
+def are_covariances(matrices: Array) -> NDArray[np.bool_]:
+    """(n,) whether matrices (n, 2, 2) are symmetric, up to `ROUNDING`, and positive definite."""
+    a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
+    symmetric = np.abs(matrices[:, 1, 0] - b) <= ROUNDING * (a + c)
+    return np.asarray(symmetric & (a > 0.0) & (c > 0.0) & (a * c > b * b))
+
+
 def _check_covariances(covariances: Array) -> None:
-    a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
-    symmetric = np.abs(covariances[:, 1, 0] - b) <= ROUNDING * (a + c)
-    good = symmetric & (a > 0.0) & (c > 0.0) & (a * c > b * b)
+    good = are_covariances(covariances)
     if not good.all():
         row = int(np.argmin(good))
         raise ValueError(

@@ -8,15 +8,14 @@ from pathlib import Path
 from typing import Literal, TextIO
 
 from ballfg.files.whole_folder import whole_folder
-
-from .checks import check_scale
-from .dataset import TRACK_FILES
-from .grouping import MAX_SIGMA, MIN_SIGMA
-from .info import INFO_FILE, DatasetInfo, write_info
-from .labels import LABELS_FILE
-from .rows import KEY, SIGMAS, VALUES
-from .table import TableWriter
-from .track import FloatArray, Track
+from ballfg.tracks.checks import check_scale
+from ballfg.tracks.dataset import TRACK_FILES
+from ballfg.tracks.grouping import MAX_SIGMA, MIN_SIGMA
+from ballfg.tracks.info import INFO_FILE, DatasetInfo, write_info
+from ballfg.tracks.labels import LABELS_FILE
+from ballfg.tracks.rows import KEY, SIGMAS, VALUES
+from ballfg.tracks.table import TableWriter
+from ballfg.tracks.track import FloatArray, Track
 
 DATASET_FILES = (INFO_FILE, *TRACK_FILES, LABELS_FILE)
 """All names that the files of a dataset can have."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from numbers import Integral, Real
+from numbers import Integral
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
@@ -11,10 +11,11 @@ from typing import Any, Final
 import numpy as np
 import yaml
 
+from ballfg.checks import check_keys, is_number
+from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.files.whole_file import write_text
 from ballfg.vision.camera import Camera
 from ballfg.vision.camera_storage import check_names, is_storage, read_storage
-from ballfg.vision.strict_yaml import check_keys, mapping, read_mapping
 
 CAMERAS_FILE: Final = "cameras.yaml"
 """Its name in the folder of a dataset or a scene."""
@@ -43,7 +44,8 @@ def read_cameras(path: str | PathLike[str], *, posed: bool = True) -> list[Camer
         return [_camera(name, content, posed) for name, content in contents.items()]
     except (ValueError, TypeError) as error:
         text = str(error)
-        raise type(error)(text if text.startswith(str(path)) else f"{path}: {text}") from None
+        rule = TypeError if isinstance(error, TypeError) else ValueError
+        raise rule(text if text.startswith(str(path)) else f"{path}: {text}") from None
 
 
 def write_cameras(path: str | PathLike[str], cameras: Iterable[Camera], *, posed: bool = True) -> None:
@@ -92,9 +94,9 @@ def _camera(name: str, content: Any, posed: bool) -> Camera:
             "Add it, or let 'ballfg calibrate-cameras --intrinsics FILE --table TABLE' find where the camera stands."
         )
     size, offset = fields["size"], fields.get("time_offset", 0.0)
-    if not (isinstance(size, list | tuple) and len(size) == 2 and all(_is(Integral, side) for side in size)):
+    if not (isinstance(size, list | tuple) and len(size) == 2 and all(_is_whole(side) for side in size)):
         raise ValueError(f"{where}: size must be width and height in pixels, as [1280, 720]; got {size!r}. Correct it.")
-    if not _is(Real, offset):
+    if not is_number(offset):
         raise ValueError(f"{where}: time_offset must be a number in s; got {offset!r}. Write it like 0.004 or 4.0e-3.")
     return Camera(
         name=name,
@@ -107,5 +109,5 @@ def _camera(name: str, content: Any, posed: bool) -> Camera:
     )
 
 
-def _is(number: type, value: object) -> bool:
-    return isinstance(value, number) and not isinstance(value, bool)
+def _is_whole(value: object) -> bool:
+    return is_number(value) and isinstance(value, Integral)

@@ -11,8 +11,8 @@ from typing import Any, Final
 import cv2
 import numpy as np
 
+from ballfg.checks import did_you_mean
 from ballfg.files.whole_file import whole_file
-from ballfg.tracks.hints import did_you_mean
 from ballfg.vision.camera import Camera
 
 MATRIX: Final = "camera_matrix"

@@ -20,7 +20,7 @@ from ballfg.benchmarks.diagnosis.limit import share
 from ballfg.benchmarks.metrics import Figure, bootstrap, pooled_rms, ratio
 from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.timing import quartiles
-from ballfg.cli.progress import progress
+from ballfg.progress import progress
 from ballfg.simulation.scene import Clock
 
 __all__ = ["FULL", "QUICK", "run_cameras"]

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.benchmarks.metrics import nees
-from ballfg.cli.progress import progress
+from ballfg.progress import progress
 from ballfg.simulation.cameras import table_rig
 from ballfg.simulation.scene import Flight, Recording, SceneConfig, free_running, record, write_scene
 from ballfg.vision.association.clock import nearest
@@ -103,7 +103,7 @@ def film(scenario: Scenario, *, quiet: bool = False) -> Filmed:
 def draw(recording: Recording, folder: Path, name: str) -> None:
     """Writes a recording's videos and stamps; with progress, if it has a name to be shown by."""
     if name:
-        write_scene(folder, recording, watch=lambda drawn: progress(drawn, recording.image_count, f"frames of {name}"))
+        write_scene(folder, recording, watch=lambda items, total, _: progress(items, total, f"frames of {name}"))
     else:
         write_scene(folder, recording)
 

@@ -17,8 +17,8 @@ from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset
 from ballfg.benchmarks.diagnosis.ideal import Ideal, ideal_case, ideal_of, read_ideal, save_ideal
 from ballfg.benchmarks.diagnosis.record import Record, case_digest, read_record, record_of
 from ballfg.benchmarks.diagnosis.truth import true_errors
-from ballfg.cli.progress import progress
 from ballfg.diagnosis import diagnose
+from ballfg.progress import progress
 from ballfg.tracks import read_dataset
 
 T = TypeVar("T")

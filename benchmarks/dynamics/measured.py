@@ -10,10 +10,10 @@ import numpy as np
 
 from ballfg.benchmarks.dynamics.task import Shot, Task
 from ballfg.benchmarks.estimators.measured import HORIZON, OBSERVE
-from ballfg.cli.progress import progress
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Estimate, Smoother, dataset_settings, dataset_surfaces, estimate_tracks
 from ballfg.prediction.apexes import measured_apexes
+from ballfg.progress import progress
 from ballfg.tracks import Dataset, Track
 
 LEAST_OBSERVED: Final = 10

@@ -25,8 +25,8 @@ from ballfg.benchmarks.dynamics.rows import add_rows
 from ballfg.benchmarks.dynamics.task import Task
 from ballfg.benchmarks.dynamics.truth import TRACKS, synthetic_task
 from ballfg.benchmarks.results import Results
-from ballfg.cli.progress import progress
 from ballfg.learning.run.loop import TrainingStoppedError
+from ballfg.progress import progress
 from ballfg.tracks import Dataset
 
 RUNS_FOLDER: Final = "runs"

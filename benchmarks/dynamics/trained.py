@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +25,10 @@ from ballfg.learning.run.run_folder import METRICS, MODEL
 from ballfg.learning.run.training import run_training
 from ballfg.learning.sequence.predictor import SequencePredictor
 from ballfg.learning.sequence.trainee import FOLDER
+from ballfg.progress import unwatched
 from ballfg.tracks import Track
 
 Array = NDArray[np.float64]
-T = TypeVar("T")
 
 OPTIMIZER: Final[dict[str, Any]] = {"learning_rate": 2e-3, "batch": 32, "epochs": 20, "clip": 5.0, "noise_step": 40.0}
 """Of all models in the factor graph."""
@@ -63,7 +63,7 @@ def trained_contender(job: Job, task: Task) -> Contender:
     begun = (folder / METRICS).is_file()
     if not (folder / MODEL).exists() and not (folder / "model").exists():
         with (job.folder / "log.txt").open("a") as log, redirect_stdout(log), redirect_stderr(log):
-            run_training(config, folder, resume=begun, watch=_unwatched)
+            run_training(config, folder, resume=begun, watch=unwatched)
     seconds = sum(epoch.seconds for epoch in read_metrics(folder / METRICS))
     if config.kind in SEQUENCES:
         predictor = SequencePredictor.load(folder / FOLDER)
@@ -191,7 +191,3 @@ class SequenceContender:
 
 def _as_it_is(track: Track) -> Track:
     return track
-
-
-def _unwatched(items: Iterable[T], total: int, what: str) -> Iterator[T]:
-    return iter(items)

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from ballfg.benchmarks.metrics import Statistic, bootstrap, inside, pooled_mean, quantile, square_norms
 from ballfg.benchmarks.results import CURVE_MARK, Results
-from ballfg.cli.progress import progress
 from ballfg.dynamics import BallModel, nominal_model
 from ballfg.estimation import (
     ESTIMATORS,
@@ -24,6 +23,7 @@ from ballfg.estimation import (
 )
 from ballfg.estimation.segmentation import Quality
 from ballfg.prediction import TrackPrediction, predict_tracks
+from ballfg.progress import progress
 from ballfg.tracks import Dataset
 
 Array = NDArray[np.float64]

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from ballfg.benchmarks.metrics import inside, nees, square_norms
 from ballfg.benchmarks.synthetic import Case
-from ballfg.cli.progress import progress
 from ballfg.estimation import Estimator, Status
 from ballfg.estimation.filters.sliding_window import WINDOW
+from ballfg.progress import progress
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 Array = NDArray[np.float64]

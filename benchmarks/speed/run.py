@@ -17,10 +17,8 @@ from ballfg.benchmarks.speed.gradient_cost import time_gradients
 from ballfg.benchmarks.speed.network import fitted_network, parameter_count
 from ballfg.benchmarks.synthetic import gaussian_settings
 from ballfg.benchmarks.timing import Stopwatch, quartiles
-from ballfg.cli.progress import progress
-from ballfg.dynamics import AnalyticModel, BallModel, Surfaces, fly_jacobian, model_from_dict, nominal_model
+from ballfg.dynamics import AnalyticModel, BallModel, Surfaces, fly_jacobian, model_from_dict, nominal_model, rollout
 from ballfg.dynamics.analytic import coefficient_sigmas
-from ballfg.dynamics.motion.rollout import rollout
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.learned import build
 from ballfg.estimation import Estimator, Online, Settings, Smoother, dataset_settings, dataset_surfaces
@@ -32,6 +30,7 @@ from ballfg.factors.covariance import marginal_covariances
 from ballfg.factors.graph import BallGraph
 from ballfg.learning.end_to_end.pretrain import pretrain
 from ballfg.prediction import Belief, Propagator
+from ballfg.progress import progress
 from ballfg.state import POSITION
 from ballfg.tracks import SPIN_LABELS, Dataset, Track
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +20,9 @@ from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_sett
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
 from ballfg.learning.calibration.population import Evidence, Population, evidence, fit_population
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.evaluation import TrackScore, Watch, judge_tracks, pass_on
+from ballfg.learning.evaluation import TrackScore, judge_tracks
 from ballfg.learning.split import Split, split_tracks, tracks_of
+from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Dataset
 
 Array = NDArray[np.float64]
@@ -113,7 +113,7 @@ def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs
     )
 
 
-def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch[Any] = pass_on) -> Iterator[Step]:
+def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unwatched) -> Iterator[Step]:
     """The remaining steps, each as soon as it is finished; none if the calibration has ended.
 
     Args:
@@ -145,7 +145,7 @@ def has_ended(config: CalibrationConfig, step: Step) -> bool:
 
 
 def score(
-    problem: Problem, values: Array, watch: Watch[Any] = pass_on, settings: Settings | None = None
+    problem: Problem, values: Array, watch: Watch = unwatched, settings: Settings | None = None
 ) -> tuple[TrackScore | None, ...]:
     """Scores of the judging tracks, in order.
 
@@ -170,7 +170,7 @@ def population_settings(problem: Problem, step: Step) -> Settings:
     return replace(problem.settings, coefficients={**problem.settings.coefficients, **learned})
 
 
-def _advance(problem: Problem, last: Step, watch: Watch[Any]) -> Step:
+def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
     """Linearise the fitted tracks about the last mean, and fit the population."""
     chosen, about = problem.chosen, np.array(last.mean)
     fits, evidences, skipped = _fit_tracks(problem, about, watch)
@@ -189,7 +189,7 @@ def _advance(problem: Problem, last: Step, watch: Watch[Any]) -> Step:
 
 
 def _fit_tracks(
-    problem: Problem, about: Array, watch: Watch[Any]
+    problem: Problem, about: Array, watch: Watch
 ) -> tuple[list[TrackFit], list[Evidence], list[tuple[str, str]]]:
     """Posterior and likelihood of each fitted track, and the skipped tracks.
 

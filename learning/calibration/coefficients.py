@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ballfg.checks import did_you_mean
 from ballfg.dynamics import AnalyticModel
-from ballfg.tracks.hints import did_you_mean
 
 Array = NDArray[np.float64]
 

@@ -18,9 +18,10 @@ from ballfg.learning.calibration.coefficients import with_values
 from ballfg.learning.calibration.picture import draw
 from ballfg.learning.calibration.report import compare, report, table
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.evaluation import Watch, summary
+from ballfg.learning.evaluation import summary
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.training_data import analytic_model, open_dataset
+from ballfg.progress import Watch
 
 
 class Checkpoint(BaseModel):
@@ -36,7 +37,7 @@ class Checkpoint(BaseModel):
     """Finished steps."""
 
 
-def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jobs: int, watch: Watch[Any]) -> None:
+def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jobs: int, watch: Watch) -> None:
     """Calibrate coefficients and write the folder of the run.
 
     Args:
@@ -70,7 +71,7 @@ def _pose(config: CalibrationConfig, jobs: int) -> Problem:
     return pose(dataset, analytic_model(config.model, dataset.info.ball.radius), config, config.jobs or jobs)
 
 
-def _steps(problem: Problem, steps: list[Step], folder: Path, watch: Watch[Any]) -> None:
+def _steps(problem: Problem, steps: list[Step], folder: Path, watch: Watch) -> None:
     """Take the steps that are left, with a checkpoint and a line of text after each."""
     begun = time.monotonic()
     for step in calibrate(problem, tuple(steps), watch=watch):
@@ -98,7 +99,7 @@ def _line(problem: Problem, step: Step, left: float) -> str:
     return "; ".join(parts)
 
 
-def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch[Any]) -> None:
+def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch) -> None:
     """Judge once more with the spread as the prior, write the results and print their paths."""
     last = steps[-1]
     mean = np.array(last.mean)

@@ -10,9 +10,10 @@ from typing import Any
 import yaml
 from pydantic import BaseModel, ValidationError
 
+from ballfg.checks import nearest
+from ballfg.files.strict_yaml import YamlError, read_yaml
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.training import TrainConfig
-from ballfg.tracks.hints import nearest
 
 Config = TrainConfig | CalibrationConfig
 CALIBRATE = "calibrate"
@@ -53,35 +54,16 @@ def _load(path: Path) -> dict[str, Any]:
     if not path.is_file():
         raise FileNotFoundError(f"config {path} does not exist; it is a YAML file, docs/train.md shows one.")
     try:
-        text = path.read_text(encoding="utf-8")
-        node = yaml.compose(text, Loader=yaml.SafeLoader)
-        content = yaml.safe_load(text)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: not readable as YAML ({' '.join(str(error).split())})") from None
+        content = read_yaml(path)
+    except YamlError as error:
+        if error.repeated is None:
+            raise
+        raise ValueError(f"{path}: '{error.repeated}' stands twice. Delete one of them.") from None
     if content is None:
         return {}
     if not isinstance(content, dict):
         raise ValueError(f"{path}: a config maps keys to values; got {content!r}. Write for instance 'seed: 0'.")
-    twice = _twice(node, "")
-    if twice is not None:
-        raise ValueError(f"{path}: '{twice}' stands twice. Delete one of them.")
     return {str(key): value for key, value in content.items()}
-
-
-def _twice(node: yaml.Node | None, prefix: str) -> str | None:
-    """The first key, with dots, that a mapping holds more than once: YAML itself would take the last."""
-    if not isinstance(node, yaml.MappingNode):
-        return None
-    seen = set()
-    for key, value in node.value:
-        name = f"{prefix}{key.value}"
-        if name in seen:
-            return name
-        seen.add(name)
-        below = _twice(value, f"{name}.")
-        if below is not None:
-            return below
-    return None
 
 
 def _override(content: dict[str, Any], override: str) -> None:

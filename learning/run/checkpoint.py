@@ -12,6 +12,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from ballfg.files.strict_yaml import YamlError, read_yaml
 from ballfg.files.whole_folder import recover, replaced_folder
 
 NAME = "checkpoint"
@@ -82,12 +83,12 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
     if not path.exists():
         return None
     try:
-        content: Any = yaml.safe_load((path / STATE).read_text(encoding="utf-8"))
+        content: Any = read_yaml(path / STATE)
         tensors = {name: load_file(_tensors(path, name)) for name in TENSORS}
         return Checkpoint(RunProgress.model_validate(content), **tensors)
     except ValidationError as error:
         reason = f"{STATE}: {error.errors()[0]['msg']}"
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, SafetensorError) as error:
+    except (OSError, YamlError, SafetensorError) as error:
         reason = " ".join(str(error).split())
     raise ValueError(f"{path}: not a whole checkpoint ({reason}). Start a new run.")
 

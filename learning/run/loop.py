@@ -10,7 +10,6 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -22,9 +21,7 @@ from ballfg.learning.run.metrics import Epoch
 from ballfg.learning.run.optimizer import make_optimizer, moments, rate_factor, restore_moments
 from ballfg.learning.run.ranks import Ranks, SharedMemory
 from ballfg.learning.trainee import BatchLoss, Trainee
-
-if TYPE_CHECKING:
-    from ballfg.learning.evaluation import Watch
+from ballfg.progress import Watch
 
 
 class TrainingStoppedError(ValueError):
@@ -49,7 +46,7 @@ class Task:
     validation: tuple[int, ...]
     config: TrainConfig
     ranks: Ranks
-    watch: Watch[list[int]]
+    watch: Watch
 
 
 @dataclass

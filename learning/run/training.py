@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.evaluation import Watch, pass_on
 from ballfg.learning.registry import TRAINEES
 from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.checkpoint import Checkpoint, read_checkpoint
@@ -18,6 +17,7 @@ from ballfg.learning.run.metrics import Epoch
 from ballfg.learning.run.ranks import TOLD_BY_FIRST, Ranks, join_ranks
 from ballfg.learning.run.record import Record
 from ballfg.learning.trainee import Prepared
+from ballfg.progress import Watch, unwatched
 
 
 def build(config: TrainConfig) -> Prepared:
@@ -29,7 +29,7 @@ def build(config: TrainConfig) -> Prepared:
     return TRAINEES[config.kind].build(config)
 
 
-def run_training(config: TrainConfig, folder: Path, *, resume: bool = False, watch: Watch[list[int]] = pass_on) -> None:
+def run_training(config: TrainConfig, folder: Path, *, resume: bool = False, watch: Watch = unwatched) -> None:
     """Train a model and write the folder of the run.
 
     Every process of a group calls this; the first one writes and prints.

@@ -15,6 +15,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from ballfg.files.strict_yaml import YamlError, read_yaml
 from ballfg.files.whole_folder import whole_folder
 from ballfg.learning.sequence.architecture import SequenceArchitecture
 from ballfg.learning.sequence.data import collate, example
@@ -157,9 +158,8 @@ def _read(folder: Path) -> tuple[FolderConfig, dict[str, Tensor]]:
         if not (folder / name).is_file():
             raise FileNotFoundError(f"{folder} must hold {CONFIG} and {WEIGHTS}; {name} is missing. Save it again.")
     try:
-        content = yaml.safe_load((folder / CONFIG).read_text(encoding="utf-8"))
-        config = FolderConfig.model_validate(content)
-    except (yaml.YAMLError, UnicodeDecodeError, ValidationError) as error:
+        config = FolderConfig.model_validate(read_yaml(folder / CONFIG))
+    except (YamlError, ValidationError) as error:
         raise ValueError(f"{folder / CONFIG}: not the config of a sequence model ({error}). Save it again.") from None
     try:
         weights = load_file(folder / WEIGHTS)

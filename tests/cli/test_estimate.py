@@ -12,10 +12,8 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 import pytest
 
-from ballfg.cli import progress as progress_module
 from ballfg.cli.estimate import Method
 from ballfg.cli.main import run
-from ballfg.cli.progress import progress
 from ballfg.estimation import ESTIMATORS
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset
@@ -231,7 +229,7 @@ def test_ctrl_c_leaves_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
-# --- help, start, progress ---------------------------------------------------------------------------------------
+# --- help, start ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("command", ["estimate", "predict"])
@@ -255,46 +253,6 @@ assert not loaded, loaded
 """
     done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-class Clock:
-    """Time that passes as a test says."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def monotonic(self) -> float:
-        return self.now
-
-
-@pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    made = Clock()
-    monkeypatch.setattr(progress_module, "time", made)
-    return made
-
-
-def work(clock: Clock, start: float, each: float, total: int) -> list[int]:
-    def items() -> object:
-        clock.now += start
-        for i in range(total):
-            clock.now += each
-            yield i
-
-    return list(progress(items(), total, "tracks estimated"))  # type: ignore[arg-type]
-
-
-def test_short_work_is_quiet(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
-    assert work(clock, 0.5, 0.1, 14) == list(range(14))
-    assert capsys.readouterr().err == ""
-
-
-def test_the_start_does_not_count_as_work(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
-    """10 s until processes run, then 0.5 s a track: the first line tells no time, the second the right one."""
-    work(clock, 10.0, 0.5, 88)
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[:2] == ["1 of 88 tracks estimated", "21 of 88 tracks estimated, 34 s left"]
-    assert len(lines) == 5
 
 
 def test_methods_are_the_estimators() -> None:

@@ -140,7 +140,7 @@ def test_force_replaces_a_simulated_dataset_and_leaves_nothing_stale(tmp_path: P
 
 
 def test_a_failure_leaves_nothing_behind(tmp_path: Path) -> None:
-    def fail(tracks: Iterable[SimulatedTrack]) -> Iterator[SimulatedTrack]:
+    def fail(tracks: Iterable[SimulatedTrack], total: int, what: str) -> Iterator[SimulatedTrack]:
         yield next(iter(tracks))
         raise KeyboardInterrupt
 

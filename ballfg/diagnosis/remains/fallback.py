@@ -5,7 +5,7 @@ First a few generic terms, which a person can read; only if those do not help, a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import cast
 
 import numpy as np
@@ -32,6 +32,7 @@ from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
 from ballfg.learning.run.loop import Task, Training, TrainingStoppedError
 from ballfg.learning.run.ranks import Ranks
 from ballfg.learning.shots import Shot, shots_of
+from ballfg.progress import unwatched
 from ballfg.tracks import Dataset, Track
 
 HELPS = 0.9
@@ -129,7 +130,7 @@ def _trained(trainee: EndToEnd, count: int, config: TrainConfig) -> bool:
     numbers = range(count)
     validation = tuple(numbers[VALIDATES - 1 :: VALIDATES])
     train = tuple(n for n in numbers if n not in validation)
-    training = Training(Task(trainee, train, validation, config, Ranks(), _unwatched))
+    training = Training(Task(trainee, train, validation, config, Ranks(), unwatched))
     try:
         for _ in training.epochs():
             pass
@@ -137,10 +138,6 @@ def _trained(trainee: EndToEnd, count: int, config: TrainConfig) -> bool:
         return False
     training.take_best()
     return True
-
-
-def _unwatched(items: Iterable[list[int]], count: int, what: str) -> Iterator[list[int]]:
-    return iter(items)
 
 
 def _size(model: LearnedModel) -> int:

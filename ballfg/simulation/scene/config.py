@@ -9,9 +9,9 @@ from typing import Final, Literal
 
 import numpy as np
 
+from ballfg.checks import check_count, check_range
 from ballfg.dynamics import AnalyticModel, Effect
 from ballfg.simulation.balls import BallKind, table_tennis
-from ballfg.simulation.checks import check_count, check_range
 from ballfg.simulation.composition import true_model
 from ballfg.simulation.config import LARGEST_JITTER, MAX_SEED
 from ballfg.simulation.settings import Settings, all_settings

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import glob
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Final, cast
@@ -19,6 +19,7 @@ from ballfg.dynamics import Effect
 from ballfg.files.destination import check_replaceable
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.whole_folder import whole_folder
+from ballfg.progress import Watch, unwatched
 from ballfg.simulation.scene.recording import Recording
 from ballfg.simulation.scene.visible import visible_columns
 from ballfg.state import STATE_NAMES
@@ -27,7 +28,6 @@ from ballfg.vision.camera import Camera
 from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
 
 Pixels = NDArray[np.uint8]
-Watch = Callable[[Iterable[Pixels]], Iterator[Pixels]]
 
 SCENE_FILE: Final = "scene.yaml"
 TRUTH_RATE: Final = 1000.0
@@ -42,7 +42,7 @@ def write_scene(
     *,
     images: bool = False,
     force: bool = False,
-    watch: Watch = iter,
+    watch: Watch = unwatched,
 ) -> None:
     """Renders a recording and writes it; all files appear together at the end, or none.
 
@@ -58,7 +58,7 @@ def write_scene(
         recording: what to draw.
         images: PNG files in place of videos.
         force: replace a scene that is there already.
-        watch: hands the images through, `Recording.image_count` of them, for instance to show progress.
+        watch: sees the images that are drawn.
     Raises:
         ValueError: the folder holds something else, or a camera cannot be a file's name.
         FileNotFoundError: the folder's parent does not exist.
@@ -70,7 +70,7 @@ def write_scene(
         if camera.name != Path(camera.name).name or camera.name.startswith("."):
             raise ValueError(f"camera names must be good as file names; got {camera.name!r}. Rename it.")
     with whole_folder(path, earlier=_earlier(path / SCENE_FILE), last=SCENE_FILE) as stage:
-        drawn = watch(_all_images(recording))
+        drawn = watch(_all_images(recording), recording.image_count, "frames drawn")
         for number, camera in enumerate(recording.cameras):
             _write_images(
                 stage, camera, recording.config.rate, drawn, len(recording.frames[number].times), images=images

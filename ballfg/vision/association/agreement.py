@@ -1,8 +1,8 @@
-"""Do the cameras agree? If not: is there one that, had it been nudged since its calibration, would explain everything?
+"""Whether the cameras agree; if not, the camera that has moved since its calibration.
 
 Each camera in turn is turned and moved (six numbers) together with all points until the reprojection error is least,
-the other cameras held. A nudged camera then explains the disagreement, and no other one does. Three cameras are needed:
-of two that disagree either may be wrong.
+while the other cameras are fixed. The camera that moved then explains the disagreement, and no other one does. Three
+cameras are needed: of two that disagree either may be wrong.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ LEAST_MISFIT: Final = 3.0
 LEAST_EXPLAINED: Final = 0.8
 """Share of what is beyond noise that a culprit must explain."""
 CLEARLY: Final = 4.0
-"""How many times as much every other camera must leave unexplained: correcting the wrong one of three cameras may halve
-the disagreement or do better, but never ends it."""
+"""Least ratio of the error that another camera leaves unexplained: correcting the wrong one of three cameras may halve
+the disagreement, but never ends it."""
 CLEARLY_WORSE: Final = 1.5
-"""And how many times the squared error must be left, noise included."""
+"""Least ratio of the squared errors, noise included."""
 LEAST_POINTS: Final = 20
-"""Seen by three cameras or more, to say anything: six numbers are fitted to them."""
+"""Fewest points, each seen by three cameras or more: six numbers are fitted to them."""
 MOST_POINTS: Final = 600
-"""That are used, evenly spread over those there are: more do not change the answer."""
+"""Most points that are used, evenly spread: more do not change the answer."""
 _LOOSE: Final = 20.0
 """px, noise with which points are made of views that may be wrong."""
 _UNSEEN: Final = 1e4
@@ -52,7 +52,7 @@ _MOVED: Final = 0.3
 
 @dataclass(frozen=True)
 class CameraAgreement:
-    """What the other cameras say about one."""
+    """One camera compared with the others."""
 
     residual: float
     """px, median distance of its sightings from the points of the others; NaN if fewer than two others saw them."""
@@ -102,7 +102,7 @@ class _Scene:
 
 
 def check_agreement(balls: Sequence[SeenBall], cameras: Sequence[Camera]) -> Agreement:
-    """Says whether the cameras agree and, if not, which one has moved.
+    """Whether the cameras agree and, if not, which one has moved.
 
     Args: balls: as `associate` gives them, for the same cameras.
     Source: docs/associate.md.

@@ -1,7 +1,7 @@
 """From every camera's candidates to balls in space; docs/associate.md tells how.
 
-Pieces of smooth motion in each image, pieces that show the same thing in several, points in space, pieces of one flight
-joined, candidates left lying picked up, and what does not fly like a ball thrown out.
+The steps: pieces of smooth motion in each image; matching of pieces between cameras; points in space; joining of pieces
+of one flight; unassigned candidates that fit; removal of tracks that do not fall like a ball.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from ballfg.vision.detection.detections import Detections
 Array = NDArray[np.float64]
 
 _DISPUTED: Final = 2
-"""Frames in which two parts of one flight may both have a candidate: the last of the first part is a wrong one then."""
+"""Most frames in which two parts of one flight both have a candidate: one of the two candidates is wrong then."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class AssociationSettings:
     """
 
     least_score: float = 0.3
-    """In [0, 1]; candidates that look less like a ball are not considered."""
+    """In [0, 1]; candidates with a lower score are not used."""
 
     least_points: int = 6
     """Points of the shortest track that is kept; at least 3."""
@@ -53,11 +53,11 @@ class AssociationSettings:
 def associate(
     detections: Sequence[Detections], cameras: Sequence[Camera], settings: AssociationSettings | None = None
 ) -> list[SeenBall]:
-    """The balls that several cameras saw, by their first point.
+    """The balls that several cameras saw, in the order of their first points.
 
-    Cameras need not share a shutter or a rate, and frames may be missing. If they do share stamps, there are points at
-    those; else at the stamps of the camera that saw most of the ball, the others interpolated. Tracks start and end by
-    themselves; a ball is one track through bounces and short gaps.
+    Cameras need not share a shutter or a rate, and frames may be missing. If the cameras share stamps, the points are
+    at those; otherwise at the stamps of the camera that saw most of the ball, and the other cameras are interpolated.
+    A ball is one track through bounces and short gaps.
 
     Args:
         detections: one for each camera, in any order.
@@ -79,7 +79,7 @@ def associate(
 
 
 def _footage(detections: Sequence[Detections], cameras: Sequence[Camera], settings: AssociationSettings) -> Footage:
-    """The recording without what does not look like a ball."""
+    """The recording without candidates of low score."""
     names = [camera.name for camera in cameras]
     by_name = {seen.camera: seen for seen in detections}
     if len(names) < 2 or len(set(names)) < len(names):
@@ -109,7 +109,7 @@ def _rows_of(pieces: Sequence[Piece], cameras: int) -> list[Rows]:
 
 
 def _joined(footage: Footage, balls: list[Gathered]) -> list[Gathered]:
-    """The balls with those put together that are parts of one flight."""
+    """The balls, those of one flight joined."""
     following = dict(successions([ball.track for ball in balls]))
     later = set(following.values())
     joined = []

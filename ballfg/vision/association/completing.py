@@ -1,4 +1,4 @@
-"""The candidates that a ball left lying: those at which its track in space points, amid its own and at the ends."""
+"""Unassigned candidates near the predicted track of a ball, between its own candidates and at the ends."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from ballfg.vision.camera import Camera
 Array = NDArray[np.float64]
 
 _GATE: Final = 16.0
-"""Squared distance from where the track points, in its covariance: 4 sigma."""
+"""Largest squared distance from the prediction, whitened: 4 sigma."""
 _WIDEST: Final = 20.0
-"""px, sigma of a prediction that points nowhere in particular."""
+"""px, largest sigma of a prediction that is used."""
 _AHEAD: Final = 2.5
-"""Frames by which a track is continued past its ends at once."""
+"""Frames by which a track is continued past its ends in one round."""
 _ROUNDS: Final = 4
-"""Times over; each reaches a little farther at the ends."""
+"""Most rounds; each reaches a little farther at the ends."""
 _STEP: Final = 1e-3
-"""m, of the differences that say how a point's error shows in the image."""
+"""m, step of the numerical derivative of the projection."""
 _SYSTEMATIC: Final = 1.0
-"""px, added to a prediction's sigma: it comes from other cameras, which are calibrated no better."""
+"""px, added to a prediction's sigma for the calibration of the other cameras, from which it comes."""
 
 
 def complete(footage: Footage, balls: Sequence[Gathered]) -> list[Gathered]:
-    """The balls with the free candidates that fit them. A candidate that fits two balls stays free."""
+    """The balls with the unassigned candidates that fit them; one that fits two balls stays unassigned."""
     done = list(balls)
     taken = [np.zeros(len(seen), dtype=bool) for seen in footage.detections]
     for ball in balls:
@@ -55,7 +55,7 @@ def complete(footage: Footage, balls: Sequence[Gathered]) -> list[Gathered]:
 
 
 def _wanted(footage: Footage, ball: Gathered, taken: Sequence[NDArray[np.bool_]]) -> list[Rows]:
-    """For each camera the free candidates at which the ball's track points."""
+    """For each camera the unassigned candidates near the ball's predicted track."""
     wanted = []
     for number, camera in enumerate(footage.cameras):
         seen = footage.detections[number]
@@ -77,7 +77,7 @@ def _wanted(footage: Footage, ball: Gathered, taken: Sequence[NDArray[np.bool_]]
 
 
 def _predicted(camera: Camera, ball: Gathered, times: Array) -> tuple[Array, Array]:
-    """Where the ball's track is in an image at some times: pixels (k, 2) and covariances (k, 2, 2); NaN if unknown."""
+    """Predicted pixels (k, 2) of the ball at times (k,), and their covariances (k, 2, 2); NaN if unknown."""
     points, spread = ball.track.at(times)
     for late, outside in ((False, times < ball.track.times[0]), (True, times > ball.track.times[-1])):
         points[outside], spread[outside] = ball.track.beyond(times[outside], last=late)

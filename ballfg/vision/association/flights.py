@@ -1,8 +1,7 @@
-"""What balls do in space: they fall. Says which tracks do, and which of them are parts of one flight.
+"""Tracks in space that fall as a ball does, and tracks that are parts of one flight.
 
-Between bounces a ball's acceleration is gravity, drag and lift; a waved arm's is not. Two tracks belong together where
-the flight out of the first meets the flight into the second: at once where the ball was hidden, with a kink where it
-bounced or was hit.
+Between bounces a ball's acceleration is gravity, drag and lift; a waved arm's is not. Two tracks belong together if the
+continuation of the first meets that of the second in the gap, with a kink where the ball bounced or was hit.
 """
 
 from __future__ import annotations
@@ -19,50 +18,51 @@ from ballfg.vision.association.paths import Path
 Array = NDArray[np.float64]
 
 LONGEST_GAP: Final = 0.3
-"""s, after which a ball that was not seen is a new one."""
+"""s. A ball that reappears after a longer gap is a new one."""
 LONGEST_HIT_GAP: Final = 0.1
-"""s, up to which a ball that comes back with any velocity is the same one, hit meanwhile; later it may have bounced."""
+"""s. A ball may have been hit in a gap up to this long, and may leave it with any velocity; in a longer one it may only
+have bounced."""
 FASTEST: Final = 80.0
 """m/s, no ball that is struck by hand is faster: the fastest served tennis balls have 73."""
 LEAST_WAY: Final = 0.05
-"""m, extent of the track of something that moves."""
+"""m, least extent of a ball's track."""
 GRAVITY: Final = np.array([0.0, 0.0, -STANDARD_GRAVITY])
 """m/s^2"""
 _SLACK: Final = 3.0
-"""m/s^2, by which a slow ball's acceleration may differ from gravity: calibration, lift of a fast spin."""
+"""m/s^2, tolerance of a slow ball's acceleration about gravity: error of the calibration, lift of a fast spin."""
 _AIR: Final = 0.25
-"""1/m, by how much more with the square of the speed: drag of 0.13 and as much lift."""
+"""1/m, growth of that tolerance with the square of the speed: drag of 0.13 and as much lift."""
 _WINDOWS: Final = (0.15, 0.3, 0.6)
-"""s, over which an acceleration is measured: short against a flight, and longer where the noise asks for it."""
+"""s, windows in which an acceleration is measured: short against a flight; the longer ones serve noisy tracks."""
 _LEAST_IN_WINDOW: Final = 5
 """Points of such a window: three make the parabola."""
 _TELLING: Final = 2.0
-"""m/s^2, standard deviation of a measured acceleration beyond which a window says nothing about gravity: something
-that hovers must not pass with all that is granted."""
+"""m/s^2, largest standard deviation of an acceleration that is compared with gravity: with a larger one a hovering
+object would pass."""
 _SIGMAS: Final = 3.0
-"""Of a measured acceleration, that are granted."""
+"""Tolerance in standard deviations of a measured acceleration."""
 _FALLING: Final = 0.5
-"""Least share of the telling windows in which a ball falls; it may be held, hit or at rest in the others."""
+"""Least share of the informative windows in which a ball falls; it may be held, hit or at rest in the others."""
 _END: Final = 0.08
-"""s, of a track's end that is continued."""
+"""s, length of a track's end that is extrapolated."""
 _STEADY: Final = 10.0
-"""m/s^2, drag and lift that the continuation does not know of."""
+"""m/s^2, standard deviation for drag and lift, which the extrapolation leaves out."""
 _FLOOR: Final = 0.01
-"""m, how far apart the ends of one flight may lie however well they are known."""
+"""m, standard deviation of an extrapolated position apart from noise."""
 _FARTHEST: Final = 0.15
-"""m, and how far however badly: two balls are told apart at that distance."""
+"""m, greatest distance between the ends of one flight, whatever their covariance: two balls may be that close."""
 _GATE: Final = 16.0
-"""Squared distance of two continuations in their covariance: 4 sigma."""
+"""Largest squared distance of two continuations, whitened: 4 sigma."""
 _FRICTION: Final = 0.5
-"""Share of its horizontal velocity that a bounce may change."""
+"""Largest relative change of the horizontal velocity in a bounce."""
 _LEAST_CHANGE: Final = 1.0
-"""m/s, by which the horizontal velocity may change however slow it is: spin drives a ball that drops."""
+"""m/s, change of the horizontal velocity that is always allowed: spin accelerates a ball that drops."""
 _STEPS: Final = 25
-"""Times tried in a gap."""
+"""Number of times in a gap at which continuations are compared."""
 
 
 def is_ball(track: Path) -> bool:
-    """Whether what moved along a track in space (d = 3) moved as a ball does: far enough, not too fast, and falling."""
+    """Whether a track in space (d = 3) is a ball's: long enough, not too fast, and falling."""
     if np.ptp(track.values, axis=0).max() < LEAST_WAY:
         return False
     for length in _WINDOWS:
@@ -73,7 +73,7 @@ def is_ball(track: Path) -> bool:
 
 
 def _falling(track: Path, length: float) -> list[bool]:
-    """For each window of a length (s) that tells, whether the motion in it is a free ball's."""
+    """Whether the motion is a free ball's, for each informative window of a length (s)."""
     found = []
     for number in range(int(track.parts[-1]) + 1):
         rows = np.flatnonzero(track.parts == number)
@@ -103,9 +103,9 @@ def _falls(track: Path, window: NDArray[np.intp]) -> bool | None:
 
 
 def meeting(earlier: Path, later: Path) -> float | None:
-    """How well a track goes on in another: squared distance of the two continuations in the gap, whitened.
+    """Squared distance, whitened, of the continuations of two tracks in the gap between them.
 
-    None where it does not: the gap is too long, or the continuations pass each other.
+    None where the tracks are not of one flight: the gap is too long, or the continuations miss each other.
     """
     start, end = float(earlier.times[-1]), float(later.times[0])
     if end < start or end - start > LONGEST_GAP or min(len(earlier.times), len(later.times)) < 2:
@@ -129,7 +129,7 @@ def _only_bounced(before: Array, after: Array) -> bool:
 
 
 def _continued(track: Path, times: Array, last: bool) -> tuple[Array, Array, Array]:
-    """A track's last or first part as it would fall on: positions (k, 3), covariances (k, 3, 3), velocity (3,)."""
+    """Positions (k, 3), covariances (k, 3, 3) and velocity (3,) of a track's last or first part in free fall."""
     rows = np.flatnonzero(track.parts == track.parts[-1 if last else 0])
     end = track.times[rows[-1 if last else 0]]
     rows = rows[np.abs(track.times[rows] - end) <= _END]
@@ -148,7 +148,7 @@ def _continued(track: Path, times: Array, last: bool) -> tuple[Array, Array, Arr
 
 
 def successions(tracks: Sequence[Path]) -> list[tuple[int, int]]:
-    """Which track goes on in which: pairs (earlier, later), no track in two pairs on the same side, best first."""
+    """Pairs (earlier, later) of tracks of one flight, best first; no track is twice on the same side."""
     found = []
     for i, earlier in enumerate(tracks):
         for j, later in enumerate(tracks):

@@ -12,9 +12,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.tracks.hints import did_you_mean
+from ballfg.checks import check_keys, did_you_mean, is_number
+from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.tracks.info import MAX_HEIGHT
-from ballfg.vision.strict_yaml import check_keys, mapping, read_mapping
 
 Array = NDArray[np.float64]
 
@@ -120,6 +120,6 @@ def _numbers(where: str, value: Any, count: int, what: str) -> Array:
 
 
 def _number(where: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+    if not is_number(value) or not np.isfinite(value):
         raise ValueError(f"{where} must be a finite number; got {value!r}. Correct it.")
     return float(value)

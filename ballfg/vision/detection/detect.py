@@ -8,15 +8,18 @@ from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from queue import Empty, Queue
-from typing import Final
+from typing import Final, TypeVar
 
 import cv2
 from joblib.externals.loky import get_reusable_executor
 
+from ballfg.progress import Watch, unwatched
 from ballfg.vision.detection.background import FEWEST
 from ballfg.vision.detection.detections import Candidates, Detections, Detector
 from ballfg.vision.detection.detector import BallDetector, DetectorSettings
 from ballfg.vision.detection.video import Video, open_video
+
+T = TypeVar("T")
 
 SAMPLE: Final = 15
 """Frames from which a background is learned: what stands in the same place in eight of them is background."""
@@ -24,9 +27,7 @@ LOOKS: Final = 1.0
 """s. When nothing was told for so long, it is looked whether a process has died."""
 TELLS: Final = 20
 """Frames after which a process says how far it is."""
-
-Watch = Callable[[Iterable[int], int], Iterable[int]]
-"""Hands the numbers of finished frames through, given with their total (an estimate); for instance to show progress."""
+SEARCHED: Final = "frames searched"
 
 
 def learn_detector(video: Video, settings: DetectorSettings | None = None) -> BallDetector:
@@ -40,19 +41,19 @@ def learn_detector(video: Video, settings: DetectorSettings | None = None) -> Ba
     return BallDetector.learn(images, settings)
 
 
-def detect(video: Video, camera: str, detector: Detector, watch: Watch | None = None) -> Detections:
+def detect(video: Video, camera: str, detector: Detector, watch: Watch = unwatched) -> Detections:
     """All candidates of a video.
 
     Args:
         video: of one camera.
         camera: its name.
         detector: called with each frame in order; for instance `learn_detector(video)`, or one of your own.
-        watch: see `Watch`; it is given the frames as they are done.
+        watch: sees the numbers of the frames that are done.
     Raises: ValueError: a video that turns out unreadable, see `Video.frames`. TypeError: a detector that does not give
         `Candidates`.
     """
     seen: list[tuple[float, Candidates]] = []
-    for _ in (watch or _unwatched)(_run(video, detector, seen), video.count):
+    for _ in watch(_run(video, detector, seen), video.count, SEARCHED):
         pass
     return Detections.of_frames(camera, seen)
 
@@ -63,7 +64,7 @@ def detect_all(
     *,
     stamps: Mapping[str, Path] | None = None,
     jobs: int = 1,
-    watch: Watch | None = None,
+    watch: Watch = unwatched,
 ) -> dict[str, Detections]:
     """All candidates of several cameras' videos.
 
@@ -72,16 +73,15 @@ def detect_all(
         make: the detector of an opened video; called in the process that runs it.
         stamps: camera -> CSV file, for those whose stamps are not the container's.
         jobs: processes; no more than cameras are of use.
-        watch: see `Watch`; it is given the frames of all cameras together.
+        watch: sees the numbers of the frames that are done, those of all cameras together.
     Raises: as `open_video` and `detect`.
     """
     opened = {name: open_video(path, (stamps or {}).get(name)) for name, path in videos.items()}
-    watch = watch or _unwatched
     if jobs == 1 or len(opened) < 2:
         total = sum(video.count for video in opened.values())
         seen: dict[str, list[tuple[float, Candidates]]] = {name: [] for name in opened}
         steps = (step for name, video in opened.items() for step in _run(video, make(video), seen[name]))
-        for _ in watch(steps, total):
+        for _ in watch(steps, total, SEARCHED):
             pass
         return {name: Detections.of_frames(name, frames) for name, frames in seen.items()}
     return _in_processes(opened, make, jobs, watch)
@@ -94,7 +94,7 @@ def _in_processes(
         told = manager.Queue()
         pool = get_reusable_executor(max_workers=min(jobs, len(videos)))
         running = [pool.submit(_job, video, name, make, told) for name, video in videos.items()]
-        for _ in watch(_told(told, running), sum(video.count for video in videos.values())):
+        for _ in watch(_told(told, running), sum(video.count for video in videos.values()), SEARCHED):
             pass
         failed = next((job for job in running if _failed(job)), None)
         if failed is not None:
@@ -116,13 +116,13 @@ def _job(video: Video, camera: str, make: Callable[[Video], Detector], told: Que
         told.put(None)
 
 
-def _telling(told: Queue[int | None], frames: Iterable[int], total: int) -> Iterator[int]:
-    number = 0
-    for number in frames:
-        if (number + 1) % TELLS == 0:
+def _telling(told: Queue[int | None], frames: Iterable[T], total: int, what: str) -> Iterator[T]:
+    done = 0
+    for done, frame in enumerate(frames, start=1):
+        if done % TELLS == 0:
             told.put(TELLS)
-        yield number
-    told.put((number + 1) % TELLS)
+        yield frame
+    told.put(done % TELLS)
 
 
 def _told(told: Queue[int | None], running: Sequence[Future[Detections]]) -> Iterator[int]:
@@ -151,7 +151,3 @@ def _run(video: Video, detector: Detector, seen: list[tuple[float, Candidates]])
             )
         seen.append((stamp, candidates))
         yield number
-
-
-def _unwatched(frames: Iterable[int], total: int) -> Iterable[int]:
-    return frames

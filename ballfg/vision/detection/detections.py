@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ballfg.tracks.sightings import ROUNDING
+from ballfg.checks import check_array
+from ballfg.tracks.sightings import are_covariances
 
 Array = NDArray[np.float64]
 
@@ -163,9 +164,7 @@ class Detections:
 
 def _numbers(what: str, field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
     """A read-only copy in float64."""
-    array = np.array(value, dtype=np.float64)
-    if array.shape != shape:
-        raise ValueError(f"{what}: {field} must have shape {shape}; got {array.shape}.")
+    array = check_array(f"{what}: {field}", value, shape, "Pass one row per candidate.")
     array.setflags(write=False)
     return array
 
@@ -191,10 +190,7 @@ def _check_fields(owner: Candidates | Detections, what: str) -> None:
     for field in ("pixels", "covariances", "scores"):
         finite = np.isfinite(getattr(owner, field))
         _refuse(~finite.all(axis=tuple(range(1, finite.ndim))), what, field, "be finite")
-    c = owner.covariances
-    definite = (c[:, 0, 0] > 0.0) & (c[:, 0, 0] * c[:, 1, 1] > c[:, 0, 1] * c[:, 1, 0])
-    skew = np.abs(c[:, 0, 1] - c[:, 1, 0]) > ROUNDING * (c[:, 0, 0] + c[:, 1, 1])
-    _refuse(~definite | skew, what, "covariances", "be symmetric and positive definite")
+    _refuse(~are_covariances(owner.covariances), what, "covariances", "be symmetric and positive definite")
     _refuse((owner.scores < 0.0) | (owner.scores > 1.0), what, "scores", "lie in [0, 1]")
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.checks import did_you_mean
 from ballfg.files.python_file import blamed, run_file
-from ballfg.tracks.hints import did_you_mean
 from ballfg.vision.detection.detections import Candidates, Detector
 from ballfg.vision.detection.video import Video
 

@@ -8,16 +8,19 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ballfg.files.destination import check_folder, check_replaceable
 from ballfg.files.whole_folder import whole_folder
+from ballfg.progress import Watch, unwatched
 from ballfg.tracks import DatasetInfo, TableWriter, write_dataset
+from ballfg.tracks.detection_columns import SCORE, seen_columns
 from ballfg.tracks.detections_file import DETECTIONS_FILE
 from ballfg.tracks.info import INFO_FILE, write_info
 from ballfg.tracks.rows import KEY, SIGMAS, VALUES
 from ballfg.vision.camera_file import CAMERAS_FILE, write_cameras
 from ballfg.vision.tracking.contact_sheet import ContactSheet, Extent
-from ballfg.vision.tracking.overlay import Watch, write_overlay
+from ballfg.vision.tracking.overlay import write_overlay
 from ballfg.vision.tracking.pipeline import Tracking
 from ballfg.vision.tracking.playback import Image
 from ballfg.vision.tracking.strobe import tapped
@@ -54,7 +57,7 @@ def write_tracking(
     table: Extent | None = None,
     streams: Streams | None = None,
     overlay: bool = True,
-    watch: Watch | None = None,
+    watch: Watch = unwatched,
 ) -> list[str]:
     """Writes dataset.yaml, tracks.csv, detections.csv, cameras.yaml, contact_sheet.png and overlay.mp4.
 
@@ -68,7 +71,7 @@ def write_tracking(
         table: (x_low, x_high, y_low, y_high) m, drawn in the contact sheet; None where it is not known.
         streams: the videos; None where there are none: then there is no overlay, and the sheet has no pictures.
         overlay: write it.
-        watch: shows how far it is.
+        watch: sees the frames of the overlay that are drawn.
     Returns: the names of the files.
     Raises: OSError: something cannot be written. ValueError: a track that breaks a rule of datasets.
     """
@@ -82,7 +85,7 @@ def write_tracking(
 
 
 def _run_videos(
-    stage: Path, tracking: Tracking, sheet: ContactSheet, streams: Streams, overlay: bool, watch: Watch | None
+    stage: Path, tracking: Tracking, sheet: ContactSheet, streams: Streams, overlay: bool, watch: Watch
 ) -> None:
     """Runs through the videos once more, for both kinds of pictures."""
     pictures = [sheet.pictures_of(i) for i in range(len(streams))]
@@ -108,21 +111,11 @@ def _write_tables(stage: Path, tracking: Tracking, info: DatasetInfo) -> None:
             detections.write(_detection_columns(tracking, camera))
 
 
-def _detection_columns(tracking: Tracking, camera: int) -> dict[str, np.ndarray | str]:
-    """All candidates of a camera; those that a ball was seen by carry its name, the others none."""
+def _detection_columns(tracking: Tracking, camera: int) -> dict[str, ArrayLike]:
+    """All candidates of a camera. Those of a ball carry its name, the others none."""
     seen = tracking.detections[camera]
     names = np.full(len(seen), "", dtype=object)
     for name, ball in zip(tracking.names, tracking.balls, strict=True):
         names[tracking.rows(ball, camera)] = name
-    sigma_u, sigma_v = (np.sqrt(seen.covariances[:, i, i]) for i in (0, 1))
-    return {
-        KEY: names,
-        "t": seen.times,
-        "camera": seen.camera,
-        "u": seen.pixels[:, 0],
-        "v": seen.pixels[:, 1],
-        "sigma_u": sigma_u,
-        "sigma_v": sigma_v,
-        "rho_uv": seen.covariances[:, 0, 1] / (sigma_u * sigma_v),
-        "score": seen.scores,
-    }
+    columns = seen_columns(seen.times, seen.camera, seen.pixels, seen.covariances)
+    return {KEY: names} | columns | {SCORE: seen.scores}

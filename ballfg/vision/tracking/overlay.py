@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import cv2
 import numpy as np
 
+from ballfg.progress import Watch, unwatched
 from ballfg.vision.tracking.palette import bgr
 from ballfg.vision.tracking.pipeline import Tracking
 from ballfg.vision.tracking.playback import Image, Schedule, play, schedule
 from ballfg.vision.tracking.view_painter import ViewPainter, write
 
-Watch = Callable[[Iterable[Any], int, str], Iterable[Any]]
 """Hands items through and shows how far it is: (items, how many, what they are)."""
 
 VIEW_WIDTH: Final = 640
@@ -37,7 +37,7 @@ PAPER, INK = (40, 40, 40), (235, 235, 235)
 
 
 def write_overlay(
-    path: Path, tracking: Tracking, streams: Sequence[Iterator[tuple[float, Image]]], watch: Watch | None = None
+    path: Path, tracking: Tracking, streams: Sequence[Iterator[tuple[float, Image]]], watch: Watch = unwatched
 ) -> int:
     """Writes the overlay video (mp4).
 
@@ -45,7 +45,7 @@ def write_overlay(
         path: a new file; its folder exists.
         tracking: what was found.
         streams: the frames of each camera once more, from the first on.
-        watch: shows how far it is.
+        watch: sees the frames that are drawn.
     Returns: the number of its frames.
     Raises: OSError: the video cannot be written.
     """
@@ -56,7 +56,7 @@ def write_overlay(
         raise OSError(f"{path}: OpenCV cannot write this video. Check the disk, or go without the overlay.")
     try:
         frames = painter.paint_all(moments, streams)
-        for frame in frames if watch is None else watch(frames, len(moments.times), "overlay frames drawn"):
+        for frame in watch(frames, len(moments.times), "overlay frames drawn"):
             video.write(frame)
     finally:
         video.release()

@@ -10,12 +10,13 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Track
 from ballfg.vision.association.agreement import Agreement, check_agreement
 from ballfg.vision.association.associate import AssociationSettings, associate
 from ballfg.vision.association.seen_ball import SeenBall
 from ballfg.vision.camera import Camera
-from ballfg.vision.detection.detect import Watch, detect_all, learn_detector
+from ballfg.vision.detection.detect import detect_all, learn_detector
 from ballfg.vision.detection.detections import Detections, Detector
 from ballfg.vision.detection.video import Video, open_video
 from ballfg.vision.tracking.recordings import check_sizes
@@ -102,7 +103,7 @@ def track_videos(
     stamps: Mapping[str, Path] | None = None,
     settings: AssociationSettings | None = None,
     jobs: int = 1,
-    watch: Watch | None = None,
+    watch: Watch = unwatched,
 ) -> Tracking:
     """Balls from the videos of a rig.
 
@@ -113,7 +114,7 @@ def track_videos(
         stamps: camera -> CSV file, for those whose stamps are not the container's.
         settings: of the association.
         jobs: processes.
-        watch: shows how far the search is, see `ballfg.vision.detection.detect.Watch`.
+        watch: sees the numbers of the frames that are searched.
     Raises: FileNotFoundError: a file is missing. ValueError: as `open_video`, `check_sizes` and `track_detections`.
     """
     check_count(cameras)

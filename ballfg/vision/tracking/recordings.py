@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from ballfg.tracks.hints import did_you_mean
+from ballfg.checks import did_you_mean
 from ballfg.vision.camera import Camera
 
 SAME_SHAPE: Final = 0.01

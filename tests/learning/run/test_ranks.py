@@ -13,7 +13,6 @@ import torch
 from safetensors.torch import load_file
 
 import tests.learning.run.falling_ball  # noqa: F401 - registers its kind
-from ballfg.cli.progress import progress
 from ballfg.learning.config.config_file import read_config
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.run.checkpoint import read_checkpoint
@@ -21,6 +20,7 @@ from ballfg.learning.run.launch import launch
 from ballfg.learning.run.metrics import read_metrics
 from ballfg.learning.run.ranks import Ranks, SharedMemory, Trouble
 from ballfg.learning.run.training import run_training
+from ballfg.progress import progress
 from tests.learning.run.talking_ranks import die, talk
 
 BALL = Path(__file__).parent / "falling_ball.py"

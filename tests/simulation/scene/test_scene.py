@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics import rollout
 from ballfg.simulation import SimulationConfig, parse_effects, simulate
 from ballfg.simulation.cameras import looking_at, table_rig
 from ballfg.simulation.scene import Clock, Recording, Renderer, SceneConfig, free_running, record

@@ -104,7 +104,7 @@ def test_images_lose_nothing_and_replace_videos(recording: Recording, tmp_path: 
 
 
 def test_nothing_is_half_written(recording: Recording, tmp_path: Path) -> None:
-    def stops(images: Iterable[NDArray[np.uint8]]) -> Iterator[NDArray[np.uint8]]:
+    def stops(images: Iterable[NDArray[np.uint8]], total: int, what: str) -> Iterator[NDArray[np.uint8]]:
         for count, image in enumerate(images):
             if count == 5:
                 raise KeyboardInterrupt

@@ -57,8 +57,8 @@ def test_ball_is_detected_in_a_video(films: dict[str, Path]) -> None:
 def test_all_cameras_give_what_each_gives(films: dict[str, Path], jobs: int) -> None:
     told: list[int] = []
 
-    def watch(frames: Iterable[int], total: int) -> Iterator[int]:
-        assert total == 2 * COUNT
+    def watch(frames: Iterable[int], total: int, what: str) -> Iterator[int]:
+        assert (total, what) == (2 * COUNT, "frames searched")
         for number in frames:
             told.append(number)
             yield number

@@ -310,7 +310,7 @@ def test_a_table_of_four_columns_in_any_order_is_enough(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("t,camera,u\n0,left,1\n", r"column 'v' is missing; expected t,camera,u,v, got t,camera,u\."),
+        ("t,camera,u\n0,left,1\n", r"column 'v' is missing; expected t,camera,u,v, got 't,camera,u'\."),
         ("t,camera,u,v,u\n0,left,1,2,3\n", "column 'u' must appear once"),
         ("t,camera,u,v\n0,left,1,2\n0,lefty,1,2\n", "line 3, column 'camera'.*got 'lefty'.*Did you mean 'left'"),
         ("t,camera,u,v\n0,left,1,2\n0,right,one,2\n", "line 3, column 'u': must be a number"),

@@ -1,14 +1,19 @@
-"""Where and why a CSV file cannot be read.
+"""CSV files: their header, their columns, and where and why one cannot be read.
 
-The fast reader says that a block is bad, not which line of the file. This slow second look runs only when there
-is an error to report, so that it can afford to read the file cell by cell.
+The fast reader says that a block is bad, not which line of the file. A slow second look runs only when there is an
+error to report, so that it can afford to read the file cell by cell.
 """
 
 import csv
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.csv as pa_csv
+
+from ballfg.checks import did_you_mean
 
 _NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 _NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|infinity)\s*", re.IGNORECASE)
@@ -41,6 +46,37 @@ def read_header(path: Path) -> list[str]:
     if "\0" in text:
         raise _not_utf8(path, 1)
     return next(csv.reader([text]))
+
+
+def check_header(path: Path, header: Sequence[str], required: Sequence[str], known: Collection[str]) -> None:
+    """Refuses a header without a needed column or with a known one twice.
+
+    Args: path: of the table.  header: its columns.  required: those needed.  known: those that mean something.
+    Raises: ValueError: naming the column.
+    """
+    text = ",".join(header)
+    shown = repr(text if len(text) <= 120 else text[:117] + "...")
+    for name in required:
+        if name not in header:
+            expected = f"expected {','.join(required)}, " if len(required) > 1 else ""
+            hint = did_you_mean(name, [other for other in header if other not in known])
+            if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
+                hint += " Cells must be separated by commas."
+            raise ValueError(
+                f"{path}: column {name!r} is missing; {expected}got {shown}. Add or rename the column.{hint}"
+            )
+    for name in known:
+        if list(header).count(name) > 1:
+            raise ValueError(f"{path}: column {name!r} must appear once; got {shown}. Rename one of them.")
+
+
+def convert_options(texts: Sequence[str], numbers: Sequence[str]) -> pa_csv.ConvertOptions:
+    """Makes the fast reader read these columns, in this order, and take no cell for a missing value."""
+    return pa_csv.ConvertOptions(
+        column_types={**dict.fromkeys(texts, pa.string()), **dict.fromkeys(numbers, pa.float64())},
+        include_columns=[*texts, *numbers],
+        null_values=[],
+    )
 
 
 def records(path: Path) -> Iterator[tuple[int, list[str]]]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterable, Iterator
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 T = TypeVar("T")
 
@@ -15,7 +15,20 @@ LINE_EVERY = 10.0
 """s between plain lines."""
 
 
-def progress(items: Iterable[T], total: int, what: str) -> Iterator[T]:
+class Watch(Protocol):
+    """Hands items through as they are done, for instance to show how far the work is: `progress` is one."""
+
+    def __call__(self, items: Iterable[T], total: int, what: str, /) -> Iterator[T]:
+        """The same items. `total` is their number, an estimate at times; `what` names them, as `tracks estimated`."""
+        ...
+
+
+def unwatched(items: Iterable[T], total: int, what: str, /) -> Iterator[T]:
+    """Hands items through and shows nothing."""
+    return iter(items)
+
+
+def progress(items: Iterable[T], total: int, what: str, /) -> Iterator[T]:
     """Hands items through and shows on stderr how far it is.
 
     Args: items: a stream.  total: how many there will be.  what: for instance `tracks estimated`.
