@@ -34,40 +34,25 @@ def augmentation(seed: int, epoch: int, track: int) -> tuple[Tensor, Tensor]:
 
 
 def apply(positions: Tensor, angle: Tensor, shift: Tensor) -> Tensor:
-    """Positions rotated about the world's z axis, then shifted.
+    """Positions (..., 3) m, rotated about the world's z axis by `angle` (...) rad, then shifted by `shift` (..., 2) m.
 
-    Args:
-        positions: (..., 3) m.
-        angle: (...) rad, broadcast against the leading dimensions: (b, 1) for (b, n, 3) positions of b tracks.
-        shift: (..., 2) m, likewise.
-
-    Returns: (..., 3) m.
+    Leading dimensions are broadcast: angles (b, 1) and shifts (b, 1, 2) for (b, n, 3) positions of b tracks.
     """
-    return rotate(positions, angle) + torch.cat([shift, torch.zeros_like(shift[..., :1])], dim=-1)
+    return rotate(positions, angle) + _horizontal(shift)
+
+
+def undo(positions: Tensor, angle: Tensor, shift: Tensor) -> Tensor:
+    """The inverse of `apply`."""
+    return rotate(positions - _horizontal(shift), -angle)
 
 
 def rotate(vectors: Tensor, angle: Tensor) -> Tensor:
-    """Vectors - velocity, spin, acceleration - rotated about the vertical; a shift does not change them.
-
-    Args:
-        vectors: (..., 3), any unit.
-        angle: (...) rad, as in `apply`.
-
-    Returns: (..., 3).
-    """
+    """Vectors (..., 3) - velocity, spin, acceleration - rotated about the vertical; a shift does not change them."""
     cos, sin = torch.cos(angle), torch.sin(angle)
     x, y, z = vectors.unbind(-1)
     return torch.stack([cos * x - sin * y, sin * x + cos * y, z], dim=-1)
 
 
-def undo(positions: Tensor, angle: Tensor, shift: Tensor) -> Tensor:
-    """The inverse of `apply`.
-
-    Args:
-        positions: (..., 3) m, rotated and shifted.
-        angle: (...) rad, as in `apply`.
-        shift: (..., 2) m, likewise.
-
-    Returns: (..., 3) m.
-    """
-    return rotate(positions - torch.cat([shift, torch.zeros_like(shift[..., :1])], dim=-1), -angle)
+def _horizontal(shift: Tensor) -> Tensor:
+    """(..., 3) from (..., 2)."""
+    return torch.cat([shift, torch.zeros_like(shift[..., :1])], dim=-1)

@@ -71,12 +71,8 @@ def judge_tracks(
 
     Returns: None for a track that cannot be judged: nothing left to predict, an estimate that failed.
     """
-    score = partial(_judge, estimator, observe, horizon)
+    score = partial(judge_track, estimator, observe=observe, horizon=horizon)
     return map_tracks(score, tracks, count, jobs)
-
-
-def _judge(estimator: Estimator, observe: float, horizon: float, track: Track) -> TrackScore | None:
-    return judge_track(estimator, track, observe, horizon)
 
 
 def judge_track(estimator: Estimator, track: Track, observe: float, horizon: float) -> TrackScore | None:

@@ -18,7 +18,7 @@ from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_settings, dataset_surfaces, estimate_tracks
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
-from ballfg.learning.calibration.population import Evidence, Population, evidence, fit_population
+from ballfg.learning.calibration.population import Evidence, evidence, fit_population
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import TrackScore, judge_tracks
 from ballfg.learning.split import Split, split_tracks, tracks_of
@@ -181,7 +181,7 @@ def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
         sigma=_plain(population.sigma),
         spread=_plain(population.spread),
         next_track=_plain(population.next_track),
-        moved=_move(population, about),
+        moved=float(np.abs((population.mean - about) / population.sigma).max()),
         fits=tuple(fits),
         skipped=tuple(skipped),
         scores=score(problem, population.mean, watch),
@@ -233,10 +233,6 @@ def _check_failures(skipped: list[tuple[str, str]], count: int, limit: float) ->
             f"more than {100 * limit:g} % of the {count} fitted tracks failed, the last one '{name}': {reason}. "
             "Raise failure_limit to go on without them."
         )
-
-
-def _move(population: Population, about: Array) -> float:
-    return float(np.abs((population.mean - about) / population.sigma).max())
 
 
 def _plain(values: Array) -> tuple[float, ...]:

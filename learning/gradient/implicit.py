@@ -59,21 +59,21 @@ class ImplicitGradient(GradientMethod):
     raises the exception of the linear solver.
     """
 
+    _exact = True
+
     def __call__(
         self, solve: Solve, stationarity: Stationarity, linear_solver: LinearSolver, parameters: Sequence[Tensor]
     ) -> Tensor:
         """The solution (n,) in the units of `solve`, differentiable in the parameters."""
-        return _attached(solve(), stationarity, linear_solver, parameters, exact=True)
+        wanted = [p for p in parameters if p.requires_grad]
+        attached: Tensor = _Solution.apply(solve().detach(), stationarity, linear_solver, self._exact, *wanted)
+        return attached
 
 
-class GaussNewtonGradient(GradientMethod):
+class GaussNewtonGradient(ImplicitGradient):
     """An approximation: the Gauss-Newton matrix for the Hessian, without the curvature of residuals and losses."""
 
-    def __call__(
-        self, solve: Solve, stationarity: Stationarity, linear_solver: LinearSolver, parameters: Sequence[Tensor]
-    ) -> Tensor:
-        """The solution (n,), with an approximate derivative by the parameters."""
-        return _attached(solve(), stationarity, linear_solver, parameters, exact=False)
+    _exact = False
 
 
 class UnrolledGradient(GradientMethod):
@@ -111,14 +111,6 @@ class _Preconditioned(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
         return ctx.linear_solver.precondition(upstream[0]), None
-
-
-def _attached(
-    point: Tensor, stationarity: Stationarity, linear_solver: LinearSolver, parameters: Sequence[Tensor], *, exact: bool
-) -> Tensor:
-    wanted = [p for p in parameters if p.requires_grad]
-    attached: Tensor = _Solution.apply(point.detach(), stationarity, linear_solver, exact, *wanted)
-    return attached
 
 
 class _Solution(torch.autograd.Function):

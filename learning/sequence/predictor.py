@@ -18,8 +18,7 @@ from torch import Tensor
 from ballfg.files.strict_yaml import YamlError, read_yaml
 from ballfg.files.whole_folder import whole_folder
 from ballfg.learning.sequence.architecture import SequenceArchitecture
-from ballfg.learning.sequence.data import collate, example
-from ballfg.learning.sequence.launcher import LauncherSettings
+from ballfg.learning.sequence.data import LauncherSettings, collate, example
 from ballfg.learning.sequence.model import SequenceModel
 from ballfg.tracks import Track
 

@@ -13,8 +13,7 @@ from torch import Tensor
 from ballfg.learning.augment import augmentation
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.sequence.architecture import SequenceArchitecture, SequenceKind
-from ballfg.learning.sequence.data import Batch, Example, collate, example
-from ballfg.learning.sequence.launcher import LauncherSettings
+from ballfg.learning.sequence.data import Batch, Example, LauncherSettings, collate, example
 from ballfg.learning.sequence.model import SequenceModel
 from ballfg.learning.sequence.predictor import SequencePredictor
 from ballfg.learning.shots import Shot
