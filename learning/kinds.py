@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, ClassVar
 
 from ballfg.learning.registry import TraineeKind, register_trainee
 
@@ -19,7 +19,7 @@ SEQUENCES = ("lstm", "diffusion")
 class Network(TraineeKind):
     """A network for the dynamics, trained through the estimator."""
 
-    unused = ("options",)
+    unused: ClassVar[tuple[str, ...]] = ("options",)
 
     @classmethod
     def build(cls, config: TrainConfig) -> Prepared:
@@ -32,7 +32,7 @@ class Network(TraineeKind):
 class Sequence(TraineeKind):
     """A network from observations to the rest of a track."""
 
-    unused = ("architecture", "model", "noise", "gradient", "options")
+    unused: ClassVar[tuple[str, ...]] = ("architecture", "model", "noise", "gradient", "options")
     augmented = True
 
     @classmethod
