@@ -1,18 +1,20 @@
-"""Covariances of all states from the Bayes net that the elimination leaves behind.
+"""Covariances of states and coefficients from the Bayes nets that the elimination leaves behind.
 
-Backwards along the track: p(x_i | x_{i+1}, c) is Gaussian with square-root information R_i and coupling S_i, so that
-with y = (x_{i+1}, c) and K_i = -R_i^-1 S_i the joint covariance follows from that of y. Nothing is inverted but the
-triangular R_i; GTSAM's `Marginals` would go through Cholesky, which a loose prior beside a tight process noise defeats.
+An elimination gives the square-root information R of a track, R^T R = J^T J, as one row of blocks per state. Backwards
+along the track, p(x_i | x_{i+1}, c) is Gaussian with R_i and the coupling S_i to y = (x_{i+1}, c), so that with
+K_i = -R_i^-1 S_i the covariance of x_i follows from that of y. Only the triangular R_i are inverted. GTSAM's
+`Marginals` goes through Cholesky, which fails for a loose prior beside a tight process noise.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from ballfg.factors.batch import Array
+from ballfg.factors.batch import COEFFICIENTS, Array, Index
 from ballfg.state import STATE_DIM
 
 
@@ -31,32 +33,101 @@ class Covariances:
     cross: Array
 
 
-def marginal_covariances(bayes_net: gtsam.GaussianBayesNet, n: int, p: int) -> Covariances:
-    """Covariances from a net over states 0..n-1 in order, then p coefficients (none if p is 0)."""
-    size = STATE_DIM + p
-    states, cross = np.empty((n, STATE_DIM, STATE_DIM)), np.empty((n, STATE_DIM, p))
-    coefficients = _inverse_gram(bayes_net.at(n).R()) if p else np.zeros((0, 0))
-    later = np.zeros((size, size))  # joint covariance of (x_{i+1}, c)
-    later[STATE_DIM:, STATE_DIM:] = coefficients
-    for i in range(n - 1, -1, -1):
-        conditional = bayes_net.at(i)
-        inverse = np.linalg.inv(conditional.R())
-        gain = np.zeros((STATE_DIM, size))
-        coupling, column = -inverse @ conditional.S(), 0
+@dataclass(frozen=True)
+class NeighbourCovariances:
+    """Covariances of t tracks with up to n states and p coefficients each.
+
+    Attributes:
+        states: (t, n, 9, 9).
+        cross: (t, n, 9, 9 + p), of each state with the next one and with the coefficients.
+        coefficients: (t, p, p).
+    """
+
+    states: Array
+    cross: Array
+    coefficients: Array
+
+    def joint(self, track: int, left: Index, right: Index) -> Array:
+        """(m, d, e) covariances of variables of one track, each pair the same, neighbours, or with the coefficients.
+
+        Args: left: (m,) variable numbers.  right: (m,).
+        """
+        if left[0] == COEFFICIENTS or right[0] == COEFFICIENTS:
+            if left[0] == right[0]:
+                return np.broadcast_to(self.coefficients[track], (len(left), *self.coefficients.shape[1:]))
+            if left[0] == COEFFICIENTS:
+                return self.joint(track, right, left).swapaxes(-1, -2)
+            return self.cross[track, left][:, :, STATE_DIM:]
+        if (left == right).all():
+            return self.states[track, left]
+        if left[0] > right[0]:
+            return self.joint(track, right, left).swapaxes(-1, -2)
+        return self.cross[track, left][:, :, :STATE_DIM]
+
+
+class SquareRootInformation:
+    """The blocks of R of several tracks, side by side.
+
+    Args:
+        bayes_nets: GTSAM's, one a track: states 0, 1, ... in order, then the coefficients if there are any.
+        lengths: number of states of each track.
+        coefficients: number p of coefficients of each.
+
+    Attributes:
+        inverse: (t, n, 9, 9) inverses of the diagonal blocks; identities beyond a track's end.
+        following: (t, n, 9, 9) blocks that couple a state to the next one.
+        shared: (t, n, 9, p) blocks that couple it to the coefficients.
+        last: (t, p, p) inverses of the coefficients' own blocks.
+    """
+
+    def __init__(self, bayes_nets: Sequence[gtsam.GaussianBayesNet], lengths: Sequence[int], coefficients: int) -> None:
+        self.tracks, self.lengths, self.coefficients = len(bayes_nets), np.array(lengths), coefficients
+        t, n = self.tracks, max(lengths)
+        root = np.zeros((t, n, STATE_DIM, STATE_DIM))
+        root[:] = np.eye(STATE_DIM)  # shorter tracks are filled up with variables that nothing depends on
+        self.following = np.zeros((t, n, STATE_DIM, STATE_DIM))
+        self.shared = np.zeros((t, n, STATE_DIM, coefficients))
+        last = np.zeros((t, coefficients, coefficients))
+        for k, (net, length) in enumerate(zip(bayes_nets, lengths, strict=True)):
+            for i in range(length):
+                conditional = net.at(i)
+                root[k, i] = conditional.R()
+                self._read_parents(k, i, length, conditional)
+            if coefficients:
+                last[k] = net.at(length).R()
+        self.inverse, self.last = np.linalg.inv(root), np.linalg.inv(last)
+
+    def _read_parents(self, track: int, state: int, length: int, conditional: gtsam.GaussianConditional) -> None:
+        column, coupling = 0, conditional.S()
         for key in conditional.keys()[1:]:
-            target = slice(STATE_DIM, size) if key == n else slice(0, STATE_DIM)
-            width = p if key == n else STATE_DIM
-            gain[:, target] = coupling[:, column : column + width]
+            blocks = self.shared if key == length else self.following
+            width = blocks.shape[-1]
+            blocks[track, state] = coupling[:, column : column + width]
             column += width
-        with_later = gain @ later
-        states[i] = inverse @ inverse.T + with_later @ gain.T
-        cross[i] = with_later[:, STATE_DIM:]
-        later[:STATE_DIM, :STATE_DIM] = states[i]
-        later[:STATE_DIM, STATE_DIM:] = cross[i]
-        later[STATE_DIM:, :STATE_DIM] = cross[i].T
-    return Covariances(states, coefficients, cross)
+
+    def log_determinants(self) -> Array:
+        """(t,) log det R, dimensionless."""
+        diagonals = (np.abs(np.diagonal(inverse, axis1=-2, axis2=-1)) for inverse in (self.inverse, self.last))
+        states, coefficients = (np.log(diagonal) for diagonal in diagonals)
+        return np.asarray(-states.sum((1, 2)) - coefficients.sum(1))
+
+    def covariances(self) -> NeighbourCovariances:
+        """Blocks of (R^T R)^-1, by the recursion from the last states back to the first, all tracks in lockstep."""
+        gain = -self.inverse @ np.concatenate((self.following, self.shared), axis=-1)
+        states, cross = self.inverse @ self.inverse.mT, np.empty_like(gain)
+        coefficients = self.last @ self.last.mT
+        later = np.zeros((self.tracks, gain.shape[-1], gain.shape[-1]))  # covariance of (x_{i+1}, c)
+        later[:, STATE_DIM:, STATE_DIM:] = coefficients
+        for i in range(states.shape[1] - 1, -1, -1):
+            cross[:, i] = gain[:, i] @ later
+            states[:, i] += cross[:, i] @ gain[:, i].mT
+            later[:, :STATE_DIM, :STATE_DIM] = states[:, i]
+            own = cross[:, i, :, STATE_DIM:]
+            later[:, :STATE_DIM, STATE_DIM:], later[:, STATE_DIM:, :STATE_DIM] = own, own.mT
+        return NeighbourCovariances(states, cross, coefficients)
 
 
-def _inverse_gram(root: Array) -> Array:
-    inverse = np.linalg.inv(root)
-    return np.asarray(inverse @ inverse.T)
+def marginal_covariances(bayes_net: gtsam.GaussianBayesNet, n: int, p: int) -> Covariances:
+    """Covariances of one track from a net over states 0..n-1 in order, then p coefficients (none if p is 0)."""
+    found = SquareRootInformation([bayes_net], [n], p).covariances()
+    return Covariances(found.states[0], found.coefficients[0], found.cross[0, :, :, STATE_DIM:])

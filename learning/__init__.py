@@ -1,4 +1,9 @@
 """Learning: models trained through the estimator, calibration of coefficients, `ballfg-train`.
 
-`ballfg-train` is its command; docs/train.md is its guide.
+docs/learn.md explains the choices, docs/train.md is the guide of the command. The sub-rooms import one way: config and
+gradient; run; end_to_end and sequence; calibration.
 """
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

@@ -1,6 +1,6 @@
 """The command `ballfg-train` and its entry point.
 
-The heavy libraries are imported inside: `ballfg-train --help` must not wait for torch or GTSAM.
+Heavy libraries are imported inside functions: `ballfg-train --help` must not wait for torch or GTSAM.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ app = typer.Typer(name="ballfg-train", add_completion=False, pretty_exceptions_e
 @app.command()
 def train(
     config: Annotated[
-        Path, typer.Argument(metavar="CONFIG.yaml", help="YAML file of what to do; docs/train.md lists its keys.")
+        Path, typer.Argument(metavar="CONFIG.yaml", help="Config file (YAML); docs/train.md lists its keys.")
     ],
     overrides: Annotated[
-        list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Keys of the config, given here instead.")
+        list[str] | None, typer.Argument(metavar="[KEY=VALUE]...", help="Config keys to override.")
     ] = None,
     data: Annotated[
-        list[str] | None, typer.Option("--data", help="Folder of the dataset; several train one model.")
+        list[str] | None, typer.Option("--data", help="Dataset folder; repeat to train one model on several.")
     ] = None,
-    out: Annotated[str | None, typer.Option("--out", help="Folder to write: new, or without an earlier run.")] = None,
-    resume: Annotated[str | None, typer.Option("--resume", help="Folder of an earlier run: continue it.")] = None,
+    out: Annotated[str | None, typer.Option("--out", help="Output folder; must not hold an earlier run.")] = None,
+    resume: Annotated[str | None, typer.Option("--resume", help="Folder of an earlier run to continue.")] = None,
 ) -> None:
     """Train a model of the ball on a dataset: a network, or the coefficients of the analytic model.
 
-    `kind` in the config says which one. With kind: calibrate, it estimates how bouncy the table is and how draggy the
-    ball, with error bars.
+    The key `kind` of the config selects the model. kind: calibrate estimates the drag of the ball and the restitution
+    of the table, with error bars.
 
     Example: ballfg-train train.yaml --data data/ballgun --out ballgun-model kind=mnn+gs optimizer.epochs=30
     """
@@ -62,7 +62,7 @@ def train(
 
 
 def _train(config: TrainConfig, folder: Path, resume: bool) -> None:
-    """In this process where a launcher has started it, or one is enough; else in processes of its own."""
+    """Train in this process if a launcher has started it or one is enough, else in new processes."""
     from ballfg.learning.run.launch import launch
     from ballfg.learning.run.ranks import started_by_launcher
     from ballfg.learning.run.run_folder import check
@@ -71,26 +71,25 @@ def _train(config: TrainConfig, folder: Path, resume: bool) -> None:
     if workers == 1 or started_by_launcher():
         _train_here(config, folder, resume)
         return
-    check(folder, config, resume=resume)  # what is wrong there is said before the processes start
+    check(folder, config, resume=resume)  # refuse a bad folder before the processes start
     status = launch(workers, _train_guarded, config, folder, resume)
     if status:
-        raise SystemExit(status)  # the first process has said why
+        raise SystemExit(status)  # the first process has printed the reason
 
 
 def _train_here(config: TrainConfig, folder: Path, resume: bool) -> None:
-    from ballfg.learning.config.build import build, export
     from ballfg.learning.run.training import run_training
 
-    run_training(config, folder, resume, build, export, progress)
+    run_training(config, folder, resume=resume, watch=progress)
 
 
 def _train_guarded(config: TrainConfig, folder: Path, resume: bool) -> int:
-    """What each process does that this command starts. Returns: its exit status."""
+    """The work of each process that this command starts. Returns: its exit status."""
     return guarded(lambda: _train_here(config, folder, resume))
 
 
 def run(arguments: Sequence[str] | None = None) -> None:
-    """Runs `ballfg-train` with the given arguments, by default the command line's, and exits.
+    """Run `ballfg-train` with the given arguments, by default those of the command line, and exit.
 
     Raises: SystemExit: always; status 0, 2 on bad input, 130 after Ctrl-C.
     """

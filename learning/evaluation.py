@@ -1,4 +1,4 @@
-"""How well a model predicts tracks that were not fitted: observe their first part, predict the rest."""
+"""The error of a model's predictions on tracks that were not fitted: observe the first part, predict the rest."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ NINETY = float(norm.ppf(0.95))
 
 
 class TrackScore(BaseModel):
-    """How one track was predicted."""
+    """Prediction errors of one track."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     name: str
-    """Of the track."""
+    """Name of the track."""
     samples: int
-    """That were predicted."""
+    """Number of predicted samples."""
     rmse: float
     """m, root of the mean squared distance between predicted and measured positions."""
     covered: float
@@ -37,16 +37,16 @@ class TrackScore(BaseModel):
 
 
 class Summary(BaseModel):
-    """How a set of tracks was predicted."""
+    """Prediction errors of a set of tracks."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     tracks: int
-    """That are summed up."""
+    """Number of tracks."""
     rmse_median: float
     """m, median over tracks."""
     rmse_pooled: float
-    """m, over all predicted samples: the worst tracks decide."""
+    """m, root mean square over all predicted samples, which the worst tracks dominate."""
     coverage_90: float
     """Share of measured coordinates inside the central 90 % intervals."""
     prediction_nis: float
@@ -61,21 +61,17 @@ def judge_tracks(
     """Scores in the order of the tracks.
 
     Args:
-        estimator: with the model that is judged.
+        estimator: with the model to judge.
         tracks: a stream.
-        observe: share of each track's duration that is seen.
+        observe: share of each track's duration that is observed.
         horizon: s that are predicted, `inf` for the whole rest.
-        jobs: processes.
-        count: how many tracks there are.
+        jobs: number of processes.
+        count: number of tracks.
 
     Returns: None for a track that cannot be judged: nothing left to predict, an estimate that failed.
     """
-    score = partial(_judge, estimator, observe, horizon)
+    score = partial(judge_track, estimator, observe=observe, horizon=horizon)
     return map_tracks(score, tracks, count, jobs)
-
-
-def _judge(estimator: Estimator, observe: float, horizon: float, track: Track) -> TrackScore | None:
-    return judge_track(estimator, track, observe, horizon)
 
 
 def judge_track(estimator: Estimator, track: Track, observe: float, horizon: float) -> TrackScore | None:
@@ -101,7 +97,7 @@ def judge_track(estimator: Estimator, track: Track, observe: float, horizon: flo
 
 
 def summary(scores: Sequence[TrackScore]) -> Summary | None:
-    """The scores of some tracks in five numbers; None for no tracks."""
+    """The summary of some scores; None for no tracks."""
     if not scores:
         return None
     samples = np.array([s.samples for s in scores], dtype=np.float64)

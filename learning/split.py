@@ -1,4 +1,4 @@
-"""Which tracks are fitted and which judge the result; decided before anything is estimated."""
+"""The split of tracks into those that are fitted and those that judge, made before anything is estimated."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from ballfg.tracks import Dataset, Track
 
 LABEL = "split"
 FIT, JUDGE, VALIDATE = "train", "test", "validation"
-"""Values of the label `split`: a calibration judges by the tests, a training validates and leaves the tests alone."""
+"""Values of the label `split`: a calibration judges by the tests, a training validates and does not use them."""
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,10 @@ class Split:
     """The parts of a dataset.
 
     Attributes:
-        fit: names of the tracks that are fitted.  judge: of those that judge.
-        left_out: why other tracks take no part, by name.
-        digest: of all stamps, positions, sigmas and labels: another dataset has another one.
+        fit: names of the tracks that are fitted.
+        judge: names of the tracks that judge.
+        left_out: reasons for the other tracks, by name.
+        digest: hash of all stamps, positions, sigmas and labels.
     """
 
     fit: tuple[str, ...]
@@ -35,11 +36,11 @@ class Split:
 
 
 def split_tracks(dataset: Dataset, how: Literal["random", "label"], seed: int, *, needs_spin: bool) -> Split:
-    """Part the tracks of a dataset, in one pass.
+    """Split the tracks of a dataset, in one pass.
 
     Args:
         dataset: the tracks.
-        how: random: half to each, the odd one to fit. label: by the label `split`.
+        how: random: half to fit, half to judge, an odd one to fit. label: by the label `split`.
         seed: of the random split.
         needs_spin: leave out tracks without a spin label.
 
@@ -80,11 +81,11 @@ def split_tracks(dataset: Dataset, how: Literal["random", "label"], seed: int, *
 
 
 def training_split(tracks: Sequence[tuple[int, Track]], config: SplitConfig, seed: int) -> tuple[list[int], list[int]]:
-    """Numbers of the tracks that train and of those that validate, in order; other tracks take no part.
+    """Numbers of the tracks that train and of those that validate, in order; other tracks are not used.
 
     Args:
         tracks: each with the number of its dataset; `alternate` counts in each dataset by itself.
-        config: how.
+        config: of the split.
         seed: of the random split.
 
     Raises: ValueError: if no track trains.

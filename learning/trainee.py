@@ -1,22 +1,24 @@
-"""The contract between what is trained and the loop that trains it."""
+"""The contract between a trained model and the loop that trains it."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import torch
 from torch import Tensor, nn
 
 
 @dataclass(frozen=True)
 class BatchLoss:
-    """What one batch of tracks gives. Everything is a sum over tracks, so that shards of a batch can be added.
+    """The loss of a batch of tracks. All numbers are sums over tracks, so that those of parts of a batch add up.
 
     Attributes:
-        total: () differentiable sum of the tracks' losses; 0 without a graph where every track failed.
-        tracks: how many tracks are in it.
+        total: () dimensionless, differentiable sum of the tracks' losses; 0 without a graph where every track failed.
+        tracks: number of tracks in it.
         squared_error: m^2, summed over `points` positions (three coordinates each).
         points: number of positions.
         failed: name and reason of each track that was left out.
@@ -28,11 +30,16 @@ class BatchLoss:
     points: int
     failed: tuple[tuple[str, str], ...] = ()
 
+    @classmethod
+    def none(cls, failed: Sequence[tuple[str, str]] = ()) -> BatchLoss:
+        """The loss of no tracks."""
+        return cls(torch.zeros((), dtype=torch.float64), 0, 0.0, 0, tuple(failed))
+
 
 class Trainee(ABC):
-    """A model with its data: what a loop can take gradients of and judge.
+    """A model with its data.
 
-    Tracks are numbered; a loop shards the numbers over processes. Nothing here may depend on how tracks are batched,
+    Tracks are numbered; a loop divides the numbers among processes. No result may depend on how tracks are batched,
     beyond rounding.
 
     Attributes:
@@ -43,11 +50,15 @@ class Trainee(ABC):
 
     @abstractmethod
     def loss(self, tracks: Sequence[int], epoch: int) -> BatchLoss:
-        """The loss on some tracks of the training part; randomness is drawn from the seed, the track and the epoch."""
+        """The loss on some training tracks; random numbers derive from the seed, the track and the epoch alone."""
 
     @abstractmethod
     def judge(self, tracks: Sequence[int]) -> BatchLoss:
-        """The same without gradient and augmentation, on tracks of any part."""
+        """The loss on any tracks, without gradient and without augmentation."""
+
+    @abstractmethod
+    def export(self, folder: Path) -> Path:
+        """Write the model into a folder. Returns: the path that other commands and classes load it from."""
 
     def groups(self) -> list[dict[str, Any]]:
         """Parameter groups for a torch optimizer, each with `name` and a `scale` on the learning rate."""
@@ -57,13 +68,28 @@ class Trainee(ABC):
         """Bring parameters back into their bounds after an optimizer's step; none by default."""
 
     def memory(self) -> dict[str, Tensor]:
-        """What, beside parameters, an uninterrupted run carries from one epoch to the next: warm starts. By name."""
+        """State beside the parameters that lasts from one epoch to the next, by name: tensors (...) of any unit."""
         return {}
 
     def remember(self, memory: dict[str, Tensor]) -> None:
-        """Take up what `memory` gave.
+        """Restore the state that `memory` gave.
 
+        Args: memory: tensors of any shape (...) and unit, by name.
         Raises: ValueError: if it is another run's.
         """
         if memory:
             raise ValueError(f"memory must be empty for this model; got {', '.join(sorted(memory))}.")
+
+
+class Prepared(NamedTuple):
+    """A trainee that is ready to train.
+
+    Attributes:
+        trainee: the model with its data.
+        train: numbers of the tracks that train.
+        validation: numbers of the tracks that validate.
+    """
+
+    trainee: Trainee
+    train: Sequence[int]
+    validation: Sequence[int]

@@ -18,13 +18,13 @@ from ballfg.benchmarks.dynamics.task import Task
 from ballfg.dynamics import BallModel, load_model
 from ballfg.estimation import Settings
 from ballfg.estimation.configure import launcher_of, learned_process
-from ballfg.learning.config.build import build, export
-from ballfg.learning.config.training import NETWORKS, SEQUENCES, TrainConfig
+from ballfg.learning.config.training import TrainConfig
+from ballfg.learning.kinds import NETWORKS, SEQUENCES
 from ballfg.learning.run.metrics import read_metrics
 from ballfg.learning.run.run_folder import METRICS, MODEL
 from ballfg.learning.run.training import run_training
-from ballfg.learning.sequence.build import load_sequence
 from ballfg.learning.sequence.predictor import SequencePredictor
+from ballfg.learning.sequence.trainee import FOLDER
 from ballfg.progress import unwatched
 from ballfg.tracks import Track
 
@@ -63,10 +63,10 @@ def trained_contender(job: Job, task: Task) -> Contender:
     begun = (folder / METRICS).is_file()
     if not (folder / MODEL).exists() and not (folder / "model").exists():
         with (job.folder / "log.txt").open("a") as log, redirect_stdout(log), redirect_stderr(log):
-            run_training(config, folder, begun, build, export, unwatched)
+            run_training(config, folder, resume=begun, watch=unwatched)
     seconds = sum(epoch.seconds for epoch in read_metrics(folder / METRICS))
     if config.kind in SEQUENCES:
-        predictor = load_sequence(folder)
+        predictor = SequencePredictor.load(folder / FOLDER)
         return SequenceContender(job.method, predictor.parameter_count, seconds, predictor)
     model = load_model(folder / MODEL, radius=task.info.ball.radius)
     return GraphContender(

@@ -1,7 +1,8 @@
-"""Calibration: the coefficients of a population of tracks, and whether they predict other tracks better.
+"""Calibration: the coefficients of a population of tracks, judged by the prediction of other tracks.
 
-Each step estimates the fitted tracks with the smoother, takes the priors out of what each says of its coefficients,
-finds the population's mean and spread, and starts again with the mean in the model, until it stays. docs/train.md.
+Each step estimates the fitted tracks with the smoother, removes the priors from their posteriors of the coefficients,
+finds the population's mean and spread, and puts the mean into the model. It ends when the mean no longer moves.
+docs/train.md.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_settings, dataset_surfaces, estimate_tracks
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
-from ballfg.learning.calibration.population import Evidence, Population, evidence, fit_population
+from ballfg.learning.calibration.population import Evidence, evidence, fit_population
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import TrackScore, judge_tracks
 from ballfg.learning.split import Split, split_tracks, tracks_of
@@ -27,7 +28,7 @@ from ballfg.tracks import Dataset
 Array = NDArray[np.float64]
 
 
-class TooManyFailures(ValueError):  # noqa: N818 - says what it is
+class TooManyFailures(ValueError):  # noqa: N818 - the name is the statement
     """More estimates failed than the config allows."""
 
 
@@ -37,13 +38,13 @@ class Problem:
 
     Attributes:
         dataset: the tracks.
-        config: what was asked for.
+        config: of the calibration.
         model: to start from.
         chosen: its coefficients that are calibrated.
-        surfaces: what the ball may bounce on.
-        settings: of the estimator, as `ballfg predict` has them.
-        split: which tracks are fitted, which judge.
-        jobs: processes.
+        surfaces: on which the ball may bounce.
+        settings: of the estimator, those of `ballfg predict`.
+        split: the tracks that are fitted and those that judge.
+        jobs: number of processes.
     """
 
     dataset: Dataset
@@ -61,7 +62,7 @@ class Problem:
 
 
 class TrackFit(BaseModel):
-    """What one track says of its p coefficients, the model's prior included."""
+    """Posterior of one track's p coefficients, the model's prior included."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
@@ -71,10 +72,7 @@ class TrackFit(BaseModel):
 
 
 class Step(BaseModel):
-    """One step; the first, number 0, only judges the model that the calibration starts from.
-
-    Everything here is plain numbers: a checkpoint holds it to the last bit.
-    """
+    """One step in plain numbers, which a checkpoint keeps to the last bit. Step 0 only judges the first model."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
@@ -90,11 +88,11 @@ class Step(BaseModel):
     moved: float | None = None
     """Largest move of a mean in this step, in standard errors."""
     fits: tuple[TrackFit, ...] = ()
-    """The tracks that were used."""
+    """Posteriors of the tracks that were used."""
     skipped: tuple[tuple[str, str], ...] = ()
-    """Name and reason of those that were not."""
+    """Name and reason of each track that was not used."""
     scores: tuple[TrackScore | None, ...] = ()
-    """How the model of this step's mean predicts each judging track; None where that failed."""
+    """Scores of the judging tracks with the mean of this step; None where a track could not be judged."""
 
 
 def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs: int = 1) -> Problem:
@@ -103,10 +101,10 @@ def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs
     Args:
         dataset: the tracks.
         model: to start from, with the ball's radius.
-        config: what to do.
-        jobs: processes.
+        config: of the calibration.
+        jobs: number of processes.
 
-    Raises: ValueError: coefficients that the model does not have or the data cannot tell, too few tracks.
+    Raises: ValueError: coefficients that the model does not have or the data cannot determine, too few tracks.
     """
     chosen = choose(model, config.coefficients)
     split = split_tracks(dataset, config.split, config.seed, needs_spin=chosen.needs_spin)
@@ -116,11 +114,11 @@ def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs
 
 
 def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unwatched) -> Iterator[Step]:
-    """The steps that are still to do, each as soon as it is done; none if the calibration has ended already.
+    """The remaining steps, each as soon as it is finished; none if the calibration has ended.
 
     Args:
         problem: from `pose`.
-        done: steps of an earlier run of the same problem; the run continues with the same numbers.
+        done: steps of an earlier run of the same problem, which continues to the same numbers.
         watch: sees the tracks pass, for instance to show progress.
 
     Raises: TooManyFailures: more estimates of fitted tracks failed than the config allows.
@@ -137,7 +135,7 @@ def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unw
 
 
 def has_converged(config: CalibrationConfig, step: Step) -> bool:
-    """Whether the mean stayed where it was."""
+    """Whether the mean has stopped moving."""
     return step.moved is not None and step.moved <= config.tolerance
 
 
@@ -167,13 +165,13 @@ def score(
 
 
 def population_settings(problem: Problem, step: Step) -> Settings:
-    """Settings whose prior of each calibrated coefficient is what the population says of a new track."""
+    """Settings with the population's distribution of a new track as the prior of each calibrated coefficient."""
     learned = dict(zip(problem.chosen.names, step.next_track, strict=True))
     return replace(problem.settings, coefficients={**problem.settings.coefficients, **learned})
 
 
 def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
-    """Linearise the fitted tracks about the last mean, and find the population anew."""
+    """Linearise the fitted tracks about the last mean, and fit the population."""
     chosen, about = problem.chosen, np.array(last.mean)
     fits, evidences, skipped = _fit_tracks(problem, about, watch)
     population = fit_population(evidences, chosen.start, chosen.sigma, chosen.low, chosen.high)
@@ -183,7 +181,7 @@ def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
         sigma=_plain(population.sigma),
         spread=_plain(population.spread),
         next_track=_plain(population.next_track),
-        moved=_move(population, about),
+        moved=float(np.abs((population.mean - about) / population.sigma).max()),
         fits=tuple(fits),
         skipped=tuple(skipped),
         scores=score(problem, population.mean, watch),
@@ -193,7 +191,7 @@ def _advance(problem: Problem, last: Step, watch: Watch) -> Step:
 def _fit_tracks(
     problem: Problem, about: Array, watch: Watch
 ) -> tuple[list[TrackFit], list[Evidence], list[tuple[str, str]]]:
-    """What each fitted track says, and which were skipped.
+    """Posterior and likelihood of each fitted track, and the skipped tracks.
 
     Coefficients that vary from track to track stay free in each track, calibrated or not.
     """
@@ -217,7 +215,7 @@ def _fit_tracks(
 
 
 def _read(estimate: Estimate, chosen: Chosen, about: Array) -> tuple[TrackFit, Evidence]:
-    """What one estimate says of the chosen coefficients. Raises: ValueError: if it failed."""
+    """Posterior and likelihood of the chosen coefficients in one estimate. Raises: ValueError: if it failed."""
     if estimate.status is not Status.OK:
         raise ValueError(estimate.status.value)
     columns = [estimate.coefficient_names.index(name) for name in chosen.names]
@@ -235,10 +233,6 @@ def _check_failures(skipped: list[tuple[str, str]], count: int, limit: float) ->
             f"more than {100 * limit:g} % of the {count} fitted tracks failed, the last one '{name}': {reason}. "
             "Raise failure_limit to go on without them."
         )
-
-
-def _move(population: Population, about: Array) -> float:
-    return float(np.abs((population.mean - about) / population.sigma).max())
 
 
 def _plain(values: Array) -> tuple[float, ...]:

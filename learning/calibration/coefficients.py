@@ -11,23 +11,12 @@ import torch
 from numpy.typing import NDArray
 
 from ballfg.checks import did_you_mean
-from ballfg.dynamics import AnalyticModel, load_model, nominal_model
+from ballfg.dynamics import AnalyticModel
 
 Array = NDArray[np.float64]
 
 NEED_SPIN_LABELS = ("flight.magnus.k", "flight.spin_decay.rate")
-"""Act through the spin alone: without measured spin, only its product with the coefficient shows."""
-
-
-def analytic_model(path: str | None, radius: float) -> AnalyticModel:
-    """The analytic model of a file, or the nominal one for None; radius in m.
-
-    Raises: ValueError: if the file's model has a learned part.
-    """
-    model = nominal_model(radius) if path is None else load_model(path, radius=radius)
-    if not isinstance(model, AnalyticModel):
-        raise ValueError(f"model must be analytic; {path} has a learned part. Give its base, or leave it out.")
-    return model
+"""Coefficients that act through the spin alone: without measured spin only their product with it is observable."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +26,10 @@ class Chosen:
     Attributes:
         names: as in `model.named_parameters()`.
         units: SI, `1` for none.
-        start: (p,) values of the model that the calibration starts from.
+        start: (p,) values in the first model.
         sigma: (p,) standard deviations of their priors.
-        low: (p,) least values accepted.  high: (p,) largest.
+        low: (p,) lower bounds.
+        high: (p,) upper bounds.
     """
 
     names: tuple[str, ...]
@@ -51,14 +41,14 @@ class Chosen:
 
     @property
     def needs_spin(self) -> bool:
-        """Whether only tracks with a spin label can tell."""
+        """Whether only tracks with a spin label are informative."""
         return any(name in NEED_SPIN_LABELS for name in self.names)
 
 
 def choose(model: AnalyticModel, names: Sequence[str]) -> Chosen:
     """The coefficients of some names.
 
-    Raises: ValueError: a name that the model does not have, that stands twice, or whose value is as good as known.
+    Raises: ValueError: a name that the model does not have, that stands twice, or whose prior sigma is 0.
     """
     known = model.declared_coefficients()
     for name in names:

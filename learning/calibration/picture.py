@@ -1,4 +1,4 @@
-"""One picture of a calibration: what each track says, what the population is, and what it brings."""
+"""The picture of a calibration: each track's coefficients, the population, and the errors before and after."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TRACKS, BAND, START = "#3b4cc0", "#d95f02", "#7f7f7f"
 
 
 def draw(problem: Problem, last: Step, comparison: Comparison, path: Path) -> None:
-    """Write the PNG; the name appears once the file is whole."""
+    """Write the picture as a PNG file."""
     panels = len(problem.chosen.names) + 1
     columns = min(panels, 4)
     rows = -(-panels // columns)
@@ -40,7 +40,7 @@ def draw(problem: Problem, last: Step, comparison: Comparison, path: Path) -> No
 
 
 def _coefficient(axes: Axes, problem: Problem, last: Step, k: int) -> None:
-    """Every track's estimate with its standard deviation, before the mean, the population and the starting value."""
+    """Each track's estimate with its standard deviation, the population, its mean, and the starting value."""
     values = np.array([fit.values[k] for fit in last.fits])
     sigmas = np.array([fit.sigmas[k] for fit in last.fits])
     order = np.argsort(values)
@@ -65,7 +65,7 @@ def _coefficient(axes: Axes, problem: Problem, last: Step, k: int) -> None:
 
 
 def _errors(axes: Axes, comparison: Comparison) -> None:
-    """RMSE of each judging track, after against before; below the diagonal it fell."""
+    """RMSE of each judging track, after against before."""
     pairs = 1e3 * comparison.pairs
     axes.set(xlabel="RMSE before, mm", ylabel="RMSE after, mm")
     axes.set_title(f"prediction better on {comparison.better} of {len(pairs)} tracks", size=10)

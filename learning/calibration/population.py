@@ -1,11 +1,11 @@
 """Empirical Bayes over tracks: the mean of a population of coefficients and its spread from track to track.
 
-Track i sees its own coefficients b_i through a Gaussian likelihood, known by its information L_i and the vector h_i =
-L_i y_i; directions that it does not see have no information. The tracks are draws b_i ~ N(theta, D) with a diagonal
-D, and theta ~ N(start, sigma^2) is the prior of the model. theta and D maximise the likelihood of all tracks with
-every b_i integrated out, times the prior of theta (N. Laird, J. Ware, "Random-effects models for longitudinal data",
-Biometrics 38, 1982). Given D, theta is a least-squares solution; D follows by the minorisation step of H. Zhou, L.
-Hu, J. Zhou, K. Lange, "MM algorithms for variance components models", J. Comput. Graph. Stat. 28, 2019, which never
+Track i has a Gaussian likelihood of its own coefficients b_i, with the information L_i and the vector h_i = L_i y_i;
+the information is zero in directions that the track does not observe. The tracks are draws b_i ~ N(theta, D) with a
+diagonal D, and theta ~ N(start, sigma^2) is the prior of the model. theta and D maximise the likelihood of all tracks
+with every b_i integrated out, times the prior of theta (N. Laird, J. Ware, "Random-effects models for longitudinal
+data", Biometrics 38, 1982). Given D, theta is a least-squares solution; D follows by the minorisation step of H. Zhou,
+L. Hu, J. Zhou, K. Lange, "MM algorithms for variance components models", J. Comput. Graph. Stat. 28, 2019, which never
 lowers the likelihood and needs no step size.
 """
 
@@ -21,24 +21,24 @@ from scipy.optimize import lsq_linear
 Array = NDArray[np.float64]
 
 MAX_STEPS = 20_000
-"""Of the iteration; some tens are usual, thousands where the spread is close to zero. A step takes 50 us."""
+"""Of the iteration: some tens are usual, thousands where the spread is close to zero. A step takes 50 us."""
 STEP_TOLERANCE = 1e-11
 """Relative change of every variance at which the iteration ends."""
 NO_SPREAD = 1e-10
 """Variance, as a share of the prior's, below which it is zero."""
 MOST_SPREAD = 100.0
-"""Variance, as a multiple of the prior's, that is never exceeded: tracks that see almost nothing set no limit."""
+"""Largest variance, as a multiple of the prior's: tracks with almost no information set no limit."""
 NO_INFORMATION = 1e-2
-"""Information of all tracks, as a share of the prior's, below which a coefficient was not seen: its spread is zero."""
+"""Information of all tracks, as a share of the prior's, below which the spread of a coefficient is zero."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What one track's measurements alone say of p coefficients.
+    """Gaussian likelihood of p coefficients from one track's measurements, without a prior.
 
     Attributes:
         information: (p, p), positive semidefinite.
-        vector: (p,) information times what the track would say they are, each relative to `about`.
+        vector: (p,) information times the most likely values, relative to `about`.
         about: (p,) the values about which the track was linearised.
     """
 
@@ -75,7 +75,7 @@ class Population:
 
 
 def evidence(mean: Array, covariance: Array, prior_mean: Array, prior_sigma: Array) -> Evidence:
-    """A track's likelihood from its posterior: the prior's information taken out again.
+    """A track's likelihood from its posterior, by removing the information of the prior.
 
     Args:
         mean: (p,) posterior mean.  covariance: (p, p) posterior covariance.
@@ -90,7 +90,7 @@ def evidence(mean: Array, covariance: Array, prior_mean: Array, prior_sigma: Arr
     values, vectors = np.linalg.eigh((whitened + whitened.T) / 2.0)
     if not values[0] > 0.0:
         raise ValueError(f"covariance must be positive definite; its least eigenvalue is {values[0]:g} prior variances")
-    # rounding leaves a little less than the prior's information in directions that the track does not see
+    # rounding leaves slightly less than the prior's information in directions that the track does not observe
     gained = np.maximum(1.0 / values - 1.0, 0.0)
     seen = gained > 0.0
     turned = vectors.T @ ((mean - prior_mean) / prior_sigma)

@@ -1,4 +1,4 @@
-"""What a calibration found, as `report.json` and as text: before and after, better or worse."""
+"""The result of a calibration as `report.json` and as text: coefficients and errors before and after."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from ballfg.learning.calibration.calibrate import Problem, Step, has_converged
 from ballfg.learning.evaluation import Summary, TrackScore, summary
 
 NEW_INFORMATION = 0.05
-"""Least share by which the data must narrow a prior; below it they say nothing of the coefficient."""
+"""Least share by which informative data narrow the prior of a coefficient."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """The judging tracks before and after, those only that could be judged every time.
+    """Scores of the judging tracks before and after, of those that could be judged each time.
 
     Attributes:
         before: with the model that the calibration started from.
         after: with the calibrated model.
         with_spread: with the calibrated model, each track's prior as wide as the population.
-        better: tracks whose RMSE fell.
+        better: number of tracks whose RMSE fell.
         pairs: (n, 2) m, RMSE before and after of each track.
-        failed: tracks that could not be judged each time.
+        failed: number of tracks that could not be judged each time.
     """
 
     before: Summary | None
@@ -53,7 +53,7 @@ def compare(
 
 
 def report(problem: Problem, last: Step, comparison: Comparison) -> dict[str, Any]:
-    """The content of `report.json`. It holds no times or paths: the same run writes the same bytes."""
+    """The content of `report.json`, without times and paths: the same run writes the same bytes."""
     return {
         "dataset": problem.dataset.info.name,
         "converged": has_converged(problem.config, last),
@@ -100,7 +100,7 @@ def _plain(found: Summary | None) -> dict[str, Any] | None:
 
 
 def verdict(problem: Problem, last: Step, comparison: Comparison) -> str:
-    """In sentences: did it converge, does it predict better, what do the data not tell."""
+    """Sentences on convergence, prediction error and coefficients that the data do not determine."""
     sentences = []
     if not has_converged(problem.config, last):
         sentences.append(

@@ -1,4 +1,4 @@
-"""A calibration from config to results: what `ballfg-train` does for the kind `calibrate`."""
+"""A calibration from config to results: `ballfg-train` with the kind `calibrate`, and its checkpoint."""
 
 from __future__ import annotations
 
@@ -6,37 +6,52 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
+from pydantic import BaseModel, ConfigDict, ValidationError
 
-from ballfg.dynamics import save_model
-from ballfg.learning.calibration import checkpoint as checkpoints
+from ballfg.dynamics import model_to_dict, save_model
 from ballfg.learning.calibration.calibrate import Problem, Step, calibrate, has_ended, population_settings, pose, score
-from ballfg.learning.calibration.coefficients import analytic_model, with_values
+from ballfg.learning.calibration.coefficients import with_values
 from ballfg.learning.calibration.picture import draw
 from ballfg.learning.calibration.report import compare, report, table
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import summary
 from ballfg.learning.run import run_folder as files
+from ballfg.learning.training_data import analytic_model, open_dataset
 from ballfg.progress import Watch
-from ballfg.tracks import read_dataset
+
+
+class Checkpoint(BaseModel):
+    """The checkpoint of a calibration, from which it continues to the same numbers."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+    data: str
+    """Digest of the dataset's content."""
+    model: dict[str, Any]
+    """Content of the model file that the run started from."""
+    steps: tuple[Step, ...]
+    """Finished steps."""
 
 
 def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jobs: int, watch: Watch) -> None:
-    """Calibrate, or continue to, and write a folder.
+    """Calibrate coefficients and write the folder of the run.
 
     Args:
-        config: how.
+        config: of the calibration.
         folder: to write; that of the earlier run if it is to `resume`.
-        jobs: processes where the config names none.
+        resume: continue after the last finished step.
+        jobs: number of processes where the config has none.
         watch: sees the tracks pass, for instance to show progress.
 
-    Raises: ValueError, FileNotFoundError: what the user can mend. KeyboardInterrupt: after Ctrl-C; the steps are kept.
+    Raises: ValueError, FileNotFoundError: bad input. KeyboardInterrupt: after Ctrl-C; finished steps are kept.
     """
     files.check(folder, config, resume=resume)
     problem = _pose(config, jobs)
-    steps = checkpoints.read_checkpoint(folder, problem) if resume else []
+    steps = read_checkpoint(folder, problem) if resume else []
     files.start(folder, config)
     print(f"{folder / files.CONFIG}: the config; {len(problem.split.fit)} tracks fit, {len(problem.split.judge)} judge")
     try:
@@ -48,22 +63,20 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
 
 
 def _pose(config: CalibrationConfig, jobs: int) -> Problem:
-    """Open dataset and model; what was repaired is said on stderr."""
+    """Open dataset and model and check them; notes go to stderr."""
     if config.data is None:
         raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
-    torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
-    dataset = read_dataset(config.data)
-    for note in dataset.notes:
-        print(f"note: {note}", file=sys.stderr)
+    torch.set_num_threads(1)  # the batches are small: threads cost more than they gain
+    dataset = open_dataset(config.data)
     return pose(dataset, analytic_model(config.model, dataset.info.ball.radius), config, config.jobs or jobs)
 
 
 def _steps(problem: Problem, steps: list[Step], folder: Path, watch: Watch) -> None:
-    """Take the steps that are left; a checkpoint and a line after each."""
+    """Take the steps that are left, with a checkpoint and a line of text after each."""
     begun = time.monotonic()
     for step in calibrate(problem, tuple(steps), watch=watch):
         steps.append(step)
-        checkpoints.write_checkpoint(folder, problem, steps)
+        write_checkpoint(folder, problem, steps)
         now = time.monotonic()
         left = (problem.config.max_iterations - step.number) * (now - begun)
         begun = now
@@ -71,7 +84,7 @@ def _steps(problem: Problem, steps: list[Step], folder: Path, watch: Watch) -> N
 
 
 def _line(problem: Problem, step: Step, left: float) -> str:
-    """One line on a step: coefficients, error, how long it can still take."""
+    """One line on a step: coefficients, error, time left."""
     judged = summary([score for score in step.scores if score is not None])
     values = ", ".join(
         f"{name} {value:.5g}" + (f" ± {step.sigma[k]:.2g}" if step.sigma else "")
@@ -87,7 +100,7 @@ def _line(problem: Problem, step: Step, left: float) -> str:
 
 
 def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch) -> None:
-    """Judge once more with the spread as the prior, write the results and say where they are."""
+    """Judge once more with the spread as the prior, write the results and print their paths."""
     last = steps[-1]
     mean = np.array(last.mean)
     spread = score(problem, mean, watch, population_settings(problem, last))
@@ -99,3 +112,29 @@ def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch)
     print(f"\n{table(problem, last, comparison)}\n\n{found['verdict']}\n")
     print(f"{folder / files.MODEL}: the calibrated model, for the --model of other commands")
     print(f"{folder / files.REPORT}: all numbers\n{folder / files.PICTURE}")
+
+
+def write_checkpoint(folder: Path, problem: Problem, steps: Sequence[Step]) -> None:
+    """Replace the checkpoint of a run."""
+    checkpoint = Checkpoint(data=problem.split.digest, model=model_to_dict(problem.model), steps=tuple(steps))
+    files.write_json(folder / files.STEPS, checkpoint.model_dump(mode="json"))
+
+
+def read_checkpoint(folder: Path, problem: Problem) -> list[Step]:
+    """The steps of an earlier run; none if it stopped before the first.
+
+    Raises: ValueError: a damaged checkpoint, or one of another dataset, another model.
+    """
+    path = folder / files.STEPS
+    if not path.is_file():
+        return []
+    try:
+        checkpoint = Checkpoint.model_validate_json(path.read_bytes())
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise ValueError(f"{path}: not a checkpoint ({first['msg']}). Start a new run.") from None
+    if checkpoint.data != problem.split.digest:
+        raise ValueError(f"{path}: was made from another dataset than {problem.dataset.path}. Give the same --data.")
+    if checkpoint.model != model_to_dict(problem.model):
+        raise ValueError(f"{path}: was started from another model. Give the same model.")
+    return list(checkpoint.steps)

@@ -1,1 +1,1 @@
-"""The config of a training or calibration, and what is built from it."""
+"""The configs of a training and of a calibration, and their file."""

@@ -1,63 +1,63 @@
-"""What a calibration is told; each field with its meaning."""
+"""The config of a calibration; each field with its meaning."""
 
 from __future__ import annotations
 
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
+
+from ballfg.learning.config.training import Count, Positive, Section, Share
 
 
-class CalibrationConfig(BaseModel):
-    """A whole calibration. The same config on the same data gives the same numbers.
+class CalibrationConfig(Section):
+    """A calibration. The same config on the same data gives the same numbers.
 
     Paths are relative to the folder in which the command runs.
     """
 
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
-
     FREE_TO_CHANGE: ClassVar[tuple[str, ...]] = ("out", "data", "model", "max_iterations", "tolerance", "jobs")
-    """Fields that a resumed run may change: they move no number, or are checked by content (data, model)."""
+    """Fields that a resumed run may change: without effect on the result, or compared by content (data, model)."""
 
     kind: Literal["calibrate"] = "calibrate"
-    """Tells this config from that of a training."""
+    """Distinguishes this config from that of a training."""
 
     model: str | None = None
     """Model file to start from; null: the nominal table-tennis model."""
 
     data: str | None = None
-    """Folder of the dataset. `--data` takes its place."""
+    """Folder of the dataset. `--data` replaces it."""
 
     out: str = "calibration"
-    """Folder that is written. `--out` takes its place."""
+    """Folder that is written. `--out` replaces it."""
 
     coefficients: Annotated[tuple[str, ...], Field(min_length=1, strict=False)] = (
         "flight.drag.k",
         "contact.restitution.e",
         "contact.table_height.offset",
     )
-    """What is calibrated, by parameter name: `flight.` or `contact.`, the effect, its coefficient."""
+    """Calibrated parameters by name: `flight.` or `contact.`, the effect, its coefficient."""
 
     split: Literal["random", "label"] = "random"
-    """How tracks are parted. random: half to fit, half to judge, by the seed. label: by the label `split` of the
-    dataset, `train` to fit and `test` to judge."""
+    """random: half of the tracks are fitted and half judge, by the seed. label: by the label `split` of the dataset,
+    `train` to fit and `test` to judge."""
 
     seed: Annotated[int, Field(ge=0)] = 0
-    """Of the random split."""
+    """Seed of the random split."""
 
     observe: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.4
     """Share of a judged track's duration that is observed; the rest is predicted."""
 
-    horizon: Annotated[float, Field(gt=0.0)] | None = None
-    """s, how far is predicted; null: to the end of the track."""
+    horizon: Positive | None = None
+    """s that are predicted; null: to the end of the track."""
 
-    max_iterations: Annotated[int, Field(ge=1)] = 10
-    """Most re-linearisations of the tracks about the new mean."""
+    max_iterations: Count = 10
+    """Maximum number of iterations; each linearises the tracks about the last mean."""
 
-    tolerance: Annotated[float, Field(gt=0.0)] = 0.05
-    """Stop when no coefficient's mean moves by more than this share of its standard error."""
+    tolerance: Positive = 0.05
+    """The run ends when no mean moves by more than this share of its standard error."""
 
-    failure_limit: Annotated[float, Field(ge=0.0, le=1.0)] = 0.2
-    """Share of the fitted tracks whose estimate may fail; they are skipped. More stop the run."""
+    failure_limit: Share = 0.2
+    """Share of the fitted tracks whose estimates may fail and are skipped. More stop the run."""
 
-    jobs: Annotated[int, Field(ge=1)] | None = None
-    """Processes; null: one per core. The numbers do not depend on it."""
+    jobs: Count | None = None
+    """Processes; null: one per core. The result does not depend on it."""

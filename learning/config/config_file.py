@@ -1,4 +1,4 @@
-"""The config file of `ballfg-train`: YAML, `key=value` overrides, and every field checked before anything starts."""
+"""The config file of `ballfg-train`: YAML with `key=value` overrides, checked before anything starts."""
 
 from __future__ import annotations
 
@@ -21,12 +21,12 @@ CALIBRATE = "calibrate"
 
 
 def read_config(path: str | Path, overrides: Iterable[str] = (), options: Mapping[str, Any] | None = None) -> Config:
-    """The config of a file, with overrides; its key `kind` decides which one it is.
+    """The config of a file with overrides. Its key `kind` decides between training and calibration.
 
     Args:
         path: YAML file; an empty one means all defaults.
         overrides: `key=value`, nested keys with dots; the value is YAML, or a number as in `1e-3`.
-        options: values that come from command-line options; they win.
+        options: values of command-line options; they take precedence.
 
     Raises:
         FileNotFoundError: if there is no such file.
@@ -109,12 +109,11 @@ def _explained(error: ValidationError, config: type[Config]) -> str:
         return f"'{key}' must hold at least one; got {got!r}. Leave it out or fill it."
     rule = first["msg"].removeprefix("Input ").removeprefix("should ").replace("a valid tuple", "a list")
     hint = " YAML reads 1e-3 as text; write 1.0e-3." if _is_number(got) else " docs/train.md lists the keys."
-    hint = f" To calibrate coefficients write 'kind: {CALIBRATE}'." if key == "kind" else hint
     return f"'{key}' must {rule}; got {got!r}.{hint}"
 
 
 def _unknown(location: list[str], config: type[Config]) -> str:
-    """What to say on a key that there is not: the nearest one, or where it would belong."""
+    """The message on an unknown key: the most similar key, or the section that has it."""
     *section, name = location
     prefix = "".join(f"{part}." for part in section)
     known = _fields_at(config, section)

@@ -1,40 +1,48 @@
 """Learning through the estimator: observations, states, rollout, error, and the gradient all the way back.
 
-The estimate is a function of the model, the launcher's embedding and the noise; the implicit function theorem gives its
-derivative (`ballfg.learning.gradient.implicit`). Source: Q. Xiao, Z. Wu, M. Gombolay 2024, section III.
+The estimate is a function of the model, the launcher's embedding and the noise. Its derivative follows from the
+implicit function theorem (`ballfg.learning.gradient.implicit`). Source: Q. Xiao, Z. Wu, M. Gombolay 2024, section III.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any, Final
 
 import torch
 from torch import Tensor
 
+from ballfg.dynamics import BallModel, save_model
 from ballfg.dynamics.motion.paths import paths
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.dynamics.trained import Trained
 from ballfg.factors.graph import LevenbergMarquardt
 from ballfg.factors.loss import Loss
+from ballfg.learning.augment import augmentation
 from ballfg.learning.config.training import LossConfig
-from ballfg.learning.end_to_end.anchor import Anchor
-from ballfg.learning.end_to_end.augment import augmentation
 from ballfg.learning.end_to_end.learnables import Learnables
+from ballfg.learning.end_to_end.pretrain import Anchor
 from ballfg.learning.end_to_end.solving import TRAINING, BatchSolver, Pose, Solved
 from ballfg.learning.gradient.conjugate_gradients import ConjugateGradients, GaussNewtonFactors, NotAMinimum
-from ballfg.learning.gradient.implicit import GradientMethod, ImplicitGradient
+from ballfg.learning.gradient.implicit import GradientMethod, ImplicitGradient, LinearSolver
 from ballfg.learning.gradient.likelihood import negative_log_likelihood
 from ballfg.learning.gradient.objective import BatchObjective
+from ballfg.learning.run.run_folder import MODEL
 from ballfg.learning.shots import Shot
 from ballfg.learning.trainee import BatchLoss, Trainee
 from ballfg.state import POSITION
 
 LOSS_UNIT: Final = 0.01
-"""m. Squared errors count in its square, so that losses are of order one."""
+"""m. Squared errors are divided by its square, so that losses are of order one."""
 SOLUTION_TOLERANCE: Final = 1e-5
-"""Relative error of a track's part in the gradient: far below the scatter between batches."""
+"""Relative error of the linear solution of each track: far below the scatter between batches."""
+MakeSolver = Callable[[GaussNewtonFactors, Tensor], LinearSolver]
+"""From the factorisations of a batch and the owners of its numbers (`ConjugateGradients`) to a solver."""
+TRAINING_SOLVER: Final[MakeSolver] = partial(ConjugateGradients, tolerance=SOLUTION_TOLERANCE)
 COEFFICIENT_STEP: Final = 20.0
 """With a learning rate of 2e-3 a coefficient moves by at most 0.04 standard deviations of its prior in a step."""
 NOISE_STEP: Final = 10.0
@@ -48,15 +56,15 @@ class Prediction:
     """Predicted positions of some tracks against what was measured.
 
     Attributes:
-        error: (t, k, 3) m, predicted less measured; zero where nothing counts.
-        counts: (t, k) bool, which points count.
+        error: (t, k, 3) m, predicted less measured; zero at points that do not count.
+        counts: (t, k) bool, the points that count.
     """
 
     error: Tensor
     counts: Tensor
 
     def finite(self) -> Tensor:
-        """(t,) bool: a number came out for every point that counts."""
+        """(t,) bool: all points of the track are finite."""
         return self.error.detach().isfinite().all(-1).all(-1)
 
 
@@ -65,13 +73,14 @@ class EndToEnd(Trainee):
 
     Args:
         shots: all of them; batches are numbers of shots.
-        learnables: what is learned.
-        loss: what is minimised.
-        method: how a loss passes through the estimate.
+        learnables: the parameters.
+        loss: the loss.
+        method: of the gradient through the estimate; by default `ImplicitGradient`.
         seed: of the augmentation.
-        augment: turn and shift the shots in training.
-        optimizer: how tightly estimates are solved.
-        anchor: how far the model is from where it started; None if that does not count.
+        augment: whether shots are rotated and shifted in training.
+        optimizer: solves the estimates, with its tolerance.
+        linear_solver: for the Hessians of a batch.
+        anchor: distance of the model from the analytic one; None if it is not part of the loss.
         coefficient_step: scale of the learning rate of declared coefficients, in their prior standard deviations.
         noise_step: scale of the learning rate of the noise's logarithms.
     """
@@ -86,6 +95,7 @@ class EndToEnd(Trainee):
         seed: int = 0,
         augment: bool = False,
         optimizer: LevenbergMarquardt = TRAINING,
+        linear_solver: MakeSolver = TRAINING_SOLVER,
         anchor: Anchor | None = None,
         coefficient_step: float = COEFFICIENT_STEP,
         noise_step: float = NOISE_STEP,
@@ -98,6 +108,7 @@ class EndToEnd(Trainee):
         self.method = method or ImplicitGradient()
         self.seed = seed
         self.augment = augment
+        self.linear_solver = linear_solver
         self.anchor = anchor
         self.coefficient_step = coefficient_step
         self.noise_step = noise_step
@@ -112,14 +123,14 @@ class EndToEnd(Trainee):
         return self.learnables.groups((*own, *rest))
 
     def after_step(self) -> None:
-        """Put coefficients and noise back into their bounds."""
+        """Clip coefficients and noise to their bounds."""
         self.learnables.bound()
 
     def loss(self, tracks: Sequence[int], epoch: int) -> BatchLoss:
-        """The loss on some tracks; its gradient is ready when this returns.
+        """The loss on some tracks, its gradient computed already.
 
-        `total` is linear in the parameters: its value is the loss, its derivative the loss's; of a likelihood in it
-        that is the derivative by the noise alone. So a track at which no gradient exists is found, and left out, here.
+        `total` is linear in the parameters and has the value and the derivative of the loss; the likelihood contributes
+        its derivative by the noise alone. Tracks without a gradient are thus found here and left out.
         """
         poses = {n: Pose(*augmentation(self.seed, epoch, n)) for n in tracks} if self.augment else {}
         solved, failed = self.solver(tracks, poses)
@@ -132,7 +143,7 @@ class EndToEnd(Trainee):
                     self.solver.warm.forget(solved[k].number)
                     failed.append((self.shots[solved[k].number].name, str(error)))
                 solved = [s for k, s in enumerate(solved) if k not in wrong]
-        return BatchLoss(torch.zeros((), dtype=torch.float64), 0, 0.0, 0, tuple(failed))
+        return BatchLoss.none(failed)
 
     def _with_gradient(self, solved: Sequence[Solved], failed: Sequence[tuple[str, str]], epoch: int) -> BatchLoss:
         graphs, minima = [s.solution.graph for s in solved], [s.solution.minimum.values for s in solved]
@@ -140,11 +151,10 @@ class EndToEnd(Trainee):
         layout, leaves = objective.layout, self.learnables.leaves()
         nets = [s.solution.minimum.step.bayes_net for s in solved if s.solution.minimum.step is not None]
         factors = GaussNewtonFactors(nets, layout.lengths, layout.coefficients)
-        linear_solver = ConjugateGradients(factors, layout.owners(), SOLUTION_TOLERANCE)
         point = self.method(
             lambda: layout.pack(minima),
             lambda at: objective.gradient(at, self.learnables.noise.noise()),
-            linear_solver,
+            self.linear_solver(factors, layout.owners()),
             leaves,
         )
         first = layout.unpack(point)[0][list(layout.starts)]
@@ -166,10 +176,10 @@ class EndToEnd(Trainee):
         return _batch_loss(surrogate, prediction, failed)
 
     def judge(self, tracks: Sequence[int]) -> BatchLoss:
-        """The loss and the error of predictions to the full horizon, without gradient and augmentation."""
+        """The loss of predictions to the full horizon, without gradient and augmentation."""
         solved, failed = self.solver(tracks, {})
         if not solved:
-            return BatchLoss(torch.zeros((), dtype=torch.float64), 0, 0.0, 0, tuple(failed))
+            return BatchLoss.none(failed)
         with torch.no_grad():
             states = [s.solution.minimum.values.states[0] for s in solved]
             prediction = self.predict(solved, torch.stack([torch.from_numpy(s) for s in states]), None)
@@ -185,7 +195,7 @@ class EndToEnd(Trainee):
     def predict(self, solved: Sequence[Solved], first: Tensor, epoch: int | None) -> Prediction:
         """Rollouts over the whole tracks from their first states.
 
-        Args: solved: t of them.  first: (t, 9).  epoch: decides how far; None: to the end of the full horizon.
+        Args: solved: t estimates.  first: (t, 9) SI units.  epoch: of the horizon; None: the full horizon.
         """
         longest = max(len(self.shots[s.number].track) for s in solved)
         error = first.new_zeros((len(solved), longest, 3))
@@ -208,7 +218,7 @@ class EndToEnd(Trainee):
         return torch.from_numpy(shot.usable & (times <= times[shot.observed - 1] + horizon + 1e-9))
 
     def _roll(self, solved: Sequence[Solved], first: Tensor, counts: Tensor, surfaces: Surfaces) -> Tensor:
-        """(t, k, 3) m, predicted less measured positions; zero where nothing counts."""
+        """(t, k, 3) m, predicted less measured positions; zero at points that do not count."""
         needed = int(counts.any(0).nonzero().max()) + 1
         times, measured = torch.zeros(len(solved), needed, dtype=torch.float64), first.new_zeros(len(solved), needed, 3)
         for k, one in enumerate(solved):
@@ -226,12 +236,30 @@ class EndToEnd(Trainee):
         return self.point_loss.of_square(square).sum(-1) / prediction.counts.sum(-1)
 
     def memory(self) -> dict[str, Tensor]:
-        """Warm starts."""
+        """Warm starts of the estimates."""
         return self.solver.warm.tensors()
 
     def remember(self, memory: dict[str, Tensor]) -> None:
-        """Take up warm starts."""
+        """Restore warm starts."""
         self.solver.warm.take(memory)
+
+    def trained_model(self) -> BallModel:
+        """The model with the noise and the launcher that were learned with it."""
+        noise, settings = self.learnables.noise, self.shots[0].settings
+        launcher = settings.launcher
+        first_spin = settings.spin_label_noise if launcher is None else launcher.sigma
+        self.learnables.model.trained = Trained(
+            process_noise={**vars(noise.start), **noise.values()},
+            position_scale=noise.position_scale(),
+            launcher=self.learnables.embedding,
+            spin_noise=first_spin * noise.spin_scale() if noise.learned or launcher is not None else None,
+        )
+        return self.learnables.model
+
+    def export(self, folder: Path) -> Path:
+        """Write the trained model. Returns: its file, for `--model` of other commands."""
+        save_model(self.trained_model(), folder / MODEL)
+        return folder / MODEL
 
 
 def _batch_loss(total: Tensor, prediction: Prediction, failed: Sequence[tuple[str, str]]) -> BatchLoss:

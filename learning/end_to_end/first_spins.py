@@ -1,8 +1,8 @@
-"""What launcher settings mean, as the analytic model sees it in the training tracks: where learning may start.
+"""First values of the spins that launcher settings mean, from the analytic model's estimates of the training tracks.
 
-Without spin labels spin shows only in what it does to the flight. From no spin, learning takes long to reach
-150 rad/s, and a group of shots may end on the wrong side of zero. The spin with which an analytic model explains a
-whole track is right within some 10 rad/s.
+Without spin labels only the flight shows the spin. From no spin, learning needs many epochs to reach 150 rad/s, and a
+group of shots may end with the wrong sign. The spin with which an analytic model explains a whole track is right
+within some 10 rad/s.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from ballfg.state import SPIN, VELOCITY
 Array = NDArray[np.float64]
 
 SPIN_PRIOR: Final = 150.0
-"""rad/s: as strong as launchers spin a ball."""
+"""rad/s, standard deviation of the prior: launchers reach this spin."""
 LEAST_SPEED: Final = 0.5
-"""m/s of horizontal motion below which a launch does not show where forward is."""
+"""m/s of horizontal motion below which a launch has no forward direction."""
 
 
 def begin_with_tracks(embedding: SpinEmbedding, shots: Iterable[Shot], model: AnalyticModel) -> None:
-    """Give an embedding the spins that a model finds in whole tracks, by least squares over their settings.
+    """Set an embedding to the spins that a model finds in whole tracks, by least squares over their settings.
 
     Args:
-        embedding: changed in place; as it is where no shot tells.
-        shots: that train. Those with a spin label, or without all settings, are passed over.
-        model: explains them, with the coefficients that vary from track to track estimated along.
+        embedding: changed in place; unchanged where no shot shows a spin.
+        shots: training shots. Those with a spin label, or without all settings, are skipped.
+        model: its coefficients that vary from track to track are estimated too.
     """
     settings, spins = [], []
     for shot in shots:
@@ -51,7 +51,7 @@ def begin_with_tracks(embedding: SpinEmbedding, shots: Iterable[Shot], model: An
 
 
 def _spin(shot: Shot, model: AnalyticModel) -> Array | None:
-    """(3,) rad/s about forward, across and up at the first sample; None where the track does not tell."""
+    """(3,) rad/s about forward, across and up at the first sample; None for a failed estimate or a slow launch."""
     wide = replace(shot.settings, launcher=None, coefficients=coefficient_sigmas(model), spin_prior=SPIN_PRIOR)
     estimate = Smoother(model, shot.surfaces, wide).estimate(shot.track)
     velocity, spin = estimate.states[0, VELOCITY], estimate.states[0, SPIN]

@@ -1,4 +1,4 @@
-"""Everything that can be learned of an estimator: the ball's model, what launcher settings mean, the noise."""
+"""The learnable parameters of an estimator: the ball's model, the meaning of launcher settings, the noise."""
 
 from __future__ import annotations
 
@@ -16,21 +16,22 @@ from ballfg.factors.batch import Noise
 from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
 
 LEARNED_NOISE = ("acceleration", "spin", "contact_velocity", "contact_tangential", "contact_spin")
-"""Numbers of the process noise that tracks tell. A hit can do anything: its noise stays."""
+"""Numbers of the process noise that are learned. A hit can have any strength, so that its noise is not."""
 WIDEST = 12.0
-"""No standard deviation leaves exp(-WIDEST) to exp(WIDEST) times where it started."""
+"""Standard deviations stay between exp(-WIDEST) and exp(WIDEST) times their starting values."""
 
 
 class NoiseScales(nn.Module):
-    """Standard deviations as logarithms relative to where they start.
+    """Standard deviations as logarithms relative to their starting values.
 
     Args:
-        process: to start from. Numbers that are zero stay zero.
-        position: to start from, as a multiple of what datasets and tracks say.
-        learned: False keeps everything where it is.
+        process: starting values. Numbers that are zero stay zero.
+        position: starting value, as a multiple of the noise that datasets and tracks state.
+        learned: False keeps all of them fixed.
 
     Attributes:
-        process: (q,) of the numbers `names`.  position, spin: () of measured positions and of spin labels.
+        process: (q,) logarithms of the numbers `names`.
+        position, spin: () logarithms of the scales of measured positions and of spin labels.
     """
 
     def __init__(self, process: ProcessNoise, *, position: float = 1.0, learned: bool) -> None:
@@ -44,7 +45,7 @@ class NoiseScales(nn.Module):
         self.spin = nn.Parameter(torch.zeros((), dtype=torch.float64), requires_grad=learned)
 
     def noise(self) -> Noise:
-        """What the factors' objective takes, relative to factors that were built with `settings` as it is now."""
+        """The noise relative to factors that were built with the present `settings`."""
         if not self.learned:
             return Noise()
         start = torch.tensor([getattr(self.start, name) for name in PROCESS_NOISE], dtype=torch.float64)
@@ -59,15 +60,15 @@ class NoiseScales(nn.Module):
         return {name: getattr(self.start, name) * scale for name, scale in zip(self.names, scales, strict=True)}
 
     def position_scale(self) -> float:
-        """Standard deviation of a measured position in multiples of what a dataset says."""
+        """Standard deviation of a measured position as a multiple of the dataset's."""
         return float(self.position.detach().exp())
 
     def spin_scale(self) -> float:
-        """The same of what labels and launcher settings say of the spin."""
+        """Standard deviation of spin labels and launcher settings as a multiple of its starting value."""
         return float(self.spin.detach().exp())
 
     def settings(self, settings: Settings) -> Settings:
-        """A dataset's settings with the noise as it is now."""
+        """A dataset's settings with the present noise."""
         spin = self.spin_scale()
         launcher = settings.launcher
         return replace(
@@ -80,13 +81,13 @@ class NoiseScales(nn.Module):
 
     @torch.no_grad()
     def bound(self) -> None:
-        """Keep all numbers positive and finite."""
+        """Clip the logarithms, so that all numbers stay positive and finite."""
         for parameter in self.parameters():
             parameter.clamp_(-WIDEST, WIDEST)
 
 
 class Learnables(nn.Module):
-    """A ball's model, an embedding of launcher settings (or None), noise."""
+    """A ball's model, an embedding of launcher settings (or None), and the noise."""
 
     def __init__(self, model: BallModel, embedding: SpinEmbedding | None, noise: NoiseScales) -> None:
         super().__init__()
@@ -95,24 +96,24 @@ class Learnables(nn.Module):
         self.noise = noise
 
     def leaves(self) -> list[Tensor]:
-        """All parameters that receive a gradient."""
+        """All trainable parameters."""
         return [p for p in self.parameters() if p.requires_grad]
 
     def groups(self, scales: Sequence[tuple[str, float]]) -> list[dict[str, Any]]:
-        """Parameter groups by the beginning of their names, each with its scale on the learning rate.
+        """Parameter groups by prefix of the name, each with its scale on the learning rate.
 
-        Args: scales: (beginning of a name, scale); the first that fits decides.
+        Args: scales: (prefix, scale); the first prefix that matches a name decides.
         """
         groups = [{"name": name or "all", "params": [], "scale": scale} for name, scale in scales]
         for name, parameter in self.named_parameters():
             if parameter.requires_grad:
-                k = next(k for k, (beginning, _) in enumerate(scales) if name.startswith(beginning))
+                k = next(k for k, (prefix, _) in enumerate(scales) if name.startswith(prefix))
                 groups[k]["params"].append(parameter)  # type: ignore[attr-defined]
         return [group for group in groups if group["params"]]
 
     @torch.no_grad()
     def bound(self) -> None:
-        """Put declared coefficients and the noise back into their bounds."""
+        """Clip declared coefficients and the noise to their bounds."""
         parameters = dict(self.model.named_parameters())
         for name, coefficient in self.model.declared_coefficients().items():
             parameters[name].clamp_(coefficient.low, coefficient.high)

@@ -1,11 +1,14 @@
-"""A learned model's start: its networks fitted to another model's flight and bounce, without any track.
+"""The distance of a model from the analytic one, on random flights and bounces: to start from, and to stay close to.
 
 An untrained network makes the estimate ill-posed, and spin without an effect on the flight cannot be learned from
-positions. So training starts from physics that is roughly right; what is wrong in it is what tracks then correct.
+positions. Training therefore starts from physics that is roughly right, and tracks correct it. A few dozen shots say
+nothing about speeds and spins other than those of their launchers; as a term of the loss, the distance keeps the model
+close to the analytic one there.
 """
 
 from __future__ import annotations
 
+import copy
 from typing import Final
 
 import torch
@@ -16,31 +19,35 @@ from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.state import SPIN, STATE_DIM, VELOCITY, VZ
 
 SAMPLES: Final = 3000
+"""Flights, and as many bounces, that a network is fitted to."""
+ANCHORS: Final = 256
+"""The same of an anchor: enough for a smooth function of six numbers."""
 SPEED: Final = 4.0
-"""m/s, standard deviation of each component of the velocities that are fitted."""
+"""m/s, standard deviation of each component of the velocities."""
 SPIN_SPREAD: Final = 120.0
 """rad/s, the same of the spins."""
 LEAST_FALL: Final = 0.3
-"""m/s, slowest fall of a fitted bounce."""
+"""m/s, slowest fall of a bounce."""
 ACCELERATION_UNIT: Final = 1.0
-"""m/s^2 of error that counts as much as one of the following."""
+"""m/s^2. Errors are divided by this unit and the next two."""
 VELOCITY_UNIT: Final = 0.1
 """m/s."""
 SPIN_UNIT: Final = 10.0
 """rad/s."""
 
 
-def pretrain(model: LearnedModel, teacher: BallModel, seed: int, iterations: int) -> float:
-    """Fit a model to a teacher on random states; always to the same weights for the same seed.
+def pretrain(model: LearnedModel, teacher: BallModel, seed: int, iterations: int, *, samples: int = SAMPLES) -> float:
+    """Fit a model to a teacher on random states; the same seed gives the same weights.
 
     Args:
         model: changed in place.
         teacher: gives rates and bounces.
         seed: of the states.
         iterations: of L-BFGS.
-    Returns: the root mean square of the errors that are left, in their units.
+        samples: number of flights, and of bounces.
+    Returns: the root mean square of the remaining errors, in their units.
     """
-    flying, bouncing = random_states(seed, SAMPLES)
+    flying, bouncing = random_states(seed, samples)
     with torch.no_grad():
         rates, after = teacher.rates(flying), teacher.bounce(bouncing)
     parameters = [*model.flight.parameters(), *model.contact.parameters()]
@@ -56,13 +63,34 @@ def pretrain(model: LearnedModel, teacher: BallModel, seed: int, iterations: int
     return float(loss().detach()) ** 0.5
 
 
-def difference(model: BallModel, flying: Tensor, bouncing: Tensor, rates: Rates, after: Tensor) -> Tensor:
-    """() mean squares of what a model's flight and bounce differ by from given ones, in their units, added up.
+class Anchor:
+    """The mean square difference of a model in training from another one.
 
     Args:
-        model: compared.
-        flying: (n, 9).  rates: given for them.
-        bouncing: (n, 9).  after: (n, 9), given for them.
+        model: in training.
+        start: the other one, as it is now.
+        seed: of the states.
+    """
+
+    def __init__(self, model: BallModel, start: BallModel, seed: int) -> None:
+        self.model = model
+        self.flying, self.bouncing = random_states(seed, ANCHORS)
+        fixed = copy.deepcopy(start)
+        with torch.no_grad():
+            self.rates, self.after = fixed.rates(self.flying), fixed.bounce(self.bouncing)
+
+    def __call__(self) -> Tensor:
+        """() mean square; one means 1 m/s^2, 0.1 m/s or 10 rad/s."""
+        return difference(self.model, self.flying, self.bouncing, self.rates, self.after)
+
+
+def difference(model: BallModel, flying: Tensor, bouncing: Tensor, rates: Rates, after: Tensor) -> Tensor:
+    """() sum of the mean square differences of a model's flight and bounce from given ones, in their units.
+
+    Args:
+        model: to compare.
+        flying: (n, 9) states.  rates: the given ones there.
+        bouncing: (n, 9) states before a bounce.  after: (n, 9), the given states after it.
     """
     acceleration, spin_rate = model.rates(flying)
     bounced = model.bounce(bouncing)
@@ -75,7 +103,7 @@ def difference(model: BallModel, flying: Tensor, bouncing: Tensor, rates: Rates,
 
 
 def random_states(seed: int, count: int) -> tuple[Tensor, Tensor]:
-    """Flying and falling balls (n, 9): velocities and spins in all directions, slow and fast."""
+    """States (n, 9) of flying and of falling balls, with velocities and spins in all directions."""
     generator = torch.Generator().manual_seed(seed)
     flying, falling = _states(generator, count), _states(generator, count)
     falling[:, VZ] = -LEAST_FALL - falling[:, VZ].abs()

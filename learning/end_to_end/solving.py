@@ -20,7 +20,7 @@ from ballfg.estimation.smoother.solution import Solution
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import Convergence, LevenbergMarquardt, Search
 from ballfg.factors.lockstep import run_together
-from ballfg.learning.end_to_end.augment import apply, rotate, undo
+from ballfg.learning.augment import apply, rotate, undo
 from ballfg.learning.end_to_end.learnables import Learnables
 from ballfg.learning.shots import Shot
 from ballfg.state import POSITION, SPIN, VELOCITY

@@ -1,31 +1,31 @@
 """Solving with the exact Hessian: conjugate gradients, preconditioned with GTSAM's Gauss-Newton factorisation.
 
-The Hessian of a batch of tracks is block diagonal, one block a track. All blocks are solved in lockstep: one product
-with the whole Hessian serves all of them, step lengths are each track's own. The Gauss-Newton matrix R^T R, which GTSAM
-has factorised on the way to the minimum, differs from a block by the curvature of the residuals alone: a few steps are
-enough.
+The Hessian of a batch of tracks is block diagonal, one block per track. All blocks are solved in lockstep: one product
+with the whole Hessian serves all of them, while each track has its own step lengths. The Gauss-Newton matrix R^T R,
+which GTSAM has factorised on the way to the minimum, differs from a block only by the curvature of the residuals, so
+that a few steps are enough.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import gtsam
 import numpy as np
 import torch
 from torch import Tensor
 
 from ballfg.factors.batch import Array
+from ballfg.factors.covariance import SquareRootInformation
 from ballfg.state import STATE_DIM
 
 Product = Callable[[Tensor], Tensor]
 
 
-class NotAMinimum(ValueError):  # noqa: N818 - says what it is
+class NotAMinimum(ValueError):  # noqa: N818 - the name is the statement
     """The objective is not at a minimum that a gradient could pass through.
 
     Attributes:
-        tracks: numbers, within the batch, of those that are not.
+        tracks: numbers within the batch of the tracks without a minimum.
     """
 
     def __init__(self, message: str, tracks: Sequence[int]) -> None:
@@ -33,65 +33,17 @@ class NotAMinimum(ValueError):  # noqa: N818 - says what it is
         self.tracks = tuple(tracks)
 
 
-class GaussNewtonFactors:
-    """The factorisations R^T R of the Gauss-Newton matrices of several tracks, ready to solve all of them at once.
-
-    Args:
-        bayes_nets: GTSAM's, one a track, states in order, then coefficients.
-        lengths: number of states of each track.
-        coefficients: number p of coefficients of each.
-
-    Attributes:
-        inverse: (t, n, 9, 9) inverses of R's diagonal blocks; identities beyond a track's end.
-        following: (t, n, 9, 9) R's blocks that couple a state to the next one.
-        shared: (t, n, 9, p) those that couple it to the coefficients.
-        last: (t, p, p) inverses of the coefficients' own blocks.
-    """
-
-    def __init__(self, bayes_nets: Sequence[gtsam.GaussianBayesNet], lengths: Sequence[int], coefficients: int) -> None:
-        self.tracks, self._p = len(bayes_nets), coefficients
-        self._lengths = np.array(lengths)
-        t, n = self.tracks, max(lengths)
-        root = np.zeros((t, n, STATE_DIM, STATE_DIM))
-        root[:] = np.eye(STATE_DIM)  # shorter tracks are filled up with variables that nothing depends on
-        self.following = np.zeros((t, n, STATE_DIM, STATE_DIM))
-        self.shared = np.zeros((t, n, STATE_DIM, coefficients))
-        last = np.zeros((t, coefficients, coefficients))
-        for k, (net, length) in enumerate(zip(bayes_nets, lengths, strict=True)):
-            for i in range(length):
-                conditional = net.at(i)
-                root[k, i] = conditional.R()
-                self._read_parents(k, i, length, conditional)
-            if coefficients:
-                last[k] = net.at(length).R()
-        self.inverse, self.last = np.linalg.inv(root), np.linalg.inv(last)
-
-    def _read_parents(self, track: int, state: int, length: int, conditional: gtsam.GaussianConditional) -> None:
-        column, coupling = 0, conditional.S()
-        for key in conditional.keys()[1:]:
-            if key == length:
-                self.shared[track, state] = coupling[:, column : column + self._p]
-                column += self._p
-            else:
-                self.following[track, state] = coupling[:, column : column + STATE_DIM]
-                column += STATE_DIM
-
-    def log_determinants(self) -> Array:
-        """(t,) log det R."""
-        blocks = (
-            np.abs(np.diagonal(self.inverse, axis1=-2, axis2=-1)),
-            np.abs(np.diagonal(self.last, axis1=-2, axis2=-1)),
-        )
-        return np.asarray(-np.log(blocks[0]).sum((1, 2)) - np.log(blocks[1]).sum(1))
+class GaussNewtonFactors(SquareRootInformation):
+    """The factorisations R^T R of the Gauss-Newton matrices of several tracks, which solves all of them at once."""
 
     def solve(self, vector: Tensor) -> Tensor:
-        """R^-1 R^-T times a vector that is packed as `Layout` says."""
+        """R^-1 R^-T times a vector (n,) in the order of `Layout`: the solution (n,), in SI units."""
         given = vector.detach().numpy()
-        split = self._lengths.sum() * STATE_DIM
-        inside = np.arange(self.inverse.shape[1]) < self._lengths[:, None]
+        split = self.lengths.sum() * STATE_DIM
+        inside = np.arange(self.inverse.shape[1]) < self.lengths[:, None]
         states = np.zeros((*inside.shape, STATE_DIM))
         states[inside] = given[:split].reshape(-1, STATE_DIM)
-        shared = given[split:].reshape(self.tracks, self._p).copy()
+        shared = given[split:].reshape(self.tracks, self.coefficients).copy()
         self._solve_transposed(states, shared)
         self._solve(states, shared)
         return torch.from_numpy(np.concatenate((states[inside].reshape(-1), shared.reshape(-1))))
@@ -103,13 +55,13 @@ class GaussNewtonFactors:
             carried = self.inverse[:, i].mT @ (states[:, i, :, None] - carried)
             states[:, i] = carried[..., 0]
             carried = self.following[:, i].mT @ carried
-        if self._p:
+        if self.coefficients:
             shared -= np.einsum("tnip,tni->tp", self.shared, states)
             shared[:] = (self.last.mT @ shared[..., None])[..., 0]
 
     def _solve(self, states: Array, shared: Array) -> None:
         """R x = y in place: the coefficients, then backwards along the tracks."""
-        if self._p:
+        if self.coefficients:
             shared[:] = (self.last @ shared[..., None])[..., 0]
             states -= np.einsum("tnip,tp->tni", self.shared, shared)
         later = np.zeros((self.tracks, STATE_DIM, 1))
@@ -123,9 +75,9 @@ class ConjugateGradients:
 
     Args:
         factors: the preconditioner.
-        owners: (n,) the block that each number of a vector belongs to.
-        tolerance: stop when each block's residual is this small against the right side, in the preconditioner's metric.
-        max_iterations: products with the Hessian.
+        owners: (n,) block number of each entry of a vector.
+        tolerance: largest residual of a block relative to the right side, in the metric of the preconditioner.
+        max_iterations: largest number of products with the Hessian.
     """
 
     def __init__(
@@ -136,17 +88,20 @@ class ConjugateGradients:
         self.tolerance = tolerance
         self.max_iterations = max_iterations
         self.iterations = 0
-        """Products that the last solution took."""
+        """Products with the Hessian in the last solution."""
 
     def precondition(self, vector: Tensor) -> Tensor:
-        """The Gauss-Newton solution."""
+        """The Gauss-Newton solution (n,), in SI units, of a right side `vector` (n,) in those of the gradient."""
         return self.factors.solve(vector)
 
     def __call__(self, product: Product, right: Tensor) -> Tensor:
-        """X with H x = right.
+        """The solution x of H x = right.
 
-        Args: product: H times a vector (n,).  right: (n,).
-        Raises: NotAMinimum: H bends downwards somewhere, or the iteration does not arrive.
+        Args:
+            product: H times a vector (n,).
+            right: (n,) in the units of the gradient.
+        Returns: (n,) in SI units of the states and coefficients.
+        Raises: NotAMinimum: H has a direction of negative curvature, or the iteration does not converge.
         """
         solution = torch.zeros_like(right)
         residual = right.clone()

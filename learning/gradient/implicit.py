@@ -1,11 +1,10 @@
 """The gradient through a solver, by the implicit function theorem.
 
 A point x* with g(x*, theta) = 0, g the derivative of an objective by x, moves with the parameters theta as
-dx*/dtheta = -H^-1 dg/dtheta, H = dg/dx. What an outer loss L says of x* becomes a gradient of theta by
-lambda = H^-1 dL/dx*, dL/dtheta = -lambda^T dg/dtheta: one linear solution, whatever the solver did to get there.
+dx*/dtheta = -H^-1 dg/dtheta, H = dg/dx. The gradient of an outer loss L(x*) by theta is -lambda^T dg/dtheta with
+lambda = H^-1 dL/dx*. This takes one linear solution, independent of the solver's iterations.
 
-A method is called with what it needs, each by itself: the solve, the stationarity condition, the linear solver, and the
-parameters.
+A method takes the solve, the stationarity condition, the linear solver and the parameters as separate arguments.
 """
 
 from __future__ import annotations
@@ -18,71 +17,72 @@ import torch
 from torch import Tensor
 
 Solve = Callable[[], Tensor]
-"""Gives the point (n,), without a graph. Raises what it likes when it finds none."""
+"""Gives the point (n,), without a graph. It may raise anything where it finds none."""
 Stationarity = Callable[[Tensor], Tensor]
-"""g: from a point (n,) that requires a gradient, the objective's derivative (n,), itself differentiable in the point
-and in the parameters."""
+"""g: from a point (n,) that requires a gradient to the objective's derivative (n,), differentiable in the point and in
+the parameters."""
 
 
 class LinearSolver(Protocol):
     """Solves with the Hessian, or with an approximation of it."""
 
     def __call__(self, product: Callable[[Tensor], Tensor], right: Tensor) -> Tensor:
-        """X with product(x) = right."""
+        """The solution x (n,) of product(x) = right (n,)."""
         ...
 
     def precondition(self, vector: Tensor) -> Tensor:
-        """The Gauss-Newton solution of a right side."""
+        """The Gauss-Newton solution (n,) of a right side (n,)."""
         ...
 
 
 class GradientMethod(ABC):
-    """How an outer loss on a solution becomes a gradient of the parameters."""
+    """The way from an outer loss on a solution to a gradient of the parameters."""
 
     @abstractmethod
     def __call__(
         self, solve: Solve, stationarity: Stationarity, linear_solver: LinearSolver, parameters: Sequence[Tensor]
     ) -> Tensor:
-        """The solution (n,), differentiable in the parameters.
+        """The solution (n,), in the units of `solve`, differentiable in the parameters.
 
         Args:
             solve: finds the point.
-            stationarity: what is zero there.
+            stationarity: the derivative that is zero there.
             linear_solver: for the Hessian.
-            parameters: leaves that may receive a gradient.
+            parameters: leaf tensors of any shape and unit that may receive a gradient.
         """
 
 
 class ImplicitGradient(GradientMethod):
-    """Exact: the full Hessian, by products that autograd computes.
+    """The exact gradient, with the full Hessian by products that autograd computes.
 
-    Memory does not depend on how many iterations the solver took. The backward pass raises what the linear solver
-    raises when the point is not a minimum.
+    Memory does not depend on the number of the solver's iterations. Where the point is not a minimum, the backward pass
+    raises the exception of the linear solver.
     """
 
-    def __call__(
-        self, solve: Solve, stationarity: Stationarity, linear_solver: LinearSolver, parameters: Sequence[Tensor]
-    ) -> Tensor:
-        """The solution (n,), differentiable in the parameters."""
-        return _attached(solve(), stationarity, linear_solver, parameters, exact=True)
-
-
-class GaussNewtonGradient(GradientMethod):
-    """Approximate: the Gauss-Newton matrix in place of the Hessian; wrong by what residuals and losses bend."""
+    _exact = True
 
     def __call__(
         self, solve: Solve, stationarity: Stationarity, linear_solver: LinearSolver, parameters: Sequence[Tensor]
     ) -> Tensor:
-        """The solution (n,), with an approximate derivative by the parameters."""
-        return _attached(solve(), stationarity, linear_solver, parameters, exact=False)
+        """The solution (n,) in the units of `solve`, differentiable in the parameters."""
+        wanted = [p for p in parameters if p.requires_grad]
+        attached: Tensor = _Solution.apply(solve().detach(), stationarity, linear_solver, self._exact, *wanted)
+        return attached
+
+
+class GaussNewtonGradient(ImplicitGradient):
+    """An approximation: the Gauss-Newton matrix for the Hessian, without the curvature of residuals and losses."""
+
+    _exact = False
 
 
 class UnrolledGradient(GradientMethod):
-    """For reference: differentiates through iterations x <- x - M g(x), M the Gauss-Newton inverse at the solution.
+    """A reference: the derivative of iterations x <- x - M g(x), M the Gauss-Newton inverse at the solution.
 
-    Tends to the exact gradient with the number of iterations; memory and time grow with it.
+    It tends to the exact gradient with the number of iterations; memory and time grow with it.
 
-    Args: iterations: how many are unrolled.
+    Args: iterations: number of unrolled iterations, at least 1.
+    Raises: ValueError: a smaller number.
     """
 
     def __init__(self, iterations: int = 30) -> None:
@@ -93,7 +93,7 @@ class UnrolledGradient(GradientMethod):
     def __call__(
         self, solve: Solve, stationarity: Stationarity, linear_solver: LinearSolver, parameters: Sequence[Tensor]
     ) -> Tensor:
-        """The solution (n,), differentiable in the parameters as far as the iterations carry it."""
+        """The solution (n,), in the units of `solve`, differentiable in the parameters through the iterations."""
         point = solve().detach().requires_grad_(True)
         for _ in range(self.iterations):
             point = point - _Preconditioned.apply(stationarity(point), linear_solver)
@@ -111,14 +111,6 @@ class _Preconditioned(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, None]:
         return ctx.linear_solver.precondition(upstream[0]), None
-
-
-def _attached(
-    point: Tensor, stationarity: Stationarity, linear_solver: LinearSolver, parameters: Sequence[Tensor], *, exact: bool
-) -> Tensor:
-    wanted = [p for p in parameters if p.requires_grad]
-    attached: Tensor = _Solution.apply(point.detach(), stationarity, linear_solver, exact, *wanted)
-    return attached
 
 
 class _Solution(torch.autograd.Function):

@@ -1,11 +1,11 @@
-"""How likely the observations are, as a function of the noise: what fixes the scale of learned noise.
+"""The likelihood of the observations as a function of the noise, which determines the scale of learned noise.
 
-Scaling all standard deviations leaves the most probable states where they are, so an error of states alone cannot tell
-it. The likelihood of the observations, all states integrated out, can. In Laplace's approximation, exact for a linear
-model with Gaussian noise, its negative logarithm is the objective at the minimum + log det(R) + the factors' log
+Scaling all standard deviations does not move the most probable states, so that an error of states cannot determine the
+scale. The likelihood of the observations with all states integrated out does. In Laplace's approximation, exact for a
+linear model with Gaussian noise, its negative logarithm is the objective at the minimum + log det(R) + the factors' log
 spreads, R^T R the Gauss-Newton matrix. Its derivative by the noise is that of sum_k tr(T S T^T) / 2 - log det(T) (R. A.
-Fisher's identity): T what rewhitens factor k, S = r r^T + J C J^T the mean square of its whitened residual under the
-posterior covariance C of its variables.
+Fisher's identity), where T rewhitens factor k and S = r r^T + J C J^T is the mean square of its whitened residual under
+the posterior covariance C of its variables.
 """
 
 from __future__ import annotations
@@ -17,26 +17,27 @@ import torch
 from torch import Tensor
 
 from ballfg.factors.batch import Array, FactorBatch, Noise, Rows, Values
+from ballfg.factors.covariance import NeighbourCovariances
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.linear import weighted
 from ballfg.factors.lockstep import linearize_together
 from ballfg.learning.gradient.conjugate_gradients import GaussNewtonFactors
-from ballfg.learning.gradient.posterior import Posterior, posterior_of
 
 
 def negative_log_likelihood(
     graphs: Sequence[BallGraph], minima: Sequence[Values], factors: GaussNewtonFactors, noise: Noise
 ) -> Tensor:
-    """(t,) of each track's observations, up to a constant, differentiable in the noise alone.
+    """(t,) of each track's observations, up to a constant; differentiable in the noise alone.
 
     Robust losses count as Gaussians with each residual's weight at the minimum.
 
     Args:
-        graphs: one a track.  minima: where their objectives are least.
+        graphs: one per track.
+        minima: of their objectives.
         factors: their Gauss-Newton factorisations there.
-        noise: relative to what the graphs were built with, which it must be equal to.
+        noise: relative to that of the graphs, to which its value must be equal.
     """
-    posterior = posterior_of(factors)
+    posterior = factors.covariances()
     log_roots = factors.log_determinants()
     totals = []
     for track, rows in enumerate(linearize_together(list(zip(graphs, minima, strict=True)))):
@@ -51,8 +52,8 @@ def negative_log_likelihood(
     return torch.stack(totals)
 
 
-def _expected(kind: FactorBatch, rows: Rows, posterior: Posterior, track: int, change: Tensor) -> Tensor:
-    """Expected negative log density of a kind's factors, as a function of what rewhitens them."""
+def _expected(kind: FactorBatch, rows: Rows, posterior: NeighbourCovariances, track: int, change: Tensor) -> Tensor:
+    """Expected negative log density of a kind's factors, as a function of the change that rewhitens them."""
     square = torch.from_numpy(_mean_square(rows, posterior, track))
     if change.dim():
         spread = -change.diagonal(dim1=-2, dim2=-1).log().sum()
@@ -60,8 +61,8 @@ def _expected(kind: FactorBatch, rows: Rows, posterior: Posterior, track: int, c
     return 0.5 * change.square() * torch.einsum("nii->", square) - len(kind) * kind.dim * change.log()
 
 
-def _mean_square(rows: Rows, posterior: Posterior, track: int) -> Array:
-    """(m, r, r) r r^T + J C J^T of each factor; residuals and Jacobians with the weights that C was made with."""
+def _mean_square(rows: Rows, posterior: NeighbourCovariances, track: int) -> Array:
+    """(m, r, r) r r^T + J C J^T of each factor; residuals and Jacobians weighted as those of C."""
     weight = rows.loss.weight(np.linalg.norm(rows.residual, axis=-1))
     total = weight[:, None, None] * rows.residual[:, :, None] * rows.residual[:, None, :]
     _, jacobians = weighted(rows)

@@ -1,8 +1,7 @@
 """The objective of many tracks' graphs as one torch function of states, model, noise and priors.
 
-The estimator minimises it in numpy, track by track. A gradient through the estimate needs it once more, differentiable
-in everything, and for a batch of tracks at once: kinds of the same sort are merged, so that a batch costs few torch
-calls.
+The estimator minimises it in numpy, track by track. A gradient through the estimate needs it again in torch, for a
+batch of tracks at once. Factors of the same sort are merged, so that a batch costs few torch calls.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ from ballfg.state import STATE_DIM
 
 @dataclass(frozen=True)
 class Layout:
-    """Where the values of each track stand in one vector: all states of all tracks, then all coefficients.
+    """The order of the values of several tracks in one vector: all states of all tracks, then all coefficients.
 
     Attributes:
         lengths: number of states of each of t tracks.
@@ -35,7 +34,7 @@ class Layout:
 
     @property
     def states(self) -> int:
-        """States of all tracks together."""
+        """Number of states of all tracks."""
         return sum(self.lengths)
 
     @property
@@ -44,7 +43,7 @@ class Layout:
         return tuple(np.concatenate(([0], np.cumsum(self.lengths[:-1]))).astype(int).tolist())
 
     def pack(self, values: Sequence[Values]) -> Tensor:
-        """One vector out of the values of each track."""
+        """One vector from the values of each track."""
         parts = [v.states.reshape(-1) for v in values] + [v.coefficients for v in values]
         return torch.from_numpy(np.concatenate(parts))
 
@@ -54,7 +53,7 @@ class Layout:
         return states, point[self.states * STATE_DIM :].view(len(self.lengths), self.coefficients)
 
     def owners(self) -> Tensor:
-        """The track that each number of the vector belongs to."""
+        """Track number of each entry of the vector."""
         track = torch.arange(len(self.lengths))
         return torch.cat(
             (
@@ -66,7 +65,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class _Block:
-    """Merged kinds: which rows of the states or coefficients their variables are, and the track of each factor."""
+    """Merged kinds: the rows of states or coefficients that their variables are, and the track of each factor."""
 
     kind: FactorBatch
     places: tuple[tuple[bool, Tensor], ...]
@@ -80,8 +79,8 @@ class BatchObjective:
     """Sum over factors of the losses, for each track of a batch.
 
     Args:
-        graphs: one a track.
-        values: the shapes of each track's variables.
+        graphs: one per track.
+        values: of each track, for the number of states and coefficients.
     """
 
     def __init__(self, graphs: Sequence[BallGraph], values: Sequence[Values]) -> None:
@@ -95,9 +94,9 @@ class BatchObjective:
         self._blocks = [_block(members, starts) for members in groups.values()]
 
     def __call__(self, point: Tensor, noise: Noise) -> Tensor:
-        """(t,) the objective of each track.
+        """(t,) the objective of each track, dimensionless.
 
-        Args: point: as `layout.pack` makes it.  noise: what is learned of it.
+        Args: point: (n,) vector of `layout.pack`, SI units.  noise: learned noise.
         """
         states, coefficients = self.layout.unpack(point)
         total = point.new_zeros(len(self.layout.lengths))
@@ -108,7 +107,7 @@ class BatchObjective:
         return total
 
     def gradient(self, point: Tensor, noise: Noise) -> Tensor:
-        """Derivative of the sum over tracks by the point, differentiable once more."""
+        """(n,) derivative of the sum over tracks by the point (n,), SI units, differentiable again."""
         with torch.enable_grad():
             (gradient,) = torch.autograd.grad(self(point, noise).sum(), point, create_graph=True)
         return gradient
@@ -122,7 +121,7 @@ def rewhitened(residual: Tensor, change: Tensor | None) -> Tensor:
 
 
 def _block(members: Sequence[tuple[int, FactorBatch]], starts: Sequence[int]) -> _Block:
-    """Kinds of one group as one kind whose variables are numbered through all tracks."""
+    """The kinds of one group as one kind, its variables numbered through all tracks."""
     moved = []
     for track, kind in members:
         shifted = copy.copy(kind)

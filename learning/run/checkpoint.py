@@ -1,4 +1,4 @@
-"""All that a training needs to continue to the same numbers: a folder of tensors and YAML, replaced as a whole."""
+"""The checkpoint of a training, from which it continues to the same numbers: a folder of tensors and YAML."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ TENSORS = ("weights", "optimizer", "memory", "best")
 """One file `<name>.safetensors` each."""
 
 
-class Standing(BaseModel):
-    """How far a run is, in plain numbers."""
+class RunProgress(BaseModel):
+    """The progress of a run, in plain numbers."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
     epoch: int
-    """Epochs done."""
+    """Number of finished epochs."""
     best_epoch: int
     """The epoch with the best weights."""
     best_rmse: float | None
-    """m, their RMSE on the validation tracks; null: none was judged."""
+    """m, RMSE of these weights on the validation tracks; null: none was judged."""
     skipped_in_row: int
-    """Steps that were skipped in a row up to now."""
+    """Steps that were skipped in a row up to the end."""
     train: int
     """Number of training tracks."""
     validation: int
@@ -42,16 +42,17 @@ class Standing(BaseModel):
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """A run after an epoch. There is no random state: all chance derives from seed, epoch and track.
+    """A run after an epoch. There is no random state: random numbers derive from seed, epoch and track.
 
     Attributes:
-        standing: how far it is.
-        weights: the module's state.  best: the same at the best epoch.
-        optimizer: `<parameter>/<moment>`.
-        memory: what the model carries from one epoch to the next.
+        progress: its progress.
+        weights: state of the module.
+        best: state of the module at the best epoch.
+        optimizer: state of the optimizer, as `<parameter>/<moment>`.
+        memory: further state of the trainee (`Trainee.memory`).
     """
 
-    standing: Standing
+    progress: RunProgress
     weights: dict[str, Tensor]
     best: dict[str, Tensor]
     optimizer: dict[str, Tensor] = field(default_factory=dict)
@@ -59,7 +60,7 @@ class Checkpoint:
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
-    """Replace the checkpoint of a run. At every moment the old or the new one is there, whole.
+    """Replace the checkpoint of a run. At every moment either the old or the new one exists as a whole.
 
     Args: folder: of the run.
     """
@@ -68,7 +69,7 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
             tensors: dict[str, Tensor] = getattr(checkpoint, name)
             owned = {key: tensor.detach().contiguous().clone() for key, tensor in tensors.items()}
             save_file(owned, _tensors(part, name))
-        text = yaml.safe_dump(checkpoint.standing.model_dump(), sort_keys=False)
+        text = yaml.safe_dump(checkpoint.progress.model_dump(), sort_keys=False)
         (part / STATE).write_text(text, encoding="utf-8")
 
 
@@ -84,7 +85,7 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
     try:
         content: Any = read_yaml(path / STATE)
         tensors = {name: load_file(_tensors(path, name)) for name in TENSORS}
-        return Checkpoint(Standing.model_validate(content), **tensors)
+        return Checkpoint(RunProgress.model_validate(content), **tensors)
     except ValidationError as error:
         reason = f"{STATE}: {error.errors()[0]['msg']}"
     except (OSError, YamlError, SafetensorError) as error:

@@ -23,7 +23,7 @@ TRAIN, VALIDATION, BEST = "#3b4cc0", "#d95f02", "#7f7f7f"
 
 
 def draw_curves(epochs: Sequence[Epoch], title: str, path: Path) -> None:
-    """Write the PNG; the name appears once the file is whole."""
+    """Write the picture as a PNG file."""
     figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 3.9), layout="constrained")
     losses = [(e.epoch, e.loss) for e in epochs if e.loss is not None]
     trained = [(e.epoch, 1e3 * e.train_rmse) for e in epochs if e.train_rmse is not None]

@@ -15,27 +15,28 @@ from torch.multiprocessing.spawn import ProcessContext, ProcessExitedException, 
 
 HOST = "127.0.0.1"
 GRACE = 60.0
-"""s that interrupted processes have to end by themselves: a solve in compiled code ends before it hears of Ctrl-C."""
-WITHOUT_A_WORD = -1
-"""Stands for the exit status of a process that has none yet."""
+"""s that interrupted processes have to end by themselves: compiled code notices Ctrl-C only when it returns."""
+NO_STATUS = -1
+"""Exit status of a process that has not returned."""
 LAST_WORDS = 10.0
-"""s that the others have to say what happened once one of them has died."""
+"""s that the other processes have to print their errors once one of them has died."""
 
 
 def launch(processes: int, work: Callable[..., int], *arguments: Any) -> int:
-    """Run `work` in several processes that `join_ranks` makes one group of.
+    """Run `work` in several processes, which `join_ranks` joins to one group.
 
     Args:
-        processes: how many.
-        work: a function of a module; takes `arguments`, which can be pickled, and returns an exit status.
+        processes: their number.
+        work: a function of a module, which returns an exit status.
+        arguments: of `work`, which can be pickled.
 
-    Returns: what `work` returned in the first process.
+    Returns: the status of the first process.
     Raises:
         ChildProcessError: if a process was killed.
         KeyboardInterrupt: after Ctrl-C, if the first process ended before it could return.
     """
     store = TCPStore(HOST, 0, is_master=True, wait_for_workers=False)
-    status = get_context("spawn").Value("i", WITHOUT_A_WORD)
+    status = get_context("spawn").Value("i", NO_STATUS)
     group = start_processes(_take_part, (processes, store.port, status, work, arguments), nprocs=processes, join=False)
     try:
         _wait(group)
@@ -44,7 +45,7 @@ def launch(processes: int, work: Callable[..., int], *arguments: Any) -> int:
             f"training process {error.error_index} was ended from outside ({error.signal_name or error.exit_code}). "
             "Memory may have run out: set workers lower, and continue with --resume."
         ) from None
-    if status.value == WITHOUT_A_WORD:  # torch ends a process that is interrupted while it starts, and says nothing
+    if status.value == NO_STATUS:  # torch ends a process that is interrupted while it starts without a message
         raise KeyboardInterrupt
     return status.value
 
@@ -57,7 +58,7 @@ def _take_part(
     work: Callable[..., int],
     arguments: tuple[Any, ...],
 ) -> None:
-    """What a started process does: the environment of torchrun, then the work."""
+    """Set the environment as torchrun does, then work."""
     os.environ.update(
         RANK=str(rank),
         LOCAL_RANK=str(rank),
@@ -69,14 +70,14 @@ def _take_part(
     )
     try:
         found = work(*arguments)
-    except SystemExit:  # the first process says why
+    except SystemExit:  # the first process prints the reason
         return
     if rank == 0:
         status.value = found
 
 
 def _wait(group: ProcessContext) -> None:
-    """Until all have ended; Ctrl-C is handed on, and who does not follow in time is killed."""
+    """Wait until all have ended. Ctrl-C is handed on, and processes that do not end in time are killed."""
     deadline: float | None = None
     while True:
         try:

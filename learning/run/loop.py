@@ -1,7 +1,7 @@
-"""The training loop: batches of tracks, the sum of their gradients, a step; then the validation tracks.
+"""The training loop: for each batch of tracks the sum of their gradients and a step; then the validation tracks.
 
-It reads top to bottom: `Training.epochs` is the whole of it. All chance derives from seed and epoch, so a loop that
-continues from a checkpoint takes the same steps, bit for bit.
+`Training.epochs` is the loop. Random numbers derive from seed and epoch, so that a loop which continues from a
+checkpoint takes the same steps, bit for bit.
 """
 
 from __future__ import annotations
@@ -10,35 +10,33 @@ import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.run.checkpoint import Checkpoint, Standing
+from ballfg.learning.run.checkpoint import Checkpoint, RunProgress
 from ballfg.learning.run.metrics import Epoch
 from ballfg.learning.run.optimizer import make_optimizer, moments, rate_factor, restore_moments
 from ballfg.learning.run.ranks import Ranks, SharedMemory
 from ballfg.learning.trainee import BatchLoss, Trainee
-
-if TYPE_CHECKING:
-    from ballfg.progress import Watch
+from ballfg.progress import Watch
 
 
 class TrainingStoppedError(ValueError):
-    """The training cannot go on; the text says why and what to try. The last checkpoint is whole."""
+    """The training cannot go on, for the reason in its text. The last checkpoint is kept."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """What is trained on what.
+    """A training.
 
     Attributes:
         trainee: the model with its data.
-        train: numbers of the tracks that train.  validation: of those that only judge; may be empty.
-        config: how.
+        train: numbers of the tracks that train.
+        validation: numbers of the tracks that judge the weights; may be empty.
+        config: of the training.
         ranks: the processes that share the work.
         watch: sees the batches pass in the first process, for instance to show progress.
     """
@@ -53,7 +51,7 @@ class Task:
 
 @dataclass
 class _Tally:
-    """Sums over tracks, and the tracks that failed on this rank."""
+    """Sums over the tracks of all ranks, and the tracks that failed on this rank."""
 
     loss: float = 0.0
     tracks: float = 0.0
@@ -72,24 +70,24 @@ class _Tally:
 
     @property
     def rmse(self) -> float | None:
-        """m; None where there is nothing finite to take it of."""
+        """m; None without a finite sum."""
         mean = self.squared_error / self.points if self.points else math.nan
         return math.sqrt(mean) if math.isfinite(mean) else None
 
 
 class Training:
-    """A run: its model, its optimizer and how far it is.
+    """A run: its model, its optimizer and its progress.
 
     Every rank of `task.ranks` calls the same methods in the same order.
     """
 
     def __init__(self, task: Task, checkpoint: Checkpoint | None = None) -> None:
-        """Start, or continue from a checkpoint. Raises: ValueError: if that is of another run."""
+        """Start, or continue from a checkpoint. Raises: ValueError: a checkpoint of another run."""
         self.task = task
         self.module = task.trainee.module
         self.optimizer = make_optimizer(task.trainee, task.config.optimizer)
         self.parameters = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
-        self.standing: Standing | None = None
+        self.progress: RunProgress | None = None
         self.best = _weights(self.module)
         self.memory = SharedMemory()
         self.skipped_in_row = 0
@@ -97,11 +95,11 @@ class Training:
             self._restore(checkpoint)
 
     def epochs(self) -> Iterator[Epoch]:
-        """The epochs that are left, the judgement before the first step among them.
+        """The epochs that are left, and in a new run epoch 0, which judges the model before the first step.
 
         Raises: TrainingStoppedError: too many tracks failed, or too many steps in a row were not finite.
         """
-        done = -1 if self.standing is None else self.standing.epoch
+        done = -1 if self.progress is None else self.progress.epoch
         for number in range(done + 1, self.task.config.optimizer.epochs + 1):
             begun = time.monotonic()
             learned = self._learn(number) if number else _Tally()
@@ -121,11 +119,11 @@ class Training:
             )
 
     def checkpoint(self) -> Checkpoint:
-        """The run after its last whole epoch. All ranks call it; between epochs only."""
-        if self.standing is None:
+        """The run after its last epoch. All ranks call it, between epochs only."""
+        if self.progress is None:
             raise ValueError("a checkpoint must follow an epoch; got none yet. Take the first of `epochs` before.")
         memory = self.memory.gather(self.task.ranks, self.task.trainee.memory())
-        return Checkpoint(self.standing, _weights(self.module), self.best, moments(self.optimizer, self.module), memory)
+        return Checkpoint(self.progress, _weights(self.module), self.best, moments(self.optimizer, self.module), memory)
 
     def take_best(self) -> None:
         """Put the best weights into the model."""
@@ -137,7 +135,7 @@ class Training:
         return -(-len(self.task.train) // self.task.config.optimizer.batch)
 
     def _learn(self, number: int) -> _Tally:
-        """One pass over the training tracks, in an order of its own."""
+        """One pass over the training tracks, in the random order of the epoch."""
         config, epoch = self.task.config, number - 1
         order = np.random.default_rng((config.seed, epoch)).permutation(np.array(self.task.train)).tolist()
         size = config.optimizer.batch
@@ -170,19 +168,18 @@ class Training:
         self._apply(gradient * (clip / norm) if clip is not None and norm > clip else gradient)
 
     def _gradients(self, batch: Sequence[int], epoch: int, tally: _Tally) -> Tensor:
-        """This rank's share of a batch: its gradient, flat, and its five sums behind it."""
+        """The gradient of this rank's share of a batch as a flat vector, followed by the five sums of the share."""
         own = self.task.ranks.own(batch)
         self.optimizer.zero_grad()
-        found = self.task.trainee.loss(own, epoch) if own else BatchLoss(torch.zeros(()), 0, 0.0, 0)
+        found = self.task.trainee.loss(own, epoch) if own else BatchLoss.none()
         if found.total.requires_grad:
             found.total.backward()
         tally.reasons += found.failed
         flat = [p.new_zeros(p.numel()) if p.grad is None else p.grad.reshape(-1) for p in self.parameters]
-        sums = (float(found.total.detach()), found.tracks, found.squared_error, found.points, len(found.failed))
-        return torch.cat([part.double() for part in flat] + [torch.tensor(sums, dtype=torch.float64)])
+        return torch.cat([part.double() for part in flat] + [_sums(found)])
 
     def _apply(self, gradient: Tensor) -> None:
-        """A step along a flat gradient."""
+        """A step with a flat gradient."""
         parts = gradient.split([parameter.numel() for parameter in self.parameters])
         for parameter, part in zip(self.parameters, parts, strict=True):
             parameter.grad = part.view_as(parameter).to(parameter.dtype)
@@ -200,7 +197,7 @@ class Training:
             )
 
     def _check_failures(self, tally: _Tally) -> None:
-        """Stop as soon as more tracks of the epoch have failed than may."""
+        """Stop as soon as more tracks of the epoch have failed than the config allows."""
         limit, count = self.task.config.failure_limit, len(self.task.train)
         if tally.failed <= limit * count:
             return
@@ -211,7 +208,7 @@ class Training:
         )
 
     def _judge(self, number: int) -> _Tally:
-        """The validation tracks with the weights as they are."""
+        """Judge the validation tracks with the present weights."""
         ranks, size = self.task.ranks, self.task.config.optimizer.batch
         own = ranks.own(self.task.validation)
         parts = [own[i : i + size] for i in range(0, len(own), size)]
@@ -219,25 +216,23 @@ class Training:
         def work() -> Tensor:
             sums = torch.zeros(5, dtype=torch.float64)
             for part in self._shown(parts, f"batches judged after epoch {number}"):
-                found = self.task.trainee.judge(part)
-                row = (float(found.total.detach()), found.tracks, found.squared_error, found.points, len(found.failed))
-                sums += torch.tensor(row, dtype=torch.float64)
+                sums += _sums(self.task.trainee.judge(part))
             return sums
 
         loss, tracks, squared_error, points, failed = ranks.sum(ranks.together(work)).tolist()
         return _Tally(loss, tracks, squared_error, points, failed)
 
     def _note(self, number: int, judged: _Tally) -> None:
-        """Keep the weights if they are the best so far. When many tracks failed, the rest tells too little."""
+        """Keep the weights if they are the best so far. An epoch in which too many tracks failed does not count."""
         reliable = judged.failed <= self.task.config.failure_limit * len(self.task.validation)
         rmse = judged.rmse if reliable else None
-        best = None if self.standing is None else self.standing.best_rmse
+        best = None if self.progress is None else self.progress.best_rmse
         better = best is None or (rmse is not None and rmse < best)
         if better:
             self.best = _weights(self.module)
-        self.standing = Standing(
+        self.progress = RunProgress(
             epoch=number,
-            best_epoch=number if better or self.standing is None else self.standing.best_epoch,
+            best_epoch=number if better or self.progress is None else self.progress.best_epoch,
             best_rmse=rmse if better else best,
             skipped_in_row=self.skipped_in_row,
             train=len(self.task.train),
@@ -252,9 +247,9 @@ class Training:
         return self.task.watch(items, len(items), what) if self.task.ranks.first else iter(items)
 
     def _restore(self, checkpoint: Checkpoint) -> None:
-        """Take up a checkpoint. Raises: ValueError: if it is of another model or other tracks."""
-        standing, task = checkpoint.standing, self.task
-        there, here = (standing.train, standing.validation), (len(task.train), len(task.validation))
+        """Restore a checkpoint. Raises: ValueError: if it is of another model or other tracks."""
+        progress, task = checkpoint.progress, self.task
+        there, here = (progress.train, progress.validation), (len(task.train), len(task.validation))
         if there != here:
             raise ValueError(
                 f"the checkpoint must be of the same tracks; it has {there[0]} to train and {there[1]} to validate, "
@@ -263,11 +258,17 @@ class Training:
         try:
             self.module.load_state_dict(checkpoint.weights)
             restore_moments(self.optimizer, self.module, checkpoint.optimizer)
-        except (RuntimeError, KeyError) as error:  # torch's own word for names and shapes that differ
+        except (RuntimeError, KeyError) as error:  # torch raises these for names and shapes that differ
             raise ValueError(f"the checkpoint must be of the same model; {error}. Start a new run.") from None
         task.trainee.remember(checkpoint.memory)
         self.memory = SharedMemory(checkpoint.memory)
-        self.standing, self.best, self.skipped_in_row = standing, checkpoint.best, standing.skipped_in_row
+        self.progress, self.best, self.skipped_in_row = progress, checkpoint.best, progress.skipped_in_row
+
+
+def _sums(found: BatchLoss) -> Tensor:
+    """(5,) the sums that ranks add up: loss, tracks, squared error, points, failed tracks."""
+    row = (float(found.total.detach()), found.tracks, found.squared_error, found.points, len(found.failed))
+    return torch.tensor(row, dtype=torch.float64)
 
 
 def _weights(module: nn.Module) -> dict[str, Tensor]:

@@ -1,4 +1,4 @@
-"""What an epoch of training came to: one row of `metrics.csv`."""
+"""The numbers of an epoch: one row of `metrics.csv`."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ class Epoch:
     """An epoch's numbers.
 
     Attributes:
-        epoch: number, from 1; 0 is the model before any step, judged only.
-        loss: mean over the training tracks; None where no step was taken.
-        train_rmse: m, of predicted positions (the norm of the error), with the weights as they were at each step.
-        validation_rmse: m, with the weights at the end; None where nothing could be judged.
+        epoch: number, from 1; 0 is the model before the first step, which is judged only.
+        loss: mean over the training tracks; None without a step.
+        train_rmse: m, of predicted positions (norm of the error), with the weights of each step.
+        validation_rmse: m, with the weights at the end; None where no track could be judged.
         learning_rate: of the last step, for a scale of 1.
         gradient_norm: of the mean loss of a batch before clipping, mean over steps.
-        skipped: steps whose loss or gradient was not finite.
-        failed: training tracks left out since their estimate failed.
-        validation_failed: the same of the validation tracks.
-        seconds: s that it took.
+        skipped: number of steps whose loss or gradient was not finite.
+        failed: number of training tracks that were left out because their estimate failed.
+        validation_failed: the same for validation tracks.
+        seconds: duration, s.
     """
 
     epoch: int
@@ -46,7 +46,7 @@ INTEGERS = ("epoch", "skipped", "failed", "validation_failed")
 
 
 def write_metrics(path: Path, epochs: Sequence[Epoch]) -> None:
-    """Write the table; an empty cell stands for None. Floats read back bit for bit."""
+    """Write the table; an empty cell stands for None. Floats are read back bit for bit."""
     text = io.StringIO()
     table = csv.DictWriter(text, [field.name for field in fields(Epoch)], lineterminator="\n")
     table.writeheader()
@@ -65,7 +65,7 @@ def read_metrics(path: Path) -> list[Epoch]:
 
 
 def epoch_line(epoch: Epoch, last: int, seconds_left: float) -> str:
-    """One line for the reader. Args: last: number of the last epoch.  seconds_left: s, a guess."""
+    """One line of text. Args: last: number of the last epoch.  seconds_left: s, estimated."""
     parts = [f"epoch {epoch.epoch}/{last}:"]
     if epoch.epoch:
         parts.append("no track learned from," if epoch.loss is None else f"loss {epoch.loss:.4g},")

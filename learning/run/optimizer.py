@@ -1,4 +1,4 @@
-"""AdamW over a trainee's parameters: its groups, its learning rate as a function of the step, its state by name."""
+"""AdamW over a trainee's parameters: groups, learning rate by step, state by parameter name."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def make_optimizer(trainee: Trainee, settings: OptimizerConfig) -> torch.optim.A
 
 
 def rate_factor(settings: OptimizerConfig, step: int, per_epoch: int) -> float:
-    """Share of the full learning rate at a step, counted from 0 over all epochs; a function of the step alone."""
+    """Share of the full learning rate at a step, counted from 0 over all epochs."""
     warm, total = settings.warm_start_epochs * per_epoch, settings.epochs * per_epoch
     if step < warm:
         return (step + 1) / warm
@@ -43,7 +43,7 @@ def moments(optimizer: torch.optim.Optimizer, module: nn.Module) -> dict[str, Te
 
 
 def restore_moments(optimizer: torch.optim.Optimizer, module: nn.Module, state: Mapping[str, Tensor]) -> None:
-    """Take up what `moments` gave. Raises: KeyError: for a parameter that the module does not have."""
+    """Restore the state that `moments` gave. Raises: KeyError: for a parameter that the module does not have."""
     parameters = dict(module.named_parameters())
     for name, tensor in state.items():
         parameter, _, moment = name.rpartition("/")

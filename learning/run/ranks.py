@@ -1,7 +1,7 @@
-"""Processes that train one model: what they add up, tell each other, and that all end together.
+"""Processes that train one model: they add up sums, exchange values, and end together.
 
-A process is a rank. Tracks are dealt out by number, whatever the batch, so that what a rank remembers of a track stays
-with it. A single process is the case of one rank: nothing is sent, the numbers are the same up to rounding.
+A process is a rank. Each rank owns tracks by their number, independent of the batch, so that its memory of a track
+stays with it. A single process is the case of one rank: nothing is sent, and the numbers are the same up to rounding.
 """
 
 from __future__ import annotations
@@ -18,18 +18,18 @@ from typing import Any, Literal, TypeVar
 import torch
 import torch.distributed as dist
 
-# its functions have the group that is there at the first import for a default: after `init` they would keep it alive
+# its functions take the group of the first import as their default: imported after `init` they would keep it alive
 import torch.distributed.nn.functional
 from torch import Tensor
 
 T = TypeVar("T")
 TOLD_BY_FIRST = 1
-"""Exit status of a process that ends without a word, since the first one says why."""
+"""Exit status of a process that prints nothing because the first one prints the reason."""
 
 
 @dataclass(frozen=True)
 class Trouble:
-    """What ended a rank's work, in words that travel."""
+    """The exception that ended a rank's work, in a form that can be sent."""
 
     rank: int
     what: Literal["interrupt", "input", "fault"]
@@ -37,7 +37,7 @@ class Trouble:
 
     @classmethod
     def of(cls, rank: int, error: BaseException) -> Trouble:
-        """What to tell the others of an exception."""
+        """The form of an exception that is sent to the other ranks."""
         if isinstance(error, KeyboardInterrupt):
             return cls(rank, "interrupt", "")
         if isinstance(error, (ValueError, TypeError, OSError)):
@@ -45,7 +45,7 @@ class Trouble:
         return cls(rank, "fault", "".join(traceback.format_exception(error)))
 
     def exception(self) -> BaseException:
-        """What the first rank raises for another one."""
+        """The exception that the first rank raises for another one."""
         if self.what == "interrupt":
             return KeyboardInterrupt()
         if self.what == "input":
@@ -58,7 +58,8 @@ class Ranks:
     """This process among those that train.
 
     Attributes:
-        rank: number of this process, from 0.  size: how many there are.
+        rank: number of this process, from 0.
+        size: number of processes.
     """
 
     rank: int = 0
@@ -68,15 +69,15 @@ class Ranks:
 
     @property
     def first(self) -> bool:
-        """Whether this is the one that writes and prints."""
+        """Whether this is the process that writes and prints."""
         return self.rank == 0
 
     def own(self, tracks: Sequence[int]) -> list[int]:
-        """Those of some tracks that are this rank's, in their order."""
+        """The tracks among some that this rank owns, in their order."""
         return [track for track in tracks if track % self.size == self.rank]
 
     def sum(self, values: Tensor) -> Tensor:
-        """(n,) sum over ranks of (n,) float64 values: taken in the order of the ranks, so the same bits everywhere."""
+        """(n,) sum over ranks of (n,) float64 values, in the order of the ranks and so the same bits on each."""
         if self.size == 1:
             return values
         parts = [torch.empty_like(values) for _ in range(self.size)]
@@ -84,7 +85,7 @@ class Ranks:
         return torch.stack(parts).sum(dim=0)
 
     def gather(self, value: T) -> list[T]:
-        """What each rank has, on every rank."""
+        """The values of all ranks, on every rank."""
         if self.size == 1:
             return [value]
         values: list[Any] = [None] * self.size
@@ -92,7 +93,7 @@ class Ranks:
         return values
 
     def from_first(self, work: Callable[[], T]) -> T:
-        """What `work` gives on the first rank, on every rank; the others do not run it. Raises: as `together`."""
+        """The result of `work` on the first rank, which alone runs it, on every rank. Raises: as `together`."""
         box: list[Any] = [self.together(lambda: work() if self.first else None)]
         if self.size > 1:
             dist.broadcast_object_list(box, src=0)
@@ -101,8 +102,8 @@ class Ranks:
     def together(self, work: Callable[[], T]) -> T:
         """Run this rank's share of the work. When it fails or is interrupted on one rank, it ends on all of them.
 
-        Raises: whatever `work` raises, on its rank; on the first rank the same in kind for another rank's; SystemExit
-            on the ranks that need say nothing since the first one does.
+        Raises: on the first rank, the exception of `work`, its own or one of the same kind for another rank's;
+            SystemExit on all other ranks, which print nothing.
         """
         if self.size == 1:
             return work()
@@ -125,7 +126,7 @@ class Ranks:
 
     @contextmanager
     def _interruptible(self) -> Iterator[None]:
-        """Ctrl-C counts here; elsewhere, while ranks wait for each other, it is kept until the next time."""
+        """Let Ctrl-C interrupt. Elsewhere, while ranks wait for each other, it is kept until the next such block."""
         self._working = True
         try:
             if self._interrupted:
@@ -136,23 +137,23 @@ class Ranks:
 
     def _on_interrupt(self, _signal: int, _frame: FrameType | None) -> None:
         if self._working:
-            self._working = False  # a terminal and a parent may both send it: once is enough
+            self._working = False  # a terminal and a parent may both send it
             raise KeyboardInterrupt
         self._interrupted = True
 
 
 class SharedMemory:
-    """What all ranks together remember, when each keeps the tracks that it owns up to date.
+    """The memory of all ranks, each of which updates the tracks that it owns.
 
-    After a run is resumed, every rank holds the memory of all tracks, and what it holds of other ranks' tracks grows
-    old. So a rank tells only what it has changed.
+    After a run is resumed, every rank holds the memory of all tracks, and that of other ranks' tracks becomes outdated.
+    A rank therefore sends its changes only.
     """
 
     def __init__(self, given: Mapping[str, Tensor] | None = None) -> None:
         self.given = {name: tensor.clone() for name, tensor in (given or {}).items()}
 
     def gather(self, ranks: Ranks, own: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The memory of all ranks, on every rank. Args: own: what this rank holds."""
+        """The memory of all ranks, on every rank. Args: own: memory of this rank."""
         known = self.given
         changed = {
             name: tensor for name, tensor in own.items() if name not in known or not torch.equal(tensor, known[name])
@@ -168,11 +169,11 @@ class SharedMemory:
 
 @contextmanager
 def join_ranks() -> Iterator[Ranks]:
-    """Take part in what torchrun, or `launch`, has started; a single rank where neither did.
+    """Join the processes that torchrun or `launch` has started; a single rank where neither did.
 
     Environment: WORLD_SIZE, RANK, MASTER_ADDR, MASTER_PORT as torchrun sets them. The backend is gloo, on CPUs.
     """
-    torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
+    torch.set_num_threads(1)  # the batches are small: threads cost more than they gain
     if not started_by_launcher():
         yield Ranks()
         return

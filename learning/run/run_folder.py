@@ -1,4 +1,4 @@
-"""The folder of a run: its config and versions, and how its files are written. None appears before it is whole."""
+"""The folder of a run: names of its files, checks before a run starts, config and versions."""
 
 from __future__ import annotations
 
@@ -18,22 +18,26 @@ CONFIG, VERSIONS, MODEL = "config.yaml", "versions.json", "model.yaml"
 STEPS, REPORT, PICTURE = "checkpoint.json", "report.json", "calibration.png"
 CHECKPOINT, METRICS, CURVES, EVENTS = "checkpoint", "metrics.csv", "curves.png", "tensorboard"
 CALIBRATION = (CONFIG, VERSIONS, MODEL, STEPS, REPORT, PICTURE)
-"""What a calibration writes."""
+"""Files of a calibration."""
 TRAINING = (CONFIG, VERSIONS, MODEL, CHECKPOINT, METRICS, CURVES, EVENTS)
-"""What a training writes, files and folders; a learned model has a folder of its own beside."""
+"""Files and folders of a training; a learned model adds a folder of its own."""
 PACKAGES = ("ballfg", "gtsam", "torch", "numpy", "scipy", "safetensors")
 
 
 def check(folder: Path, config: Config, *, resume: bool) -> None:
-    """Refuse a folder before anything is done. Raises: as `check_resumable` and `check_new`."""
+    """Check the folder before a run starts: it must hold no earlier run, or one with the same config to `resume`.
+
+    Raises:
+        ValueError: a file, or a folder with an earlier run; to resume, a config that would change the numbers.
+        FileNotFoundError: no run to resume.
+    """
     if resume:
-        check_resumable(folder, config)
+        _check_resumable(folder, config)
     else:
-        check_new(folder)
+        _check_new(folder)
 
 
-def check_new(folder: Path) -> None:
-    """Refuse a folder in which something would be lost. Raises: ValueError: a file, or a folder with an earlier run."""
+def _check_new(folder: Path) -> None:
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"out must be a folder; {folder} is a file. Choose another name.")
     there = [name for name in (*CALIBRATION, *TRAINING) if (folder / name).exists()]
@@ -44,18 +48,14 @@ def check_new(folder: Path) -> None:
         )
 
 
-def check_resumable(folder: Path, config: Config) -> None:
-    """Refuse to continue a run under another config.
-
-    Raises: FileNotFoundError: no run in the folder. ValueError: a field differs that would change the numbers.
-    """
+def _check_resumable(folder: Path, config: Config) -> None:
     if not (folder / CONFIG).is_file():
         raise FileNotFoundError(f"--resume needs the folder of an earlier run; {folder} has no {CONFIG}.")
     earlier, now = (_flat(each.model_dump(mode="json")) for each in (read_config(folder / CONFIG), config))
     for name in ("kind", *now):
-        if name not in config.FREE_TO_CHANGE and earlier[name] != now[name]:
+        if name not in config.FREE_TO_CHANGE and earlier.get(name) != now[name]:
             raise ValueError(
-                f"a resumed run must keep its config; '{name}' was {earlier[name]!r} and is {now[name]!r}. "
+                f"a resumed run must keep its config; '{name}' was {earlier.get(name)!r} and is {now[name]!r}. "
                 f"Give {folder / CONFIG} as the config, or start a new run."
             )
 
@@ -78,5 +78,5 @@ def start(folder: Path, config: Config) -> None:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON; floats read back bit for bit."""
+    """Write JSON; floats are read back bit for bit."""
     write_text(path, json.dumps(content, indent=1, allow_nan=False) + "\n")

@@ -1,4 +1,4 @@
 from .architecture import SequenceArchitecture as SequenceArchitecture
-from .launcher import LauncherSettings as LauncherSettings
+from .data import LauncherSettings as LauncherSettings
 from .predictor import SequencePredictor as SequencePredictor
 from .trainee import SequenceTrainee as SequenceTrainee

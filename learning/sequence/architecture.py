@@ -1,4 +1,4 @@
-"""Which sequence model, of which size; and how one is made."""
+"""Kind and size of a sequence model, and the model itself."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ballfg.learning.sequence.model import SequenceModel
 
 SequenceKind = Literal["lstm", "diffusion"]
 DEFAULT_WIDTH: dict[SequenceKind, int] = {"lstm": 96, "diffusion": 64}
-"""By validation on simulated tracks."""
+"""Chosen by validation on simulated tracks."""
 _MODELS: dict[SequenceKind, type[LstmModel] | type[DiffusionModel]] = {"lstm": LstmModel, "diffusion": DiffusionModel}
 
 
@@ -46,11 +46,11 @@ class SequenceArchitecture:
         return cls(kind, DEFAULT_WIDTH.get(kind, 0))
 
     def empty(self, settings: int, points: int) -> SequenceModel:
-        """A model whose weights and scales are still to be loaded."""
+        """A model before its weights and scales are loaded."""
         return _MODELS[self.kind](settings, points, self.width)
 
     def untrained(self, examples: Sequence[Example], seed: int) -> SequenceModel:
-        """A model with the scales of some examples and initial weights from the seed. Global randomness stays."""
+        """A model with the scales of some examples and weights drawn by the seed; torch's generator is unchanged."""
         settings = len(examples[0].settings)
         points = Frame(settings).fit(examples)
         with torch.random.fork_rng(devices=[]):

@@ -1,9 +1,9 @@
-"""Tracks as padded tensors: what was observed of each, what the launcher was told, and what is asked."""
+"""Tracks as padded tensors: observations, launcher settings, and the times to predict."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
@@ -11,11 +11,50 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
-from ballfg.learning.end_to_end.augment import apply
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.learning.augment import apply
 from ballfg.tracks import Track
 
 LEAST_OBSERVED = 2
-"""Fewest observations that tell a direction."""
+"""Fewest observations that show a direction."""
+
+
+@dataclass(frozen=True)
+class LauncherSettings:
+    """The labels of a track that are its launcher's settings; none: a model sees observations only.
+
+    Attributes:
+        labels: names; those in `categories` are text, one-hot over their values, the others are numbers.
+        categories: the values that each text label takes.
+    """
+
+    labels: tuple[str, ...] = ()
+    categories: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+
+    @property
+    def size(self) -> int:
+        """Number of numbers."""
+        return len(self._reader().names) if self.labels else 0
+
+    def of(self, track: Track) -> Tensor:
+        """(k,) the settings of a track, in the units of their labels.
+
+        Raises: ValueError: if a label is missing, or is not a number or one of the known categories.
+        """
+        if not self.labels:
+            return torch.zeros(0, dtype=torch.float64)
+        settings = self._reader().settings(track.labels)
+        if settings is None:
+            got = {name: track.labels.get(name) for name in self.labels}
+            raise ValueError(
+                f"labels of track {track.name!r} must be known launcher settings; got {got}. "
+                "Complete them or leave the track out."
+            )
+        return settings
+
+    def _reader(self) -> SpinEmbedding:
+        """Reads labels by the rules of the dynamics models; its weights are not used."""
+        return SpinEmbedding(self.labels, self.categories)
 
 
 @dataclass(frozen=True)
@@ -26,8 +65,8 @@ class Example:
         observed_times: (n,) s, increasing to 0.
         observed: (n, 3) m, world frame.
         settings: (k,) the launcher's settings as numbers.
-        times: (m,) s, increasing and positive: where the rest is asked.
-        rest: (m, 3) m, what was measured there; nan where nothing was.
+        times: (m,) s, increasing and positive, to predict.
+        rest: (m, 3) m, measured there; nan without a measurement.
     """
 
     observed_times: Tensor
@@ -37,7 +76,7 @@ class Example:
     rest: Tensor
 
     def seen_from(self, angle: Tensor, shift: Tensor) -> Example:
-        """The same shot from another place (`augment.apply`): () rad, (2,) m. Launcher settings stay as they are."""
+        """The same shot, rotated by () rad and shifted by (2,) m (`augment.apply`); launcher settings stay the same."""
         return replace(self, observed=apply(self.observed, angle, shift), rest=apply(self.rest, angle, shift))
 
 
@@ -83,7 +122,7 @@ def example(track: Track, observed: int, settings: Tensor, times: ArrayLike | No
         observed: >= 2.
         settings: (k,) of this track's launcher.
         times: (m,) s in the track's own time, increasing, later than the last observed sample; None: the stamps of
-            the rest, with what was measured there.
+            the rest, with their measurements.
 
     Raises: ValueError: too few samples, nothing to predict, or times that do not increase from the last observed one.
     """

@@ -1,7 +1,7 @@
-"""Conditional diffusion baseline: from noise to the rest of a track, told what was observed.
+"""Conditional diffusion baseline: from noise to the rest of a track, given the observations.
 
-The network predicts the clean path at every noise level. Levels reach pure noise, so that nothing of the answer leaks
-into training. Source: J. Ho, A. Jain, P. Abbeel 2020 (training); J. Song, C. Meng, S. Ermon 2021 (sampling without
+The network predicts the clean path at every noise level. The last level is pure noise, so that training sees nothing of
+the answer there. Source: J. Ho, A. Jain, P. Abbeel 2020 (training); J. Song, C. Meng, S. Ermon 2021 (sampling without
 noise); S. Lin et al. 2024 (zero terminal signal-to-noise ratio).
 """
 
@@ -15,29 +15,28 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.learning.sequence.data import Batch
-from ballfg.learning.sequence.denoiser import Denoiser
-from ballfg.learning.sequence.encoder import Encoder
 from ballfg.learning.sequence.frame import Frame
 from ballfg.learning.sequence.model import Draw, SequenceModel
+from ballfg.learning.sequence.networks import Denoiser, Encoder
 
 LEVELS = 1000
 """Noise levels; the last is pure noise."""
 DRAWS = 2
-"""Noise levels that a track is trained on per epoch: its observations are read once for all of them."""
+"""Noise levels per track and epoch; the observations are encoded once for all of them."""
 PURE = 0.2
-"""Share of the draws that are at pure noise: sampling starts there, and its first step decides most."""
+"""Share of the draws at pure noise, where sampling starts and its first step decides most."""
 STEPS = 4
-"""Of sampling. On simulated tracks ten steps predict no better."""
+"""Steps of the sampling. On simulated tracks ten steps predict no better."""
 SAMPLES = 4
-"""Paths whose mean is the prediction: on simulated tracks its error is 6 % below one path's; eight gain no more."""
+"""Paths whose mean is the prediction: 6 % less error than one path on simulated tracks; eight gain no more."""
 START_SEED = 0
-"""Of the noise that samplings start from, the same for every track."""
+"""Seed of the noise that sampling starts from, the same for every track."""
 NOISE_STREAM = 1
-"""Sets the noise apart from the augmentation of the same seed, epoch and track."""
+"""Makes the noise differ from the augmentation of the same seed, epoch and track."""
 
 
 def noise_schedule() -> Any:
-    """The levels: cosine, from nearly clean to pure noise. Raises: ImportError: without the package diffusers."""
+    """Cosine levels from nearly clean to pure noise. Raises: ImportError: without the package diffusers."""
     try:
         from diffusers import DDIMScheduler
     except ImportError as error:
@@ -89,7 +88,7 @@ class DiffusionModel(SequenceModel):
         return losses, self.path(denoised.detach().mean(dim=1), batch)
 
     def predict(self, batch: Batch) -> Tensor:
-        """The mean of the paths that sampling without noise leads to from fixed starts; see `SequenceModel`."""
+        """The mean of the paths that sampling gives from fixed starts; see `SequenceModel`."""
         generator = torch.Generator().manual_seed(START_SEED)
         starts = torch.randn(SAMPLES, self.points, 3, generator=generator)[:, : self.points_asked(batch)]
         told = self._condition(batch).repeat_interleave(SAMPLES, dim=0)
@@ -101,7 +100,7 @@ class DiffusionModel(SequenceModel):
         return self.path(path.unflatten(0, (-1, SAMPLES)).mean(dim=1), batch)
 
     def _condition(self, batch: Batch) -> Tensor:
-        """(b, c) what was observed and set."""
+        """(b, c) condition from observations and launcher settings."""
         read = self.encoder(batch, self.frame)
         told: Tensor = self.bridge(torch.cat([read, self.frame.settings(batch).float()], dim=-1))
         return told

@@ -15,9 +15,9 @@ from torch import Tensor, nn
 from ballfg.learning.sequence.data import Batch, Example, collate
 
 LARGEST_GAP = 2.5
-"""Steps between two measured samples beyond which a straight line tells nothing: a bounce may hide there."""
+"""Steps between two samples beyond which nothing is interpolated, since a bounce may lie between them."""
 ROUND = 1e-6
-"""Share of a step by which stamps may miss the grid and still count as on it: stamps are written with few decimals."""
+"""Share of a step by which stamps may miss the grid and still count as on it; files round them."""
 
 
 class Frame(nn.Module):
@@ -47,7 +47,7 @@ class Frame(nn.Module):
         self.register_buffer("settings_unit", torch.ones(settings, dtype=torch.float64))
 
     def fit(self, examples: Sequence[Example]) -> int:
-        """Take the scales of some examples.
+        """Set the scales from some examples.
 
         Returns: the number of grid points that reach to the end of the longest.
 
@@ -78,7 +78,7 @@ class Frame(nn.Module):
         return torch.cat([last[:, :2], self.height[0].expand(len(last), 1)], dim=-1)
 
     def inward(self, positions: Tensor, batch: Batch) -> Tensor:
-        """World positions (b, m, 3) m as the network sees them."""
+        """World positions (b, m, 3) m in the frame."""
         return (positions - self.origin(batch)[:, None]) / self.units
 
     def outward(self, local: Tensor, batch: Batch) -> Tensor:
@@ -90,7 +90,7 @@ class Frame(nn.Module):
         return (batch.settings - self.settings_mean) / self.settings_unit
 
     def at_times(self, path: Tensor, times: Tensor) -> Tensor:
-        """A path on the grid, at any times: straight between its points, straight on beyond the last.
+        """A path on the grid, at any times: linear between its points and beyond the last.
 
         Args:
             path: (b, points + 1, 3) at 0, step, 2 step ...
@@ -105,7 +105,7 @@ class Frame(nn.Module):
         return (1 - weight) * path.gather(1, index) + weight * path.gather(1, index + 1)
 
     def on_grid(self, local: Tensor, batch: Batch, points: int) -> tuple[Tensor, Tensor]:
-        """What was measured, on the grid: straight between samples.
+        """The measured rest on the grid, linear between samples.
 
         Args:
             local: (b, m, 3) the rest, as from `inward`.

@@ -1,4 +1,4 @@
-"""LSTM baseline: one recurrent network reads the observations, another walks on from the last of them."""
+"""LSTM baseline: one recurrent network reads the observations, another predicts step by step."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from ballfg.learning.sequence.frame import Frame
 from ballfg.learning.sequence.model import Draw, SequenceModel
 
 STRIDE = 0.05
-"""Units of the frame that an output of one moves the ball in one grid step, so that outputs are of order one."""
+"""Units of the frame per grid step for an output of one, so that outputs are of order one."""
 SHORTEST_STEP = 0.1
-"""Least interval between observations, in grid steps, that a displacement is divided by: stamps jitter."""
+"""Least interval between observations, in grid steps, that a displacement is divided by, since stamps jitter."""
 
 
 class LstmModel(SequenceModel):

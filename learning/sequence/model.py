@@ -13,7 +13,7 @@ from ballfg.learning.sequence.data import Batch
 from ballfg.learning.sequence.frame import ROUND, Frame
 
 Draw = tuple[int, int, int]
-"""Seed, epoch and track: what the randomness of one track's loss comes from."""
+"""Seed, epoch and track, from which the random numbers of one track's loss derive."""
 
 
 class SequenceModel(nn.Module, ABC):
@@ -31,14 +31,14 @@ class SequenceModel(nn.Module, ABC):
 
     @abstractmethod
     def losses(self, batch: Batch, draws: Sequence[Draw]) -> tuple[Tensor, Tensor]:
-        """What training takes the gradient of.
+        """The losses of a batch.
 
         Args:
             batch: with a measured rest.
             draws: one for each track.
 
-        Returns: (losses, positions): (b,) differentiable, in squared units of the frame; (b, m, 3) m what the model
-            held for the rest while it was trained on it, without gradient.
+        Returns: (losses, positions): (b,) differentiable, in squared units of the frame; (b, m, 3) m, the rest as
+            predicted in training, without gradient.
         """
 
     @abstractmethod

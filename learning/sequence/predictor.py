@@ -1,23 +1,47 @@
-"""A trained sequence model for use: predictions from tracks, and its folder on disk."""
+"""A trained sequence model for use: predictions from tracks, and its folder with a config and weights."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Annotated, Literal
 
 import numpy as np
 import torch
+import yaml
 from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor
 
+from ballfg.files.strict_yaml import YamlError, read_yaml
+from ballfg.files.whole_folder import whole_folder
 from ballfg.learning.sequence.architecture import SequenceArchitecture
-from ballfg.learning.sequence.data import collate, example
-from ballfg.learning.sequence.files import read_folder, write_folder
-from ballfg.learning.sequence.launcher import LauncherSettings
+from ballfg.learning.sequence.data import LauncherSettings, collate, example
 from ballfg.learning.sequence.model import SequenceModel
 from ballfg.tracks import Track
 
 CHUNK = 64
-"""Tracks that are predicted at once: bounds the memory."""
+"""Tracks that are predicted at once, which bounds the memory."""
+CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
+
+
+class FolderConfig(BaseModel):
+    """What `config.yaml` says."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+    kind: Literal["lstm", "diffusion"]
+    """Of the model."""
+    width: int
+    """Of its hidden states."""
+    points: Annotated[int, Field(ge=1)]
+    """Of the grid on which it predicts."""
+    labels: Annotated[tuple[str, ...], Field(strict=False)]
+    """Labels that are launcher settings."""
+    categories: dict[str, Annotated[tuple[str, ...], Field(strict=False)]]
+    """Values of those that are text."""
 
 
 class SequencePredictor:
@@ -59,7 +83,14 @@ class SequencePredictor:
     def predict_many(
         self, tracks: Sequence[Track], observed: Sequence[int], times: Sequence[ArrayLike]
     ) -> list[NDArray[np.float64]]:
-        """The same for many tracks: one entry of `observed` and `times` each.
+        """Positions of many tracks, as `predict` gives them.
+
+        Args:
+            tracks: as for `predict`.
+            observed: one number per track.
+            times: (k,) s, one array per track.
+
+        Returns: (k, 3) m, one array per track.
 
         Raises: ValueError: as `predict`.
         """
@@ -80,6 +111,9 @@ class SequencePredictor:
 
         Raises: ValueError: if the folder exists.
         """
+        folder = Path(folder)
+        if folder.exists():
+            raise ValueError(f"folder must be new; {folder} exists. Choose another name or delete it.")
         config = {
             "kind": self.architecture.kind,
             "width": self.architecture.width,
@@ -87,7 +121,11 @@ class SequencePredictor:
             "labels": list(self.launcher.labels),
             "categories": {label: list(values) for label, values in self.launcher.categories.items()},
         }
-        write_folder(Path(folder), config, self.model.state_dict())
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        with whole_folder(folder) as part:
+            text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
+            (part / CONFIG).write_text(text, encoding="utf-8")
+            save_file({name: value.contiguous() for name, value in self.model.state_dict().items()}, part / WEIGHTS)
 
     @classmethod
     def load(cls, folder: str | Path) -> SequencePredictor:
@@ -97,7 +135,7 @@ class SequencePredictor:
             FileNotFoundError: the folder or one of its files is missing.
             ValueError: a file is damaged, or weights do not go with the config.
         """
-        config, weights = read_folder(Path(folder))
+        config, weights = _read(Path(folder))
         architecture = SequenceArchitecture(config.kind, config.width)
         launcher = LauncherSettings(config.labels, config.categories)
         model = architecture.empty(launcher.size, config.points)
@@ -111,3 +149,19 @@ class SequencePredictor:
             )
         model.load_state_dict(weights)
         return cls(architecture, launcher, model)
+
+
+def _read(folder: Path) -> tuple[FolderConfig, dict[str, Tensor]]:
+    """Config and weights of a folder."""
+    for name in (CONFIG, WEIGHTS):
+        if not (folder / name).is_file():
+            raise FileNotFoundError(f"{folder} must hold {CONFIG} and {WEIGHTS}; {name} is missing. Save it again.")
+    try:
+        config = FolderConfig.model_validate(read_yaml(folder / CONFIG))
+    except (YamlError, ValidationError) as error:
+        raise ValueError(f"{folder / CONFIG}: not the config of a sequence model ({error}). Save it again.") from None
+    try:
+        weights = load_file(folder / WEIGHTS)
+    except SafetensorError as error:
+        raise ValueError(f"{folder / WEIGHTS}: not readable as safetensors ({error}). Save the model again.") from None
+    return config, weights

@@ -1,35 +1,43 @@
-"""A sequence model with its tracks, as the training loop takes it."""
+"""A sequence model with its tracks, for the training loop."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import cast
 
 import torch
 from torch import Tensor
 
-from ballfg.learning.end_to_end.augment import augmentation
-from ballfg.learning.sequence.architecture import SequenceArchitecture
-from ballfg.learning.sequence.data import Batch, Example, collate, example
-from ballfg.learning.sequence.launcher import LauncherSettings
+from ballfg.learning.augment import augmentation
+from ballfg.learning.config.training import TrainConfig
+from ballfg.learning.sequence.architecture import SequenceArchitecture, SequenceKind
+from ballfg.learning.sequence.data import Batch, Example, LauncherSettings, collate, example
 from ballfg.learning.sequence.model import SequenceModel
 from ballfg.learning.sequence.predictor import SequencePredictor
-from ballfg.learning.trainee import BatchLoss, Trainee
+from ballfg.learning.shots import Shot
+from ballfg.learning.trainee import BatchLoss, Prepared, Trainee
+from ballfg.learning.training_data import read_training_data
 from ballfg.tracks import Track
+
+FOLDER = "model"
+"""Of the predictor, in that of a training."""
 
 
 class SequenceTrainee(Trainee):
     """Trains an LSTM or diffusion model to predict the unobserved rest of tracks.
 
-    A track that cannot be used - too short, launcher settings missing - is reported as failed whenever it is asked for.
+    A track that cannot be used - too short, launcher settings missing - counts as failed in each batch.
 
     Args:
         tracks: all parts.
-        observed: how many samples are observed of each.
-        train: numbers of the tracks whose scales the model takes; at least one that can be used.
+        observed: number of observed samples of each.
+        train: numbers of the training tracks, from which the model takes its scales; at least one that can be used.
         architecture: kind and size.
-        launcher: which labels are settings.
+        launcher: its labels.
         seed: of initial weights, augmentation and diffusion noise, >= 0.
-        augment: turn and shift training tracks.
+        augment: whether training tracks are rotated and shifted.
 
     Raises: ValueError: if no track of the training part can be used.
     """
@@ -71,7 +79,7 @@ class SequenceTrainee(Trainee):
         """
         numbers = [number for number in tracks if number in self._examples]
         if not numbers:
-            return self._nothing(tracks)
+            return BatchLoss.none(self._failed(tracks))
         examples = [self._seen(number, epoch) for number in numbers]
         batch = collate(examples)
         losses, positions = self.module.losses(batch, [(self._seed, epoch, number) for number in numbers])
@@ -81,7 +89,7 @@ class SequenceTrainee(Trainee):
         """Mean squared error of true predictions, diffusion: sampled; the sum over tracks, in squared units."""
         numbers = [number for number in tracks if number in self._examples]
         if not numbers:
-            return self._nothing(tracks)
+            return BatchLoss.none(self._failed(tracks))
         batch = collate([self._examples[number] for number in numbers])
         with torch.no_grad():
             positions = self.module.predict(batch)
@@ -91,6 +99,12 @@ class SequenceTrainee(Trainee):
     def predictor(self) -> SequencePredictor:
         """The model as it is now, for use."""
         return SequencePredictor(self._architecture, self._launcher, self.module)
+
+    def export(self, folder: Path) -> Path:
+        """Write the predictor. Returns: its folder, for `SequencePredictor.load`."""
+        path = folder / FOLDER
+        self.predictor().save(path)
+        return path
 
     def _seen(self, number: int, epoch: int) -> Example:
         if not self._augment:
@@ -107,8 +121,35 @@ class SequenceTrainee(Trainee):
             failed=self._failed(tracks),
         )
 
-    def _nothing(self, tracks: Sequence[int]) -> BatchLoss:
-        return BatchLoss(torch.zeros((), dtype=torch.float64), 0, 0.0, 0, self._failed(tracks))
-
     def _failed(self, tracks: Sequence[int]) -> tuple[tuple[str, str], ...]:
         return tuple((self._names[number], self._unusable[number]) for number in tracks if number in self._unusable)
+
+
+def build_sequence(config: TrainConfig) -> Prepared:
+    """The trainee of the kinds lstm and diffusion, on the same shots as a model of the dynamics would have.
+
+    Raises: ValueError, FileNotFoundError: bad input.
+    """
+    data = read_training_data(config)
+    launcher = LauncherSettings()
+    if data.embedding is not None:
+        launcher = LauncherSettings(data.embedding.labels, data.embedding.categories)
+    usable = [_usable(shot) for shot in data.shots]
+    trainee = SequenceTrainee(
+        [track for track, _ in usable],
+        [observed for _, observed in usable],
+        data.train,
+        architecture=SequenceArchitecture.of(cast(SequenceKind, config.kind)),
+        launcher=launcher,
+        seed=config.seed,
+        augment=config.augmented,
+    )
+    return Prepared(trainee, data.train, data.validation)
+
+
+def _usable(shot: Shot) -> tuple[Track, int]:
+    """The usable samples of a shot, and the number of those that are observed."""
+    keep, track = shot.usable, shot.track
+    sigmas = None if track.sigmas is None else track.sigmas[keep]
+    kept = replace(track, times=track.times[keep], positions=track.positions[keep], sigmas=sigmas)
+    return kept, int(keep[: shot.observed].sum())

@@ -12,7 +12,7 @@ import yaml
 
 from ballfg.cli.main import run as ballfg
 from ballfg.dynamics import load_model
-from ballfg.learning.calibration import checkpoint as checkpoints
+from ballfg.learning.calibration import run as calibration
 from ballfg.learning.calibration.coefficients import values_of
 from ballfg.learning.cli import run
 from ballfg.learning.run import run_folder as files
@@ -66,14 +66,14 @@ def test_a_run_writes_all_its_files(finished: Path, few_tracks: Path, tmp_path: 
 
 
 def interrupt_after(monkeypatch: pytest.MonkeyPatch, steps: int) -> None:
-    real = checkpoints.write_checkpoint
+    real = calibration.write_checkpoint
 
     def write(folder: Path, problem: Any, done: list[Any]) -> None:
         real(folder, problem, done)
         if len(done) == steps:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(checkpoints, "write_checkpoint", write)
+    monkeypatch.setattr(calibration, "write_checkpoint", write)
 
 
 def test_ctrl_c_keeps_the_checkpoint_and_a_resumed_run_ends_the_same(

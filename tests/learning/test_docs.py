@@ -6,8 +6,12 @@ import re
 
 import pytest
 import torch
+import yaml
+from safetensors.torch import load_file
 
-from ballfg.learning.config.config_file import read_config
+from ballfg.learning import TRAINEES, read_config
+from ballfg.learning.run.metrics import read_metrics
+from ballfg.simulation import SimulationConfig, write_simulation
 from tests.learning.estimates import directional
 from tests.places import DOCS
 
@@ -36,9 +40,28 @@ def test_training_from_python(examples: list[str], tmp_path, monkeypatch, capsys
     assert trained.position_scale != 1.0
 
 
+def test_a_kind_of_one_s_own(examples: list[str], tmp_path, monkeypatch, capsys) -> None:
+    """One class and one registration: it trains through the config file, for one epoch."""
+    monkeypatch.chdir(tmp_path)
+    write_simulation("shots", SimulationConfig(tracks=5, rate=60.0, seed=1))
+    with TRAINEES.restored():
+        names: dict[str, object] = {"__name__": "guide"}
+        exec(compile(examples[1], str(GUIDE), "exec"), names)
+        exec(compile(examples[2], str(GUIDE), "exec"), names)
+        with pytest.raises(ValueError, match=r"'kind' must be 'a-tune', .* or 'parabola'; got 'parabel'"):
+            read_config("parabola.yaml", ["kind=parabel"])
+    assert "parabola: 4 tracks train, 1 validate" in capsys.readouterr().out
+    before, after = read_metrics(tmp_path / "shots-parabola" / "metrics.csv")
+    assert (before.epoch, after.epoch) == (0, 1)
+    assert after.validation_rmse < before.validation_rmse
+    down = float(load_file(tmp_path / "shots-parabola" / "parabola.safetensors")["acceleration"][2])
+    assert down < 0.0
+    assert yaml.safe_load((tmp_path / "shots-parabola" / "config.yaml").read_text())["kind"] == "parabola"
+
+
 def test_gradient_of_a_foreign_solver(examples: list[str], capsys) -> None:
     names: dict = {}
-    exec(compile(examples[1], str(GUIDE), "exec"), names)
+    exec(compile(examples[3], str(GUIDE), "exec"), names)
     assert capsys.readouterr().out.startswith("[")
     assert float(names["residual"](names["solve"]()).detach().abs().max()) > 0.1  # it does bend
 

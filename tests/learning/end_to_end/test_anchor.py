@@ -8,10 +8,9 @@ import pytest
 import torch
 
 from ballfg.dynamics import nominal_model
-from ballfg.learning.config.build import build
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.end_to_end.anchor import Anchor
-from ballfg.learning.end_to_end.pretrain import random_states
+from ballfg.learning.end_to_end.pretrain import Anchor, random_states
+from ballfg.learning.run.training import build
 from ballfg.state import VELOCITY, VZ
 
 SMALL = {"width_flight": 4, "width_contact": 4, "depth": 1, "residual": True}

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.learning.config.build import build
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.run.optimizer import make_optimizer
+from ballfg.learning.run.training import build
 
 
 def after_a_step(data: Path, **optimizer: float) -> dict[str, float]:

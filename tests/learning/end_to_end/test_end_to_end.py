@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -13,10 +14,10 @@ from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.learned import LearnedModel, build
 from ballfg.estimation import Smoother
 from ballfg.factors.graph import LevenbergMarquardt
+from ballfg.learning.augment import augmentation
 from ballfg.learning.config.training import LossConfig
 from ballfg.learning.end_to_end import end_to_end, solving
-from ballfg.learning.end_to_end.augment import augmentation
-from ballfg.learning.end_to_end.end_to_end import COEFFICIENT_STEP, LOSS_UNIT, EndToEnd
+from ballfg.learning.end_to_end.end_to_end import COEFFICIENT_STEP, LOSS_UNIT, SOLUTION_TOLERANCE, EndToEnd
 from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
 from ballfg.learning.end_to_end.solving import Pose
 from ballfg.learning.gradient.conjugate_gradients import ConjugateGradients, NotAMinimum
@@ -76,18 +77,18 @@ STEPS = {
 }
 
 
-def test_gradient_is_that_of_the_loss(monkeypatch) -> None:
+EXACT = partial(ConjugateGradients, tolerance=1e-12)
+
+
+def test_gradient_is_that_of_the_loss() -> None:
     """Through rollout and estimate together; 1e-7 is seen when both are solved tightly."""
-    monkeypatch.setattr(end_to_end, "SOLUTION_TOLERANCE", 1e-12)
-    check(trainee(LossConfig(position_scale=0.01)), STEPS, 2e-6)
+    check(trainee(LossConfig(position_scale=0.01), linear_solver=EXACT), STEPS, 2e-6)
 
 
 def test_gradient_as_it_is_used() -> None:
     """With the tolerances of a training, against those of the tight solution."""
     loose = gradient(trainee(optimizer=solving.TRAINING))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(end_to_end, "SOLUTION_TOLERANCE", 1e-12)
-        tight = gradient(trainee())
+    tight = gradient(trainee(linear_solver=EXACT))
     errors = {name: float((loose[name] - tight[name]).norm() / tight[name].norm()) for name in tight}
     print({name: f"{error:.0e}" for name, error in errors.items()})  # shown by -s
     assert max(errors.values()) < 1e-3
@@ -314,20 +315,18 @@ def test_tracks_that_do_not_converge_are_left_out() -> None:
 
 
 class Choosy(ConjugateGradients):
-    """Finds no minimum wherever a track of `length` states is in the batch."""
-
-    length = 0
+    """Finds no minimum wherever a track of one sample less than the others is in the batch."""
 
     def __call__(self, product, right):
         lengths = torch.bincount(self.owners) // 9
-        wrong = (lengths == self.length).nonzero()[:, 0].tolist()
+        wrong = (lengths == OBSERVED - 1).nonzero()[:, 0].tolist()
         if wrong:
             raise NotAMinimum("no minimum", wrong)
         return super().__call__(product, right)
 
 
 @pytest.mark.parametrize("wrong", [1, 2])
-def test_tracks_without_a_gradient_are_left_out(wrong, monkeypatch) -> None:
+def test_tracks_without_a_gradient_are_left_out(wrong) -> None:
     """Found in the backward pass; the others' loss and gradient are what they are without it."""
     model, settings = usual_ball(), replace(SETTINGS, launcher=launcher())
     tracks = measured(model, lengths=(36, 30, 40))
@@ -339,8 +338,7 @@ def test_tracks_without_a_gradient_are_left_out(wrong, monkeypatch) -> None:
     learner = EndToEnd(made, learnables, LossConfig())
     others = [k for k in range(3) if k != wrong]
     expected, gradients = learner.loss(others, 0), gradient(learner, others)
-    monkeypatch.setattr(Choosy, "length", OBSERVED - 1)
-    monkeypatch.setattr(end_to_end, "ConjugateGradients", Choosy)
+    learner.linear_solver = partial(Choosy, tolerance=SOLUTION_TOLERANCE)
     found = learner.loss((0, 1, 2), 0)
     assert found.failed == ((f"track {wrong}", "no minimum"),)
     assert (found.tracks, found.points) == (expected.tracks, expected.points)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.learning.config.build import build
 from ballfg.learning.config.training import TrainConfig
+from ballfg.learning.run.training import build
 from ballfg.simulation import MeasurementNoise, SimulationConfig, table_tennis, write_simulation
 from ballfg.tracks import read_dataset, write_dataset
 

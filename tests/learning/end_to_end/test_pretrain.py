@@ -8,15 +8,11 @@ import torch
 from ballfg.dynamics import nominal_model
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.learned import LearnedModel, build
-from ballfg.learning.end_to_end import pretrain as module
 from ballfg.learning.end_to_end.pretrain import pretrain
 from ballfg.state import SPIN, VELOCITY
 from tests.learning.estimates import usual_ball
 
-
-@pytest.fixture(autouse=True)
-def few_samples(monkeypatch) -> None:
-    monkeypatch.setattr(module, "SAMPLES", 300)
+SAMPLES = 300
 
 
 def small(kind: str = "mnn+gs", *, spin_rate: bool = False) -> LearnedModel:
@@ -44,7 +40,7 @@ def misfit(model: LearnedModel, teacher, seed: int, *, spin_rate: bool = False) 
 def test_a_fit_is_better_on_states_that_it_did_not_see() -> None:
     model, teacher = small(), nominal_model()
     before = misfit(model, teacher, 99)
-    left = pretrain(model, teacher, seed=0, iterations=60)
+    left = pretrain(model, teacher, seed=0, iterations=60, samples=SAMPLES)
     after = misfit(model, teacher, 99)
     print(before, left, after)  # shown by -s
     assert after < 0.5 * before
@@ -54,15 +50,15 @@ def test_a_fit_is_better_on_states_that_it_did_not_see() -> None:
 def test_what_is_left_is_what_is_returned() -> None:
     """No iterations past the first: the states of the seed, the units of the module."""
     model, teacher = small(spin_rate=True), usual_ball()  # whose spin decays
-    left = pretrain(model, teacher, seed=3, iterations=1)
+    left = pretrain(model, teacher, seed=3, iterations=1, samples=SAMPLES)
     assert left == pytest.approx(misfit(model, teacher, 4, spin_rate=True), rel=0.3)
 
 
 def test_the_same_seed_gives_the_same_weights() -> None:
     first, second, other = small(), small(), small()
-    pretrain(first, nominal_model(), seed=0, iterations=3)
-    pretrain(second, nominal_model(), seed=0, iterations=3)
-    pretrain(other, nominal_model(), seed=1, iterations=3)
+    pretrain(first, nominal_model(), seed=0, iterations=3, samples=SAMPLES)
+    pretrain(second, nominal_model(), seed=0, iterations=3, samples=SAMPLES)
+    pretrain(other, nominal_model(), seed=1, iterations=3, samples=SAMPLES)
     for (name, a), b, c in zip(first.named_parameters(), second.parameters(), other.parameters(), strict=True):
         assert torch.equal(a, b), name
         assert not torch.equal(a, c) or name == "offset"
@@ -72,7 +68,7 @@ def test_only_the_networks_change() -> None:
     """Not the surfaces' offset, and nothing of the teacher; no gradient is left behind in it."""
     model, teacher = small("mlp"), usual_ball()
     offset, values = model.offset.detach().clone(), [p.detach().clone() for p in teacher.parameters()]
-    pretrain(model, teacher, seed=0, iterations=2)
+    pretrain(model, teacher, seed=0, iterations=2, samples=SAMPLES)
     assert torch.equal(model.offset, offset)
     assert all(torch.equal(p, v) for p, v in zip(teacher.parameters(), values, strict=True))
     assert all(p.grad is None for p in teacher.parameters())

@@ -10,7 +10,7 @@ import torch
 
 from ballfg.estimation import Smoother
 from ballfg.factors.graph import LevenbergMarquardt
-from ballfg.learning.end_to_end.augment import augmentation
+from ballfg.learning.augment import augmentation
 from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
 from ballfg.learning.end_to_end.solving import BatchSolver, Pose, WarmStarts
 from ballfg.tracks import SPIN_LABELS, Track

@@ -16,7 +16,6 @@ from ballfg.factors.covariance import marginal_covariances
 from ballfg.factors.loss import Loss
 from ballfg.learning.end_to_end.learnables import NoiseScales
 from ballfg.learning.gradient.likelihood import negative_log_likelihood
-from ballfg.learning.gradient.posterior import posterior_of
 from tests.learning.estimates import (
     NOISE,
     SETTINGS,
@@ -184,7 +183,7 @@ def test_pieces_that_nothing_links() -> None:
 def test_posterior_covariances_are_the_smoother_s(coefficients) -> None:
     """Padding of the shorter track changes nothing, and neighbours' covariances are those of a dense inverse."""
     found = falling(coefficients=coefficients).solve()
-    posterior = posterior_of(factors_of(found))
+    posterior = factors_of(found).covariances()
     for k, one in enumerate(found):
         n, p = len(one.minimum.values.states), int(coefficients)
         expected = marginal_covariances(one.minimum.step.bayes_net, n, p)

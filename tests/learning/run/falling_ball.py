@@ -1,7 +1,7 @@
 """A small model with data of its own, for the tests of the loop: drag and gravity of falling balls, by rollouts.
 
-Start: `python falling_ball.py CONFIG.yaml --data WORDS ...` is `ballfg-train` with this model; the words of `data`
-say what its tracks are like.
+It is registered as the kind `falling-balls`. `python falling_ball.py CONFIG.yaml --data WORDS ...` is `ballfg-train`
+with this kind; the words of `data` say what its tracks are like.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -18,17 +17,12 @@ from safetensors.torch import save_file
 from torch import Tensor, nn
 
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.trainee import BatchLoss, Trainee
+from ballfg.learning.registry import TraineeKind, register_trainee
+from ballfg.learning.trainee import BatchLoss, Prepared, Trainee
 
 TRUE_DRAG, TRUE_GRAVITY = 0.4, 9.81
 TIMES = torch.linspace(0.0, 0.6, 13, dtype=torch.float64)
 NOISE = 0.001
-
-
-class Run(NamedTuple):
-    trainee: Trainee
-    train: range
-    validation: range
 
 
 class Ball(nn.Module):
@@ -52,8 +46,11 @@ class Ball(nn.Module):
         return -self.drag * velocity.norm(dim=-1, keepdim=True) * velocity + down
 
 
-class FallingBalls(Trainee):
+@register_trainee
+class FallingBalls(Trainee, TraineeKind):
     """Tracks whose first velocity is not known: each visit improves it, from where the last one left it."""
+
+    name = "falling-balls"
 
     def __init__(self, words: Sequence[str], seed: int, tracks: int = 13) -> None:
         self.words, self.seed = words, seed
@@ -67,6 +64,19 @@ class FallingBalls(Trainee):
             start = torch.tensor([4.0, 3.0]) + torch.randn(tracks, 2, generator=random, dtype=torch.float64)
             places = truth(start)
         self.measured = places + NOISE * torch.randn(places.shape, generator=random, dtype=torch.float64)
+
+    @classmethod
+    def build(cls, config: TrainConfig) -> Prepared:
+        assert config.data is not None
+        if "missing" in config.data:
+            raise FileNotFoundError("dataset missing does not exist.")
+        print("note: read", file=sys.stderr)
+        validation = range(10, 10 if config.split.by == "none" else 13)
+        return Prepared(cls(config.data, config.seed), range(10), validation)
+
+    def export(self, folder: Path) -> Path:
+        save_file(self.module.state_dict(), folder / "ball.safetensors")
+        return folder / "ball.safetensors"
 
     def loss(self, tracks: Sequence[int], epoch: int) -> BatchLoss:
         if "slow" in self.words:
@@ -115,21 +125,6 @@ class FallingBalls(Trainee):
         self.velocities = {int(name.split(".")[0]): tensor for name, tensor in memory.items()}
 
 
-def build(config: TrainConfig) -> Run:
-    assert config.data is not None
-    if "missing" in config.data:
-        raise FileNotFoundError("dataset missing does not exist.")
-    print("note: read", file=sys.stderr)
-    return Run(FallingBalls(config.data, config.seed), range(10), range(10, 10 if config.split.by == "none" else 13))
-
-
-def export(trainee: Trainee, folder: Path) -> Path:
-    save_file(trainee.module.state_dict(), folder / "ball.safetensors")
-    return folder / "ball.safetensors"
-
-
-if __name__ in ("__main__", "__mp_main__"):  # the latter in processes that the former starts
-    sys.modules["ballfg.learning.config.build"] = sys.modules[__name__]
 if __name__ == "__main__":
     from ballfg.learning.cli import run
 

@@ -1,4 +1,4 @@
-"""What two processes of a group say to each other; run by `test_distributed` through `launch`."""
+"""What two processes of a group say to each other; run by `test_ranks` through `launch`."""
 
 from __future__ import annotations
 

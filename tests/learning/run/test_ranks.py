@@ -12,6 +12,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+import tests.learning.run.falling_ball  # noqa: F401 - registers its kind
 from ballfg.learning.config.config_file import read_config
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.run.checkpoint import read_checkpoint
@@ -20,12 +21,11 @@ from ballfg.learning.run.metrics import read_metrics
 from ballfg.learning.run.ranks import Ranks, SharedMemory, Trouble
 from ballfg.learning.run.training import run_training
 from ballfg.progress import progress
-from tests.learning.run import falling_ball
 from tests.learning.run.talking_ranks import die, talk
 
 BALL = Path(__file__).parent / "falling_ball.py"
 TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2")
-CONFIG = "seed: 3\noptimizer: {learning_rate: 0.02, batch: 3, epochs: 3}\n"
+CONFIG = "kind: falling-balls\nseed: 3\noptimizer: {learning_rate: 0.02, batch: 3, epochs: 3}\n"
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def trained(folder: Path, *words: str, start: tuple[str, ...] = (sys.executable,
 def one(folder: Path) -> Path:
     config = read_config(folder / "train.yaml", ["data=plain"])
     assert isinstance(config, TrainConfig)
-    run_training(config, folder / "one", False, falling_ball.build, falling_ball.export, progress)
+    run_training(config, folder / "one", resume=False, watch=progress)
     return folder / "one"
 
 
@@ -122,7 +122,7 @@ def test_ctrl_c_keeps_the_last_epoch(folder: Path, workers: int) -> None:
     ]
     kept = read_checkpoint(out)
     assert kept is not None
-    assert kept.standing.epoch == 2
+    assert kept.progress.epoch == 2
     assert [row.epoch for row in read_metrics(out / "metrics.csv")] == [0, 1, 2]
     assert not [path.name for path in out.iterdir() if path.name.startswith(".")]
 

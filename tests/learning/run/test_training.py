@@ -13,12 +13,12 @@ import yaml
 from safetensors.torch import load_file
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
+import tests.learning.run.falling_ball  # noqa: F401 - registers its kind
 from ballfg.learning.config.training import OptimizerConfig, TrainConfig
+from ballfg.learning.run import record, training
 from ballfg.learning.run import run_folder as files
-from ballfg.learning.run import training
 from ballfg.learning.run.checkpoint import read_checkpoint
 from ballfg.learning.run.metrics import Epoch, epoch_line, read_metrics, write_metrics
-from tests.learning.run.falling_ball import build, export
 
 
 def pass_on(items: Iterable[list[int]], _total: int, _what: str) -> Iterator[list[int]]:
@@ -27,11 +27,11 @@ def pass_on(items: Iterable[list[int]], _total: int, _what: str) -> Iterator[lis
 
 def config(*, epochs: int = 4, seed: int = 3, data: str = "plain", **fields: Any) -> TrainConfig:
     optimizer = OptimizerConfig(learning_rate=0.05, batch=4, epochs=epochs, schedule="constant")
-    return TrainConfig(seed=seed, data=data, optimizer=optimizer, **fields)
+    return TrainConfig(**{"kind": "falling-balls", "seed": seed, "data": data, "optimizer": optimizer} | fields)
 
 
 def run(settings: TrainConfig, folder: Path, *, resume: bool = False) -> None:
-    training.run_training(settings, folder, resume, build, export, pass_on)
+    training.run_training(settings, folder, resume=resume, watch=pass_on)
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_a_run_writes_all_its_files(finished: Path) -> None:
     kept = read_checkpoint(finished)
     assert kept is not None
     assert torch.equal(load_file(finished / "ball.safetensors")["drag"], kept.best["drag"])
-    assert kept.standing.best_rmse == min(row.validation_rmse for row in rows if row.validation_rmse)
+    assert kept.progress.best_rmse == min(row.validation_rmse for row in rows if row.validation_rmse)
 
 
 def test_tensorboard_shows_the_same_numbers(finished: Path) -> None:
@@ -87,14 +87,14 @@ def test_a_resumed_run_is_the_uninterrupted_one(finished: Path, tmp_path: Path, 
 def test_ctrl_c_between_checkpoints_says_what_is_kept(
     tmp_path: Path, capsys: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    real = training.write_metrics
+    real = record.write_metrics
 
     def write(path: Path, epochs: list[Epoch]) -> None:
         if epochs[-1].epoch == 3:
             raise KeyboardInterrupt
         real(path, epochs)
 
-    monkeypatch.setattr(training, "write_metrics", write)
+    monkeypatch.setattr(record, "write_metrics", write)
     with pytest.raises(KeyboardInterrupt):
         run(config(checkpoint_every=2), tmp_path / "run")
     assert f"epochs up to 2 are kept; continue with --resume {tmp_path / 'run'}" in capsys.readouterr().err
@@ -109,7 +109,7 @@ def test_what_does_not_fit_is_refused_and_nothing_is_changed(finished: Path, tmp
         (config(), False, "out must not hold an earlier run"),
         (config(seed=4), True, "'seed' was 3 and is 4"),
         (config(data="other"), True, r"'data' was \['plain'\] and is \['other'\]"),
-        (config(kind="mlp"), True, "'kind' was 'mnn\\+gs' and is 'mlp'"),
+        (config(kind="mlp"), True, "'kind' was 'falling-balls' and is 'mlp'"),
     ):
         with pytest.raises(ValueError, match=message):
             run(settings, folder, resume=resume)

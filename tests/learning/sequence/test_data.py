@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.learning.end_to_end.augment import apply, augmentation
+from ballfg.learning.augment import apply, augmentation
 from ballfg.learning.sequence.data import collate, example
 from ballfg.tracks import Track
 

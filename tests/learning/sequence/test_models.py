@@ -10,8 +10,7 @@ import pytest
 import torch
 
 from ballfg.learning.sequence.architecture import SequenceArchitecture, SequenceKind
-from ballfg.learning.sequence.data import Example, collate, example
-from ballfg.learning.sequence.launcher import LauncherSettings
+from ballfg.learning.sequence.data import Example, LauncherSettings, collate, example
 from ballfg.learning.sequence.model import SequenceModel
 from ballfg.tracks import Track
 

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from ballfg.learning.end_to_end.augment import SHIFT, apply, augmentation, rotate, undo
+from ballfg.learning.augment import SHIFT, apply, augmentation, rotate, undo
 
 
 def test_a_quarter_turn_takes_x_to_y_and_the_shift_comes_after() -> None:

@@ -13,12 +13,12 @@ from ballfg.dynamics import load_model
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.estimation import dataset_settings
-from ballfg.learning.config.build import FIRST_SPIN, FIRST_SPIN_NOISE, build, categories_of, export, trained_model
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.end_to_end import pretrain
 from ballfg.learning.end_to_end.end_to_end import EndToEnd
 from ballfg.learning.gradient.implicit import GaussNewtonGradient, ImplicitGradient, UnrolledGradient
+from ballfg.learning.run.training import build
 from ballfg.learning.sequence.trainee import SequenceTrainee
+from ballfg.learning.training_data import FIRST_SPIN, FIRST_SPIN_NOISE, categories_of
 from ballfg.tracks import Track, read_dataset
 
 OBSERVE = {"samples": 25}
@@ -32,11 +32,6 @@ def config(data: Path | list[Path], **fields) -> TrainConfig:
 
 def launched(**fields) -> dict:
     return {"launcher": {"labels": ["topspin", "sidespin", "group"]}, "loss": {"likelihood": 1.0}} | fields
-
-
-@pytest.fixture(autouse=True)
-def few_samples(monkeypatch) -> None:
-    monkeypatch.setattr(pretrain, "SAMPLES", 100)
 
 
 def test_coefficients_of_the_analytic_model(few_tracks) -> None:
@@ -140,7 +135,7 @@ def test_a_label_that_no_track_has(few_tracks) -> None:
 def test_categories_are_the_texts() -> None:
     times, positions = np.arange(2.0), np.zeros((2, 3))
     labels = ({"gun": "b", "level": 2.0}, {"gun": "a", "level": 3.0}, {"gun": "b"})
-    tracks = [(0, Track(str(k), times, positions, labels=one)) for k, one in enumerate(labels)]
+    tracks = [Track(str(k), times, positions, labels=one) for k, one in enumerate(labels)]
     assert categories_of(["level", "gun"], tracks) == {"gun": ("a", "b")}
 
 
@@ -153,7 +148,7 @@ def test_a_trained_model_goes_out_and_into_an_estimator(no_spin_labels, tmp_path
         learnables.noise.position.fill_(0.5)
         learnables.noise.spin.fill_(-1.0)
         learnables.embedding.weight += 0.25
-    path = export(trainee, tmp_path)
+    path = trainee.export(tmp_path)
     model, dataset = (
         load_model(path, radius=read_dataset(no_spin_labels).info.ball.radius),
         read_dataset(no_spin_labels),
@@ -176,7 +171,7 @@ def test_a_trained_model_goes_out_and_into_an_estimator(no_spin_labels, tmp_path
 
 def test_without_launcher_nothing_is_said_of_spins(few_tracks) -> None:
     trainee, *_ = build(config(few_tracks, kind="a-tune"))
-    trained = trained_model(trainee).trained
+    trained = trainee.trained_model().trained
     assert (trained.launcher, trained.spin_noise, trained.position_scale) == (None, None, 1.0)
     assert dict(trained.process_noise) == vars(trainee.shots[0].settings.process)
 
@@ -210,6 +205,6 @@ def test_tracks_that_are_too_short_are_told(few_tracks, capsys) -> None:
 
 def test_a_learned_model_is_no_start(no_spin_labels, tmp_path) -> None:
     trainee, *_ = build(config(no_spin_labels, architecture=SMALL))
-    path = export(trainee, tmp_path)
+    path = trainee.export(tmp_path)
     with pytest.raises(ValueError, match=r"model must be analytic; .* has a learned part"):
         build(config(no_spin_labels, kind="a-tune", model=str(path)))

@@ -1,0 +1,65 @@
+"""From a config to a model of the dynamics that is trained through the estimator."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from ballfg.dynamics import AnalyticModel, BallModel
+from ballfg.dynamics.networks.architecture import Architecture
+from ballfg.dynamics.networks.learned import build as build_model
+from ballfg.learning.config.training import TrainConfig
+from ballfg.learning.end_to_end.end_to_end import EndToEnd
+from ballfg.learning.end_to_end.first_spins import begin_with_tracks
+from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
+from ballfg.learning.end_to_end.pretrain import Anchor, pretrain
+from ballfg.learning.gradient.implicit import GaussNewtonGradient, GradientMethod, ImplicitGradient, UnrolledGradient
+from ballfg.learning.kinds import NETWORKS
+from ballfg.learning.trainee import Prepared
+from ballfg.learning.training_data import read_training_data
+
+GRADIENTS: Mapping[str, type[GradientMethod]] = {
+    "implicit": ImplicitGradient,
+    "gauss-newton": GaussNewtonGradient,
+    "unrolled": UnrolledGradient,
+}
+
+
+def build_end_to_end(config: TrainConfig) -> Prepared:
+    """The trainee of the kinds a-tune, mlp, mlp+gs, skip+gs and mnn+gs.
+
+    Raises: ValueError, FileNotFoundError: bad input.
+    """
+    data = read_training_data(config)
+    if data.embedding is not None and config.launcher.start == "tracks":
+        begin_with_tracks(data.embedding, [data.shots[k] for k in data.train], data.analytic)
+    noise = NoiseScales(
+        data.shots[0].settings.process,
+        position=config.noise.position_scale or 1.0,
+        learned=config.loss.likelihood > 0.0,
+    )
+    model = _model(config, data.analytic)
+    trainee = EndToEnd(
+        data.shots,
+        Learnables(model, data.embedding, noise),
+        config.loss,
+        method=GRADIENTS[config.gradient](),
+        seed=config.seed,
+        augment=config.augmented,
+        anchor=Anchor(model, data.analytic, config.seed) if config.loss.anchor > 0.0 else None,
+        coefficient_step=config.optimizer.coefficient_step,
+        noise_step=config.optimizer.noise_step,
+    )
+    return Prepared(trainee, data.train, data.validation)
+
+
+def _model(config: TrainConfig, analytic: AnalyticModel) -> BallModel:
+    if config.kind not in NETWORKS:
+        return analytic
+    chosen = config.architecture.model_dump(exclude_none=True, exclude={"pretrain"})
+    architecture = Architecture.of(config.kind, **chosen)  # type: ignore[arg-type]
+    base = analytic if architecture.residual else None
+    model = build_model(architecture, radius=analytic.radius, base=base, seed=config.seed)
+    if base is None and config.architecture.pretrain:
+        left = pretrain(model, analytic, config.seed, config.architecture.pretrain)
+        print(f"networks fitted to the analytic model: {left:.2g} m/s^2, 0.1 m/s, 10 rad/s left", flush=True)
+    return model

@@ -1,0 +1,76 @@
+"""The record of a training, written after each epoch: metrics, curves, TensorBoard, checkpoints, a line of text."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from statistics import fmean
+
+from torch.utils.tensorboard import SummaryWriter
+
+from ballfg.learning.run import run_folder as files
+from ballfg.learning.run.checkpoint import Checkpoint, write_checkpoint
+from ballfg.learning.run.curves import draw_curves
+from ballfg.learning.run.loop import Task
+from ballfg.learning.run.metrics import Epoch, epoch_line, read_metrics, write_metrics
+
+SCALARS = {
+    "loss/train": ("loss", 1.0),
+    "rmse_mm/train": ("train_rmse", 1e3),
+    "rmse_mm/validation": ("validation_rmse", 1e3),
+    "optimizer/learning_rate": ("learning_rate", 1.0),
+    "optimizer/gradient_norm": ("gradient_norm", 1.0),
+    "tracks/failed": ("failed", 1.0),
+    "tracks/validation_failed": ("validation_failed", 1.0),
+    "steps/skipped": ("skipped", 1.0),
+    "time/seconds": ("seconds", 1.0),
+}
+"""Name of each TensorBoard curve, the number of an epoch that it shows, and its scale."""
+
+
+class Record:
+    """The files of a training, which the first process writes.
+
+    Args:
+        task: the training.
+        folder: of the run.
+        checkpoint: from which the run continues. Rows of later epochs are dropped, and those epochs run again.
+    """
+
+    def __init__(self, task: Task, folder: Path, checkpoint: Checkpoint | None) -> None:
+        self.folder, self.last = folder, task.config.optimizer.epochs
+        self.saved = -1 if checkpoint is None else checkpoint.progress.epoch
+        rows = read_metrics(folder / files.METRICS) if checkpoint is not None else []
+        self.epochs = [row for row in rows if row.epoch <= self.saved]
+        self.taken: list[float] = []
+        self.title = f"{task.config.kind}: {len(task.train)} tracks train, {len(task.validation)} validate"
+        files.start(folder, task.config)
+        self.tensorboard = SummaryWriter(str(folder / files.EVENTS), purge_step=self.saved + 1)
+        print(f"{folder / files.CONFIG}: the config; {self.title}", flush=True)
+
+    @property
+    def kept(self) -> str:
+        """The epochs that an interrupted run keeps, in words."""
+        return "no epoch is kept yet" if self.saved < 0 else f"epochs up to {self.saved} are kept"
+
+    def write(self, epoch: Epoch, checkpoint: Checkpoint | None) -> None:
+        """Write the row first and then the checkpoint: rows after the last checkpoint are computed again."""
+        self.epochs.append(epoch)
+        write_metrics(self.folder / files.METRICS, self.epochs)
+        for name, (attribute, scale) in SCALARS.items():
+            value = getattr(epoch, attribute)
+            if value is not None:
+                self.tensorboard.add_scalar(name, scale * value, epoch.epoch)
+        self.tensorboard.flush()
+        if checkpoint is not None:
+            write_checkpoint(self.folder, checkpoint)
+            self.saved = epoch.epoch
+        if epoch.epoch:
+            self.taken.append(epoch.seconds)
+        left = (self.last - epoch.epoch) * fmean(self.taken) if self.taken else 0.0
+        print(epoch_line(epoch, self.last, left), flush=True)
+
+    def close(self) -> None:
+        """Draw the curves and close the event files."""
+        self.tensorboard.close()
+        if self.epochs:
+            draw_curves(self.epochs, self.title, self.folder / files.CURVES)

@@ -1,0 +1,170 @@
+"""From a config to the data of a training: datasets, split, shots, and the settings of the estimator."""
+
+from __future__ import annotations
+
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+
+from ballfg.dynamics import AnalyticModel, load_model, nominal_model
+from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.estimation import Settings, dataset_settings, dataset_surfaces
+from ballfg.estimation.launcher import Launcher
+from ballfg.learning.config.training import TrainConfig
+from ballfg.learning.shots import Shot, shots_of
+from ballfg.learning.split import training_split
+from ballfg.tracks import Dataset, Track, read_dataset
+
+FIRST_SPIN = {"topspin": (0.0, 50.0, 0.0), "sidespin": (0.0, 0.0, 50.0)}
+"""rad/s about (forward, across, up) per level of the settings with a known axis; other settings start at no spin."""
+FIRST_SPIN_NOISE = 60.0
+"""rad/s, standard deviation of the spin given the settings, before anything is learned."""
+
+
+@dataclass(frozen=True)
+class TrainingData:
+    """The data of a training.
+
+    Attributes:
+        shots: the tracks, each cut into an observed part and a rest to predict.
+        train: numbers of the shots that train.
+        validation: numbers of the shots that validate.
+        analytic: the analytic model that is tuned, corrected, or where networks start.
+        embedding: the spin that the launcher's settings mean; None without settings.
+    """
+
+    shots: Sequence[Shot]
+    train: Sequence[int]
+    validation: Sequence[int]
+    analytic: AnalyticModel
+    embedding: SpinEmbedding | None
+
+
+def read_training_data(config: TrainConfig) -> TrainingData:
+    """Read the datasets of a config and cut their tracks into shots. Notes on them go to stderr.
+
+    Raises: ValueError, FileNotFoundError: bad input, for instance no track that can be used.
+    """
+    datasets = [open_dataset(folder) for folder in config.data or ()]
+    tracks = [(number, _grouped(track, dataset)) for number, dataset in enumerate(datasets) for track in dataset]
+    analytic = _analytic(config, datasets)
+    train, validation = training_split(tracks, config.split, config.seed)
+    embedding = _embedding(config, [tracks[k][1] for k in train])
+    settings = [_settings(config, dataset, analytic, embedding) for dataset in datasets]
+    shots, kept = _shots(config, datasets, tracks, analytic, settings)
+    train, validation = ([kept[k] for k in part if k in kept] for part in (train, validation))
+    if not train:
+        raise ValueError(f"data must hold a track to train on; none of {len(tracks)} can be used. See the notes above.")
+    return TrainingData(shots, train, validation, analytic, embedding)
+
+
+def open_dataset(folder: str) -> Dataset:
+    """The dataset of a folder; notes on repairs go to stderr. Raises: ValueError, FileNotFoundError: as in reading."""
+    dataset = read_dataset(folder)
+    for note in dataset.notes:
+        print(f"note: {note}", file=sys.stderr)
+    return dataset
+
+
+def analytic_model(path: str | None, radius: float) -> AnalyticModel:
+    """The analytic model of a file, or the nominal one for None; radius in m.
+
+    Raises: ValueError: if the file's model has a learned part.
+    """
+    model = nominal_model(radius) if path is None else load_model(path, radius=radius)
+    if not isinstance(model, AnalyticModel):
+        raise ValueError(f"model must be analytic; {path} has a learned part. Give its base, or leave it out.")
+    return model
+
+
+def categories_of(labels: Sequence[str], tracks: Sequence[Track]) -> dict[str, tuple[str, ...]]:
+    """The values of those labels that are text. Raises: ValueError: if no track has a label."""
+    categories: dict[str, tuple[str, ...]] = {}
+    for label in labels:
+        values = [track.labels.get(label) for track in tracks]
+        if all(value is None for value in values):
+            raise ValueError(f"launcher.labels must be labels of the tracks; no track has '{label}'. See labels.csv.")
+        texts = sorted({value for value in values if isinstance(value, str)})
+        if texts:
+            categories[label] = tuple(texts)
+    return categories
+
+
+def _grouped(track: Track, dataset: Dataset) -> Track:
+    """The track with a label `group`; a dataset without groups is one group of its own name."""
+    return track if "group" in track.labels else replace(track, labels={**track.labels, "group": dataset.info.name})
+
+
+def _analytic(config: TrainConfig, datasets: Sequence[Dataset]) -> AnalyticModel:
+    radii = {dataset.info.ball.radius for dataset in datasets}
+    if len(radii) > 1:
+        raise ValueError(f"data must be of one kind of ball; got radii {sorted(radii)} m. Train a model for each.")
+    model = analytic_model(config.model, radii.pop())
+    if not model.measures_plainly:
+        raise ValueError("model must have no measurement effects; got some, which training does not know. Remove them.")
+    return model
+
+
+def _embedding(config: TrainConfig, tracks: Sequence[Track]) -> SpinEmbedding | None:
+    """The meaning of the launcher's settings before anything is learned."""
+    labels = config.launcher.labels
+    if labels is None:
+        return None
+    categories = categories_of(labels, tracks)
+    names = SpinEmbedding(labels, categories).names
+    rows = [FIRST_SPIN.get(name, (0.0, 0.0, 0.0)) for name in names]
+    return SpinEmbedding(labels, categories, torch.tensor(rows, dtype=torch.float64))
+
+
+def _settings(
+    config: TrainConfig, dataset: Dataset, analytic: AnalyticModel, embedding: SpinEmbedding | None
+) -> Settings:
+    """The estimator's settings for a dataset, with the noise of the config; the model counts as exact."""
+    given = config.noise.model_dump(exclude_none=True, exclude={"position_scale"})
+    spin = given.pop("spin_label", None)
+    settings = dataset_settings(dataset, analytic)
+    launcher = None
+    if embedding is not None:
+        launcher = Launcher(embedding, spin or FIRST_SPIN_NOISE, {"group": dataset.info.name})
+    return replace(
+        settings,
+        process=replace(settings.process, **given),
+        coefficients={},
+        launcher=launcher,
+        spin_label_noise=spin or settings.spin_label_noise,
+    )
+
+
+def _shots(
+    config: TrainConfig,
+    datasets: Sequence[Dataset],
+    tracks: Sequence[tuple[int, Track]],
+    analytic: AnalyticModel,
+    settings: Sequence[Settings],
+) -> tuple[list[Shot], dict[int, int]]:
+    """Shots, and the number of each track's shot; reasons for tracks without one go to stderr."""
+    shots: list[Shot] = []
+    kept: dict[int, int] = {}
+    reasons: Counter[str] = Counter()
+    for number, dataset in enumerate(datasets):
+        mine = [k for k, (owner, _) in enumerate(tracks) if owner == number]
+        made = shots_of(
+            (tracks[k][1] for k in mine),
+            analytic,
+            dataset_surfaces(dataset),
+            settings[number],
+            samples=config.observe.samples,
+            seconds=config.observe.seconds,
+        )
+        for k, (_, shot) in zip(mine, made, strict=True):
+            if isinstance(shot, str):
+                reasons[f"{dataset.info.name}: {shot}"] += 1
+            else:
+                kept[k] = len(shots)
+                shots.append(shot)
+    for reason, count in reasons.items():
+        print(f"note: {count} tracks of {reason}", file=sys.stderr)
+    return shots, kept
