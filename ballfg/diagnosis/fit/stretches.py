@@ -1,35 +1,31 @@
-"""What a diagnosis fits: stretches of tracks without a hit, as one padded batch.
+"""Stretches: parts of tracks without a hit, as one padded batch.
 
-A stretch starts at its first usable sample with a state of its own, flies and bounces at contacts whose order is known,
-and ends before the next hit or when the ball comes to rest. Deterministic motion from its first state is all that a
-model claims; what the samples hold beyond it is noise or something that the model lacks.
+A stretch starts at its first usable sample with a state of its own. The ball flies and bounces at contacts whose order
+is known. The stretch ends before the next hit or when the ball comes to rest. The motion is deterministic, so what the
+samples hold beyond it is noise or an effect that the model lacks.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from ballfg.diagnosis.result import Array, Index, Mask
 from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.launcher import Launcher
-from ballfg.estimation.segmentation import Contact
 from ballfg.estimation.smoother.problem import effective_sigmas
 from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.state import STATE_DIM
 from ballfg.tracks import Track
 
 LEAST_SAMPLES = 10
 """A stretch of fewer samples tells next to nothing once its nine start values are found."""
 LEAST_DURATION = 0.08
-"""s. The same for short ones."""
-
-Array = NDArray[np.float64]
+"""s. A shorter stretch tells next to nothing either."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +46,7 @@ class Stretches:
     """
 
     names: tuple[str, ...]
-    track: NDArray[np.int64]
+    track: Index
     settings: Array
     times: Tensor
     positions: Tensor
@@ -74,11 +70,11 @@ class Stretches:
         return self.sigmas[..., 0].isfinite()
 
     @property
-    def labelled(self) -> NDArray[np.bool_]:
+    def labelled(self) -> Mask:
         """(n,) whether each has a spin label."""
         return np.asarray(~np.isnan(self.labels[:, 0].numpy()))
 
-    def take(self, rows: Sequence[int] | NDArray[np.int64] | NDArray[np.bool_]) -> Stretches:
+    def take(self, rows: Sequence[int] | Index | Mask) -> Stretches:
         """Some of the stretches."""
         index = np.arange(len(self))[np.asarray(rows)]
         where = torch.from_numpy(index)
@@ -89,17 +85,17 @@ class Stretches:
 
 @dataclass(frozen=True)
 class _Stretch:
-    """One of them, not padded yet."""
+    """One stretch, not padded yet: fields as in `Stretches`."""
 
     name: str
-    track: int
     settings: Array
     times: Array
     positions: Array
     sigmas: Array
     start: Array
-    contacts: tuple[Contact, ...]
-    label: Array | None
+    heights: Array
+    contacts: Array
+    label: Array
 
 
 def stretches_of(smoother: Smoother, tracks: Iterable[Track], launcher: Launcher, jobs: int = 1) -> Stretches:
@@ -108,22 +104,21 @@ def stretches_of(smoother: Smoother, tracks: Iterable[Track], launcher: Launcher
     Args:
         smoother: finds contacts, hits and outliers, and the states from which the fit starts.
         tracks: as measured.
-        launcher: what the settings of a shot are; its weights do not matter.
+        launcher: reads the settings of a shot; its weights do not matter.
         jobs: processes.
-    Raises: ValueError: if no track has a stretch that is long enough.
+
+    Raises:
+        ValueError: if no track has a stretch that is long enough.
     """
     tracks = list(tracks)
-    found = [
-        stretch
-        for number, stretches in enumerate(map_tracks(partial(_cut, smoother, launcher), tracks, len(tracks), jobs))
-        for stretch in (replace(s, track=number) for s in stretches)
-    ]
+    cut = list(map_tracks(partial(_cut, smoother, launcher), tracks, len(tracks), jobs))
+    found = [stretch for stretches in cut for stretch in stretches]
     if not found:
         raise ValueError(
             f"tracks must hold free flights of at least {LEAST_SAMPLES} samples and {LEAST_DURATION:g} s; none does. "
             "Record longer tracks."
         )
-    return _padded(found)
+    return _batch(found, np.repeat(np.arange(len(cut)), [len(stretches) for stretches in cut]))
 
 
 def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[_Stretch]:
@@ -140,49 +135,41 @@ def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[_Stretch]
         usable = first + np.flatnonzero(segmentation.usable[first : last + 1])
         if len(usable) < LEAST_SAMPLES or track.times[usable[-1]] - track.times[usable[0]] < LEAST_DURATION:
             continue
-        begin = float(track.times[usable[0]])
-        contacts = tuple(
-            Contact(c.interval, c.time - begin, c.height)
-            for c in estimate.contacts
-            if usable[0] <= c.interval < usable[-1] and begin < c.time < track.times[usable[-1]]
-        )
-        labelled = usable[0] == 0 and track.spin_label is not None
+        begin, end = float(track.times[usable[0]]), track.times[usable[-1]]
+        met = [c for c in estimate.contacts if usable[0] <= c.interval < usable[-1] and begin < c.time < end]
+        launched = usable[0] == 0
         stretches.append(
             _Stretch(
                 name=track.name,
-                track=0,
-                settings=settings if usable[0] == 0 else np.zeros_like(settings),
+                settings=settings if launched else np.zeros_like(settings),
                 times=track.times[usable] - begin,
                 positions=track.positions[usable],
                 sigmas=sigma[usable],
                 start=estimate.states[usable[0]],
-                contacts=contacts,
-                label=track.spin_label if labelled else None,
+                heights=np.array([c.height for c in met], dtype=np.float64),
+                contacts=np.array([c.time - begin for c in met], dtype=np.float64),
+                label=track.spin_label if launched and track.spin_label is not None else np.full(3, np.nan),
             )
         )
     return stretches
 
 
-def _padded(found: Sequence[_Stretch]) -> Stretches:
-    n, k = len(found), max(len(s.times) for s in found)
-    c = max(len(s.contacts) for s in found)
-    times, positions = np.zeros((n, k)), np.zeros((n, k, 3))
-    sigmas = np.full((n, k, 3), np.inf)
-    heights, contacts, labels = np.full((n, c), np.nan), np.full((n, c), np.nan), np.full((n, 3), np.nan)
-    starts = np.zeros((n, STATE_DIM))
-    for i, s in enumerate(found):
-        m = len(s.times)
-        times[i, :m], times[i, m:] = s.times, s.times[-1]
-        positions[i, :m], positions[i, m:] = s.positions, s.positions[-1]
-        sigmas[i, :m] = s.sigmas
-        starts[i] = s.start
-        for j, contact in enumerate(s.contacts):
-            heights[i, j], contacts[i, j] = contact.height, contact.time
-        if s.label is not None:
-            labels[i] = s.label
-    return Stretches(
-        tuple(s.name for s in found),
-        np.array([s.track for s in found]),
-        np.stack([s.settings for s in found]),
-        *(torch.from_numpy(a) for a in (times, positions, sigmas, starts, heights, contacts, labels)),
-    )
+def _batch(found: Sequence[_Stretch], track: Index) -> Stretches:
+    samples, contacts = max(len(s.times) for s in found), max(len(s.contacts) for s in found)
+    padded = {
+        "times": [_padded(s.times, samples) for s in found],
+        "positions": [_padded(s.positions, samples) for s in found],
+        "sigmas": [_padded(s.sigmas, samples, np.inf) for s in found],
+        "starts": [s.start for s in found],
+        "heights": [_padded(s.heights, contacts, np.nan) for s in found],
+        "contacts": [_padded(s.contacts, contacts, np.nan) for s in found],
+        "labels": [s.label for s in found],
+    }
+    tensors = {name: torch.from_numpy(np.stack(rows)) for name, rows in padded.items()}
+    return Stretches(tuple(s.name for s in found), track, np.stack([s.settings for s in found]), **tensors)
+
+
+def _padded(rows: Array, length: int, fill: float | None = None) -> Array:
+    """Rows (m, ...) continued to a length, with a number or else with the last row."""
+    width = [(0, length - len(rows))] + [(0, 0)] * (rows.ndim - 1)
+    return np.pad(rows, width, "edge") if fill is None else np.pad(rows, width, constant_values=fill)

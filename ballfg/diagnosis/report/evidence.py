@@ -8,12 +8,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from ballfg.diagnosis.report import pictures
 from ballfg.diagnosis.report.parts import Html, bar, items, picture, section, table, tag
 from ballfg.diagnosis.report.wording import NONE, fixed, joined, listed, number, plus_minus, probability
-from ballfg.diagnosis.result import Candidate, Diagnosis, Fallback, Standing, Value
+from ballfg.diagnosis.result import Candidate, Diagnosis, Fallback, Outcome, Value
 from ballfg.dynamics import EFFECTS
 
 SHOWN = 8
 """Rows of a ranking that are seen at once; the others unfold."""
-COLOURS = {Standing.ADDED: "added", Standing.ALIKE: "alike"}
+COLOURS = {Outcome.ADDED: "added", Outcome.ALIKE: "alike"}
 """Classes of the style for what became of a candidate."""
 RANKING = ("candidate", "squared residual it would explain", "by chance", "BIC", "first estimate", "what became of it")
 
@@ -87,8 +87,8 @@ def rankings(diagnosis: Diagnosis) -> Html:
 def _lines(row: Sequence[Candidate], most: float) -> Iterator[tuple[str, ...]]:
     """The rows of a table; most: what fills a bar."""
     for c in row:
-        colour = COLOURS.get(c.standing, "other")
-        unseen = c.standing is Standing.INVISIBLE
+        colour = COLOURS.get(c.outcome, "other")
+        unseen = c.outcome is Outcome.INVISIBLE
         length = math.log1p(max(c.explained, 0.0)) / math.log1p(most) if most > 0.0 and not unseen else 0.0
         explained = Html() if unseen else tag("span", bar(length, colour), number(c.explained))
         yield (
@@ -97,14 +97,14 @@ def _lines(row: Sequence[Candidate], most: float) -> Iterator[tuple[str, ...]]:
             NONE if unseen else probability(c.p_value),
             NONE if c.delta_bic is None else f"{c.delta_bic:+.0f}",
             NONE if unseen else listed(c.estimate),
-            tag("span", c.standing.value, kind=f"badge {colour}"),
+            tag("span", c.outcome.value, kind=f"badge {colour}"),
         )
 
 
 def invisible(diagnosis: Diagnosis) -> Html:
     """Candidates about which these data say nothing: they may be there all the same."""
     last = {c.name: c for row in diagnosis.rounds for c in row}
-    names = [name for name, c in last.items() if c.standing is Standing.INVISIBLE]
+    names = [name for name, c in last.items() if c.outcome is Outcome.INVISIBLE]
     if not names:
         return Html()
     words = (

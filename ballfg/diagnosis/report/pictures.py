@@ -14,19 +14,20 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from ballfg.diagnosis.remains.binned import at_contact, binned, in_flight, slip_speed
+from ballfg.diagnosis.report.binned import at_contact, binned, in_flight, slip_speed
 from ballfg.diagnosis.result import (
+    Array,
     Candidate,
     ContactResiduals,
     Errors,
     FlightResiduals,
+    Index,
     MeasurementResiduals,
+    Outcome,
     Residuals,
-    Standing,
 )
 from ballfg.state import SPIN, VELOCITY
 
-Array = NDArray[np.float64]
 Series = Mapping[str, Residuals]
 """Residuals by what the legend calls them: `before` and `after`, or one alone."""
 
@@ -45,7 +46,7 @@ NAMED = 6
 """Candidates of the first round that the picture of the rounds names, beside those added later."""
 LINES_OF_TEXT = 18
 """That fit above each other beside the picture of the rounds."""
-MARKED = {Standing.ADDED: ("added", AFTER), Standing.ALIKE: ("alike", BEFORE)}
+MARKED = {Outcome.ADDED: ("added", AFTER), Outcome.ALIKE: ("alike", BEFORE)}
 """Word and colour of the candidates that stand out there."""
 
 
@@ -188,21 +189,21 @@ def ranking(rounds: Sequence[Sequence[Candidate]]) -> Figure:
     """What each candidate explains, round after round: an added effect takes along what only resembled it."""
     figure, panels = _grid(1, 1, (7.6, 4.2))
     axes = panels[0, 0]
-    standing = {c.name: c.standing for row in reversed(rounds) for c in row}
-    standing |= {c.name: c.standing for row in rounds for c in row if c.standing is Standing.ADDED}
+    outcome = {c.name: c.outcome for row in reversed(rounds) for c in row}
+    outcome |= {c.name: c.outcome for row in rounds for c in row if c.outcome is Outcome.ADDED}
     lines: dict[str, list[tuple[int, float]]] = {}
     for i, row in enumerate(rounds):
         for c in row:
-            if c.standing is not Standing.INVISIBLE:
+            if c.outcome is not Outcome.INVISIBLE:
                 lines.setdefault(c.name, []).append((i + 1, max(c.explained, LEAST_EXPLAINED)))
     for name, line in lines.items():
-        _, colour = MARKED.get(standing[name], ("", GREY))
-        front = 2 + (standing[name] in MARKED) + (standing[name] is Standing.ADDED)
+        _, colour = MARKED.get(outcome[name], ("", GREY))
+        front = 2 + (outcome[name] in MARKED) + (outcome[name] is Outcome.ADDED)
         axes.plot(*zip(*line, strict=True), "o-", color=colour, markersize=5, linewidth=1.2, zorder=front)
     first = [c.name for c in rounds[0] if c.name in lines]
-    named = first[:NAMED] + [name for name in first[NAMED:] if standing[name] is Standing.ADDED]
+    named = first[:NAMED] + [name for name in first[NAMED:] if outcome[name] is Outcome.ADDED]
     for name, height in _apart({name: lines[name][0][1] for name in named}).items():
-        word, colour = MARKED.get(standing[name], ("", "black"))
+        word, colour = MARKED.get(outcome[name], ("", "black"))
         axes.plot((0.95, 1.0), (height, lines[name][0][1]), color=GREY, linewidth=0.6, zorder=1)
         axes.text(0.93, height, f"{name}, {word}" if word else name, ha="right", va="center", size=9, color=colour)
     axes.set(yscale="log", xlim=(0.2, len(rounds) + 0.3), xlabel="round", ylabel="squared whitened residual explained")
@@ -233,9 +234,7 @@ def _grid(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, N
     return figure, panels
 
 
-def _means(
-    column: Iterable[Axes], against: Array, values: Array, sigmas: Array, stretch: NDArray[np.int64], label: str
-) -> None:
+def _means(column: Iterable[Axes], against: Array, values: Array, sigmas: Array, stretch: Index, label: str) -> None:
     """Three components of a residual, one in each panel of a column, as means over bins."""
     colour = BEFORE if label == "before" else AFTER
     for axes, component, sigma in zip(column, values.T, sigmas.T, strict=True):

@@ -6,29 +6,20 @@ from collections.abc import Iterable, Mapping
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from ballfg.diagnosis.fit.problem import Fit, common_precision, linearise
+from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Value
 from ballfg.diagnosis.search.hypothesis import with_effects
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.dynamics.trained import Trained
 
-Array = NDArray[np.float64]
-
 LEAST_SPIN_SIGMA = 1.0
 """rad/s. A launcher is not taken to repeat its spin better than that."""
 
 
 def calibrated_model(fit: Fit, embedding: SpinEmbedding) -> AnalyticModel:
-    """The fitted model, for estimates and predictions.
-
-    Args:
-        fit: of an `AnalyticModel`.
-        embedding: names the launcher settings of the fit.
-    """
-    assert isinstance(fit.problem.model, AnalyticModel)
+    """The fitted model, for estimates and predictions; embedding: names the launcher settings of the fit."""
     model = with_effects(fit.problem.model)  # a copy
     parameters = dict(model.named_parameters())
     with torch.no_grad():
@@ -49,12 +40,9 @@ def values_of(fit: Fit, names: Iterable[str], declared: Mapping[str, float]) -> 
 
     Args: names: those wanted.  declared: values that the model stated before the fit, for those that it did.
     """
-    system = linearise(fit.problem, fit.unknowns, fit.noise, fit.predicted)
-    total = system.eliminated().gram.sum(axis=0)[:-1, :-1] + np.diag(common_precision(fit.problem))
-    sigmas = np.sqrt(np.diagonal(np.linalg.inv(total)))
-    place = {name: i for i, name in enumerate(fit.problem.free)}
+    total = fit.linearised().eliminated().gram.sum(axis=0)[:-1, :-1] + np.diag(fit.problem.common_precision)
+    sigmas = dict(zip(fit.problem.free, np.sqrt(np.diagonal(np.linalg.inv(total))).tolist(), strict=False))
     units = fit.problem.model.declared_coefficients()
     return {
-        name: Value(fit.unknowns.values[name], float(sigmas[place[name]]), units[name].unit, declared.get(name))
-        for name in names
+        name: Value(fit.unknowns.values[name], sigmas[name], units[name].unit, declared.get(name)) for name in names
     }

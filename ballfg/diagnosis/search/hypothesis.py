@@ -5,19 +5,25 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import cast
 
+import numpy as np
+
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.result import Array
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.effect import Coefficient, Effect
-from ballfg.dynamics.scene import Scene
+from ballfg.dynamics.scene import Scene, Vector
 
 SECTION = {"flight": "flight", "bounce": "contact", "measurement": "measurement"}
 """Attribute of the model that holds the effects of a kind."""
 LOOSE = 10.0
-"""By how much the prior of a hypothesis' coefficient is wider than the effect says: the data are to decide."""
-
+"""Factor by which the prior of a hypothesis' coefficient is wider than the effect declares: the data are to decide."""
 INEXACT = 0.02
-"""Spread of a coefficient that is taken to be exact, as a share of its value: a wrong clock or length shows so in g."""
+"""Spread of a coefficient that is declared as exact, as a share of its value: a wrong clock or length shows so in g."""
+LEAST_GAP = 1e-4
+"""s. Stamps nearer together tell no speed."""
 
 
 @dataclass(frozen=True)
@@ -39,6 +45,11 @@ class Hypothesis:
         """Of the effect."""
         return self.effect.name
 
+    @cached_property
+    def coefficients(self) -> dict[str, Coefficient]:
+        """Of the effect, by name."""
+        return {c.name: c for c in self.effect.coefficients}
+
     def parameter(self, coefficient: str) -> str:
         """Its name among the model's parameters."""
         return f"{SECTION[self.effect.kind]}.{self.name}.{coefficient}"
@@ -51,21 +62,17 @@ class Hypothesis:
     @property
     def usual(self) -> bool:
         """Whether balls usually have the effect: its nominal strength is not zero, and its absence far from it."""
-        listed = {c.name: c for c in self.effect.coefficients}
-        return any(listed[n].default != listed[n].absent for n in self.strengths)
+        return any(self.coefficients[n].default != self.coefficients[n].absent for n in self.strengths)
 
     def strain(self, values: Mapping[str, float]) -> float:
-        """By how many standard deviations of its prior the furthest strength is from its usual value.
-
-        Args: values: by parameter name.
-        """
-        listed = {c.name: c for c in self.effect.coefficients}
+        """Prior standard deviations between the furthest strength and its usual value; values: by parameter name."""
+        listed = self.coefficients
         far = (abs(values[self.parameter(n)] - listed[n].default) / _spread(listed[n]) for n in self.strengths)
         return max(far, default=0.0)
 
     def free(self) -> dict[str, Coefficient]:
-        """What a refit estimates beside what was free before: strengths, and shapes that are uncertain."""
-        listed = {c.name: c for c in self.effect.coefficients}
+        """Coefficients that a refit estimates in addition: strengths, and shapes that are uncertain."""
+        listed = self.coefficients
         loose = {self.parameter(n): replace(listed[n], sigma=LOOSE * _spread(listed[n])) for n in self.strengths}
         formed = {self.parameter(n): listed[n] for n in self.shape if listed[n].absent is None and listed[n].sigma > 0}
         return loose | formed
@@ -74,8 +81,7 @@ class Hypothesis:
         """The model with the effect in it, its strengths absent; the model itself where it has the effect already."""
         if has_effect(model, self.name):
             return model
-        listed = {c.name: c for c in self.effect.coefficients}
-        absent = {n: cast(float, listed[n].absent) for n in self.strengths}
+        absent = {n: cast(float, self.coefficients[n].absent) for n in self.strengths}
         return with_effects(model, self.effect(**{**self.shape, **absent}))
 
 
@@ -107,13 +113,18 @@ def without_effect(model: AnalyticModel, name: str) -> AnalyticModel:
 
 
 def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effect]]) -> list[Hypothesis]:
-    """Everything that the model may lack and that could act in these data.
+    """All effects that the model may lack and that could act in these data.
 
-    That is each effect of the catalogue that it does not have and whose needs it meets, in each shape that the scene
-    suggests; and each effect that it has with coefficients taken to be exact.
+    An effect of the catalogue that the model lacks, and whose needs it meets, is listed in each shape that the scene
+    suggests. An effect that the model has is listed with the coefficients that are declared as exact.
 
     Args:
-        model: as declared so far.  scene: what the data span.  catalogue: effects by class.
+        model: as declared so far.
+        scene: extent of the data.
+        catalogue: effects by class.
+
+    Returns:
+        The hypotheses, in the order of the catalogue.
     """
     listed: list[Hypothesis] = []
     for effect in catalogue:
@@ -132,6 +143,36 @@ def _applies(effect: type[Effect], scene: Scene) -> bool:
     return scene.labels > 0 or not effect.name.startswith("spin_label")
 
 
-def declared_free(model: AnalyticModel) -> dict[str, Coefficient]:
-    """Coefficients that a fit of the declared model estimates: those whose prior leaves room."""
-    return {n: c for n, c in model.declared_coefficients().items() if c.sigma > 0.0 and c.absent is not None}
+def scene_of(fit: Fit) -> Scene:
+    """The extent of the stretches of a fit: places, speeds, impacts and spin labels.
+
+    Args:
+        fit: of a model to the stretches.
+
+    Returns:
+        The scene, in m and m/s.
+    """
+    stretches = fit.problem.stretches
+    used = stretches.used.numpy()
+    positions, times = stretches.positions.numpy()[used], stretches.times.numpy()
+    gaps = np.maximum(np.gradient(times, axis=1), LEAST_GAP)[..., None]
+    velocities = np.gradient(fit.predicted.positions, axis=1) / gaps
+    impacts = [
+        -velocities[i, max(0, int(np.searchsorted(times[i], time)) - 2), 2]  # no difference spans the contact there
+        for i, row in enumerate(fit.predicted.contacts)
+        for time in row[np.isfinite(row)]
+    ]
+    return Scene(
+        _vector(positions.min(axis=0)),
+        _vector(positions.max(axis=0)),
+        _vector(np.median(positions, axis=0)),
+        float(np.median(np.linalg.norm(velocities[used], axis=-1))),
+        float(np.median(impacts)) if impacts else float("nan"),
+        len(impacts),
+        int(stretches.labelled.sum()),
+    )
+
+
+def _vector(values: Array) -> Vector:
+    x, y, z = values.tolist()
+    return x, y, z

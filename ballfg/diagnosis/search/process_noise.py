@@ -1,8 +1,9 @@
-"""How far real balls stray from a model from one moment to the next: the process noise that predictions call for.
+"""The process noise of measured balls: how far they stray from a model from one moment to the next.
 
-The fit is deterministic: what balls do beside their model goes to the residual. A prediction needs it as process noise,
-else it is too sure of itself, or gives away what the observed part tells. The usual process noise of measured tracks is
-scaled as a whole, to the scale at which the finding half is predicted with the largest likelihood.
+The fit is deterministic, so that all motion beside the model goes to the residual. Predictions need that motion as
+process noise. Too little of it makes them overconfident; too much makes them ignore the observed part. The usual
+process noise of measured tracks is scaled as a whole, to the scale at which predictions of the search half have the
+largest likelihood.
 """
 
 from __future__ import annotations
@@ -14,8 +15,9 @@ from typing import cast
 
 import numpy as np
 
+from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.result import Errors
-from ballfg.diagnosis.search.evaluation import JudgedTrack, prediction_errors
+from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.trained import Trained
 from ballfg.estimation.configure import dataset_settings, dataset_surfaces
@@ -25,20 +27,22 @@ from ballfg.tracks import Dataset
 SCALES = (0.03, 0.1, 0.3, 1.0)
 """Of the usual process noise; the likelihood is flat between neighbours."""
 MOST_PREDICTED = 15
-"""Tracks that are predicted for it, evenly over those given."""
+"""Tracks that are predicted to choose the scale, evenly over those given."""
 SCALED = ("acceleration", "spin", "contact_velocity", "contact_tangential", "contact_spin")
-"""What is scaled; a hit remains a hit."""
+"""Numbers of the process noise that are scaled; the noise of a hit stays."""
 
 
 @dataclass(frozen=True)
-class Predicting:
+class PredictiveModel:
     """A model with the process noise that predicts best, and its errors on tracks that it was fitted to."""
 
     model: AnalyticModel
     errors: Errors
 
 
-def with_process_noise(model: AnalyticModel, tracks: Sequence[JudgedTrack], dataset: Dataset, jobs: int) -> Predicting:
+def with_process_noise(
+    model: AnalyticModel, tracks: Sequence[EvaluationTrack], dataset: Dataset, jobs: int = 1
+) -> PredictiveModel:
     """The model with the process noise that predicts tracks best.
 
     Args: model: with `trained`, which is replaced.  tracks: those that it was fitted to.
@@ -51,10 +55,10 @@ def with_process_noise(model: AnalyticModel, tracks: Sequence[JudgedTrack], data
         settings = dataset_settings(dataset, model)
         tried.append(prediction_errors(model, some, dataset_surfaces(dataset), settings, jobs))
         if len(tried) > 1 and tried[-1].log_likelihood < tried[-2].log_likelihood:
-            break  # it has one maximum
+            break  # the likelihood has one maximum
     best = int(np.argmax([errors.log_likelihood for errors in tried]))
     model.trained = _scaled(trained, SCALES[best])
-    return Predicting(model, tried[best])
+    return PredictiveModel(model, tried[best])
 
 
 def _scaled(trained: Trained, scale: float) -> Trained:
