@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.diagnosis.fit.problem import linearise
-from ballfg.diagnosis.remains.drift import RECORDING, recording_block
+from ballfg.diagnosis.remains.drift import DRIFT, drift_block
 from ballfg.diagnosis.remains.generic import ALARM, generic_tests
 
 COUNT = 20
@@ -36,7 +35,7 @@ def two_sessions(make_ball, make_launches, make_shots, make_fit):
 
 
 def recording_test(fit):
-    (found,) = [t for t in generic_tests(fit) if t.name == RECORDING]
+    (found,) = [t for t in generic_tests(fit) if t.name == DRIFT]
     return found
 
 
@@ -52,8 +51,8 @@ def test_one_session_is_silent(calm_fit):
 
 
 def test_columns_are_those_of_the_coefficients_from_minus_to_plus_one_sigma(calm_fit):
-    system = linearise(calm_fit.problem, calm_fit.unknowns, calm_fit.noise, calm_fit.predicted)
-    block = recording_block(calm_fit, system)
+    system = calm_fit.linearised()
+    block = drift_block(calm_fit, system)
     free = calm_fit.problem.free
     assert block.quantities == tuple(free)
     sigmas = np.array([c.sigma for c in free.values()])
@@ -67,5 +66,5 @@ def test_one_track_tells_nothing_of_changes(calm_fit):
     alone = replace(
         calm_fit, problem=replace(calm_fit.problem, stretches=replace(stretches, track=np.zeros_like(stretches.track)))
     )
-    system = linearise(calm_fit.problem, calm_fit.unknowns, calm_fit.noise, calm_fit.predicted)
-    assert recording_block(alone, system) is None
+    system = calm_fit.linearised()
+    assert drift_block(alone, system) is None
