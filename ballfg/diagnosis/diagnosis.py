@@ -13,16 +13,13 @@ from ballfg.diagnosis.remains.fallback import fallback
 from ballfg.diagnosis.remains.generic import ALARM, generic_tests
 from ballfg.diagnosis.remains.residuals import residuals_of
 from ballfg.diagnosis.report.wording import sentence
-from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, GenericTest, Unexplained, Value, Verdict
+from ballfg.diagnosis.result import Diagnosis, Errors, GenericTest, Unexplained, Value, Verdict
 from ballfg.diagnosis.search.calibrated import calibrated_model, values_of
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.loop import Search, SearchLoop
 from ballfg.diagnosis.search.process_noise import PredictiveModel, with_process_noise
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.effect import Effect
-from ballfg.dynamics.effects.registry import EFFECTS
-from ballfg.dynamics.model import BallModel
-from ballfg.estimation.configure import dataset_settings
+from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
+from ballfg.estimation import dataset_settings
 from ballfg.tracks import Dataset
 
 MOSTLY = 0.1
@@ -60,7 +57,7 @@ def diagnose(
             f"model must be an AnalyticModel, to which effects can be added; got {type(model).__name__}. "
             "Diagnose its analytic part."
         )
-    tell = watch or _silent
+    tell = watch or (lambda line: None)
     holdout = hold_out(dataset, model, jobs, tell)
     loop = SearchLoop(holdout, tuple(catalogue or EFFECTS.values()), partial(_predictive, holdout, jobs), tell)
     search = loop.run(model)
@@ -76,8 +73,10 @@ def diagnose(
         tell("describing what is left without a name")
         tracks = [part.track for part in holdout.search_tracks]
         helped = fallback(search.fit, holdout.launcher.embedding, dataset, tracks, named, evaluate)
-    unexplained = _unexplained(tests, helped)
+    alarms = sorted(_alarms(tests), key=lambda test: test.name == "time")  # a place says more than a correlation
+    unexplained = Unexplained(alarms[0].where if alarms else "", _share(tests), tests, helped)
     residuals = residuals_of(search.first)
+    declared = {name: float(value.detach()) for name, value in model.named_parameters()}
     return Diagnosis(
         dataset=dataset.info.name,
         verdict=verdict,
@@ -88,7 +87,7 @@ def diagnose(
         after=named if helped is None else helped.after,
         tracks_found_on=len(np.unique(holdout.search.track)),
         tracks_judged_on=len(before.by_track),
-        calibrated=_calibrated(search.fit, model),
+        calibrated=values_of(search.fit, [name for name in search.fit.problem.free if name in declared], declared),
         noise=_noise(search.fit, holdout),
         unexplained=unexplained,
         model=search.predictive.model if helped is None else helped.model,
@@ -96,10 +95,6 @@ def diagnose(
         residuals_after=residuals if search.fit is search.first else residuals_of(search.fit),
         excluded=holdout.excluded,
     )
-
-
-def _silent(line: str) -> None:
-    """Watches nothing."""
 
 
 def _predictive(holdout: Holdout, jobs: int, fit: Fit) -> PredictiveModel:
@@ -126,16 +121,6 @@ def _verdict(search: Search, tests: Sequence[GenericTest]) -> Verdict:
     if not search.findings:
         return Verdict.UNEXPLAINED if _alarms(tests) else Verdict.NOTHING
     return Verdict.FOUND if _share(tests) < MOSTLY else Verdict.UNEXPLAINED
-
-
-def _unexplained(tests: tuple[GenericTest, ...], helped: Fallback | None) -> Unexplained:
-    alarms = sorted(_alarms(tests), key=lambda test: test.name == "time")  # a place says more than a correlation
-    return Unexplained(alarms[0].where if alarms else "", _share(tests), tests, helped)
-
-
-def _calibrated(fit: Fit, declared: AnalyticModel) -> dict[str, Value]:
-    values = {name: float(value.detach()) for name, value in declared.named_parameters()}
-    return values_of(fit, [name for name in fit.problem.free if name in values], values)
 
 
 def _noise(fit: Fit, holdout: Holdout) -> dict[str, Value]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.dynamics.model import BallModel
+from ballfg.dynamics import BallModel
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]

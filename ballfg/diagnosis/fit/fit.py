@@ -19,8 +19,8 @@ from ballfg.diagnosis.fit.sensitivity import Predicted, predict
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System
 from ballfg.diagnosis.result import Mask
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.estimation.settings import Settings
+from ballfg.dynamics import AnalyticModel
+from ballfg.estimation import Settings
 from ballfg.state import SPIN, STATE_DIM
 
 MOST_STEPS = 15
@@ -91,7 +91,10 @@ def fit_problem(problem: Problem, unknowns: Unknowns, noise: Noise, *, settle_no
 def _minimise(now: Fit) -> Fit:
     damping = FIRST_DAMPING
     for _ in range(MOST_STEPS if np.isfinite(now.cost) else 0):
-        now = replace(now, problem=replace(now.problem, stretches=_with_contacts(now)), steps=now.steps + 1)
+        stretches, found = now.problem.stretches, torch.from_numpy(now.predicted.contacts)
+        guesses = torch.where(found.isnan(), stretches.contacts, found)
+        problem = replace(now.problem, stretches=replace(stretches, contacts=guesses))
+        now = replace(now, problem=problem, steps=now.steps + 1)
         moved, damping = _step(now, damping)
         if moved is None:
             break
@@ -99,12 +102,6 @@ def _minimise(now: Fit) -> Fit:
         if gain < TOLERANCE * max(1.0, now.cost):
             break
     return now
-
-
-def _with_contacts(now: Fit) -> Stretches:
-    """The stretches with predicted contact times as guesses; a contact without a prediction keeps its guess."""
-    found, stretches = torch.from_numpy(now.predicted.contacts), now.problem.stretches
-    return replace(stretches, contacts=torch.where(found.isnan(), stretches.contacts, found))
 
 
 def _step(now: Fit, damping: float) -> tuple[Fit | None, float]:

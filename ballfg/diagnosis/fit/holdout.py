@@ -10,16 +10,11 @@ import numpy as np
 
 from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, Stretches, stretches_of
 from ballfg.diagnosis.result import Array
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
-from ballfg.dynamics.surfaces import Surfaces
+from ballfg.dynamics import AnalyticModel, SpinEmbedding, Surfaces
+from ballfg.estimation import Launcher, Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.batch import map_tracks
-from ballfg.estimation.configure import dataset_settings, dataset_surfaces
-from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.measurement.as_measured import plainly_measured
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
-from ballfg.estimation.settings import Settings
-from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.tracks import Dataset, Track
 
 MOST_TRACKS = 200

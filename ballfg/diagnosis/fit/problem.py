@@ -12,8 +12,7 @@ from ballfg.diagnosis.fit.sensitivity import Predicted, predict, sensitivity
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System
 from ballfg.diagnosis.result import Array, Index
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.effect import Coefficient
+from ballfg.dynamics import AnalyticModel, Coefficient
 from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED
 from ballfg.state import SPIN, STATE_DIM, VELOCITY
 

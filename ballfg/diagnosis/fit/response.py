@@ -21,7 +21,7 @@ from ballfg.diagnosis.fit.dual import dual_level, make_dual
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.shooting import LEAST_ARC, Arc, Trajectories, shoot
 from ballfg.diagnosis.result import Array, Index
-from ballfg.dynamics.model import BallModel, substitute
+from ballfg.dynamics import BallModel, substitute
 from ballfg.state import STATE_DIM, VELOCITY
 
 NODE = 0.01

@@ -17,7 +17,7 @@ from ballfg.diagnosis.fit.dual import dual_level, make_dual
 from ballfg.diagnosis.fit.shooting import Trajectories, shoot
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.result import Array
-from ballfg.dynamics.model import BallModel, substitute
+from ballfg.dynamics import BallModel, substitute
 from ballfg.state import SPIN, STATE_DIM
 
 MOST_ROWS = 3000

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.model import BallModel, take_rows
-from ballfg.dynamics.motion.contact import contact_time
-from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, fly, rk4_from
+from ballfg.dynamics import BallModel, contact_time, fly
+from ballfg.dynamics.model import take_rows
+from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, rk4_from
 from ballfg.dynamics.motion.paths import hermite
 from ballfg.state import VELOCITY
 

@@ -7,8 +7,9 @@ samples hold beyond it is noise or an effect that the model lacks.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -16,16 +17,19 @@ import torch
 from torch import Tensor
 
 from ballfg.diagnosis.result import Array, Index, Mask
+from ballfg.estimation import Launcher, Smoother
 from ballfg.estimation.batch import map_tracks
-from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.smoother.problem import effective_sigmas
-from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.tracks import Track
 
 LEAST_SAMPLES = 10
 """A stretch of fewer samples tells next to nothing once its nine start values are found."""
 LEAST_DURATION = 0.08
 """s. A shorter stretch tells next to nothing either."""
+TENSORS = ("times", "positions", "sigmas", "starts", "heights", "contacts", "labels")
+"""Names of the tensors of `Stretches`."""
+PADDING = {"sigmas": math.inf, "heights": math.nan, "contacts": math.nan}
+"""Numbers that stand for missing samples and contacts; times and positions repeat the last one."""
 
 
 @dataclass(frozen=True)
@@ -78,24 +82,8 @@ class Stretches:
         """Some of the stretches."""
         index = np.arange(len(self))[np.asarray(rows)]
         where = torch.from_numpy(index)
-        fields = ("times", "positions", "sigmas", "starts", "heights", "contacts", "labels")
-        tensors = {name: getattr(self, name)[where] for name in fields}
+        tensors = {name: getattr(self, name)[where] for name in TENSORS}
         return Stretches(tuple(self.names[i] for i in index), self.track[index], self.settings[index], **tensors)
-
-
-@dataclass(frozen=True)
-class _Stretch:
-    """One stretch, not padded yet: fields as in `Stretches`."""
-
-    name: str
-    settings: Array
-    times: Array
-    positions: Array
-    sigmas: Array
-    start: Array
-    heights: Array
-    contacts: Array
-    label: Array
 
 
 def stretches_of(smoother: Smoother, tracks: Iterable[Track], launcher: Launcher, jobs: int = 1) -> Stretches:
@@ -112,16 +100,17 @@ def stretches_of(smoother: Smoother, tracks: Iterable[Track], launcher: Launcher
     """
     tracks = list(tracks)
     cut = list(map_tracks(partial(_cut, smoother, launcher), tracks, len(tracks), jobs))
-    found = [stretch for stretches in cut for stretch in stretches]
+    found = [replace(stretch, track=np.array([number])) for number, own in enumerate(cut) for stretch in own]
     if not found:
         raise ValueError(
             f"tracks must hold free flights of at least {LEAST_SAMPLES} samples and {LEAST_DURATION:g} s; none does. "
             "Record longer tracks."
         )
-    return _batch(found, np.repeat(np.arange(len(cut)), [len(stretches) for stretches in cut]))
+    return joined(found)
 
 
-def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[_Stretch]:
+def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[Stretches]:
+    """Each stretch of a track by itself."""
     known = launcher.settings(track)
     settings = np.zeros(len(launcher.embedding.names)) if known is None else known
     segmentation = smoother.segment(track)
@@ -138,38 +127,35 @@ def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[_Stretch]
         begin, end = float(track.times[usable[0]]), track.times[usable[-1]]
         met = [c for c in estimate.contacts if usable[0] <= c.interval < usable[-1] and begin < c.time < end]
         launched = usable[0] == 0
-        stretches.append(
-            _Stretch(
-                name=track.name,
-                settings=settings if launched else np.zeros_like(settings),
-                times=track.times[usable] - begin,
-                positions=track.positions[usable],
-                sigmas=sigma[usable],
-                start=estimate.states[usable[0]],
-                heights=np.array([c.height for c in met], dtype=np.float64),
-                contacts=np.array([c.time - begin for c in met], dtype=np.float64),
-                label=track.spin_label if launched and track.spin_label is not None else np.full(3, np.nan),
-            )
-        )
+        rows = {
+            "times": track.times[usable] - begin,
+            "positions": track.positions[usable],
+            "sigmas": sigma[usable],
+            "starts": estimate.states[usable[0]],
+            "heights": np.array([c.height for c in met], dtype=np.float64),
+            "contacts": np.array([c.time - begin for c in met], dtype=np.float64),
+            "labels": track.spin_label if launched and track.spin_label is not None else np.full(3, np.nan),
+        }
+        tensors = {name: torch.from_numpy(row).unsqueeze(0) for name, row in rows.items()}
+        own = settings if launched else np.zeros_like(settings)
+        stretches.append(Stretches((track.name,), np.zeros(1, dtype=np.int64), own[None], **tensors))
     return stretches
 
 
-def _batch(found: Sequence[_Stretch], track: Index) -> Stretches:
-    samples, contacts = max(len(s.times) for s in found), max(len(s.contacts) for s in found)
-    padded = {
-        "times": [_padded(s.times, samples) for s in found],
-        "positions": [_padded(s.positions, samples) for s in found],
-        "sigmas": [_padded(s.sigmas, samples, np.inf) for s in found],
-        "starts": [s.start for s in found],
-        "heights": [_padded(s.heights, contacts, np.nan) for s in found],
-        "contacts": [_padded(s.contacts, contacts, np.nan) for s in found],
-        "labels": [s.label for s in found],
-    }
-    tensors = {name: torch.from_numpy(np.stack(rows)) for name, rows in padded.items()}
-    return Stretches(tuple(s.name for s in found), track, np.stack([s.settings for s in found]), **tensors)
+def joined(parts: Sequence[Stretches]) -> Stretches:
+    """Several batches of stretches as one, padded to the longest."""
+    tensors = {}
+    for name in TENSORS:
+        own = [getattr(part, name) for part in parts]
+        length = max(tensor.shape[1] for tensor in own)
+        tensors[name] = torch.cat([_padded(tensor, length, PADDING.get(name)) for tensor in own])
+    names = tuple(name for part in parts for name in part.names)
+    track, settings = (np.concatenate([getattr(part, name) for part in parts]) for name in ("track", "settings"))
+    return Stretches(names, track, settings, **tensors)
 
 
-def _padded(rows: Array, length: int, fill: float | None = None) -> Array:
-    """Rows (m, ...) continued to a length, with a number or else with the last row."""
-    width = [(0, length - len(rows))] + [(0, 0)] * (rows.ndim - 1)
-    return np.pad(rows, width, "edge") if fill is None else np.pad(rows, width, constant_values=fill)
+def _padded(rows: Tensor, length: int, fill: float | None) -> Tensor:
+    """Rows (n, m, ...) continued to a length, with a number or else with the last of each."""
+    missing = (len(rows), length - rows.shape[1], *rows.shape[2:])
+    rest = rows[:, -1:].expand(missing) if fill is None else rows.new_full(missing, fill)
+    return torch.cat((rows, rest), dim=1)

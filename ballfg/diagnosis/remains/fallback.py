@@ -16,16 +16,10 @@ from ballfg.diagnosis.remains.sparse import SparseTerms, fit_with_terms, sparse_
 from ballfg.diagnosis.result import Errors, Fallback
 from ballfg.diagnosis.search.calibrated import calibrated_model
 from ballfg.diagnosis.search.process_noise import with_process_noise
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.networks.architecture import Architecture
-from ballfg.dynamics.networks.learned import LearnedModel, build
-from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
-from ballfg.estimation.configure import dataset_settings, dataset_surfaces
+from ballfg.dynamics import AnalyticModel, Architecture, BallModel, LearnedModel, SpinEmbedding, build
+from ballfg.estimation import Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.measurement.as_measured import plainly_measured
 from ballfg.estimation.measurement.invert_measurement import ThroughMeasurement
-from ballfg.estimation.settings import Settings
-from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.learning.config.training import LossConfig, OptimizerConfig, TrainConfig
 from ballfg.learning.end_to_end.end_to_end import EndToEnd
 from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales

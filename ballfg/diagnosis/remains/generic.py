@@ -12,13 +12,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.system import System
 from ballfg.diagnosis.remains.drift import DRIFT, describe_drift, drift_block
-from ballfg.diagnosis.remains.label_check import LABEL, LabelCheck, check_labels
+from ballfg.diagnosis.remains.label_check import LABEL, check_labels
 from ballfg.diagnosis.remains.patterns import EVERYWHERE, PLAUSIBLE, Block, blocks_of
-from ballfg.diagnosis.remains.whiteness import Whiteness, whiteness
+from ballfg.diagnosis.remains.whiteness import whiteness
 from ballfg.diagnosis.result import Array, GenericTest
-from ballfg.diagnosis.search.score import Pattern, pattern_tests
-from ballfg.diagnosis.search.signatures import Signatures, signatures_of
+from ballfg.diagnosis.search.score import pattern_tests
+from ballfg.diagnosis.search.signatures import signatures_of
 
 ALARM = 0.005
 """Probability that any of the tests of a fit that lacks nothing raises an alarm: p-values below it are alarms."""
@@ -31,26 +32,22 @@ MOST_SEEN = 95.0
 
 
 @dataclass(frozen=True)
-class _Tested:
-    """The outcome for one block: where it lives, and the test in its leading directions."""
+class _Test:
+    """One test of one fit.
 
-    block: Block
+    Attributes:
+        kind: as in `GenericTest`.
+        quantities: of the block, in words; none for other tests.
+        where: place of the pattern, in words.
+        p_value: not corrected for the number of tests.
+        size: of the pattern, whose ratio to that at the start is its share.
+    """
+
+    kind: str
+    quantities: tuple[str, ...]
     where: str
-    pattern: Pattern
-
-
-@dataclass(frozen=True)
-class _Examined:
-    """All tests of one fit."""
-
-    found: list[_Tested]
-    whiteness: Whiteness
-    labels: LabelCheck | None
-
-    def of_block(self, block: Block) -> _Tested | None:
-        """The test of a block of the same quantities."""
-        same = [t for t in self.found if (t.block.kind, t.block.quantities) == (block.kind, block.quantities)]
-        return same[0] if same else None
+    p_value: float
+    size: float
 
 
 def generic_tests(fit: Fit, reference: Fit | None = None) -> tuple[GenericTest, ...]:
@@ -63,35 +60,32 @@ def generic_tests(fit: Fit, reference: Fit | None = None) -> tuple[GenericTest, 
     Returns:
         The tests, the least probable first.
     """
-    now = _examine(fit)
-    start = now if reference is None or reference is fit else _examine(reference)
-    quieter = 1.0 if reference is None else _noise_square(fit) / _noise_square(reference)
-    count = len(now.found) + 1 + (now.labels is not None)
-    tests = [_block_test(tested, start.of_block(tested.block), quieter, count) for tested in now.found]
-    tests.append(_time_test(now.whiteness, start.whiteness, count))
-    if now.labels is not None and start.labels is not None:
-        tests.append(_label_test(now.labels, start.labels, count))
-    return tuple(sorted(tests, key=lambda t: t.p_value))
+    tests = _tests_of(fit)
+    first = tests if reference is None or reference is fit else _tests_of(reference)
+    sizes = {(test.kind, test.quantities): test.size for test in first}
+    found = []
+    for test in tests:
+        whole = max(test.size, sizes.get((test.kind, test.quantities), 0.0))
+        share = test.size / whole if whole > 0.0 else 0.0
+        found.append(GenericTest(test.kind, test.where, min(1.0, len(tests) * test.p_value), share))
+    return tuple(sorted(found, key=lambda t: t.p_value))
 
 
-def _noise_square(fit: Fit) -> float:
-    """Mean square of the noise's scale. It turns shares of whitened residuals into shares of plain ones."""
-    return float((fit.noise.position**2).mean())
-
-
-def _examine(fit: Fit) -> _Examined:
+def _tests_of(fit: Fit) -> list[_Test]:
     system = fit.linearised()
-    drifting = drift_block(fit, system)
-    blocks = [*blocks_of(fit), *([] if drifting is None else [drifting])]
+    drifting, drift, labels = drift_block(fit, system), whiteness(fit, system), check_labels(fit, system)
+    tests = _block_tests(fit, system, [*blocks_of(fit), *([] if drifting is None else [drifting])])
+    tests.append(_Test("time", (), drift.where, drift.p_value, drift.drift**2))
+    if labels is not None:
+        tests.append(_Test(LABEL, (), labels.where, labels.p_value, float(len(labels.contradicted))))
+    return tests
+
+
+def _block_tests(fit: Fit, system: System, blocks: list[Block]) -> list[_Test]:
+    """Tests of all blocks that the data show at all."""
     signatures = signatures_of(fit, system, np.concatenate([block.columns for block in blocks], axis=-1))
-    return _Examined(_tested(fit, signatures, blocks), whiteness(fit, system), check_labels(fit, system))
-
-
-def _tested(fit: Fit, signatures: Signatures, blocks: list[Block]) -> list[_Tested]:
-    """Every block that the data show at all."""
     efficient = signatures.efficient()
-    information = efficient.total
-    score, at = efficient.score.sum(axis=0), 0
+    information, score, at = efficient.total, efficient.score.sum(axis=0), 0
     seen: list[tuple[Block, str]] = []
     directions: list[Array] = []
     for block in blocks:
@@ -103,8 +97,11 @@ def _tested(fit: Fit, signatures: Signatures, blocks: list[Block]) -> list[_Test
             words = describe_drift(fit, block, strengths) if block.kind == DRIFT else where(block, strengths)
             seen.append((block, words))
             directions.append(turn)
-    patterns = pattern_tests(signatures, directions)
-    return [_Tested(*of, pattern) for of, pattern in zip(seen, patterns, strict=True)]
+    noise = float((fit.noise.position**2).mean())  # shares are of residuals that are not whitened
+    return [
+        _Test(block.kind, block.quantities, words, p.p_value, noise * max(0.0, p.explained - p.rank))
+        for (block, words), p in zip(seen, pattern_tests(signatures, directions), strict=True)
+    ]
 
 
 def _leading(information: Array, tracks: int, own: slice, count: int) -> Array:
@@ -131,22 +128,3 @@ def where(block: Block, strengths: Array) -> str:
     }[block.kind]
     depends = f"is off {EVERYWHERE}" if name == EVERYWHERE else f"depends on {name}"
     return f"{block.kind}: {what} {block.axes[axis]} {depends}, up to {factor * size:.2g} {unit}"
-
-
-def _block_test(tested: _Tested, start: _Tested | None, quieter: float, count: int) -> GenericTest:
-    left = quieter * max(0.0, tested.pattern.explained - tested.pattern.rank)
-    first = max(left, 0.0 if start is None else start.pattern.explained - start.pattern.rank)
-    p_value, share = min(1.0, count * tested.pattern.p_value), left / first if first > 0.0 else 0.0
-    return GenericTest(tested.block.kind, tested.where, p_value, share)
-
-
-def _time_test(now: Whiteness, start: Whiteness, count: int) -> GenericTest:
-    whole = max(now.drift, start.drift)
-    where = f"time: samples within {1e3 * now.reach:.0f} ms err alike, by {1e3 * now.drift:.2g} mm"
-    share = (now.drift / whole) ** 2 if whole > 0.0 else 0.0
-    return GenericTest("time", where, min(1.0, count * now.p_value), share)
-
-
-def _label_test(labels: LabelCheck, start: LabelCheck, count: int) -> GenericTest:
-    now, first = len(labels.contradicted), len(start.contradicted)
-    return GenericTest(LABEL, labels.where, min(1.0, count * labels.p_value), now / max(now, first) if now else 0.0)

@@ -43,6 +43,11 @@ class Whiteness:
     spread: Array
     nis: Array
 
+    @property
+    def where(self) -> str:
+        """The time and size of the common error, in words."""
+        return f"time: samples within {1e3 * self.reach:.0f} ms err alike, by {1e3 * self.drift:.2g} mm"
+
 
 def whiteness(fit: Fit, system: System) -> Whiteness:
     """The test of a fit for drift along its tracks; system: of the fit, linearised at its minimum."""
@@ -59,7 +64,7 @@ def whiteness(fit: Fit, system: System) -> Whiteness:
         total, variance, third = _summed(residual, taken, kept, kernel)
         sums.append(total)
         spreads.append(np.sqrt(variance))
-        p_values.append(_gamma_tail(total, variance, third))
+        p_values.append(float(stats.pearson3.sf(total / np.sqrt(variance), third / variance**1.5)))
         products.append(total / (3.0 * kernel.sum()))
     most = int(np.argmin(p_values))
     sigma = float(np.sqrt((fit.sigmas[stretches.used.numpy()] ** 2).mean()))
@@ -100,23 +105,14 @@ def _summed(residual: Array, taken: Array, kept: Mask, kernel: Array) -> tuple[f
     scale = (residual**2).sum(axis=(1, 2)) / freedom
     products = residual @ residual.swapaxes(-1, -2)
     sums = (kernel * products).sum(axis=(1, 2)) / scale + c * freedom
-    uneven = _unevenness(kernel, products, scale)
-    return float(sums.sum()), uneven * float(variance.sum()), uneven**1.5 * float(skew.sum())
-
-
-def _unevenness(kernel: Array, products: Array, scale: Array) -> float:
-    """By how much noise that differs from sample to sample (jitter on a fast ball) raises the variance; at least 1."""
+    # noise that differs from sample to sample (jitter on a fast ball) raises the variance
     seen = (kernel**2 * products**2).sum(axis=(1, 2)) / scale**2
-    return max(1.0, float(seen.sum() / (3.0 * (kernel**2).sum())))
+    uneven = max(1.0, float(seen.sum() / (3.0 * (kernel**2).sum())))
+    return float(sums.sum()), uneven * float(variance.sum()), uneven**1.5 * float(skew.sum())
 
 
 def _trace(matrices: Array) -> Array:
     return np.asarray(np.trace(matrices, axis1=-2, axis2=-1))
-
-
-def _gamma_tail(value: float, variance: float, third: float) -> float:
-    """Probability of a larger value, mean zero."""
-    return float(stats.pearson3.sf(value / np.sqrt(variance), third / variance**1.5))
 
 
 def _without(system: System, samples: Mask) -> System:

@@ -42,7 +42,10 @@ def write_report(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> None:
     with tempfile.TemporaryDirectory(prefix=f".{folder.name}.", suffix=".part", dir=folder.parent) as temporary:
         made = Path(temporary) / "report"
         made.mkdir()
-        _write_all(diagnosis, made)
+        save_model(diagnosis.model, made / MODEL)
+        (made / PAGE).write_text(page(diagnosis), encoding="utf-8")
+        text = json.dumps(content(diagnosis), indent=2, allow_nan=False, ensure_ascii=False)
+        (made / REPORT).write_text(text + "\n", encoding="utf-8")
         _move(made, folder)
 
 
@@ -61,13 +64,6 @@ def check_report_folder(folder: Path) -> None:
         )
     if not folder.absolute().parent.is_dir():
         raise FileNotFoundError(f"out must be in an existing folder; {folder.parent} is none. Create it first.")
-
-
-def _write_all(diagnosis: Diagnosis, folder: Path) -> None:
-    save_model(diagnosis.model, folder / MODEL)
-    (folder / PAGE).write_text(page(diagnosis), encoding="utf-8")
-    text = json.dumps(content(diagnosis), indent=2, allow_nan=False, ensure_ascii=False)
-    (folder / REPORT).write_text(text + "\n", encoding="utf-8")
 
 
 def _move(made: Path, folder: Path) -> None:

@@ -10,9 +10,7 @@ import torch
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Value
 from ballfg.diagnosis.search.hypothesis import with_effects
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
-from ballfg.dynamics.trained import Trained
+from ballfg.dynamics import AnalyticModel, SpinEmbedding, Trained
 
 LEAST_SPIN_SIGMA = 1.0
 """rad/s. A launcher is not taken to repeat its spin better than that."""

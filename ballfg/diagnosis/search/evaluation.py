@@ -15,12 +15,10 @@ from ballfg.diagnosis.fit.system import by_track
 from ballfg.diagnosis.result import Array, Errors
 from ballfg.diagnosis.search.score import score_tests
 from ballfg.diagnosis.search.signatures import Signatures
-from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.registry import make_estimator
-from ballfg.estimation.settings import Settings
+from ballfg.dynamics import BallModel, Surfaces
+from ballfg.estimation import Settings, make_estimator
+from ballfg.prediction import TrackPrediction, predict_tracks
 from ballfg.prediction.apexes import measured_apexes, path_apex
-from ballfg.prediction.tracks import TrackPrediction, predict_tracks
 
 OBSERVED = 0.4
 """Share of each track that is observed; the rest is predicted."""

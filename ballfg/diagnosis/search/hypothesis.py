@@ -11,9 +11,7 @@ from typing import cast
 import numpy as np
 
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.result import Array
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.effect import Coefficient, Effect
+from ballfg.dynamics import AnalyticModel, Coefficient, Effect
 from ballfg.dynamics.scene import Scene, Vector
 
 SECTION = {"flight": "flight", "bounce": "contact", "measurement": "measurement"}
@@ -131,16 +129,13 @@ def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effe
         if has_effect(model, effect.name):
             exact = tuple(c.name for c in effect.coefficients if c.sigma == 0.0 and c.absent is not None)
             listed += [Hypothesis(effect, {}, exact)] if exact else []
-        elif all(has_effect(model, needed) for needed in effect.needs) and _applies(effect, scene):
+            continue
+        bounces = effect.kind != "bounce" or scene.contacts > 0
+        labels = not effect.name.startswith("spin_label") or scene.labels > 0
+        if bounces and labels and all(has_effect(model, needed) for needed in effect.needs):
             strengths = tuple(c.name for c in effect.coefficients if c.absent is not None)
             listed += [Hypothesis(effect, shape, strengths) for shape in effect.shapes(scene)]
     return listed
-
-
-def _applies(effect: type[Effect], scene: Scene) -> bool:
-    if effect.kind == "bounce":
-        return scene.contacts > 0
-    return scene.labels > 0 or not effect.name.startswith("spin_label")
 
 
 def scene_of(fit: Fit) -> Scene:
@@ -162,17 +157,16 @@ def scene_of(fit: Fit) -> Scene:
         for i, row in enumerate(fit.predicted.contacts)
         for time in row[np.isfinite(row)]
     ]
+    low, high, middle = (
+        cast(Vector, tuple(place.tolist()))
+        for place in (positions.min(axis=0), positions.max(axis=0), np.median(positions, axis=0))
+    )
     return Scene(
-        _vector(positions.min(axis=0)),
-        _vector(positions.max(axis=0)),
-        _vector(np.median(positions, axis=0)),
+        low,
+        high,
+        middle,
         float(np.median(np.linalg.norm(velocities[used], axis=-1))),
         float(np.median(impacts)) if impacts else float("nan"),
         len(impacts),
         int(stretches.labelled.sum()),
     )
-
-
-def _vector(values: Array) -> Vector:
-    x, y, z = values.tolist()
-    return x, y, z

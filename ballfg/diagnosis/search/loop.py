@@ -24,8 +24,7 @@ from ballfg.diagnosis.search.evaluation import HeldOutGain, held_out_gain
 from ballfg.diagnosis.search.hypothesis import has_effect, hypotheses, scene_of, with_effects
 from ballfg.diagnosis.search.label_frames import frame_hypotheses
 from ballfg.diagnosis.search.process_noise import PredictiveModel
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.effect import Effect
+from ballfg.dynamics import AnalyticModel, Effect
 from ballfg.dynamics.effects.measurement.spin_label_frame import SpinLabelFrame
 
 MOST_EFFECTS = 4
@@ -156,7 +155,11 @@ def _tried(
     leading, refits = shortlist(scored), []
     for candidate in leading:
         tell(f"fitting with {candidate.hypothesis.name}")
-        refits += [refit(before, shaped) for shaped in _shaped(before, candidate)]
+        shaped = [candidate]
+        if candidate.hypothesis.effect is SpinLabelFrame:
+            frames = frame_hypotheses(before, candidate.hypothesis)
+            shaped = [Scored(frame, None, candidate.p_value) for frame in frames]
+        refits += [refit(before, one) for one in shaped]
     called = {candidate.hypothesis.name for candidate in leading}
     for place, hypothesis in enumerate([s.hypothesis for s in scored]):
         if hypothesis.name in called or not hypothesis.usual or has_effect(model, hypothesis.name):
@@ -173,13 +176,6 @@ def _tried(
         refits += [fitted] if fitted.scored.p_value < ALARM else []
     ranked = sorted(scored, key=lambda s: s.explained, reverse=True)
     return ranked, sorted(refits, key=lambda r: r.delta_bic)
-
-
-def _shaped(before: Fit, scored: Scored) -> list[Scored]:
-    """The shapes to refit for a hypothesis: itself, or the likely frames of spin labels."""
-    if scored.hypothesis.effect is not SpinLabelFrame:
-        return [scored]
-    return [Scored(frame, None, scored.p_value) for frame in frame_hypotheses(before, scored.hypothesis)]
 
 
 def _finding(winner: _Confirmed, alike: tuple[str, ...]) -> Finding:

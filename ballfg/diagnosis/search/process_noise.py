@@ -18,9 +18,8 @@ import numpy as np
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.result import Errors
 from ballfg.diagnosis.search.evaluation import prediction_errors
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.trained import Trained
-from ballfg.estimation.configure import dataset_settings, dataset_surfaces
+from ballfg.dynamics import AnalyticModel, Trained
+from ballfg.estimation import dataset_settings, dataset_surfaces
 from ballfg.estimation.settings import MEASURED
 from ballfg.tracks import Dataset
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from ballfg.diagnosis.fit.shooting import shoot
+from ballfg.dynamics import rollout
 from ballfg.dynamics.model import substitute
-from ballfg.dynamics.motion import rollout
 from ballfg.dynamics.motion.paths import paths
 
 pytestmark = pytest.mark.usefixtures("no_graph")

@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, stretches_of
-from ballfg.dynamics import Surfaces
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics import Surfaces, rollout
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.settings import Settings

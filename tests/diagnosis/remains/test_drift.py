@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
+from ballfg.diagnosis.fit.stretches import joined
 from ballfg.diagnosis.remains.drift import DRIFT, drift_block
 from ballfg.diagnosis.remains.generic import ALARM, generic_tests
 
@@ -21,17 +21,7 @@ def two_sessions(make_ball, make_launches, make_shots, make_fit):
         make_shots(make_ball(restitution={"e": e}), make_launches(COUNT // 2, seed), seed).stretches
         for e, seed in ((0.95, 31), (0.87, 32))
     ]
-    together = type(parts[0])(
-        names=tuple(f"{i:03d}" for i in range(COUNT)),
-        track=np.arange(COUNT),
-        settings=np.concatenate([p.settings for p in parts]),
-        **{
-            name: torch.cat([getattr(p, name)[:, :width] for p in parts])
-            for name in ("times", "positions", "sigmas", "starts", "heights", "contacts", "labels")
-            for width in [min(getattr(p, name).shape[1] for p in parts)]
-        },
-    )
-    return make_fit(make_ball(), together)
+    return make_fit(make_ball(), replace(joined(parts), track=np.arange(COUNT)))
 
 
 def recording_test(fit):

@@ -71,7 +71,6 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return picture(Figure(figsize=(0.1, 0.1)), caption)
 
     monkeypatch.setattr("ballfg.diagnosis.report.page.picture", blank)
-    monkeypatch.setattr("ballfg.diagnosis.report.evidence.picture", blank)
     return captions
 
 
