@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.fit.holdout import Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.remains.fallback import fallback
@@ -14,10 +15,9 @@ from ballfg.diagnosis.remains.generic import ALARM, generic_tests
 from ballfg.diagnosis.remains.residuals import residuals_of
 from ballfg.diagnosis.report.wording import sentence
 from ballfg.diagnosis.result import Diagnosis, Errors, GenericTest, Unexplained, Value, Verdict
-from ballfg.diagnosis.search.calibrated import calibrated_model, values_of
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.loop import Search, SearchLoop
-from ballfg.diagnosis.search.process_noise import PredictiveModel, with_process_noise
+from ballfg.diagnosis.search.process_noise import PredictiveModel, calibrated_model, with_process_noise
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
 from ballfg.estimation import dataset_settings
 from ballfg.tracks import Dataset

@@ -14,9 +14,8 @@ from ballfg.diagnosis.fit.holdout import hold_out
 from ballfg.diagnosis.fit.problem import Problem, declared_free
 from ballfg.diagnosis.fit.stretches import Stretches, stretches_of
 from ballfg.diagnosis.result import Errors
-from ballfg.diagnosis.search.calibrated import calibrated_model
 from ballfg.diagnosis.search.evaluation import prediction_errors
-from ballfg.diagnosis.search.process_noise import with_process_noise
+from ballfg.diagnosis.search.process_noise import calibrated_model, with_process_noise
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effect import Coefficient
 from ballfg.estimation import Smoother, dataset_settings

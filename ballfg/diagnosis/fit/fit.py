@@ -8,7 +8,7 @@ effects declare, so that those which the data cannot determine keep their declar
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
@@ -18,7 +18,7 @@ from ballfg.diagnosis.fit.problem import Fit, Noise, Problem, Robust, Unknowns, 
 from ballfg.diagnosis.fit.sensitivity import Predicted, predict
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System
-from ballfg.diagnosis.result import Mask
+from ballfg.diagnosis.result import Mask, Value
 from ballfg.dynamics import AnalyticModel
 from ballfg.estimation import Settings
 from ballfg.state import SPIN, STATE_DIM
@@ -86,6 +86,19 @@ def fit_problem(problem: Problem, unknowns: Unknowns, noise: Noise, *, settle_no
     for _ in range(SCALE_ROUNDS if settle_noise else 0):
         result = _minimise(Fit.at(result.problem, result.unknowns, _settled(result), result.steps))
     return result
+
+
+def values_of(fit: Fit, names: Iterable[str], declared: Mapping[str, float]) -> dict[str, Value]:
+    """Fitted coefficients with their standard deviations, by parameter name.
+
+    Args: names: those wanted.  declared: values that the model stated before the fit, for those that it did.
+    """
+    total = fit.linearised().eliminated().gram.sum(axis=0)[:-1, :-1] + np.diag(fit.problem.common_precision)
+    sigmas = dict(zip(fit.problem.free, np.sqrt(np.diagonal(np.linalg.inv(total))).tolist(), strict=False))
+    units = fit.problem.model.declared_coefficients()
+    return {
+        name: Value(fit.unknowns.values[name], sigmas[name], units[name].unit, declared.get(name)) for name in names
+    }
 
 
 def _minimise(now: Fit) -> Fit:

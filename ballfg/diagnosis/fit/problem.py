@@ -14,12 +14,13 @@ from ballfg.diagnosis.fit.system import System
 from ballfg.diagnosis.result import Array, Index
 from ballfg.dynamics import AnalyticModel, Coefficient
 from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED
+from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, STATE_DIM, VELOCITY
 
-HUBER = 3.0
-"""Norm of a whitened position residual (three coordinates) beyond which a sample counts less."""
-LABEL_CAUCHY = 3.0
-"""Scale of the robust weight of a spin label, in its standard deviations: labels were seen to contradict the flight."""
+POSITION_LOSS = Loss("huber", 3.0)
+"""Of a whitened position residual (three coordinates)."""
+LABEL_LOSS = Loss("cauchy", 3.0)
+"""Of a whitened spin label: labels were seen to contradict the flight."""
 LAUNCHER_SPIN_SIGMA = 150.0
 """rad/s, prior of the spin that a launcher setting of typical size means, per axis, about zero."""
 
@@ -146,12 +147,11 @@ class Fit:
     def robust(self) -> Robust:
         """Huber's weights and losses of positions, Cauchy's of labels."""
         length = np.linalg.norm(self.whitened, axis=-1)
-        weight = np.minimum(1.0, HUBER / np.maximum(length, HUBER))
-        loss = np.where(length <= HUBER, 0.5 * length**2, HUBER * length - 0.5 * HUBER**2)
-        square, labelled = (self.whitened_spins**2).sum(axis=-1), self.problem.stretches.labelled
-        spin_weight = np.where(labelled, 1.0 / (1.0 + square / LABEL_CAUCHY**2), 1.0)
-        spin_loss = np.where(labelled, 0.5 * LABEL_CAUCHY**2 * np.log1p(square / LABEL_CAUCHY**2), 0.5 * square)
-        return Robust(weight, spin_weight, loss.sum(axis=-1) + spin_loss)
+        spin, labelled = np.linalg.norm(self.whitened_spins, axis=-1), self.problem.stretches.labelled
+        spin_weight = np.where(labelled, LABEL_LOSS.weight(spin), 1.0)
+        spin_loss = np.where(labelled, LABEL_LOSS.value(spin), 0.5 * spin**2)
+        losses = POSITION_LOSS.value(length).sum(axis=-1) + spin_loss
+        return Robust(POSITION_LOSS.weight(length), spin_weight, losses)
 
     @cached_property
     def cost(self) -> float:

@@ -14,8 +14,7 @@ from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.remains.sparse import SparseTerms, fit_with_terms, sparse_terms
 from ballfg.diagnosis.result import Errors, Fallback
-from ballfg.diagnosis.search.calibrated import calibrated_model
-from ballfg.diagnosis.search.process_noise import with_process_noise
+from ballfg.diagnosis.search.process_noise import calibrated_model, with_process_noise
 from ballfg.dynamics import AnalyticModel, Architecture, BallModel, LearnedModel, SpinEmbedding, build
 from ballfg.estimation import Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.measurement.as_measured import plainly_measured

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from ballfg.diagnosis.result import Array, ContactResiduals, FlightResiduals, Index
+from ballfg.dynamics.motion.impact import slip_velocity
 from ballfg.state import SPIN, VELOCITY
 
 MOST_BINS, LEAST_BINS = 12, 3
@@ -59,8 +61,8 @@ def at_contact(residuals: ContactResiduals) -> tuple[Array, Array]:
 
 def slip_speed(states: Array, radius: float) -> Array:
     """(m,) m/s at which the lowest point of a ball of `radius` m slides over the ground."""
-    velocity, spin = states[:, VELOCITY], states[:, SPIN]
-    return np.asarray(np.hypot(velocity[:, 0] - radius * spin[:, 1], velocity[:, 1] + radius * spin[:, 0]))
+    velocity, spin = torch.from_numpy(states[:, VELOCITY]), torch.from_numpy(states[:, SPIN])
+    return slip_velocity(velocity, spin, radius).norm(dim=-1).numpy()
 
 
 def binned(against: Array, values: Array, sigmas: Array, stretch: Index) -> Bins:

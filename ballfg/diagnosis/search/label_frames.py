@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from ballfg.diagnosis.fit.fit import fit_problem
-from ballfg.diagnosis.fit.problem import LABEL_CAUCHY, Fit
+from ballfg.diagnosis.fit.problem import LABEL_LOSS, Fit
 from ballfg.diagnosis.result import Array
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.dynamics.effects.measurement.spin_label_frame import signed_permutations
@@ -60,5 +60,5 @@ def _disagreement(labels: Array, spins: Array, covariances: Array, frame: Array,
     covariance = frame @ covariances @ frame.T + noise**2 * np.eye(3)
     apart = labels - spins @ frame.T
     square = (apart * np.linalg.solve(covariance, apart[..., None])[..., 0]).sum(axis=-1)
-    robust = LABEL_CAUCHY**2 * np.log1p(square / LABEL_CAUCHY**2) + np.linalg.slogdet(covariance)[1]
+    robust = 2.0 * LABEL_LOSS.value(np.sqrt(square)) + np.linalg.slogdet(covariance)[1]
     return float(robust.sum())

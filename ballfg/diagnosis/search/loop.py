@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
-from ballfg.diagnosis.fit.fit import fit_model, fit_problem
+from ballfg.diagnosis.fit.fit import fit_model, fit_problem, values_of
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Candidate, Finding, Outcome, Value
-from ballfg.diagnosis.search.calibrated import values_of
 from ballfg.diagnosis.search.candidates import (
     ALARM,
     Refit,
@@ -21,7 +20,7 @@ from ballfg.diagnosis.search.candidates import (
     shortlist,
 )
 from ballfg.diagnosis.search.evaluation import HeldOutGain, held_out_gain
-from ballfg.diagnosis.search.hypothesis import has_effect, hypotheses, scene_of, with_effects
+from ballfg.diagnosis.search.hypothesis import has_effect, hypotheses, scene_of
 from ballfg.diagnosis.search.label_frames import frame_hypotheses
 from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.dynamics import AnalyticModel, Effect
@@ -82,7 +81,7 @@ class SearchLoop:
     def run(self, model: AnalyticModel) -> Search:
         """Add effects to the declared model until none helps."""
         self.watch(f"fitting the declared model to {len(self.holdout.search)} flights")
-        first = fit_model(with_effects(model), self.holdout.search, self.holdout.settings)
+        first = fit_model(model, self.holdout.search, self.holdout.settings)
         declared = self.predictive(first)
         search = Search(first, declared, first, declared)
         while len(search.findings) == len(search.rounds) < MOST_EFFECTS:  # each round so far has added an effect

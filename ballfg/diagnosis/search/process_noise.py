@@ -1,9 +1,9 @@
-"""The process noise of measured balls: how far they stray from a model from one moment to the next.
+"""From a fit to a model that others can use: fitted coefficients, noise and launcher, and the process noise.
 
-The fit is deterministic, so that all motion beside the model goes to the residual. Predictions need that motion as
-process noise. Too little of it makes them overconfident; too much makes them ignore the observed part. The usual
-process noise of measured tracks is scaled as a whole, to the scale at which predictions of the search half have the
-largest likelihood.
+Process noise is how far measured balls stray from a model from one moment to the next. The fit is deterministic, so
+that all motion beside the model goes to the residual. Predictions need that motion as process noise. Too little of it
+makes them overconfident; too much makes them ignore the observed part. The usual process noise of measured tracks is
+scaled as a whole, to the scale at which predictions of the search half have the largest likelihood.
 """
 
 from __future__ import annotations
@@ -14,11 +14,14 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
+import torch
 
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
+from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Errors
 from ballfg.diagnosis.search.evaluation import prediction_errors
-from ballfg.dynamics import AnalyticModel, Trained
+from ballfg.diagnosis.search.hypothesis import with_effects
+from ballfg.dynamics import AnalyticModel, SpinEmbedding, Trained
 from ballfg.estimation import dataset_settings, dataset_surfaces
 from ballfg.estimation.settings import MEASURED
 from ballfg.tracks import Dataset
@@ -29,6 +32,8 @@ MOST_PREDICTED = 15
 """Tracks that are predicted to choose the scale, evenly over those given."""
 SCALED = ("acceleration", "spin", "contact_velocity", "contact_tangential", "contact_spin")
 """Numbers of the process noise that are scaled; the noise of a hit stays."""
+LEAST_SPIN_SIGMA = 1.0
+"""rad/s. A launcher is not taken to repeat its spin better than that."""
 
 
 @dataclass(frozen=True)
@@ -37,6 +42,23 @@ class PredictiveModel:
 
     model: AnalyticModel
     errors: Errors
+
+
+def calibrated_model(fit: Fit, embedding: SpinEmbedding) -> AnalyticModel:
+    """The fitted model, for estimates and predictions; embedding: names the launcher settings of the fit."""
+    model = with_effects(fit.problem.model)  # a copy
+    parameters = dict(model.named_parameters())
+    with torch.no_grad():
+        for name, value in fit.unknowns.values.items():
+            parameters[name].fill_(value)
+    unlabelled = not fit.problem.stretches.labelled.all()
+    learned = SpinEmbedding(embedding.labels, embedding.categories, torch.from_numpy(fit.unknowns.launcher))
+    model.trained = Trained(
+        position_scale=float(np.sqrt((fit.noise.position**2).mean())),
+        launcher=learned.requires_grad_(False) if unlabelled else None,
+        spin_noise=max(fit.noise.spin, LEAST_SPIN_SIGMA) if unlabelled else fit.noise.label,
+    )
+    return model
 
 
 def with_process_noise(

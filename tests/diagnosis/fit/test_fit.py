@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 
 from ballfg.diagnosis.fit.fit import first_guess, fit_problem, reachable
 from ballfg.diagnosis.fit.problem import (
-    LABEL_CAUCHY,
+    LABEL_LOSS,
     Fit,
     Noise,
     Problem,
@@ -43,7 +43,7 @@ def dense_residual(problem, noise, surfaces):
         position = (stretches.positions - motion[..., :3]).numpy() / (stretches.sigmas.numpy() * noise.position)
         spin = (stretches.labels.numpy() - starts[:, 6:].numpy()) / noise.label
         square = np.maximum((spin**2).sum(-1, keepdims=True), 1e-12)
-        spin = spin * np.sqrt(LABEL_CAUCHY**2 * np.log1p(square / LABEL_CAUCHY**2) / square)  # its square is the loss
+        spin = spin * np.sqrt(2.0 * LABEL_LOSS.value(np.sqrt(square)) / square)  # its square is the loss
         return np.concatenate((position.ravel(), spin.ravel(), (values - centre) / sigma))
 
     return residual

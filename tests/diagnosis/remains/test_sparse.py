@@ -7,9 +7,9 @@ import itertools
 import numpy as np
 import pytest
 
+from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.remains.fallback import describe
 from ballfg.diagnosis.remains.sparse import MOST_TERMS, fit_with_terms, select, sparse_terms
-from ballfg.diagnosis.search.calibrated import values_of
 from ballfg.dynamics import AnalyticModel, model_from_dict, model_to_dict
 from ballfg.dynamics.effects.flight.generic import GenericFlight
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
+from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.fit.problem import launch_axes
-from ballfg.diagnosis.search.calibrated import calibrated_model, values_of
+from ballfg.diagnosis.search.process_noise import calibrated_model
 from ballfg.dynamics import load_model, save_model
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 
