@@ -20,7 +20,7 @@ TENSORS = ("weights", "optimizer", "memory", "best")
 """One file `<name>.safetensors` each."""
 
 
-class Standing(BaseModel):
+class RunProgress(BaseModel):
     """How far a run is, in plain numbers."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
@@ -44,13 +44,13 @@ class Checkpoint:
     """A run after an epoch. There is no random state: all chance derives from seed, epoch and track.
 
     Attributes:
-        standing: how far it is.
+        progress: how far it is.
         weights: the module's state.  best: the same at the best epoch.
         optimizer: `<parameter>/<moment>`.
         memory: what the model carries from one epoch to the next.
     """
 
-    standing: Standing
+    progress: RunProgress
     weights: dict[str, Tensor]
     best: dict[str, Tensor]
     optimizer: dict[str, Tensor] = field(default_factory=dict)
@@ -69,7 +69,7 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     for name in TENSORS:
         tensors: dict[str, Tensor] = getattr(checkpoint, name)
         save_file({key: tensor.detach().contiguous().clone() for key, tensor in tensors.items()}, _tensors(part, name))
-    text = yaml.safe_dump(checkpoint.standing.model_dump(), sort_keys=False)
+    text = yaml.safe_dump(checkpoint.progress.model_dump(), sort_keys=False)
     (part / STATE).write_text(text, encoding="utf-8")
     for path in part.iterdir():
         _flush(path)
@@ -92,7 +92,7 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
     try:
         content: Any = yaml.safe_load((path / STATE).read_text(encoding="utf-8"))
         tensors = {name: load_file(_tensors(path, name)) for name in TENSORS}
-        return Checkpoint(Standing.model_validate(content), **tensors)
+        return Checkpoint(RunProgress.model_validate(content), **tensors)
     except ValidationError as error:
         reason = f"{STATE}: {error.errors()[0]['msg']}"
     except (OSError, UnicodeDecodeError, yaml.YAMLError, SafetensorError) as error:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.run.checkpoint import Checkpoint, Standing
+from ballfg.learning.run.checkpoint import Checkpoint, RunProgress
 from ballfg.learning.run.metrics import Epoch
 from ballfg.learning.run.optimizer import make_optimizer, moments, rate_factor, restore_moments
 from ballfg.learning.run.ranks import Ranks, SharedMemory
@@ -89,7 +89,7 @@ class Training:
         self.module = task.trainee.module
         self.optimizer = make_optimizer(task.trainee, task.config.optimizer)
         self.parameters = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
-        self.standing: Standing | None = None
+        self.progress: RunProgress | None = None
         self.best = _weights(self.module)
         self.memory = SharedMemory()
         self.skipped_in_row = 0
@@ -101,7 +101,7 @@ class Training:
 
         Raises: TrainingStoppedError: too many tracks failed, or too many steps in a row were not finite.
         """
-        done = -1 if self.standing is None else self.standing.epoch
+        done = -1 if self.progress is None else self.progress.epoch
         for number in range(done + 1, self.task.config.optimizer.epochs + 1):
             begun = time.monotonic()
             learned = self._learn(number) if number else _Tally()
@@ -122,10 +122,10 @@ class Training:
 
     def checkpoint(self) -> Checkpoint:
         """The run after its last whole epoch. All ranks call it; between epochs only."""
-        if self.standing is None:
+        if self.progress is None:
             raise ValueError("a checkpoint must follow an epoch; got none yet. Take the first of `epochs` before.")
         memory = self.memory.gather(self.task.ranks, self.task.trainee.memory())
-        return Checkpoint(self.standing, _weights(self.module), self.best, moments(self.optimizer, self.module), memory)
+        return Checkpoint(self.progress, _weights(self.module), self.best, moments(self.optimizer, self.module), memory)
 
     def take_best(self) -> None:
         """Put the best weights into the model."""
@@ -231,13 +231,13 @@ class Training:
         """Keep the weights if they are the best so far. When many tracks failed, the rest tells too little."""
         reliable = judged.failed <= self.task.config.failure_limit * len(self.task.validation)
         rmse = judged.rmse if reliable else None
-        best = None if self.standing is None else self.standing.best_rmse
+        best = None if self.progress is None else self.progress.best_rmse
         better = best is None or (rmse is not None and rmse < best)
         if better:
             self.best = _weights(self.module)
-        self.standing = Standing(
+        self.progress = RunProgress(
             epoch=number,
-            best_epoch=number if better or self.standing is None else self.standing.best_epoch,
+            best_epoch=number if better or self.progress is None else self.progress.best_epoch,
             best_rmse=rmse if better else best,
             skipped_in_row=self.skipped_in_row,
             train=len(self.task.train),
@@ -253,8 +253,8 @@ class Training:
 
     def _restore(self, checkpoint: Checkpoint) -> None:
         """Take up a checkpoint. Raises: ValueError: if it is of another model or other tracks."""
-        standing, task = checkpoint.standing, self.task
-        there, here = (standing.train, standing.validation), (len(task.train), len(task.validation))
+        progress, task = checkpoint.progress, self.task
+        there, here = (progress.train, progress.validation), (len(task.train), len(task.validation))
         if there != here:
             raise ValueError(
                 f"the checkpoint must be of the same tracks; it has {there[0]} to train and {there[1]} to validate, "
@@ -267,7 +267,7 @@ class Training:
             raise ValueError(f"the checkpoint must be of the same model; {error}. Start a new run.") from None
         task.trainee.remember(checkpoint.memory)
         self.memory = SharedMemory(checkpoint.memory)
-        self.standing, self.best, self.skipped_in_row = standing, checkpoint.best, standing.skipped_in_row
+        self.progress, self.best, self.skipped_in_row = progress, checkpoint.best, progress.skipped_in_row
 
 
 def _weights(module: nn.Module) -> dict[str, Tensor]:

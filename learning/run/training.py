@@ -74,7 +74,7 @@ class _Record:
     def __init__(self, task: Task, folder: Path, checkpoint: Checkpoint | None) -> None:
         """Write config and versions; of an earlier run's rows, keep those that the checkpoint knows of."""
         self.folder, self.last = folder, task.config.optimizer.epochs
-        self.saved = -1 if checkpoint is None else checkpoint.standing.epoch
+        self.saved = -1 if checkpoint is None else checkpoint.progress.epoch
         rows = read_metrics(folder / files.METRICS) if checkpoint is not None else []
         self.epochs = [row for row in rows if row.epoch <= self.saved]
         self.taken: list[float] = []
@@ -130,9 +130,9 @@ def _is_due(epoch: Epoch, config: TrainConfig) -> bool:
 def _finish(training: Training, folder: Path, export: Export) -> None:
     """Write the model with the best weights and say what is where."""
     model = export(training.task.trainee, folder)
-    standing = training.standing
-    if standing is not None and standing.best_rmse is not None:
-        print(f"best: epoch {standing.best_epoch}, validation RMSE {1e3 * standing.best_rmse:.2f} mm")
+    progress = training.progress
+    if progress is not None and progress.best_rmse is not None:
+        print(f"best: epoch {progress.best_epoch}, validation RMSE {1e3 * progress.best_rmse:.2f} mm")
     else:
         print("no validation track could be judged: the weights are those of the last epoch")
     print(f"{model}: the trained model\n{folder / files.METRICS}: all numbers\n{folder / files.CURVES}")

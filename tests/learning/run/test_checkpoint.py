@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 import torch
 
-from ballfg.learning.run.checkpoint import Checkpoint, Standing, read_checkpoint, write_checkpoint
+from ballfg.learning.run.checkpoint import Checkpoint, RunProgress, read_checkpoint, write_checkpoint
 
 
 def made(epoch: int) -> Checkpoint:
     random = torch.Generator().manual_seed(epoch)
     tensors = [torch.randn(3, 2, generator=random, dtype=torch.float64) for _ in range(4)]
     return Checkpoint(
-        standing=Standing(epoch=epoch, best_epoch=1, best_rmse=0.1 + 0.2, skipped_in_row=0, train=5, validation=2),
+        progress=RunProgress(epoch=epoch, best_epoch=1, best_rmse=0.1 + 0.2, skipped_in_row=0, train=5, validation=2),
         weights={"layer.weight": tensors[0].T},  # not contiguous
         best={"layer.weight": tensors[1]},
         optimizer={"layer.weight/step": torch.tensor(3.0)},
@@ -23,7 +23,7 @@ def made(epoch: int) -> Checkpoint:
 
 
 def same(a: Checkpoint | None, b: Checkpoint) -> bool:
-    if a is None or a.standing != b.standing:
+    if a is None or a.progress != b.progress:
         return False
     parts: list[tuple[Any, Any]] = [(getattr(a, n), getattr(b, n)) for n in ("weights", "best", "optimizer", "memory")]
     return all(x.keys() == y.keys() and all(torch.equal(x[k], y[k]) for k in x) for x, y in parts)

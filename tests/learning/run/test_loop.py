@@ -37,7 +37,7 @@ def finished(training: Training) -> list[Epoch]:
 
 
 def same_bits(a: Checkpoint, b: Checkpoint) -> None:
-    assert a.standing == b.standing
+    assert a.progress == b.progress
     for name in ("weights", "best", "optimizer", "memory"):
         x, y = getattr(a, name), getattr(b, name)
         assert x.keys() == y.keys()
@@ -97,7 +97,7 @@ def test_a_resumed_run_is_the_uninterrupted_one_bit_for_bit() -> None:
     same_bits(resumed.checkpoint(), whole.checkpoint())
     # and it is not for want of memory or chance: without them the numbers differ
     bare = begun.checkpoint()
-    forgetful = Training(task(batch=3, epochs=4), Checkpoint(bare.standing, bare.weights, bare.best, bare.optimizer))
+    forgetful = Training(task(batch=3, epochs=4), Checkpoint(bare.progress, bare.weights, bare.best, bare.optimizer))
     finished(forgetful)
     assert not torch.equal(forgetful.module.drag, whole.module.drag)
     other = Training(task(batch=3, epochs=4, seed=4))
@@ -112,7 +112,7 @@ def test_the_best_weights_are_kept_beside_the_last() -> None:
     best = int(np.argmin(errors))
     assert 0 < best < 7
     kept = training.checkpoint()
-    assert (kept.standing.best_epoch, kept.standing.best_rmse) == (best, errors[best])
+    assert (kept.progress.best_epoch, kept.progress.best_rmse) == (best, errors[best])
     until_then = Training(task(epochs=best, **swinging))
     finished(until_then)
     training.take_best()
@@ -123,7 +123,7 @@ def test_the_best_weights_are_kept_beside_the_last() -> None:
 def test_without_validation_the_last_weights_are_the_best() -> None:
     training = Training(task(validation=()))
     assert {epoch.validation_rmse for epoch in finished(training)} == {None}
-    assert training.checkpoint().standing.best_rmse is None
+    assert training.checkpoint().progress.best_rmse is None
     assert torch.equal(training.best["drag"], training.module.drag)
 
 
@@ -155,7 +155,7 @@ def test_steps_that_are_not_finite_are_skipped_and_then_stop_it() -> None:
     second = next(epochs)
     assert (second.skipped, second.loss) == (3, None)
     assert torch.equal(training.module.drag, kept)
-    assert training.checkpoint().standing.skipped_in_row == 3
+    assert training.checkpoint().progress.skipped_in_row == 3
     with pytest.raises(
         TrainingStoppedError, match=r"not finite in 11 steps in a row. Set optimizer.learning_rate lower"
     ):
@@ -176,7 +176,7 @@ def test_another_run_is_not_continued() -> None:
         (there.weights, {"other/step": torch.tensor(1.0)}),
     ):
         with pytest.raises(ValueError, match="must be of the same model"):
-            Training(task(), Checkpoint(there.standing, weights, there.best, optimizer))
+            Training(task(), Checkpoint(there.progress, weights, there.best, optimizer))
 
 
 def test_a_group_with_a_parameter_of_no_name_is_refused() -> None:

@@ -122,7 +122,7 @@ def test_ctrl_c_keeps_the_last_epoch(folder: Path, workers: int) -> None:
     ]
     kept = read_checkpoint(out)
     assert kept is not None
-    assert kept.standing.epoch == 2
+    assert kept.progress.epoch == 2
     assert [row.epoch for row in read_metrics(out / "metrics.csv")] == [0, 1, 2]
     assert not [path.name for path in out.iterdir() if path.name.startswith(".")]
 

@@ -52,7 +52,7 @@ def test_a_run_writes_all_its_files(finished: Path) -> None:
     kept = read_checkpoint(finished)
     assert kept is not None
     assert torch.equal(load_file(finished / "ball.safetensors")["drag"], kept.best["drag"])
-    assert kept.standing.best_rmse == min(row.validation_rmse for row in rows if row.validation_rmse)
+    assert kept.progress.best_rmse == min(row.validation_rmse for row in rows if row.validation_rmse)
 
 
 def test_tensorboard_shows_the_same_numbers(finished: Path) -> None:
