@@ -57,7 +57,7 @@ def diagnose(
 
 
 def _summary(diagnosis: Diagnosis) -> Iterator[str]:
-    """The diagnosis in lines: the sentence, effects, errors on the judging half, what is left."""
+    """The diagnosis in lines: the sentence, effects, errors on the held-out half, the rest."""
     from ballfg.diagnosis.report.wording import listed, probability
 
     yield f"{diagnosis.verdict.value}: {diagnosis.sentence}"

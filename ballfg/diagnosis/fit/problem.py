@@ -18,9 +18,9 @@ from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, STATE_DIM, VELOCITY
 
 POSITION_LOSS = Loss("huber", 3.0)
-"""Of a whitened position residual (three coordinates)."""
+"""Loss of a whitened position residual (three coordinates)."""
 LABEL_LOSS = Loss("cauchy", 3.0)
-"""Of a whitened spin label: labels were seen to contradict the flight."""
+"""Loss of a whitened spin label: labels were seen to contradict the flight."""
 LAUNCHER_SPIN_SIGMA = 150.0
 """rad/s, prior of the spin that a launcher setting of typical size means, per axis, about zero."""
 

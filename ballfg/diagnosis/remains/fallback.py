@@ -36,7 +36,7 @@ VALIDATES = 5
 LEAST_LEARNED = 10
 """From fewer shots no network learns to predict others."""
 EPOCHS = 30
-"""Of the training: about a minute for 25 tracks."""
+"""Epochs of the training: about a minute for 25 tracks."""
 POSITION_SCALE = 0.03
 """m, prediction error beyond which a track's part in the loss grows only linearly, so that no few tracks dominate."""
 

@@ -26,7 +26,7 @@ ALARM = 0.005
 TRACKS_PER_DIRECTION = 4
 """Tracks for each direction of a block that is tested: their scatter must tell the directions' covariance."""
 LEAST_INFORMATION = 1.0
-"""Of a direction that is tested: the data tell its strength to the size of a pattern that is large in practice."""
+"""Least information of a direction that is tested: its strength is known to the size of a pattern large in practice."""
 MOST_SEEN = 95.0
 """Percentile over the data that "up to" means."""
 

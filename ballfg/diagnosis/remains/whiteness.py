@@ -33,7 +33,6 @@ class Whiteness:
         drift: m, root of the mean product of the errors of such pairs: the part that neighbouring samples share.
         explained: for each reach, the sum of U.
         spread: for each reach, the standard deviation of that sum without drift.
-        nis: (3,) mean squared residual along x, y, z over the stated noise, per degree of freedom.
     """
 
     p_value: float
@@ -41,7 +40,6 @@ class Whiteness:
     drift: float
     explained: Array
     spread: Array
-    nis: Array
 
     @property
     def where(self) -> str:
@@ -68,14 +66,12 @@ def whiteness(fit: Fit, system: System) -> Whiteness:
         products.append(total / (3.0 * kernel.sum()))
     most = int(np.argmin(p_values))
     sigma = float(np.sqrt((fit.sigmas[stretches.used.numpy()] ** 2).mean()))
-    freedom = kept.sum() - (taken**2).sum(axis=(0, 1, 3))
     return Whiteness(
         p_value=min(1.0, len(REACHES) * p_values[most]),
         reach=REACHES[most],
         drift=sigma * float(np.sqrt(max(0.0, products[most]))),
         explained=np.array(sums),
         spread=np.array(spreads),
-        nis=fit.noise.position**2 * (residual**2).sum(axis=(0, 1)) / freedom,
     )
 
 

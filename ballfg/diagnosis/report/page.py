@@ -19,7 +19,7 @@ COLOURS = {Outcome.ADDED: "added", Outcome.ALIKE: "alike"}
 """Classes of the style for the verdict and for the outcome of a candidate."""
 SHOWN = 8
 """Rows of a ranking that are seen at once; the others unfold."""
-RANKING = ("candidate", "squared residual it would explain", "by chance", "BIC", "first estimate", "what became of it")
+RANKING = ("candidate", "squared residual it would explain", "by chance", "BIC", "first estimate", "outcome")
 
 
 def page(diagnosis: Diagnosis) -> str:
@@ -80,7 +80,7 @@ def _card(name: str, was: float, now: float, unit: str, changed: bool, note: str
     old = tag("span", f"{fixed(was, decimals)} → ", kind="was") if changed and math.isfinite(was) else Html()
     shown = f"{fixed(now, decimals)}{unit}" if math.isfinite(now) else NONE
     if not math.isfinite(now):
-        note = "nothing to judge by"
+        note = "nothing to compare"
     elif not note and changed:
         note = change(was, now)
     below = tag("span", note, kind="quiet") if note else Html()
@@ -101,7 +101,7 @@ def _finding(finding: Finding) -> Html:
         (
             f"Probability of so strong a trace by chance, all candidates counted: {probability(finding.p_value)}.",
             f"The model's BIC {verb} by {abs(finding.delta_bic):.0f} with it, refitted.",
-            f"On the judging tracks it {gain} {number(abs(finding.held_out_gain))} of log likelihood per track; "
+            f"On the held-out tracks it {gain} {number(abs(finding.held_out_gain))} of log likelihood per track; "
             f"probability of that by chance: {probability(finding.held_out_p)}.",
             f"Cannot be told from {joined(others)}." if others else "No other candidate explains as much.",
         )
@@ -130,13 +130,13 @@ def _left_over(diagnosis: Diagnosis) -> Html:
         share = f"That is {100 * left.share_of_residual:.0f} % of the pattern that was there at the start."
     shares = [f"{100 * t.share:.0f} %" if math.isfinite(t.share) else NONE for t in left.tests]
     tests = table(
-        ("test", "by chance", "share of the first pattern", "what it sees"),
+        ("test", "by chance", "share of the first pattern", "pattern"),
         ((t.name, probability(t.p_value), share, t.where) for t, share in zip(left.tests, shares, strict=True)),
     )
     rest = Html()
     if left.fallback is not None:
         without, within = (fixed(e.prediction_rmse_mm, 1) for e in (left.fallback.before, left.fallback.after))
-        purpose = "It describes the rest without naming a cause. Prediction error on the judging tracks:"
+        purpose = "It describes the rest without naming a cause. Prediction error on the held-out tracks:"
         rest = tag(
             "article",
             tag("h3", "A stopgap: ", left.fallback.kind),
@@ -218,9 +218,9 @@ def _invisible(diagnosis: Diagnosis) -> Html:
 
 def _coefficients(diagnosis: Diagnosis) -> Html:
     """Declared coefficients and noise, as declared and as fitted."""
-    calibrated = table(("coefficient", "declared", "fitted with all that was added"), _values(diagnosis.calibrated))
-    noise = table(("position noise along", "stated", "as the tracks have it"), _values(diagnosis.noise))
-    return section("The numbers of the model and of the noise", calibrated, noise)
+    calibrated = table(("coefficient", "declared", "fitted with the added effects"), _values(diagnosis.calibrated))
+    noise = table(("position noise along", "stated", "estimated"), _values(diagnosis.noise))
+    return section("Coefficients and noise", calibrated, noise)
 
 
 def _values(values: Mapping[str, Value]) -> Iterator[tuple[str, ...]]:
@@ -231,9 +231,9 @@ def _values(values: Mapping[str, Value]) -> Iterator[tuple[str, ...]]:
 def _evaluation(diagnosis: Diagnosis) -> Html:
     """The halves, their use, and tracks that were left out."""
     words = (
-        f"{diagnosis.tracks_found_on} tracks served to find, {diagnosis.tracks_judged_on} others to judge. "
-        "Residual pictures, ranking and coefficients are of the first, errors of the second. Probabilities count all "
-        "candidates that were tested, and take the noise as the tracks show it."
+        f"{diagnosis.tracks_found_on} tracks were searched, {diagnosis.tracks_judged_on} others were held out. "
+        "Residuals, rankings and coefficients are those of the first, errors those of the second. Probabilities are "
+        "corrected for the number of candidates and use the noise that the tracks show."
     )
     excluded = items(diagnosis.excluded)
-    return section("How it was judged", tag("p", words), tag("p", "Left out:") if excluded else "", excluded)
+    return section("How it was evaluated", tag("p", words), tag("p", "Left out:") if excluded else "", excluded)

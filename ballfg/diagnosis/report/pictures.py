@@ -147,7 +147,7 @@ def histogram(series: Series) -> Figure:
 
 
 def errors_by_track(before: Errors, after: Errors) -> Figure:
-    """Each judging track's prediction error before and after, joined by a line; the diamonds pool all tracks."""
+    """Prediction error of each held-out track before and after, joined by a line; the diamonds pool all tracks."""
     figure, panels = _grid(1, 1, (4.6, 4.2))
     axes = panels[0, 0]
     pairs = np.stack((before.by_track, after.by_track), axis=-1)

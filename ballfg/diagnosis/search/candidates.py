@@ -59,7 +59,7 @@ class Refit:
 
     @property
     def name(self) -> str:
-        """Of the effect."""
+        """Name of the effect."""
         return self.scored.hypothesis.name
 
 

@@ -40,12 +40,12 @@ class Hypothesis:
 
     @property
     def name(self) -> str:
-        """Of the effect."""
+        """Name of the effect."""
         return self.effect.name
 
     @cached_property
     def coefficients(self) -> dict[str, Coefficient]:
-        """Of the effect, by name."""
+        """Coefficients of the effect, by name."""
         return {c.name: c for c in self.effect.coefficients}
 
     def parameter(self, coefficient: str) -> str:

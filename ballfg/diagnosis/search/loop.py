@@ -44,7 +44,7 @@ ALIKE = 6.0
 
 @dataclass(frozen=True)
 class Search:
-    """Where the search stands after some rounds.
+    """State of the search after some rounds.
 
     Attributes:
         first, declared: fit of the declared model, and that model as it predicts.

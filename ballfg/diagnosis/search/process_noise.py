@@ -27,7 +27,7 @@ from ballfg.estimation.settings import MEASURED
 from ballfg.tracks import Dataset
 
 SCALES = (0.03, 0.1, 0.3, 1.0)
-"""Of the usual process noise; the likelihood is flat between neighbours."""
+"""Factors on the usual process noise that are tried; the likelihood is flat between neighbours."""
 MOST_PREDICTED = 15
 """Tracks that are predicted to choose the scale, evenly over those given."""
 SCALED = ("acceleration", "spin", "contact_velocity", "contact_tangential", "contact_spin")
