@@ -1,4 +1,4 @@
-"""`ballfg diagnose`: what the model of a dataset's tracks lacks."""
+"""`ballfg diagnose`: effects that a model lacks, by the tracks of a dataset."""
 
 from __future__ import annotations
 
@@ -20,17 +20,18 @@ def diagnose(
         Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.", callback=check_dataset)
     ],
     out: Annotated[Path, typer.Option(help="Folder of the report: new, empty or with an earlier report.")],
-    model: Annotated[Path | None, typer.Option(help="Model file; the nominal table-tennis model without it.")] = None,
+    model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal table-tennis model.")] = None,
     effects: OwnEffects = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes.", show_default="one per core")] = default_jobs(),
+    jobs: Annotated[int, typer.Option(min=1, help="Processes to use.", show_default="one per core")] = default_jobs(),
 ) -> None:
-    """Is anything lacking in the model? What, how sure, what else could it be, and what does it bring?
+    """Find effects that the model lacks, with their evidence, their alternatives and the gain in prediction.
 
     Example: ballfg diagnose data/aimy --model model.yaml --out diagnosis
 
-    Half of the tracks serve to find, the others to judge. The folder then holds
-    report.html to read, report.json for programs, and model.yaml, the corrected
-    model, for the --model of other commands.
+    One half of the tracks is searched for effects. The other half is held out to
+    evaluate them. The folder holds the report to read (report.html), the same
+    for programs (report.json), and the corrected model for the --model of other
+    commands (model.yaml).
     """
     from ballfg.diagnosis import diagnose as find
     from ballfg.diagnosis.report.report import MODEL, PAGE, REPORT, check_report_folder, write_report
@@ -58,7 +59,7 @@ def diagnose(
 
 
 def _summary(diagnosis: Diagnosis) -> Iterator[str]:
-    """The diagnosis in lines: the sentence, effects, errors on the judging half, what is left."""
+    """The diagnosis in lines: the sentence, effects, errors on the held-out half, the rest."""
     from ballfg.diagnosis.report.wording import listed, probability
 
     yield f"{diagnosis.verdict.value}: {diagnosis.sentence}"

@@ -1,4 +1,7 @@
-"""Find what a model lacks: residuals, candidate effects, tests, the loop and its report."""
+"""Find effects that a model of the ball lacks.
+
+`diagnose` does the whole diagnosis and `write_report` writes its result. The other functions are single steps of it.
+"""
 
 import lazy_loader
 

@@ -1,5 +1,17 @@
 from .diagnosis import diagnose as diagnose
+from .fit.fit import fit_model as fit_model
+from .fit.holdout import hold_out as hold_out
+from .remains.fallback import learned_residual as learned_residual
+from .remains.generic import generic_tests as generic_tests
+from .remains.residuals import residuals_of as residuals_of
+from .remains.sparse import sparse_terms as sparse_terms
 from .report.report import write_report as write_report
 from .result import Diagnosis as Diagnosis
 from .result import Finding as Finding
 from .result import Verdict as Verdict
+from .search.candidates import refit as refit
+from .search.candidates import score_all as score_all
+from .search.evaluation import held_out_gain as held_out_gain
+from .search.evaluation import prediction_errors as prediction_errors
+from .search.hypothesis import hypotheses as hypotheses
+from .search.hypothesis import scene_of as scene_of

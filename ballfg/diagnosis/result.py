@@ -1,4 +1,4 @@
-"""What a diagnosis says: the verdict, effects added with their evidence, errors before and after, what is left."""
+"""The result of a diagnosis: the verdict, effects added with their evidence, errors before and after, the rest."""
 
 from __future__ import annotations
 
@@ -9,9 +9,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.dynamics.model import BallModel
+from ballfg.dynamics import BallModel
 
 Array = NDArray[np.float64]
+Index = NDArray[np.int64]
+Mask = NDArray[np.bool_]
+"""Arrays of the whole room."""
 
 
 class Verdict(enum.Enum):
@@ -22,44 +25,8 @@ class Verdict(enum.Enum):
     UNEXPLAINED = "unexplained"
 
 
-@dataclass(frozen=True)
-class Value:
-    """A number with its standard deviation and unit. `declared`: what the model said before, where it said anything."""
-
-    value: float
-    sigma: float
-    unit: str
-    declared: float | None = None
-
-
-@dataclass(frozen=True)
-class Finding:
-    """An effect that was added to the model.
-
-    Attributes:
-        name, kind, sentence, decide: of the effect: what it is; what to measure to tell it from others.
-        parameters: its coefficients as fitted on the finding half.
-        p_value: of its score test, corrected for the number of candidates tested.
-        delta_bic: BIC of the model with it minus BIC without; negative is better.
-        indistinguishable_from: candidates that would have explained as much.
-        held_out_gain: log likelihood per track that it adds on the judging half, natural units.
-        held_out_p: probability of such a gain there by chance.
-    """
-
-    name: str
-    kind: str
-    sentence: str
-    decide: str
-    parameters: Mapping[str, Value]
-    p_value: float
-    delta_bic: float
-    indistinguishable_from: tuple[str, ...]
-    held_out_gain: float
-    held_out_p: float
-
-
-class Standing(enum.Enum):
-    """What became of a candidate in a round."""
+class Outcome(enum.Enum):
+    """The outcome of a round for one of its candidates."""
 
     ADDED = "added"
     ALIKE = "cannot be told from the one added"
@@ -72,6 +39,45 @@ class Standing(enum.Enum):
 
 
 @dataclass(frozen=True)
+class Value:
+    """A number with its standard deviation and unit. `declared`: the model's value before the fit, if it had one."""
+
+    value: float
+    sigma: float
+    unit: str
+    declared: float | None = None
+
+
+@dataclass(frozen=True)
+class Finding:
+    """An effect that was added to the model.
+
+    Attributes:
+        name: of the effect.
+        kind: of the effect: `flight`, `bounce` or `measurement`.
+        parameters: its coefficients as fitted on the search half.
+        p_value: of its score test, corrected for the number of candidates tested.
+        delta_bic: BIC of the model with it minus BIC without; negative is better.
+        indistinguishable_from: candidates that would have explained as much.
+        held_out_gain: log likelihood per track that it adds on the held-out half, natural units.
+        held_out_p: probability of such a gain there by chance.
+        sentence: describes the effect.
+        decide: the measurement that tells the effect from others.
+    """
+
+    name: str
+    kind: str
+    parameters: Mapping[str, Value]
+    p_value: float
+    delta_bic: float
+    indistinguishable_from: tuple[str, ...]
+    held_out_gain: float
+    held_out_p: float
+    sentence: str
+    decide: str
+
+
+@dataclass(frozen=True)
 class Candidate:
     """One row of a round's ranking.
 
@@ -81,7 +87,7 @@ class Candidate:
         explained: squared whitened residual that it would explain.
         p_value: of its score test, corrected for the number of candidates.
         delta_bic: after a full refit; None where the score did not call for one.
-        standing: what became of it.
+        outcome: of the round.
     """
 
     name: str
@@ -90,12 +96,12 @@ class Candidate:
     explained: float
     p_value: float
     delta_bic: float | None
-    standing: Standing
+    outcome: Outcome
 
 
 @dataclass(frozen=True)
 class Errors:
-    """On the judging half: the first 40 % of each track observed, the rest predicted.
+    """Prediction errors on the held-out half: the first 40 % of each track observed, the rest predicted.
 
     Attributes:
         prediction_rmse_mm: root mean square distance of predicted from measured positions.
@@ -114,14 +120,14 @@ class Errors:
 
 @dataclass(frozen=True)
 class GenericTest:
-    """A test for a pattern that needs no name.
+    """A test for a pattern of any cause.
 
     Attributes:
         name: `flight`, `contact`, `measurement`, `recording` (coefficients from track to track), `label` (spin labels
             against flights) or `time` (whiteness along the tracks).
-        where: in words, on what the pattern depends and how large it is.
+        where: place, dependence and size of the pattern in words.
         p_value: probability of such a pattern by chance.
-        share: part of what was there at the start that this pattern would still explain.
+        share: part of the pattern at the start that is still there, 0 to 1.
     """
 
     name: str
@@ -132,12 +138,12 @@ class GenericTest:
 
 @dataclass(frozen=True)
 class Fallback:
-    """What explains the rest without naming it.
+    """A description of the rest without a name.
 
     Attributes:
         kind: `sparse terms` or `learned residual`.
         description: the terms, or the network.
-        before, after: errors on the judging half without and with it, named effects in both.
+        before, after: errors on the held-out half without and with it, named effects in both.
         model: the model with it.
     """
 
@@ -150,11 +156,11 @@ class Fallback:
 
 @dataclass(frozen=True)
 class Unexplained:
-    """What is left at the end.
+    """The pattern that is left at the end.
 
     Attributes:
         where: one sentence; empty where nothing is left.
-        share_of_residual: of the pattern that was there at the start, 0 to 1.
+        share_of_residual: part of the pattern at the start that is left, 0 to 1.
         tests: all generic tests at the end.
         fallback: None where none was needed or none helped.
     """
@@ -167,14 +173,17 @@ class Unexplained:
 
 @dataclass(frozen=True)
 class FlightResiduals:
-    """Accelerations that the fit would have to invent in flight, one a bin of time of each stretch.
+    """Accelerations in flight that the model lacks, one for each bin of time of each stretch.
 
     Attributes:
-        stretch: (m,) number of the stretch.  times: (m,) s since its first sample.
-        states: (m, 9) there.  acceleration: (m, 3) m/s^2.  covariance: (m, 3, 3).
+        stretch: (m,) number of the stretch.
+        times: (m,) s since its first sample.
+        states: (m, 9) at these times.
+        acceleration: (m, 3) m/s^2.
+        covariance: (m, 3, 3) of it.
     """
 
-    stretch: NDArray[np.int64]
+    stretch: Index
     times: Array
     states: Array
     acceleration: Array
@@ -186,13 +195,16 @@ class ContactResiduals:
     """Outgoing minus predicted motion at each contact.
 
     Attributes:
-        stretch: (m,).  number: (m,) of the contact in its stretch.  times: (m,) s.
+        stretch: (m,) number of the stretch.
+        number: (m,) of the contact in its stretch.
+        times: (m,) s since the stretch's first sample.
         incoming: (m, 9) state before it.
-        velocity: (m, 3) m/s.  spin: (m, 3) rad/s.  covariance: (m, 6, 6) of both.
+        velocity, spin: (m, 3) m/s and (m, 3) rad/s.
+        covariance: (m, 6, 6) of both.
     """
 
-    stretch: NDArray[np.int64]
-    number: NDArray[np.int64]
+    stretch: Index
+    number: Index
     times: Array
     incoming: Array
     velocity: Array
@@ -205,12 +217,15 @@ class MeasurementResiduals:
     """Measured minus fitted positions.
 
     Attributes:
-        stretch: (m,).  times: (m,) s since the stretch's first sample.
-        states: (m, 9) there.  since_contact: (m,) s since the last contact, NaN before the first one.
-        position: (m, 3) m.  sigma: (m, 3) m, noise.
+        stretch: (m,) number of the stretch.
+        times: (m,) s since the stretch's first sample.
+        states: (m, 9) at these times.
+        since_contact: (m,) s since the last contact, NaN before the first one.
+        position: (m, 3) m.
+        sigma: (m, 3) m, noise.
     """
 
-    stretch: NDArray[np.int64]
+    stretch: Index
     times: Array
     states: Array
     since_contact: Array
@@ -220,7 +235,7 @@ class MeasurementResiduals:
 
 @dataclass(frozen=True)
 class Residuals:
-    """What a fit leaves, in three kinds; `names` (n,) of the track of each stretch."""
+    """Residuals of a fit in three kinds; `names` (n,) of the track of each stretch."""
 
     names: tuple[str, ...]
     flight: FlightResiduals
@@ -230,21 +245,25 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Diagnosis:
-    """The whole answer.
+    """The result of a diagnosis.
 
     Attributes:
-        verdict, sentence: the answer, and the same in one sentence with numbers.
+        dataset: its name.
+        verdict: the answer.
+        sentence: the answer in one sentence with numbers.
         findings: effects in the order added.
         rounds: the ranking of all candidates in each round, best first.
-        before, after: errors on the judging half with the declared model as calibrated, and with the corrected one:
-            named effects, and the fallback where there is one.
-        tracks_found_on, tracks_judged_on: sizes of the halves.
+        before: errors on the held-out half with the declared model as calibrated.
+        after: the same with the corrected model: named effects, and the fallback where there is one.
+        tracks_found_on: tracks of the search half.
+        tracks_judged_on: tracks of the held-out half.
         calibrated: declared coefficients as fitted with the corrected model.
         noise: position noise along x, y, z as estimated (m), and as stated.
-        unexplained: what is left.
+        unexplained: the pattern that is left.
         model: the corrected model.
-        residuals_before, residuals_after: on the finding half.
-        excluded: sentences on tracks that had no part and why.
+        residuals_before: of the search half with the declared model.
+        residuals_after: of the search half with the corrected model.
+        excluded: sentences on tracks that were not used.
     """
 
     dataset: str

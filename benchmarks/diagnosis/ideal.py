@@ -23,15 +23,12 @@ from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.record import case_digest
 from ballfg.benchmarks.record_file import read_record_file, write_record
-from ballfg.diagnosis.fit.columns import signatures
-from ballfg.diagnosis.fit.fit import fit, followed, start_from
+from ballfg.diagnosis.fit.fit import fit_model
 from ballfg.diagnosis.fit.holdout import launcher_labels
-from ballfg.diagnosis.fit.problem import Problem
 from ballfg.diagnosis.fit.stretches import stretches_of
 from ballfg.diagnosis.search.candidates import ALARM
-from ballfg.diagnosis.search.hypothesis import declared_free
 from ballfg.diagnosis.search.loop import CONFIRMED
-from ballfg.diagnosis.search.signatures import visible_directions
+from ballfg.diagnosis.search.signatures import hypothesis_signatures, visible_directions
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces
 
 Array = NDArray[np.float64]
@@ -94,10 +91,8 @@ def ideal_of(name: str, seed: int) -> Ideal:
         settings, tracks = dataset_settings(dataset, model), list(dataset)
     smoother = Smoother(model, dataset_surfaces(dataset), settings)
     stretches = stretches_of(smoother, tracks, launcher_labels(dataset, tracks, settings))
-    problem = Problem(model, followed(model, stretches), declared_free(model))
-    unknowns, noise = start_from(problem, settings.spin_label_noise, settings.spin_prior)
-    at_truth = fit(problem, unknowns, noise, settle_noise=False)
-    found, _ = signatures(at_truth, [plant.hypothesis()])
+    at_truth = fit_model(model, stretches, settings, settle_noise=False)
+    found, _ = hypothesis_signatures(at_truth, [plant.hypothesis()])
     efficient, direction = found.efficient(), plant.direction()
     rank = visible_directions(efficient.total, efficient.raw).shape[1]
     return Ideal(case_digest(case), rank, float(direction @ efficient.total @ direction))

@@ -109,7 +109,7 @@ def _leading(listed: tuple[Candidate, ...], planted: tuple[str, ...]) -> tuple[R
             float(c.explained),
             float(c.p_value),
             None if c.delta_bic is None else float(c.delta_bic),
-            c.standing.value,
+            c.outcome.value,
         )
         for c in kept
     )

@@ -9,15 +9,13 @@ import torch
 from ballfg.benchmarks.diagnosis.cases import Case
 from ballfg.benchmarks.diagnosis.data import actual_model, declared_model
 from ballfg.benchmarks.diagnosis.effects import PLANTS
-from ballfg.diagnosis.fit.fit import fit, followed, start_from
-from ballfg.diagnosis.fit.holdout import halves_of
-from ballfg.diagnosis.fit.problem import Problem
-from ballfg.diagnosis.fit.process_noise import with_process_noise
+from ballfg.diagnosis.fit.fit import first_guess, fit_problem, reachable
+from ballfg.diagnosis.fit.holdout import hold_out
+from ballfg.diagnosis.fit.problem import Problem, declared_free
 from ballfg.diagnosis.fit.stretches import Stretches, stretches_of
 from ballfg.diagnosis.result import Errors
-from ballfg.diagnosis.search.calibrated import calibrated_model
 from ballfg.diagnosis.search.evaluation import prediction_errors
-from ballfg.diagnosis.search.hypothesis import declared_free
+from ballfg.diagnosis.search.process_noise import calibrated_model, with_process_noise
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effect import Coefficient
 from ballfg.estimation import Smoother, dataset_settings
@@ -27,21 +25,21 @@ from ballfg.tracks import Dataset
 
 
 def true_errors(case: Case, dataset: Dataset) -> Errors:
-    """Errors on the judging half of the true model, its coefficients fitted to the finding half.
+    """Errors on the held-out half of the true model, its coefficients fitted to the search half.
 
     Args: case: with planted effects of the catalogue and one session.  dataset: its tracks.
     """
     truth, declared = actual_model(case), declared_model(case, dataset.info.ball.radius)
-    halves = halves_of(dataset, declared, 1, _unwatched)  # as the diagnosis has them: both are judged by the same
+    holdout = hold_out(dataset, declared)  # as the diagnosis has them: both are judged by the same
     moving = plainly_measured(truth)
-    smoother = Smoother(moving, halves.surfaces, dataset_settings(dataset, moving))
-    finding = stretches_of(smoother, [part.track for part in halves.found_on], halves.launcher)
-    finding = followed(truth, _with_labelled_spins(truth, finding))
-    problem = Problem(truth, finding, {**declared_free(declared), **planted_free(case)})
-    start = start_from(problem, halves.settings.spin_label_noise, halves.settings.spin_prior)
-    fitted = calibrated_model(fit(problem, *start), halves.launcher.embedding)
-    model = with_process_noise(fitted, halves.found_on, dataset, 1).model
-    return prediction_errors(model, halves.judged, halves.surfaces, dataset_settings(dataset, model), 1)
+    smoother = Smoother(moving, holdout.surfaces, dataset_settings(dataset, moving))
+    search = stretches_of(smoother, [part.track for part in holdout.search_tracks], holdout.launcher)
+    search = reachable(truth, _with_labelled_spins(truth, search))
+    problem = Problem(truth, search, {**declared_free(declared), **planted_free(case)})
+    start = first_guess(problem, holdout.settings.spin_label_noise, holdout.settings.spin_prior)
+    fitted = calibrated_model(fit_problem(problem, *start), holdout.launcher.embedding)
+    model = with_process_noise(fitted, holdout.search_tracks, dataset).model
+    return prediction_errors(model, holdout.held_out_tracks, holdout.surfaces, dataset_settings(dataset, model))
 
 
 def planted_free(case: Case) -> dict[str, Coefficient]:
@@ -62,7 +60,3 @@ def _with_labelled_spins(model: AnalyticModel, stretches: Stretches) -> Stretche
     labelled = torch.from_numpy(stretches.labelled)
     starts[labelled, SPIN] = spins[labelled]
     return replace(stretches, starts=starts)
-
-
-def _unwatched(line: str) -> None:
-    """Nobody watches."""

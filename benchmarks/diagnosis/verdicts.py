@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.record import Found, Record
-from ballfg.diagnosis.result import Standing, Verdict
+from ballfg.diagnosis.result import Outcome, Verdict
 
 LARGEST_GROUP = 3
 """Effects that a diagnosis may name together and still be right."""
@@ -28,7 +28,7 @@ def honest(record: Record, name: str) -> bool:
     if record.found:
         return name in (record.found[0].name, *record.found[0].alike)
     standings = [ranked.standing for ranked in record.rounds[-1] if ranked.name == name] if record.rounds else []
-    return standings == [Standing.INVISIBLE.value]
+    return standings == [Outcome.INVISIBLE.value]
 
 
 def right(record: Record, planted: tuple[str, ...]) -> bool:

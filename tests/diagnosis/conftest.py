@@ -11,12 +11,17 @@ import pytest
 import torch
 from torch import Tensor
 
-from ballfg.diagnosis.fit.fit import fit, start_from
+from ballfg.diagnosis.fit.fit import first_guess, fit_model, fit_problem
 from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.fit.stretches import Stretches
-from ballfg.diagnosis.search.hypothesis import declared_free
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
+from ballfg.dynamics.effect import Effect
+from ballfg.dynamics.effects.bounce.restitution import Restitution
+from ballfg.dynamics.effects.flight.drag import Drag
+from ballfg.dynamics.effects.flight.gravity import Gravity
+from ballfg.dynamics.effects.flight.magnus import Magnus
 from ballfg.dynamics.motion.paths import paths
+from ballfg.estimation.settings import Settings
 
 TABLE = 0.76
 SURFACES = Surfaces(TABLE)
@@ -112,8 +117,23 @@ def shots(
 
 def fitted(model: AnalyticModel, stretches: Stretches, *, settle_noise: bool = True) -> Fit:
     """The joint fit of a declared model."""
-    problem = Problem(model, stretches, declared_free(model))
-    return fit(problem, *start_from(problem, LABEL_NOISE, 60.0), settle_noise=settle_noise)
+    return fit_model(model, stretches, Settings(spin_label_noise=LABEL_NOISE), settle_noise=settle_noise)
+
+
+def known_ball(*effects: Effect) -> AnalyticModel:
+    """A ball without friction that nothing is free of, and further effects."""
+    return AnalyticModel([Gravity(), Drag(), Magnus(), Restitution(), *effects]).requires_grad_(False)
+
+
+def fitted_to_known(stretches: Stretches, *effects: Effect) -> Fit:
+    """The fit of first states alone, with `known_ball`."""
+    unknowns, noise = first_guess(problem := Problem(known_ball(*effects), stretches, {}), LABEL_NOISE, 60.0)
+    return fit_problem(problem, unknowns, noise, settle_noise=False)
+
+
+@pytest.fixture(scope="session")
+def make_known_ball() -> Callable[..., AnalyticModel]:
+    return known_ball
 
 
 @pytest.fixture(scope="session")
@@ -134,6 +154,11 @@ def make_shots() -> Callable[..., Shots]:
 @pytest.fixture(scope="session")
 def make_fit() -> Callable[..., Fit]:
     return fitted
+
+
+@pytest.fixture(scope="session")
+def make_known_fit() -> Callable[..., Fit]:
+    return fitted_to_known
 
 
 @pytest.fixture(scope="session")

@@ -17,8 +17,8 @@ from ballfg.diagnosis.result import (
     FlightResiduals,
     GenericTest,
     MeasurementResiduals,
+    Outcome,
     Residuals,
-    Standing,
     Unexplained,
     Value,
     Verdict,
@@ -92,31 +92,31 @@ def errors(size: float, seed: int) -> Errors:
 
 
 def _candidate(
-    name: str, kind: str, explained: float, standing: Standing, bic: float | None = None, **estimate: Value
+    name: str, kind: str, explained: float, outcome: Outcome, bic: float | None = None, **estimate: Value
 ) -> Candidate:
     p = min(1.0, 26.0 * math.exp(-0.5 * explained))
-    return Candidate(name, kind, estimate, explained, p, bic, standing)
+    return Candidate(name, kind, estimate, explained, p, bic, outcome)
 
 
 def rounds() -> tuple[tuple[Candidate, ...], ...]:
     """Two rounds: the wind is added in the first; in the second nothing is needed."""
     wind = {axis: Value(v, 0.012, "m/s") for axis, v in zip("xyz", (0.2, 0.004, -0.01), strict=True)}
     first = (
-        _candidate("wind", "flight", 612.0, Standing.ADDED, -598.3, **wind),
-        _candidate("gust_region", "flight", 585.0, Standing.ALIKE, -590.1, x=Value(0.31, 0.02, "m/s")),
-        _candidate("drag_speed", "flight", 212.0, Standing.WEAKER, -180.0, slope=Value(-0.021, 0.002, "s/m")),
-        _candidate("time_scale", "measurement", 95.0, Standing.WEAKER, share=Value(0.0021, 0.0002, "1")),
-        _candidate("frame_tilt", "measurement", 40.0, Standing.WEAKER, x=Value(0.0011, 0.0002, "rad")),
-        _candidate("magnus_saturation", "flight", 9.0, Standing.WEAKER, slope=Value(-0.1, 0.04, "1")),
-        _candidate("table_tilt", "bounce", 3.4, Standing.WEAKER, x=Value(0.0004, 0.0003, "rad")),
-        _candidate("spin_decay", "flight", 0.8, Standing.WEAKER, rate=Value(0.05, 0.07, "1/s")),
-        _candidate("restitution_speed", "bounce", 0.5, Standing.WEAKER, slope=Value(0.001, 0.002, "s/m")),
-        _candidate("spin_label_scale", "measurement", 0.0, Standing.INVISIBLE),
-        _candidate("wind_shear", "flight", 0.02, Standing.INVISIBLE, x=Value(0.1, 9.0, "1/s")),
+        _candidate("wind", "flight", 612.0, Outcome.ADDED, -598.3, **wind),
+        _candidate("gust_region", "flight", 585.0, Outcome.ALIKE, -590.1, x=Value(0.31, 0.02, "m/s")),
+        _candidate("drag_speed", "flight", 212.0, Outcome.WEAKER, -180.0, slope=Value(-0.021, 0.002, "s/m")),
+        _candidate("time_scale", "measurement", 95.0, Outcome.WEAKER, share=Value(0.0021, 0.0002, "1")),
+        _candidate("frame_tilt", "measurement", 40.0, Outcome.WEAKER, x=Value(0.0011, 0.0002, "rad")),
+        _candidate("magnus_saturation", "flight", 9.0, Outcome.WEAKER, slope=Value(-0.1, 0.04, "1")),
+        _candidate("table_tilt", "bounce", 3.4, Outcome.WEAKER, x=Value(0.0004, 0.0003, "rad")),
+        _candidate("spin_decay", "flight", 0.8, Outcome.WEAKER, rate=Value(0.05, 0.07, "1/s")),
+        _candidate("restitution_speed", "bounce", 0.5, Outcome.WEAKER, slope=Value(0.001, 0.002, "s/m")),
+        _candidate("spin_label_scale", "measurement", 0.0, Outcome.INVISIBLE),
+        _candidate("wind_shear", "flight", 0.02, Outcome.INVISIBLE, x=Value(0.1, 9.0, "1/s")),
     )
     second = tuple(
-        replace(c, explained=0.004 * c.explained + 1.1, p_value=1.0, delta_bic=None, standing=Standing.NOT_NEEDED)
-        if c.standing is not Standing.INVISIBLE
+        replace(c, explained=0.004 * c.explained + 1.1, p_value=1.0, delta_bic=None, outcome=Outcome.NOT_NEEDED)
+        if c.outcome is not Outcome.INVISIBLE
         else c
         for c in first[1:]
     )
@@ -177,7 +177,7 @@ def silent() -> Diagnosis:
     contact = left.contact
     none = ContactResiduals(**{name: getattr(contact, name)[:0] for name in ContactResiduals.__dataclass_fields__})
     same = replace(left, contact=none)
-    quiet = tuple(replace(c, standing=Standing.NOT_NEEDED, delta_bic=None, p_value=1.0) for c in rounds()[1])
+    quiet = tuple(replace(c, outcome=Outcome.NOT_NEEDED, delta_bic=None, p_value=1.0) for c in rounds()[1])
     return replace(
         found(),
         verdict=Verdict.NOTHING,

@@ -1,8 +1,8 @@
-"""Dual numbers of torch's forward mode, at a tenth of the time where they meet plain numbers.
+"""Dual numbers of torch's forward mode, faster by ten where they meet plain numbers.
 
-Where one operand of torch 2.13's arithmetic has a tangent and the other has none, torch stands a tensor of symbolic
-zeros in for the missing one, and works out in Python what shape the result has: 80 to 200 microseconds an operation,
-where two tangents take 5. So missing tangents of plain operands are written out as zeros here before torch sees them.
+Where only one operand of torch 2.13's arithmetic has a tangent, torch replaces the missing one by a tensor of symbolic
+zeros and finds the shape of the result in Python. That takes 80 to 200 microseconds an operation; with two tangents it
+takes 5. Here missing tangents of plain operands are therefore filled with zeros beforehand.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ ARITHMETIC: Final = frozenset(
     + [getattr(torch, name) for name in _FUNCTIONS]
     + [torch.linalg.cross]
 )
-"""Functions of two operands or more of which a plain one costs so much."""
+"""Functions of two or more operands, in which a plain operand is slow."""
 
 
 @contextmanager
 def dual_level() -> Iterator[None]:
-    """A level of torch's forward mode, as `torch.autograd.forward_ad.dual_level`, in which plain operands are cheap."""
+    """A level of torch's forward mode, as `torch.autograd.forward_ad.dual_level`, in which plain operands are fast."""
     with forward.dual_level(), _WrittenZeros():
         yield
 
@@ -39,8 +39,8 @@ def dual_level() -> Iterator[None]:
 def make_dual(primal: Tensor, tangent: Tensor) -> Tensor:
     """A tensor with a tangent, within `dual_level()`.
 
-    The first one makes torch 2.13 compile rules of its own with `torch.jit.script`, which warns that it is deprecated:
-    nothing that a caller could mend, and an error where warnings are errors.
+    The first call makes torch 2.13 compile its own rules with `torch.jit.script`, which warns that it is deprecated. No
+    caller can avoid that warning, and it would be an error where warnings are errors.
     """
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "`torch.jit.script` is deprecated", DeprecationWarning)

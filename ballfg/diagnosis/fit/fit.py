@@ -1,45 +1,32 @@
 """The joint fit of a declared model: first states stretch by stretch, coefficients and launcher over all of them.
 
-Gauss-Newton with Levenberg's damping; the scale of the noise is estimated along each axis from what is left, and so is
-the scatter of unlabelled spins about what the launcher tells. Coefficients have the priors that their effects declare,
-so that what the data cannot tell stays put.
+The method is Gauss-Newton with Levenberg's damping. The scale of the noise is estimated along each axis from the
+residuals, and so is the scatter of unlabelled spins about the launcher's mean. Coefficients have the priors that their
+effects declare, so that those which the data cannot determine keep their declared values.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import copy
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from ballfg.diagnosis.fit.problem import (
-    Fit,
-    Noise,
-    Problem,
-    Robust,
-    Unknowns,
-    common_precision,
-    linearise,
-    robust,
-    weighted_residual,
-    whitened_spins,
-)
+from ballfg.diagnosis.fit.problem import Fit, Noise, Problem, Robust, Unknowns, declared_free
 from ballfg.diagnosis.fit.sensitivity import Predicted, predict
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System
-from ballfg.dynamics.model import BallModel
+from ballfg.diagnosis.result import Mask, Value
+from ballfg.dynamics import AnalyticModel
+from ballfg.estimation import Settings
 from ballfg.state import SPIN, STATE_DIM
-
-Array = NDArray[np.float64]
 
 MOST_STEPS = 15
 """Gauss-Newton steps of one minimisation."""
 SCALE_ROUNDS = 3
 """Noise and weights are settled after so many minimisations."""
-FOLLOW_UPS = 1
-"""Corrections of first states after each step; further ones gain nothing that the next step does not."""
 TOLERANCE = 1e-5
 """A minimisation ends when the objective falls by less than this share."""
 FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e6
@@ -49,104 +36,132 @@ LEAST_SPIN_SCATTER = 1.0
 """rad/s. Unlabelled spins are taken to scatter at least so much."""
 
 
-def start_from(problem: Problem, label_noise: float, spin_prior: float) -> tuple[Unknowns, Noise]:
-    """Where a fit starts that knows nothing better."""
+def fit_model(model: AnalyticModel, stretches: Stretches, settings: Settings, *, settle_noise: bool = True) -> Fit:
+    """Fit a model's coefficients to stretches, with all first states.
+
+    Args:
+        model: as declared; it is copied. Coefficients with a prior are estimated.
+        stretches: the data. Those whose contacts the model does not reach from the first guess are left out.
+        settings: of the dataset; the noise of spin labels and the prior of spins.
+        settle_noise: whether the scale of the noise is estimated too.
+
+    Returns:
+        The minimum.
+    """
+    model = copy.deepcopy(model).requires_grad_(False)
+    problem = Problem(model, reachable(model, stretches), declared_free(model))
+    start = first_guess(problem, settings.spin_label_noise, settings.spin_prior)
+    return fit_problem(problem, *start, settle_noise=settle_noise)
+
+
+def reachable(model: AnalyticModel, stretches: Stretches, values: Mapping[str, float] | None = None) -> Stretches:
+    """Those stretches whose contacts a model reaches from the first guess of their states.
+
+    Args: values: coefficients by parameter name that differ from the model's own, as fitted.
+    """
+    predicted = predict(model, stretches, stretches.starts.numpy(), values or {})
+    reached: Mask = np.asarray(np.isfinite(predicted.positions).all(axis=(1, 2)))
+    return stretches.take(reached)
+
+
+def first_guess(problem: Problem, label_noise: float, spin_prior: float) -> tuple[Unknowns, Noise]:
+    """The smoother's first states and the declared coefficients; label_noise and spin_prior in rad/s."""
     values = dict(zip(problem.free, problem.centres.tolist(), strict=True))
-    unknowns = Unknowns(
-        problem.stretches.starts.numpy().copy(), values, np.zeros((problem.stretches.settings.shape[1], 3))
-    )
+    launcher = np.zeros((problem.stretches.settings.shape[1], 3))
+    unknowns = Unknowns(problem.stretches.starts.numpy().copy(), values, launcher)
     return unknowns, Noise(label=label_noise, spin=spin_prior)
 
 
-def fit(problem: Problem, unknowns: Unknowns, noise: Noise, *, settle_noise: bool = True) -> Fit:
+def fit_problem(problem: Problem, unknowns: Unknowns, noise: Noise, *, settle_noise: bool = True) -> Fit:
     """Minimise over all unknowns, and settle the scale of the noise.
 
     Args:
-        unknowns: where to start: every stretch must reach its contacts from there, as those of `followed` do, or the
-            result is the start itself, its cost infinite.
+        problem: the data, the model and the priors.
+        unknowns: first guess. Every stretch must reach its contacts from there, as those of `reachable` do; else the
+            result is the first guess itself, its cost infinite.
         noise: scales to start from; kept as they are unless `settle_noise`.
+        settle_noise: whether the scale of the noise is estimated.
     """
-    result = _minimise(problem, unknowns, noise, 0)
+    result = _minimise(Fit.at(problem, unknowns, noise))
     for _ in range(SCALE_ROUNDS if settle_noise else 0):
-        noise = _settled(result)
-        result = _minimise(result.problem, result.unknowns, noise, result.steps)
+        result = _minimise(Fit.at(result.problem, result.unknowns, _settled(result), result.steps))
     return result
 
 
-def objective(problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Predicted) -> float:
-    """Half the robust sum of squares, priors included; infinite where a stretch misses a contact."""
-    cost = float(robust(problem, unknowns, noise, predicted).losses.sum())
-    values = np.array([unknowns.values[name] for name in problem.free])
-    cost += 0.5 * float((problem.precisions * (values - problem.centres) ** 2).sum())
-    cost += 0.5 * float((problem.launcher_precision[:, None] * unknowns.launcher**2).sum())
-    return cost if np.isfinite(cost) else np.inf
+def values_of(fit: Fit, names: Iterable[str], declared: Mapping[str, float]) -> dict[str, Value]:
+    """Fitted coefficients with their standard deviations, by parameter name.
+
+    Args: names: those wanted.  declared: values that the model stated before the fit, for those that it did.
+    """
+    total = fit.linearised().eliminated().gram.sum(axis=0)[:-1, :-1] + np.diag(fit.problem.common_precision)
+    sigmas = dict(zip(fit.problem.free, np.sqrt(np.diagonal(np.linalg.inv(total))).tolist(), strict=False))
+    units = fit.problem.model.declared_coefficients()
+    return {
+        name: Value(fit.unknowns.values[name], sigmas[name], units[name].unit, declared.get(name)) for name in names
+    }
 
 
-def _minimise(problem: Problem, unknowns: Unknowns, noise: Noise, steps: int) -> Fit:
-    predicted = predict(problem.model, problem.stretches, unknowns.starts, unknowns.values)
-    cost, damping = objective(problem, unknowns, noise, predicted), FIRST_DAMPING
-    if not np.isfinite(cost):
-        return Fit(problem, unknowns, noise, predicted, cost, steps)
-    for _ in range(MOST_STEPS):
-        problem = replace(problem, stretches=_with_contacts(problem.stretches, predicted))
-        system = linearise(problem, unknowns, noise, predicted)
-        weights = robust(problem, unknowns, noise, predicted)
-        steps += 1
-        improved, tries = False, 0
-        while not improved and damping < LARGEST_DAMPING:
-            moved = _moved(problem, unknowns, system, damping)
-            moved, moved_predicted = _followed_up(problem, moved, noise, system, weights)
-            moved_cost = objective(problem, moved, noise, moved_predicted)
-            improved, tries = moved_cost < cost, tries + 1
-            damping *= 10.0 if not improved else 0.1 if tries == 1 else 1.0
-        if not improved:
+def _minimise(now: Fit) -> Fit:
+    damping = FIRST_DAMPING
+    for _ in range(MOST_STEPS if np.isfinite(now.cost) else 0):
+        stretches, found = now.problem.stretches, torch.from_numpy(now.predicted.contacts)
+        guesses = torch.where(found.isnan(), stretches.contacts, found)
+        problem = replace(now.problem, stretches=replace(stretches, contacts=guesses))
+        now = replace(now, problem=problem, steps=now.steps + 1)
+        moved, damping = _step(now, damping)
+        if moved is None:
             break
-        gain, cost = cost - moved_cost, moved_cost
-        unknowns, predicted = moved, moved_predicted
-        if gain < TOLERANCE * max(1.0, cost):
+        gain, now = now.cost - moved.cost, moved
+        if gain < TOLERANCE * max(1.0, now.cost):
             break
-    return Fit(problem, unknowns, noise, predicted, cost, steps)
+    return now
 
 
-def _moved(problem: Problem, unknowns: Unknowns, system: System, damping: float) -> Unknowns:
-    """The unknowns after a damped Gauss-Newton step; coefficients stay within their bounds."""
-    q = len(problem.free)
+def _step(now: Fit, damping: float) -> tuple[Fit | None, float]:
+    """The fit after one step, None where no damping lowers the objective; and the damping of the next step."""
+    system, first = now.linearised(), damping
+    while damping < LARGEST_DAMPING:
+        moved = _followed_up(_moved(now, system, damping), system, now.robust)
+        if moved.cost < now.cost:
+            return moved, 0.1 * damping if damping == first else damping
+        damping *= 10.0
+    return None, damping
+
+
+def _moved(now: Fit, system: System, damping: float) -> Fit:
+    """The fit after a damped Gauss-Newton step; coefficients stay within their bounds."""
+    problem, unknowns = now.problem, now.unknowns
+    q, precision = len(problem.free), problem.common_precision
     values = np.array([unknowns.values[name] for name in problem.free])
-    precision = common_precision(problem)
     pull = precision * np.concatenate((problem.centres - values, -unknowns.launcher.ravel()))
     eliminated = system.eliminated(damping)
     step = eliminated.common_step(precision, pull, damping) if problem.shared else np.zeros_like(pull)
-    low = np.array([c.low for c in problem.free.values()])
-    high = np.array([c.high for c in problem.free.values()])
+    low, high = (np.array([getattr(c, end) for c in problem.free.values()]) for end in ("low", "high"))
     moved = np.clip(values + step[:q], low, high)
     starts = unknowns.starts + eliminated.start_step(np.concatenate((moved - values, step[q:])))
-    return Unknowns(
-        starts, dict(zip(problem.free, moved.tolist(), strict=True)), unknowns.launcher + step[q:].reshape(-1, 3)
-    )
+    launcher = unknowns.launcher + step[q:].reshape(-1, 3)
+    named = dict(zip(problem.free, moved.tolist(), strict=True))
+    return Fit.at(problem, Unknowns(starts, named, launcher), now.noise, now.steps)
 
 
-def _followed_up(
-    problem: Problem, moved: Unknowns, noise: Noise, system: System, weights: Robust
-) -> tuple[Unknowns, Predicted]:
-    """First states brought after a step of all unknowns, and the prediction there.
+def _followed_up(moved: Fit, system: System, weights: Robust) -> Fit:
+    """The fit with first states corrected once more after a step of all unknowns.
 
-    A step of coefficients times a step of states is what a linearised problem leaves out, and with many samples it is
-    much: states take most of it up. No derivative is taken again; a stretch that does not gain stays where it was.
+    The linearised problem leaves out the product of a step of coefficients and a step of states. With many samples that
+    product is large, and first states can take most of it up. The derivatives stay as they are; a stretch that does
+    not gain keeps its state. Further corrections would gain nothing that the next step does not.
     """
-    predicted = predict(problem.model, problem.stretches, moved.starts, moved.values)
-    for _ in range(FOLLOW_UPS):
-        losses = robust(problem, moved, noise, predicted).losses
-        correction = system.start_correction(weighted_residual(problem, moved, noise, predicted, weights))
-        closer = replace(moved, starts=moved.starts + correction)
-        closer_predicted = predict(problem.model, problem.stretches, closer.starts, closer.values)
-        gains = robust(problem, closer, noise, closer_predicted).losses < losses
-        moved = replace(moved, starts=np.where(gains[:, None], closer.starts, moved.starts))
-        predicted = _chosen(gains, closer_predicted, predicted)
-    return moved, predicted
+    correction = system.start_correction(moved.weighted_residual(weights))
+    unknowns = replace(moved.unknowns, starts=moved.unknowns.starts + correction)
+    closer = Fit.at(moved.problem, unknowns, moved.noise)
+    gains = closer.robust.losses < moved.robust.losses
+    starts = np.where(gains[:, None], unknowns.starts, moved.unknowns.starts)
+    predicted = _chosen(gains, closer.predicted, moved.predicted)
+    return replace(moved, unknowns=replace(unknowns, starts=starts), predicted=predicted)
 
 
-def _chosen(first: NDArray[np.bool_], one: Predicted, other: Predicted) -> Predicted:
-    """Of each stretch (n,) either what `one` says or what `other` does."""
+def _chosen(first: Mask, one: Predicted, other: Predicted) -> Predicted:
+    """The prediction `one` for some stretches (n,), `other` for the rest."""
     return Predicted(
         np.where(first[:, None, None], one.positions, other.positions),
         np.where(first[:, None], one.labels, other.labels),
@@ -154,40 +169,21 @@ def _chosen(first: NDArray[np.bool_], one: Predicted, other: Predicted) -> Predi
     )
 
 
-def _with_contacts(stretches: Stretches, predicted: Predicted) -> Stretches:
-    """The same with the contact times of a prediction as guesses; the old one stays for a contact it has not."""
-    found = torch.from_numpy(predicted.contacts)
-    return replace(stretches, contacts=torch.where(found.isnan(), stretches.contacts, found))
-
-
-def followed(model: BallModel, stretches: Stretches, values: Mapping[str, float] | None = None) -> Stretches:
-    """Those stretches whose contacts a model reaches from the first guess of their states.
-
-    Args: values: coefficients by parameter name that differ from the model's own, as fitted.
-    """
-    predicted = predict(model, stretches, stretches.starts.numpy(), values or {})
-    reached: NDArray[np.bool_] = np.asarray(np.isfinite(predicted.positions).all(axis=(1, 2)))
-    return stretches.take(reached)
-
-
 def _settled(result: Fit) -> Noise:
-    """Noise from what is left: median absolute deviation per axis, with the degrees of freedom that states took."""
+    """Noise from the residuals: median absolute deviation per axis, with the degrees of freedom that states took."""
     used = result.problem.stretches.used.numpy()
-    whitened = result.whitened
     taken = (STATE_DIM - 3) * len(used) / (3.0 * used.sum())
-    spread = np.array([np.median(np.abs(whitened[..., a][used])) for a in range(3)]) / NORMAL_MEDIAN
+    spread = np.array([np.median(np.abs(result.whitened[..., a][used])) for a in range(3)]) / NORMAL_MEDIAN
     position = result.noise.position * spread / np.sqrt(1.0 - taken)
     return replace(result.noise, position=position, spin=_spin_scatter(result))
 
 
 def _spin_scatter(result: Fit) -> float:
-    """rad/s: root of the expected square of an unlabelled spin about what its launcher tells, one step of EM."""
+    """rad/s: root of the expected square of an unlabelled spin about its launcher's mean, one step of EM."""
     unlabelled = ~result.problem.stretches.labelled
     if not unlabelled.any():
         return result.noise.spin
-    system = linearise(result.problem, result.unknowns, result.noise, result.predicted)
-    by_start = system.by_start[unlabelled]
-    covariance = np.linalg.inv(by_start.swapaxes(-1, -2) @ by_start)[:, SPIN, SPIN]
-    about = whitened_spins(result.problem, result.unknowns, result.noise, result.predicted)[unlabelled]
+    covariance = np.linalg.inv(result.linearised().start_information[unlabelled])[:, SPIN, SPIN]
+    about = result.whitened_spins[unlabelled]
     square = (about * result.noise.spin) ** 2 + np.diagonal(covariance, axis1=-2, axis2=-1)
     return max(float(np.sqrt(square.mean())), LEAST_SPIN_SCATTER)

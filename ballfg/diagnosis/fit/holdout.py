@@ -1,107 +1,137 @@
-"""A dataset ready for diagnosis: every second track to find with, the others to judge by."""
+"""A dataset split for diagnosis: every second track to search for effects, the others held out."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, Stretches, stretches_of
-from ballfg.diagnosis.search.evaluation import JudgedTrack
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
-from ballfg.dynamics.surfaces import Surfaces
+from ballfg.diagnosis.result import Array
+from ballfg.dynamics import AnalyticModel, SpinEmbedding, Surfaces
+from ballfg.estimation import Launcher, Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.batch import map_tracks
-from ballfg.estimation.configure import dataset_settings, dataset_surfaces
-from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.measurement.as_measured import plainly_measured
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
-from ballfg.estimation.settings import Settings
-from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.tracks import Dataset, Track
 
 MOST_TRACKS = 200
-"""Tracks that are looked at, evenly over the dataset: more cost time in proportion and change no verdict."""
+"""Tracks that are used, evenly over the dataset. Computing time grows with their number; verdicts do not change."""
 LEAST_TRACKS = 6
-"""Fewer leave three to find with: no scatter between tracks to measure noise by."""
+"""Fewer tracks leave fewer than three to search, whose scatter cannot measure the noise."""
 LAUNCHER_LABELS = ("topspin", "sidespin", "speed")
 """Launcher settings that a dataset's labels may hold as numbers."""
 
 
 @dataclass(frozen=True)
-class Halves:
-    """What is looked at.
+class EvaluationTrack:
+    """The part of a track that a model is to explain: up to the first hit or rest, without outliers.
 
     Attributes:
-        dataset: where it comes from.
+        track: that part.
+        bounces: (b,) s, contacts in it.
+    """
+
+    track: Track
+    bounces: Array
+
+
+@dataclass(frozen=True)
+class Holdout:
+    """A dataset in two halves.
+
+    Attributes:
+        dataset: the whole.
         settings: its noise, as stated or estimated.
         surfaces: where its balls bounce.
         launcher: which labels of a shot tell its spin; its weights mean nothing.
-        finding, judging: stretches of the two halves.
-        found_on, judged: tracks of the two halves up to their first hit.
-        excluded: sentences on what has no part.
+        search, held_out: stretches of the two halves.
+        search_tracks, held_out_tracks: tracks of the two halves up to their first hit.
+        excluded: sentences on tracks that are not used.
     """
 
     dataset: Dataset
     settings: Settings
     surfaces: Surfaces
     launcher: Launcher
-    finding: Stretches
-    judging: Stretches
-    found_on: tuple[JudgedTrack, ...]
-    judged: tuple[JudgedTrack, ...]
+    search: Stretches
+    held_out: Stretches
+    search_tracks: tuple[EvaluationTrack, ...]
+    held_out_tracks: tuple[EvaluationTrack, ...]
     excluded: tuple[str, ...]
 
 
-def halves_of(dataset: Dataset, model: AnalyticModel, jobs: int, watch: Callable[[str], None]) -> Halves:
-    """Split a dataset and find the stretches of both halves.
+def hold_out(
+    dataset: Dataset,
+    model: AnalyticModel,
+    jobs: int = 1,
+    watch: Callable[[str], None] | None = None,
+    *,
+    most_tracks: int = MOST_TRACKS,
+) -> Holdout:
+    """Split a dataset in two and find the stretches of both halves.
 
-    Args: dataset: of at least `LEAST_TRACKS` tracks.  model: as declared.  jobs: processes.  watch: told of progress.
-    Raises: ValueError: if there are too few tracks.
+    Args:
+        dataset: of at least `LEAST_TRACKS` tracks.
+        model: as declared.
+        jobs: processes.
+        watch: is told of progress, in lines.
+        most_tracks: of a larger dataset so many tracks are used, evenly spread.
+
+    Returns:
+        Both halves, as stretches to fit and as tracks to predict.
+
+    Raises:
+        ValueError: if there are too few tracks, or a half without a stretch that is long enough.
     """
-    tracks, excluded = _chosen(dataset)
+    tracks, excluded = _chosen(dataset, most_tracks)
     settings, surfaces = dataset_settings(dataset, model), dataset_surfaces(dataset)
     launcher = launcher_labels(dataset, tracks, settings)
-    louder = _louder(tracks, settings)
-    heard = replace(settings, position_scale=louder * settings.position_scale)
-    smoother = Smoother(plainly_measured(model), surfaces, heard)
-    watch(f"estimating {len(tracks)} tracks")
-    finding, judging = (stretches_of(smoother, half, launcher, jobs) for half in (tracks[::2], tracks[1::2]))
-    finding, judging = (replace(half, sigmas=half.sigmas / louder) for half in (finding, judging))
-    parts = [list(map_tracks(_JudgedPart(smoother), half, len(half), jobs)) for half in (tracks[::2], tracks[1::2])]
-    found_on, judged = (tuple(part for part in half if part is not None) for half in parts)
-    lost = len(tracks) - len(np.unique(finding.track)) - len(np.unique(judging.track))
+    excess = _excess_noise(tracks, settings)
+    noisy = replace(settings, position_scale=excess * settings.position_scale)
+    smoother = Smoother(plainly_measured(model), surfaces, noisy)
+    if watch is not None:
+        watch(f"estimating {len(tracks)} tracks")
+    halves = tracks[::2], tracks[1::2]
+    search, held_out = (stretches_of(smoother, half, launcher, jobs) for half in halves)
+    search, held_out = (replace(half, sigmas=half.sigmas / excess) for half in (search, held_out))
+    parts = [list(map_tracks(partial(_evaluation_track, smoother), half, len(half), jobs)) for half in halves]
+    search_tracks, held_out_tracks = (tuple(part for part in half if part is not None) for half in parts)
+    lost = len(tracks) - len(np.unique(search.track)) - len(np.unique(held_out.track))
     if lost:
         excluded.append(f"{lost} of {len(tracks)} tracks hold no free flight that is long enough")
-    return Halves(dataset, settings, surfaces, launcher, finding, judging, found_on, judged, tuple(excluded))
+    return Holdout(
+        dataset, settings, surfaces, launcher, search, held_out, search_tracks, held_out_tracks, tuple(excluded)
+    )
 
 
-def _chosen(dataset: Dataset) -> tuple[list[Track], list[str]]:
+def _chosen(dataset: Dataset, most: int) -> tuple[list[Track], list[str]]:
     count = len(dataset)
     if count < LEAST_TRACKS:
         raise ValueError(
             f"dataset must hold at least {LEAST_TRACKS} tracks, half to find with and half to judge by; got {count}. "
             "Record more."
         )
-    kept = set(np.linspace(0, count - 1, min(count, MOST_TRACKS)).round().astype(int).tolist())
+    kept = set(np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist())
     excluded = [] if len(kept) == count else [f"of {count} tracks {len(kept)}, evenly spread, were looked at"]
     return [track for i, track in enumerate(dataset) if i in kept], excluded
 
 
-def _louder(tracks: Sequence[Track], settings: Settings) -> float:
-    """By how much the noise that tracks show exceeds what is stated, at least 1.
+def _excess_noise(tracks: Sequence[Track], settings: Settings) -> float:
+    """Noise that the tracks show over the stated noise, at least 1.
 
-    Outliers are told by their distance from where the ball is expected. With less noise expected than there
-    is, that would leave out ordinary samples which differ from their neighbours: those that stay err alike, as if a
-    force were missing.
+    Outliers are recognised by their distance from the expected place of the ball. With the stated noise, if it is too
+    small, ordinary samples that differ from their neighbours would count as outliers. The errors of the remaining
+    samples would then be alike, as if a force were missing.
     """
     shown = estimate_position_noise(tracks)
     return max(1.0, float(np.max(shown / (settings.position_scale * np.asarray(settings.position_noise)))))
 
 
 def launcher_labels(dataset: Dataset, tracks: list[Track], settings: Settings) -> Launcher:
-    """What tells how tracks without a spin label were launched: settings, else groups, else that they are one set."""
+    """The labels that tell how unlabelled spins were launched: settings, else groups, else one group for all."""
     names = tuple(n for n in LAUNCHER_LABELS if all(isinstance(t.labels.get(n), float) for t in tracks))
     if names:
         return Launcher(SpinEmbedding(names, {}), settings.spin_prior)
@@ -110,23 +140,16 @@ def launcher_labels(dataset: Dataset, tracks: list[Track], settings: Settings) -
     return Launcher(SpinEmbedding(("group",), {"group": groups}), settings.spin_prior, {"group": own})
 
 
-@dataclass(frozen=True)
-class _JudgedPart:
-    """Cuts a track to what a model is to explain; pickles, so that processes can do it."""
-
-    smoother: Smoother
-
-    def __call__(self, track: Track) -> JudgedTrack | None:
-        segmentation = self.smoother.segment(track)
-        first, last = segmentation.segments[0]
-        last = min([last, *(rest.first for rest in segmentation.rests if rest.first >= first)])
-        usable = np.flatnonzero(segmentation.usable[: last + 1])
-        if len(usable) < LEAST_SAMPLES:
-            return None
-        sigmas = None if track.sigmas is None else track.sigmas[usable]
-        labels = track.labels if usable[0] == 0 else {}
-        part = replace(
-            track, times=track.times[usable], positions=track.positions[usable], sigmas=sigmas, labels=labels
-        )
-        bounces = np.array([c.time for c in segmentation.contacts if c.time <= part.times[-1]])
-        return JudgedTrack(part, bounces)
+def _evaluation_track(smoother: Smoother, track: Track) -> EvaluationTrack | None:
+    """The part of a track that a model is to explain; None where it has too few samples."""
+    segmentation = smoother.segment(track)
+    first, last = segmentation.segments[0]
+    last = min([last, *(rest.first for rest in segmentation.rests if rest.first >= first)])
+    usable = np.flatnonzero(segmentation.usable[: last + 1])
+    if len(usable) < LEAST_SAMPLES:
+        return None
+    sigmas = None if track.sigmas is None else track.sigmas[usable]
+    labels = track.labels if usable[0] == 0 else {}
+    part = replace(track, times=track.times[usable], positions=track.positions[usable], sigmas=sigmas, labels=labels)
+    bounces = np.array([c.time for c in segmentation.contacts if c.time <= part.times[-1]])
+    return EvaluationTrack(part, bounces)

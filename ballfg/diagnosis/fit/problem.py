@@ -1,27 +1,26 @@
-"""What a diagnosis fits: the unknowns, their priors and losses, and the linearised rows at some unknowns."""
+"""A fit problem with its unknowns, priors and losses, and the linearised rows at some unknowns."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ballfg.diagnosis.fit.sensitivity import Predicted, Sensitivity, sensitivity
+from ballfg.diagnosis.fit.sensitivity import Predicted, predict, sensitivity
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System
-from ballfg.dynamics.effect import Coefficient
-from ballfg.dynamics.model import BallModel
+from ballfg.diagnosis.result import Array, Index
+from ballfg.dynamics import AnalyticModel, Coefficient
 from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED
+from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, STATE_DIM, VELOCITY
 
-Array = NDArray[np.float64]
-
-HUBER = 3.0
-"""Norm of a whitened position residual (three coordinates) beyond which a sample counts less."""
-LABEL_CAUCHY = 3.0
-"""Scale of the robust weight of a spin label, in its standard deviations: labels were seen to contradict the flight."""
+POSITION_LOSS = Loss("huber", 3.0)
+"""Loss of a whitened position residual (three coordinates)."""
+LABEL_LOSS = Loss("cauchy", 3.0)
+"""Loss of a whitened spin label: labels were seen to contradict the flight."""
 LAUNCHER_SPIN_SIGMA = 150.0
 """rad/s, prior of the spin that a launcher setting of typical size means, per axis, about zero."""
 
@@ -52,17 +51,17 @@ class Noise:
 
 @dataclass(frozen=True)
 class Problem:
-    """What is fitted to what.
+    """Data and the model that is fitted to them.
 
     Attributes:
         model: with every effect that has a coefficient among `free`.
         stretches: the data.
         free: declared coefficients to estimate, by parameter name, with their priors.
-        shared: whether what all stretches share is estimated; else only first states are, as when a fit is judged on
-            other tracks.
+        shared: whether coefficients and launcher are estimated. Otherwise only first states are, as in an evaluation
+            on other tracks.
     """
 
-    model: BallModel
+    model: AnalyticModel
     stretches: Stretches
     free: Mapping[str, Coefficient]
     shared: bool = True
@@ -84,62 +83,10 @@ class Problem:
         typical = (self.stretches.settings**2).mean(axis=0)
         return np.asarray(np.where(typical > 0.0, typical, 1.0) / LAUNCHER_SPIN_SIGMA**2)
 
-
-@dataclass(frozen=True)
-class Fit:
-    """A minimum.
-
-    Attributes:
-        problem: what was fitted.
-        unknowns: the estimates.
-        noise: as estimated with them.
-        predicted: at the minimum.
-        cost: objective: half the sum of robust losses and prior terms, at that noise.
-        steps: Gauss-Newton steps taken in total.
-    """
-
-    problem: Problem
-    unknowns: Unknowns
-    noise: Noise
-    predicted: Predicted
-    cost: float
-    steps: int
-
     @property
-    def sigmas(self) -> Array:
-        """(n, k, 3) m, stated noise times its estimated scale; infinite where there is no sample."""
-        return np.asarray(self.problem.stretches.sigmas.numpy() * self.noise.position)
-
-    @property
-    def whitened(self) -> Array:
-        """(n, k, 3) position residuals over their noise; zero where there is no sample."""
-        return whitened_positions(self.problem, self.noise, self.predicted)
-
-    @property
-    def robust(self) -> Robust:
-        """Weights and losses at the minimum."""
-        return robust(self.problem, self.unknowns, self.noise, self.predicted)
-
-
-def launch_axes(starts: Array) -> Array:
-    """(n, 3, 3) columns forward (horizontally), across (z x forward) and up of launches (n, 9)."""
-    x, y = starts[:, VELOCITY.start], starts[:, VELOCITY.start + 1]
-    length = np.sqrt(x**2 + y**2 + SOFT_SPEED**2)
-    x, y, zero = x / length, y / length, np.zeros_like(x)
-    return np.stack(
-        (np.stack((x, y, zero), -1), np.stack((-y, x, zero), -1), np.stack((zero, zero, zero + 1.0), -1)), axis=-1
-    )
-
-
-def whitened_spins(problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Predicted) -> Array:
-    """(n, 3) whitened residual of each spin against its label, or where there is none against its launcher."""
-    labels, labelled = problem.stretches.labels.numpy(), problem.stretches.labelled
-    local = problem.stretches.settings @ unknowns.launcher
-    mean = (launch_axes(unknowns.starts) @ local[..., None])[..., 0]
-    unlabelled = (mean - unknowns.starts[:, SPIN]) / noise.spin
-    with np.errstate(invalid="ignore"):
-        about = (labels - predicted.labels) / noise.label
-    return np.where(labelled[:, None], about, unlabelled)
+    def common_precision(self) -> Array:
+        """(q + 3 s,) of the priors of all common columns: coefficients, then launcher settings."""
+        return np.concatenate((self.precisions, np.repeat(self.launcher_precision, 3)))
 
 
 @dataclass(frozen=True)
@@ -151,65 +98,110 @@ class Robust:
     losses: Array
 
 
-def robust(problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Predicted) -> Robust:
-    """Huber's weights for positions, Cauchy's for labels, at some unknowns."""
-    length = np.linalg.norm(whitened_positions(problem, noise, predicted), axis=-1)
-    weight = np.minimum(1.0, HUBER / np.maximum(length, HUBER))
-    loss = np.where(length <= HUBER, 0.5 * length**2, HUBER * length - 0.5 * HUBER**2)
-    spins, labelled = whitened_spins(problem, unknowns, noise, predicted), problem.stretches.labelled
-    square = (spins**2).sum(axis=-1)
-    spin_weight = np.where(labelled, 1.0 / (1.0 + square / LABEL_CAUCHY**2), 1.0)
-    spin_loss = np.where(labelled, 0.5 * LABEL_CAUCHY**2 * np.log1p(square / LABEL_CAUCHY**2), 0.5 * square)
-    return Robust(weight, spin_weight, loss.sum(axis=-1) + spin_loss)
+@dataclass(frozen=True)
+class Fit:
+    """Unknowns of a problem and the samples that they predict. The result of a fit is the one at the minimum.
+
+    Attributes:
+        problem: the data, the model and the priors.
+        unknowns: the estimates.
+        noise: scale of the noise.
+        predicted: samples that the unknowns predict.
+        steps: Gauss-Newton steps taken so far.
+    """
+
+    problem: Problem
+    unknowns: Unknowns
+    noise: Noise
+    predicted: Predicted
+    steps: int = 0
+
+    @classmethod
+    def at(cls, problem: Problem, unknowns: Unknowns, noise: Noise, steps: int = 0) -> Fit:
+        """The prediction at some unknowns."""
+        predicted = predict(problem.model, problem.stretches, unknowns.starts, unknowns.values)
+        return cls(problem, unknowns, noise, predicted, steps)
+
+    @cached_property
+    def sigmas(self) -> Array:
+        """(n, k, 3) m, stated noise times its estimated scale; infinite where there is no sample."""
+        return np.asarray(self.problem.stretches.sigmas.numpy() * self.noise.position)
+
+    @cached_property
+    def whitened(self) -> Array:
+        """(n, k, 3) position residuals over their noise; zero where there is no sample."""
+        return np.asarray((self.problem.stretches.positions.numpy() - self.predicted.positions) / self.sigmas)
+
+    @cached_property
+    def whitened_spins(self) -> Array:
+        """(n, 3) whitened residual of each spin against its label, or against its launcher where it has no label."""
+        stretches, unknowns = self.problem.stretches, self.unknowns
+        local = stretches.settings @ unknowns.launcher
+        mean = (launch_axes(unknowns.starts) @ local[..., None])[..., 0]
+        unlabelled = (mean - unknowns.starts[:, SPIN]) / self.noise.spin
+        with np.errstate(invalid="ignore"):
+            about = (stretches.labels.numpy() - self.predicted.labels) / self.noise.label
+        return np.where(stretches.labelled[:, None], about, unlabelled)
+
+    @cached_property
+    def robust(self) -> Robust:
+        """Huber's weights and losses of positions, Cauchy's of labels."""
+        length = np.linalg.norm(self.whitened, axis=-1)
+        spin, labelled = np.linalg.norm(self.whitened_spins, axis=-1), self.problem.stretches.labelled
+        spin_weight = np.where(labelled, LABEL_LOSS.weight(spin), 1.0)
+        spin_loss = np.where(labelled, LABEL_LOSS.value(spin), 0.5 * spin**2)
+        losses = POSITION_LOSS.value(length).sum(axis=-1) + spin_loss
+        return Robust(POSITION_LOSS.weight(length), spin_weight, losses)
+
+    @cached_property
+    def cost(self) -> float:
+        """Half the robust sum of squares, priors included; infinite where a stretch misses a contact."""
+        problem, cost = self.problem, float(self.robust.losses.sum())
+        values = np.array([self.unknowns.values[name] for name in problem.free])
+        cost += 0.5 * float((problem.precisions * (values - problem.centres) ** 2).sum())
+        cost += 0.5 * float((problem.launcher_precision[:, None] * self.unknowns.launcher**2).sum())
+        return cost if np.isfinite(cost) else np.inf
+
+    def weighted_residual(self, weights: Robust) -> Array:
+        """(n, m) whitened residuals of positions and spins, with the roots of some weights."""
+        positions = self.whitened * np.sqrt(weights.samples)[..., None]
+        spins = self.whitened_spins * np.sqrt(weights.spins)[:, None]
+        return np.concatenate((positions.reshape(len(spins), -1), spins), axis=1)
+
+    def position_rows(self, derivative: Array, stretches: Index | slice = np.s_[:]) -> Array:
+        """(m, 3 k, d) whitened, robustly weighted rows of derivatives (m, k, 3, d) of the positions of m stretches."""
+        scale = np.sqrt(self.robust.samples[stretches])[..., None] / self.sigmas[stretches]
+        return np.asarray((derivative * scale[..., None]).reshape(len(derivative), -1, derivative.shape[-1]))
+
+    def linearised(self) -> System:
+        """The whitened, robustly weighted rows; common columns are coefficients, then launcher settings."""
+        stretches, unknowns, noise = self.problem.stretches, self.unknowns, self.noise
+        derivative = sensitivity(
+            self.problem.model, stretches, unknowns.starts, unknowns.values, tuple(self.problem.free)
+        )
+        positions, labelled = self.position_rows(derivative.positions), stretches.labelled[:, None, None]
+        spins = np.zeros((len(stretches), 3, derivative.labels.shape[-1]))
+        spins[:, range(3), range(SPIN.start, SPIN.stop)] = 1.0 / noise.spin
+        spins = np.where(labelled, derivative.labels / noise.label, spins) * np.sqrt(self.robust.spins)[:, None, None]
+        towards = -launch_axes(unknowns.starts)[:, :, None, :] * stretches.settings[:, None, :, None] / noise.spin
+        by_launcher = np.zeros((*positions.shape[:2], unknowns.launcher.size))
+        by_launcher = np.concatenate(
+            (by_launcher, np.where(labelled, 0.0, towards.reshape(len(stretches), 3, -1))), axis=1
+        )
+        rows = np.concatenate((positions, spins), axis=1)
+        by_common = np.concatenate((rows[..., STATE_DIM:], by_launcher), axis=-1)
+        return System(self.weighted_residual(self.robust), rows[..., :STATE_DIM], by_common)
 
 
-def whitened_positions(problem: Problem, noise: Noise, predicted: Predicted) -> Array:
-    """(n, k, 3) measured minus predicted over the noise; zero where there is no sample."""
-    sigma = problem.stretches.sigmas.numpy() * noise.position
-    return np.asarray((problem.stretches.positions.numpy() - predicted.positions) / sigma)
+def launch_axes(starts: Array) -> Array:
+    """(n, 3, 3) columns forward (horizontally), across (z x forward) and up of launches (n, 9)."""
+    x, y = starts[:, VELOCITY.start], starts[:, VELOCITY.start + 1]
+    length = np.sqrt(x**2 + y**2 + SOFT_SPEED**2)
+    x, y, zero = x / length, y / length, np.zeros_like(x)
+    forward, across, up = (x, y, zero), (-y, x, zero), (zero, zero, zero + 1.0)
+    return np.stack([np.stack(axis, axis=-1) for axis in (forward, across, up)], axis=-1)
 
 
-def weighted_residual(
-    problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Predicted, weights: Robust
-) -> Array:
-    """(n, m) whitened residuals of positions and spins, with the roots of some weights."""
-    positions = whitened_positions(problem, noise, predicted) * np.sqrt(weights.samples)[..., None]
-    spins = whitened_spins(problem, unknowns, noise, predicted) * np.sqrt(weights.spins)[:, None]
-    return np.concatenate((positions.reshape(len(spins), -1), spins), axis=1)
-
-
-def assemble(
-    problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Predicted, derivative: Sensitivity
-) -> System:
-    """The whitened, robustly weighted rows; common columns are coefficients, then launcher settings."""
-    stretches = problem.stretches
-    n, k = stretches.times.shape
-    sigma = stretches.sigmas.numpy() * noise.position
-    labelled = stretches.labelled
-    weights = robust(problem, unknowns, noise, predicted)
-    root, spin_root = np.sqrt(weights.samples)[..., None], np.sqrt(weights.spins)[:, None]
-    q = derivative.positions.shape[-1] - STATE_DIM
-    rows = (derivative.positions * (root / sigma)[..., None]).reshape(n, 3 * k, -1)
-    spin_rows = np.zeros((n, 3, STATE_DIM + q))
-    spin_rows[:, range(3), range(SPIN.start, SPIN.stop)] = 1.0 / noise.spin
-    by_label = derivative.labels / noise.label
-    spin_rows = np.where(labelled[:, None, None], by_label, spin_rows) * spin_root[..., None]
-    by_launcher = np.zeros((n, 3 * k + 3, unknowns.launcher.size))
-    towards = -launch_axes(unknowns.starts)[:, :, None, :] * stretches.settings[:, None, :, None] / noise.spin
-    by_launcher[:, 3 * k :] = np.where(labelled[:, None, None], 0.0, towards.reshape(n, 3, -1))
-    both = np.concatenate((rows, spin_rows), axis=1)
-    residual = weighted_residual(problem, unknowns, noise, predicted, weights)
-    return System(residual, both[..., :STATE_DIM], np.concatenate((both[..., STATE_DIM:], by_launcher), axis=-1))
-
-
-def linearise(problem: Problem, unknowns: Unknowns, noise: Noise, predicted: Predicted) -> System:
-    """The system at some unknowns."""
-    derivative = sensitivity(
-        problem.model, problem.stretches, unknowns.starts, unknowns.values, tuple(problem.free), by_start=True
-    )
-    return assemble(problem, unknowns, noise, predicted, derivative)
-
-
-def common_precision(problem: Problem) -> Array:
-    """(q + 3 s,) precisions of the priors of all common columns."""
-    return np.concatenate((problem.precisions, np.repeat(problem.launcher_precision, 3)))
+def declared_free(model: AnalyticModel) -> dict[str, Coefficient]:
+    """Coefficients that a fit of the declared model estimates: those whose prior leaves room."""
+    return {n: c for n, c in model.declared_coefficients().items() if c.sigma > 0.0 and c.absent is not None}

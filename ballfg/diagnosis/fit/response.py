@@ -1,9 +1,10 @@
-"""How the samples answer to what happens on the way: accelerations in flight, kicks right after contacts.
+"""Response of the samples to accelerations in flight and to kicks right after contacts.
 
-To first order, an acceleration a(s) along the fitted motion moves what is measured at time t by P(t) times the integral
-over s < t of F(s)^-1 (0, a(s), 0), by variation of constants. F and P are the derivatives of the state, and of the
-measured position, by the state with which an arc of free flight begins. So one pass of nine directions for each arc
-serves every pattern of forces; P's columns for velocity and spin are the answers to kicks after the contact.
+To first order, an acceleration a(s) along the fitted motion moves the position measured at time t by P(t) times the
+integral over s < t of F(s)^-1 (0, a(s), 0), by variation of constants. F and P are the derivatives of the state and of
+the measured position by the state with which an arc of free flight begins. One pass of nine directions for each arc
+thus serves every pattern of forces. The columns of P for velocity and spin are the responses to kicks after the
+contact.
 """
 
 from __future__ import annotations
@@ -14,13 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.autograd.forward_ad as forward
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ballfg.diagnosis.fit.dual import dual_level, make_dual
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.shooting import LEAST_ARC, Arc, Trajectories, shoot
-from ballfg.dynamics.model import BallModel, substitute
+from ballfg.diagnosis.result import Array, Index
+from ballfg.dynamics import BallModel, substitute
 from ballfg.state import STATE_DIM, VELOCITY
 
 NODE = 0.01
@@ -28,37 +29,34 @@ NODE = 0.01
 MOST_STRETCHES = 100
 """Stretches of one pass; memory is about a megabyte each."""
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-
 
 @dataclass(frozen=True)
-class Along:
+class FittedPath:
     """The fitted motion of n stretches.
 
     Attributes:
-        motion: as shot.  times: (k, n) s, true times of the samples since the first one.
-        states: (n, k, 9) there.  contacts: (n, c) s, NaN where there is none.
-        ends: (n,) s, where the last arc of each ends.
+        motion: its arcs.
+        times: (k, n) s, true times of the samples since the first one.
+        states: (n, k, 9) at the samples.
     """
 
     motion: Trajectories
     times: Tensor
     states: Array
-    contacts: Array
-    ends: Array
 
 
 @dataclass(frozen=True)
 class ArcResponse:
-    """Answers of m stretches to what happens in one of their arcs, with q nodes and k samples.
+    """Responses of m stretches to forces and kicks in one of their arcs, with q nodes and k samples.
 
     Attributes:
         rows: (m,) numbers of the stretches.
         number: of the arc: 0 is before the first contact, j follows contact j - 1.
-        begun: (m,) s since the first sample.  step: (m,) s between nodes.
+        begun: (m,) s since the first sample.
+        step: (m,) s between nodes.
         incoming: (m, 9) state before the contact with which the arc begins; the first state itself for arc 0.
-        nodes: (m, q, 9) states.  times: (m, q) s since the first sample.
+        nodes: (m, q, 9) states.
+        times: (m, q) s of the nodes since the first sample.
         inverse: (m, q, 9, 3) of the derivative of a node's state by the arc's first state, columns of the velocity.
         positions: (m, k, 3, 9) m, derivative of the measured positions by the arc's first state; zero before it.
         passed: (m, k) number of nodes before each sample.
@@ -75,7 +73,7 @@ class ArcResponse:
     positions: Array
     passed: Index
 
-    def answer(self, acceleration: Array) -> Array:
+    def response_to(self, acceleration: Array) -> Array:
         """(m, k, 3, p) m by which accelerations (m, q, 3, p) m/s^2 at the nodes move the measured positions."""
         pulled = self.step[:, None, None, None] * (self.inverse @ acceleration)
         gathered = np.concatenate((np.zeros_like(pulled[:, :1]), pulled.cumsum(axis=1)), axis=1)
@@ -83,11 +81,11 @@ class ArcResponse:
 
     @property
     def kicks(self) -> Array:
-        """(m, k, 3, 6) answers to a unit of velocity (m/s), then of spin (rad/s), at the arc's begin."""
+        """(m, k, 3, 6) responses to a unit of velocity (m/s), then of spin (rad/s), at the beginning of the arc."""
         return self.positions[..., VELOCITY.start :]
 
 
-def along(fit: Fit) -> Along:
+def fitted_path(fit: Fit) -> FittedPath:
     """The motion at a fit's minimum."""
     stretches = fit.problem.stretches
     with torch.no_grad():
@@ -96,24 +94,20 @@ def along(fit: Fit) -> Along:
         starts = torch.from_numpy(fit.unknowns.starts)
         motion = shoot(model, starts, stretches.heights, stretches.contacts, stretches.ends)
         states = motion.states(times).transpose(0, 1).numpy()
-    return Along(motion, times, states, motion.contacts.numpy(), stretches.ends.numpy())
+    return FittedPath(motion, times, states)
 
 
-def responses(fit: Fit, path: Along) -> Iterator[ArcResponse]:
-    """The answers of all arcs, in order of time.
-
-    Args: path: `along(fit)`.
-    """
+def responses(fit: Fit, path: FittedPath) -> Iterator[ArcResponse]:
+    """The responses of all arcs, in order of time; path: `fitted_path(fit)`."""
     for number, arc in enumerate(path.motion.arcs):
         for part in torch.split(torch.arange(len(arc.rows)), MOST_STRETCHES):
             yield _arc_response(fit, path, number, part)
 
 
 def weighted(fit: Fit, positions: Array, rows: Index) -> Array:
-    """(m, 3 k + 3, p) rows as in the fit's system, of derivatives (m, k, 3, p) of positions; labels do not answer."""
-    scaled = positions * (np.sqrt(fit.robust.samples[rows])[..., None] / fit.sigmas[rows])[..., None]
-    flat = scaled.reshape(len(rows), -1, positions.shape[-1])
-    return np.concatenate((flat, np.zeros((len(rows), 3, positions.shape[-1]))), axis=1)
+    """(m, 3 k + 3, p) rows as in the fit's system, of derivatives (m, k, 3, p) of positions; labels do not respond."""
+    moved = fit.position_rows(positions, rows)
+    return np.concatenate((moved, np.zeros((len(rows), 3, positions.shape[-1]))), axis=1)
 
 
 def _valued(fit: Fit, count: int) -> BallModel:
@@ -122,11 +116,10 @@ def _valued(fit: Fit, count: int) -> BallModel:
     return substitute(fit.problem.model, columns)
 
 
-def _arc_response(fit: Fit, path: Along, number: int, part: Tensor) -> ArcResponse:
+def _arc_response(fit: Fit, path: FittedPath, number: int, part: Tensor) -> ArcResponse:
     arc = path.motion.arcs[number]
     rows, begun = arc.rows[part], arc.begun[part]
-    contacts = path.motion.contacts[rows, number:]
-    until = torch.from_numpy(path.ends)[rows]
+    contacts, until = path.motion.contacts[rows, number:], fit.problem.stretches.ends[rows]
     if contacts.shape[1]:
         until = torch.where(contacts[:, 0].isnan(), until, contacts[:, 0])
     duration = (until - begun).clamp_min(LEAST_ARC).numpy()
@@ -135,7 +128,6 @@ def _arc_response(fit: Fit, path: Along, number: int, part: Tensor) -> ArcRespon
     nodes = torch.from_numpy((np.arange(count)[:, None] + 0.5) * step)  # (q, m) s since the arc began
     states, by_first, positions = _shot(fit, path, number, part, nodes)
     since = path.times[:, rows].T.numpy() - begun.numpy()[:, None]
-    passed = np.clip(np.ceil(since / step[:, None] - 0.5), 0, count).astype(np.int64)
     return ArcResponse(
         rows=rows.numpy(),
         number=number,
@@ -146,7 +138,7 @@ def _arc_response(fit: Fit, path: Along, number: int, part: Tensor) -> ArcRespon
         times=(begun + nodes).T.numpy(),
         inverse=np.asarray(np.linalg.inv(by_first)[..., VELOCITY], dtype=np.float64),
         positions=positions,
-        passed=passed,
+        passed=np.clip(np.ceil(since / step[:, None] - 0.5), 0, count).astype(np.int64),
     )
 
 
@@ -158,10 +150,10 @@ def _at(arc: Arc, rows: Tensor, times: Tensor) -> Array:
     return np.asarray(arc.states(asked.unsqueeze(0))[0, where].numpy())
 
 
-def _shot(fit: Fit, path: Along, number: int, part: Tensor, nodes: Tensor) -> tuple[Array, Array, Array]:
-    """From a dual shot of an arc's first state: states at nodes, their derivative by it, that of measured positions.
+def _shot(fit: Fit, path: FittedPath, number: int, part: Tensor, nodes: Tensor) -> tuple[Array, Array, Array]:
+    """A dual shot from an arc's first state: states at nodes, and two derivatives by that first state.
 
-    Returns: (m, q, 9), (m, q, 9, 9), (m, k, 3, 9).
+    Returns: states (m, q, 9), their derivatives (m, q, 9, 9), those of the measured positions (m, k, 3, 9).
     """
     arc, stretches = path.motion.arcs[number], fit.problem.stretches
     rows, begun = arc.rows[part].repeat(STATE_DIM), arc.begun[part].repeat(STATE_DIM)

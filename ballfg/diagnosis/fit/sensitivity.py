@@ -1,4 +1,4 @@
-"""What a model says each sample should be, and how that changes with first states and coefficients.
+"""Predicted samples, and their derivatives by first states and coefficients.
 
 Derivatives are torch's forward mode: the batch is repeated once per direction, with a dual number in that direction.
 """
@@ -6,29 +6,27 @@ Derivatives are torch's forward mode: the batch is repeated once per direction, 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
 import torch.autograd.forward_ad as forward
-from numpy.typing import NDArray
 from torch import Tensor
 
 from ballfg.diagnosis.fit.dual import dual_level, make_dual
 from ballfg.diagnosis.fit.shooting import Trajectories, shoot
 from ballfg.diagnosis.fit.stretches import Stretches
-from ballfg.dynamics.model import BallModel, substitute
+from ballfg.diagnosis.result import Array
+from ballfg.dynamics import BallModel, substitute
 from ballfg.state import SPIN, STATE_DIM
 
 MOST_ROWS = 3000
-"""Rows of one forward pass: more are cut into several; memory is some 50 kB a row."""
-
-Array = NDArray[np.float64]
+"""Rows of one forward pass. More rows take several passes; a row needs some 50 kB of memory."""
 
 
 @dataclass(frozen=True)
 class Predicted:
-    """What should have been measured, for n stretches of k samples.
+    """Samples as a model predicts them, for n stretches of k samples.
 
     Attributes:
         positions: (n, k, 3) m.
@@ -50,17 +48,27 @@ class Sensitivity:
 
 
 def predict(model: BallModel, stretches: Stretches, starts: Array, values: Mapping[str, float]) -> Predicted:
-    """What a model says, with some of its coefficients replaced.
+    """The samples that a model predicts.
 
     Args:
-        model: the ball.  stretches: stamps and contacts.
+        model: the ball.
+        stretches: stamps and contacts.
         starts: (n, 9) states at the first samples.
-        values: coefficients by name as in `model.named_parameters()`.
+        values: coefficients that replace the model's own, by name as in `model.named_parameters()`.
     """
     with torch.no_grad():
         columns = {name: torch.full((len(stretches), 1), value, dtype=torch.float64) for name, value in values.items()}
         positions, labels, motion = _measured(substitute(model, columns), stretches, torch.from_numpy(starts))
     return Predicted(positions.numpy(), labels.numpy(), motion.contacts.numpy())
+
+
+@dataclass(frozen=True)
+class _Direction:
+    """A component of the first state or a coefficient, and values that other coefficients have meanwhile."""
+
+    component: int | None = None
+    name: str | None = None
+    values: Mapping[str, float] = field(default_factory=dict)
 
 
 def sensitivity(
@@ -72,41 +80,30 @@ def sensitivity(
     *,
     by_start: bool = True,
     shapes: Sequence[Mapping[str, float]] = (),
+    most_rows: int = MOST_ROWS,
 ) -> Sensitivity:
     """Derivatives by the nine components of the first state (unless not `by_start`), then by the named coefficients.
 
     Args:
+        model, stretches, starts, values: as for `predict`.
         names: coefficients among `values`; one that is named again has one derivative for each of its shapes.
+        by_start: whether first states are among the directions.
         shapes: for each name, values of other coefficients with which that derivative is taken; empty: none.
-        Others as for `predict`.
+        most_rows: of one forward pass.
     """
-    wanted = [_Direction(number, None, {}) for number in range(STATE_DIM if by_start else 0)]
+    wanted = [_Direction(component=number) for number in range(STATE_DIM if by_start else 0)]
     wanted += [_Direction(None, name, shape) for name, shape in zip(names, shapes or [{}] * len(names), strict=True)]
-    size = max(1, MOST_ROWS // len(stretches))
+    size = max(1, most_rows // len(stretches))
     parts = [
-        _directions(model, stretches, starts, values, wanted[first : first + size])
+        _derivatives(model, stretches, starts, values, wanted[first : first + size])
         for first in range(0, len(wanted), size)
     ]
-    return Sensitivity(
-        np.concatenate([p.positions for p in parts], axis=-1), np.concatenate([p.labels for p in parts], axis=-1)
-    )
+    positions, labels = ([getattr(part, name) for part in parts] for name in ("positions", "labels"))
+    return Sensitivity(np.concatenate(positions, axis=-1), np.concatenate(labels, axis=-1))
 
 
-@dataclass(frozen=True)
-class _Direction:
-    """What a derivative is taken by: a component of the first state, or a coefficient, with others at some values."""
-
-    component: int | None
-    name: str | None
-    values: Mapping[str, float]
-
-
-def _directions(
-    model: BallModel,
-    stretches: Stretches,
-    starts: Array,
-    values: Mapping[str, float],
-    wanted: Sequence[_Direction],
+def _derivatives(
+    model: BallModel, stretches: Stretches, starts: Array, values: Mapping[str, float], wanted: Sequence[_Direction]
 ) -> Sensitivity:
     n, d = len(stretches), len(wanted)
     repeated = stretches.take(np.tile(np.arange(n), d))
@@ -125,12 +122,9 @@ def _directions(
     with dual_level():
         columns = {name: make_dual(primals[name], tangents[name]) for name in values}
         dual = make_dual(state, state_tangent)
-        positions, labels, _ = _measured(substitute(model, columns), repeated, dual)
-        moved, relabelled = _tangent(positions), _tangent(labels)
-    k = positions.shape[1]
-    return Sensitivity(
-        np.moveaxis(moved.numpy().reshape(d, n, k, 3), 0, -1), np.moveaxis(relabelled.numpy().reshape(d, n, 3), 0, -1)
-    )
+        measured = _measured(substitute(model, columns), repeated, dual)[:2]
+        moved, relabelled = (_tangent(part).numpy().reshape(d, n, *part.shape[1:]) for part in measured)
+    return Sensitivity(np.moveaxis(moved, 0, -1), np.moveaxis(relabelled, 0, -1))
 
 
 def _tangent(dual: Tensor) -> Tensor:

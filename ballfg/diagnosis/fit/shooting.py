@@ -1,8 +1,8 @@
 """Motion from a first state, through contacts whose number and order are known: smooth in everything.
 
-A rollout decides by itself where the ball bounces, so that a small change can add or lose a bounce. Here the contacts
-are given, each with a guess of its time; the contact times are solved for. Each row flies in equal steps of its
-own from contact to contact, and a Hermite polynomial gives the states in between.
+A rollout finds the bounces itself, so that a small change can add or lose one. Here the contacts are given, each with a
+guess of its time, and only their times are solved for. Each row flies in equal steps of its own from contact to
+contact; a Hermite polynomial gives the states in between.
 """
 
 from __future__ import annotations
@@ -13,16 +13,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.model import BallModel, take_rows
-from ballfg.dynamics.motion.contact import contact_time
-from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, fly, rk4_from
+from ballfg.dynamics import BallModel, contact_time, fly
+from ballfg.dynamics.model import take_rows
+from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, rk4_from
 from ballfg.dynamics.motion.paths import hermite
 from ballfg.state import VELOCITY
 
 LONGEST_STEP, LONGEST_WAY = 0.04, 0.4
-"""s and m of one integration step: twice those of a rollout, and the rollout's own from 20 m/s on. A flight of a second
-then ends within a micrometre of the rollout's, far below what any camera sees. However wild a state that a fit tries,
-steps become no shorter."""
+"""s and m of one integration step: twice those of a rollout below 20 m/s, the rollout's own above. A flight of a second
+then ends within a micrometre of the rollout's, far below the resolution of any camera. Steps become no shorter than a
+rollout's, however fast a state that a fit tries."""
 LEAST_ARC = 1e-3
 """s. An arc between two contacts is taken to last at least so long when its steps are laid out."""
 
@@ -32,8 +32,8 @@ class Arc:
     """Flight of some rows from one contact to the next.
 
     Attributes:
-        rows: (m,) which ones.
-        begun: (m,) s, when each began.
+        rows: (m,) their numbers.
+        begun: (m,) s, beginning of each.
         step: (m, 1) s.
         nodes: (j + 1, m, 9) states.
         slopes: (j + 1, m, 9) their derivatives by time.
@@ -61,7 +61,7 @@ class Trajectories:
 
     Attributes:
         arcs: in order of time.
-        contacts: (r, c) s, when each contact happened; NaN where there is none, or the ball never got there.
+        contacts: (r, c) s, time of each contact; NaN where there is none, or the ball never got there.
     """
 
     arcs: tuple[Arc, ...]
@@ -87,29 +87,30 @@ def shoot(model: BallModel, start: Tensor, heights: Tensor, guesses: Tensor, end
         heights: (r, c) m, declared heights of the surfaces met, in order; NaN where there is no further one.
         guesses: (r, c) s, about when.
         ends: (r,) s, how long to fly.
-    Returns: differentiable, backward and forward, in start and coefficients. A row that misses a contact is NaN from
-        there on.
+
+    Returns:
+        The motion, differentiable backward and forward in start and coefficients. A row that misses a contact is NaN
+        from there on.
     """
     rows, begun, own = torch.arange(len(start)), torch.zeros_like(start[:, 0]), model
     arcs: list[Arc] = []
     contacts = torch.full_like(heights, torch.nan)
-    for number in range(heights.shape[1] + 1):
-        meets = (
-            ~heights[rows, number].isnan() if number < heights.shape[1] else torch.zeros_like(rows, dtype=torch.bool)
-        )
-        until = torch.where(meets, guesses[rows, number], ends[rows]) if number < heights.shape[1] else ends[rows]
+    last = torch.full_like(ends, torch.nan).unsqueeze(-1)  # no arc ends with a contact after the last one
+    for height, guess in zip(*(torch.cat((a, last), dim=1).T for a in (heights, guesses)), strict=True):
+        meets = ~height[rows].isnan()
+        until = torch.where(meets, guess[rows], ends[rows])
         arc = _fly_arc(own, rows, start, begun, until - begun.detach())
         arcs.append(arc)
         if not bool(meets.any()):
             break
         own, count = take_rows(own, meets, len(rows)), len(arc.nodes) - 1
         rows, near = rows[meets], arc.nodes[-1][meets]
-        tau = contact_time(own, near, heights[rows, number])
+        tau = contact_time(own, near, height[rows])
         lost = tau.isnan()
         start = own.bounce(fly(own, near, tau.masked_fill(lost, 0.0)))
         start = torch.where(lost.unsqueeze(-1), torch.nan, start)
         begun = begun[meets] + count * arc.step[meets, 0] + tau.masked_fill(lost, 0.0)
-        contacts[rows, number] = begun.detach().masked_fill(lost, torch.nan)
+        contacts[rows, len(arcs) - 1] = begun.detach().masked_fill(lost, torch.nan)
     return Trajectories(tuple(arcs), contacts)
 
 

@@ -1,35 +1,35 @@
-"""What a diagnosis fits: stretches of tracks without a hit, as one padded batch.
+"""Stretches: parts of tracks without a hit, as one padded batch.
 
-A stretch starts at its first usable sample with a state of its own, flies and bounces at contacts whose order is known,
-and ends before the next hit or when the ball comes to rest. Deterministic motion from its first state is all that a
-model claims; what the samples hold beyond it is noise or something that the model lacks.
+A stretch starts at its first usable sample with a state of its own. The ball flies and bounces at contacts whose order
+is known. The stretch ends before the next hit or when the ball comes to rest. The motion is deterministic, so what the
+samples hold beyond it is noise or an effect that the model lacks.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from ballfg.diagnosis.result import Array, Index, Mask
+from ballfg.estimation import Launcher, Smoother
 from ballfg.estimation.batch import map_tracks
-from ballfg.estimation.launcher import Launcher
-from ballfg.estimation.segmentation import Contact
 from ballfg.estimation.smoother.problem import effective_sigmas
-from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.state import STATE_DIM
 from ballfg.tracks import Track
 
 LEAST_SAMPLES = 10
 """A stretch of fewer samples tells next to nothing once its nine start values are found."""
 LEAST_DURATION = 0.08
-"""s. The same for short ones."""
-
-Array = NDArray[np.float64]
+"""s. A shorter stretch tells next to nothing either."""
+TENSORS = ("times", "positions", "sigmas", "starts", "heights", "contacts", "labels")
+"""Names of the tensors of `Stretches`."""
+PADDING = {"sigmas": math.inf, "heights": math.nan, "contacts": math.nan}
+"""Numbers that stand for missing samples and contacts; times and positions repeat the last one."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Stretches:
     """
 
     names: tuple[str, ...]
-    track: NDArray[np.int64]
+    track: Index
     settings: Array
     times: Tensor
     positions: Tensor
@@ -74,32 +74,16 @@ class Stretches:
         return self.sigmas[..., 0].isfinite()
 
     @property
-    def labelled(self) -> NDArray[np.bool_]:
+    def labelled(self) -> Mask:
         """(n,) whether each has a spin label."""
         return np.asarray(~np.isnan(self.labels[:, 0].numpy()))
 
-    def take(self, rows: Sequence[int] | NDArray[np.int64] | NDArray[np.bool_]) -> Stretches:
+    def take(self, rows: Sequence[int] | Index | Mask) -> Stretches:
         """Some of the stretches."""
         index = np.arange(len(self))[np.asarray(rows)]
         where = torch.from_numpy(index)
-        fields = ("times", "positions", "sigmas", "starts", "heights", "contacts", "labels")
-        tensors = {name: getattr(self, name)[where] for name in fields}
+        tensors = {name: getattr(self, name)[where] for name in TENSORS}
         return Stretches(tuple(self.names[i] for i in index), self.track[index], self.settings[index], **tensors)
-
-
-@dataclass(frozen=True)
-class _Stretch:
-    """One of them, not padded yet."""
-
-    name: str
-    track: int
-    settings: Array
-    times: Array
-    positions: Array
-    sigmas: Array
-    start: Array
-    contacts: tuple[Contact, ...]
-    label: Array | None
 
 
 def stretches_of(smoother: Smoother, tracks: Iterable[Track], launcher: Launcher, jobs: int = 1) -> Stretches:
@@ -108,25 +92,25 @@ def stretches_of(smoother: Smoother, tracks: Iterable[Track], launcher: Launcher
     Args:
         smoother: finds contacts, hits and outliers, and the states from which the fit starts.
         tracks: as measured.
-        launcher: what the settings of a shot are; its weights do not matter.
+        launcher: reads the settings of a shot; its weights do not matter.
         jobs: processes.
-    Raises: ValueError: if no track has a stretch that is long enough.
+
+    Raises:
+        ValueError: if no track has a stretch that is long enough.
     """
     tracks = list(tracks)
-    found = [
-        stretch
-        for number, stretches in enumerate(map_tracks(partial(_cut, smoother, launcher), tracks, len(tracks), jobs))
-        for stretch in (replace(s, track=number) for s in stretches)
-    ]
+    cut = list(map_tracks(partial(_cut, smoother, launcher), tracks, len(tracks), jobs))
+    found = [replace(stretch, track=np.array([number])) for number, own in enumerate(cut) for stretch in own]
     if not found:
         raise ValueError(
             f"tracks must hold free flights of at least {LEAST_SAMPLES} samples and {LEAST_DURATION:g} s; none does. "
             "Record longer tracks."
         )
-    return _padded(found)
+    return joined(found)
 
 
-def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[_Stretch]:
+def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[Stretches]:
+    """Each stretch of a track by itself."""
     known = launcher.settings(track)
     settings = np.zeros(len(launcher.embedding.names)) if known is None else known
     segmentation = smoother.segment(track)
@@ -140,49 +124,38 @@ def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[_Stretch]
         usable = first + np.flatnonzero(segmentation.usable[first : last + 1])
         if len(usable) < LEAST_SAMPLES or track.times[usable[-1]] - track.times[usable[0]] < LEAST_DURATION:
             continue
-        begin = float(track.times[usable[0]])
-        contacts = tuple(
-            Contact(c.interval, c.time - begin, c.height)
-            for c in estimate.contacts
-            if usable[0] <= c.interval < usable[-1] and begin < c.time < track.times[usable[-1]]
-        )
-        labelled = usable[0] == 0 and track.spin_label is not None
-        stretches.append(
-            _Stretch(
-                name=track.name,
-                track=0,
-                settings=settings if usable[0] == 0 else np.zeros_like(settings),
-                times=track.times[usable] - begin,
-                positions=track.positions[usable],
-                sigmas=sigma[usable],
-                start=estimate.states[usable[0]],
-                contacts=contacts,
-                label=track.spin_label if labelled else None,
-            )
-        )
+        begin, end = float(track.times[usable[0]]), track.times[usable[-1]]
+        met = [c for c in estimate.contacts if usable[0] <= c.interval < usable[-1] and begin < c.time < end]
+        launched = usable[0] == 0
+        rows = {
+            "times": track.times[usable] - begin,
+            "positions": track.positions[usable],
+            "sigmas": sigma[usable],
+            "starts": estimate.states[usable[0]],
+            "heights": np.array([c.height for c in met], dtype=np.float64),
+            "contacts": np.array([c.time - begin for c in met], dtype=np.float64),
+            "labels": track.spin_label if launched and track.spin_label is not None else np.full(3, np.nan),
+        }
+        tensors = {name: torch.from_numpy(row).unsqueeze(0) for name, row in rows.items()}
+        own = settings if launched else np.zeros_like(settings)
+        stretches.append(Stretches((track.name,), np.zeros(1, dtype=np.int64), own[None], **tensors))
     return stretches
 
 
-def _padded(found: Sequence[_Stretch]) -> Stretches:
-    n, k = len(found), max(len(s.times) for s in found)
-    c = max(len(s.contacts) for s in found)
-    times, positions = np.zeros((n, k)), np.zeros((n, k, 3))
-    sigmas = np.full((n, k, 3), np.inf)
-    heights, contacts, labels = np.full((n, c), np.nan), np.full((n, c), np.nan), np.full((n, 3), np.nan)
-    starts = np.zeros((n, STATE_DIM))
-    for i, s in enumerate(found):
-        m = len(s.times)
-        times[i, :m], times[i, m:] = s.times, s.times[-1]
-        positions[i, :m], positions[i, m:] = s.positions, s.positions[-1]
-        sigmas[i, :m] = s.sigmas
-        starts[i] = s.start
-        for j, contact in enumerate(s.contacts):
-            heights[i, j], contacts[i, j] = contact.height, contact.time
-        if s.label is not None:
-            labels[i] = s.label
-    return Stretches(
-        tuple(s.name for s in found),
-        np.array([s.track for s in found]),
-        np.stack([s.settings for s in found]),
-        *(torch.from_numpy(a) for a in (times, positions, sigmas, starts, heights, contacts, labels)),
-    )
+def joined(parts: Sequence[Stretches]) -> Stretches:
+    """Several batches of stretches as one, padded to the longest."""
+    tensors = {}
+    for name in TENSORS:
+        own = [getattr(part, name) for part in parts]
+        length = max(tensor.shape[1] for tensor in own)
+        tensors[name] = torch.cat([_padded(tensor, length, PADDING.get(name)) for tensor in own])
+    names = tuple(name for part in parts for name in part.names)
+    track, settings = (np.concatenate([getattr(part, name) for part in parts]) for name in ("track", "settings"))
+    return Stretches(names, track, settings, **tensors)
+
+
+def _padded(rows: Tensor, length: int, fill: float | None) -> Tensor:
+    """Rows (n, m, ...) continued to a length, with a number or else with the last of each."""
+    missing = (len(rows), length - rows.shape[1], *rows.shape[2:])
+    rest = rows[:, -1:].expand(missing) if fill is None else rows.new_full(missing, fill)
+    return torch.cat((rows, rest), dim=1)

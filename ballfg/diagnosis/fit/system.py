@@ -1,8 +1,8 @@
 """The linearised problem of all stretches, with the first states eliminated stretch by stretch.
 
-Columns are whatever acts on all stretches: declared coefficients, mean spins of launcher groups, candidate effects, and
-the residual itself. What is left of a column once the best first state has absorbed its part is its projected
-signature; inner products of projected signatures, summed over each track, are all that tests and fits need.
+Common columns are those of everything that acts on all stretches: declared coefficients, launcher settings and
+candidate effects. The best first state absorbs a part of each column; the rest is its projected signature. Tests and
+fits need only the inner products of projected signatures, summed over each track.
 """
 
 from __future__ import annotations
@@ -10,11 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.diagnosis.result import Array, Index
 from ballfg.state import STATE_DIM
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -24,41 +22,46 @@ class System:
     Attributes:
         residual: (n, m) measured minus predicted.
         by_start: (n, m, 9) derivative of the prediction by the first state.
-        by_common: (n, m, q) the same by what all stretches share.
+        by_common: (n, m, q) derivative of the prediction by everything that all stretches share.
     """
 
     residual: Array
     by_start: Array
     by_common: Array
 
+    @property
+    def columns(self) -> Array:
+        """(n, m, q + 1) common columns, then the residual."""
+        return np.concatenate((self.by_common, self.residual[..., None]), axis=-1)
+
+    @property
+    def start_information(self) -> Array:
+        """(n, 9, 9) information of the first states."""
+        return np.asarray(self.by_start.swapaxes(-1, -2) @ self.by_start)
+
     def eliminated(self, damping: float = 0.0) -> Eliminated:
         """The first states solved for in terms of everything else; `damping` as in Levenberg-Marquardt."""
-        transposed = self.by_start.swapaxes(-1, -2)
-        hessian = transposed @ self.by_start
-        diagonal = np.arange(STATE_DIM)
+        hessian, columns, diagonal = self.start_information, self.columns, np.arange(STATE_DIM)
         hessian[:, diagonal, diagonal] *= 1.0 + damping
-        columns = np.concatenate((self.by_common, self.residual[..., None]), axis=-1)
-        pulled = transposed @ columns
+        pulled = self.by_start.swapaxes(-1, -2) @ columns
         solved = np.linalg.solve(hessian, pulled)
         gram = columns.swapaxes(-1, -2) @ columns - pulled.swapaxes(-1, -2) @ solved
         return Eliminated(np.asarray(solved), np.asarray(gram))
 
     def start_correction(self, residual: Array) -> Array:
-        """(n, 9) step of the first states alone against another residual (n, m): derivatives stay as they are."""
-        transposed = self.by_start.swapaxes(-1, -2)
-        step = np.linalg.solve(transposed @ self.by_start, transposed @ residual[..., None])
-        return np.asarray(step[..., 0])
+        """(n, 9) step of the first states alone against another residual (n, m), with the same derivatives."""
+        pulled = self.by_start.swapaxes(-1, -2) @ residual[..., None]
+        return np.asarray(np.linalg.solve(self.start_information, pulled)[..., 0])
 
     def projected(self) -> Array:
-        """(n, m, q + 1) what first states leave of each column, the residual last."""
-        transposed = self.by_start.swapaxes(-1, -2)
-        columns = np.concatenate((self.by_common, self.residual[..., None]), axis=-1)
-        return np.asarray(columns - self.by_start @ np.linalg.solve(transposed @ self.by_start, transposed @ columns))
+        """(n, m, q + 1) columns and residual with the part that first states absorb taken away."""
+        pulled = self.by_start.swapaxes(-1, -2) @ self.columns
+        return np.asarray(self.columns - self.by_start @ np.linalg.solve(self.start_information, pulled))
 
 
 @dataclass(frozen=True)
 class Eliminated:
-    """What is left once first states are solved for.
+    """A system without its first states.
 
     Attributes:
         solved: (n, 9, q + 1) first states that absorb each column, the residual last.
@@ -69,7 +72,7 @@ class Eliminated:
     gram: Array
 
     def common_step(self, precision: Array, pull: Array, damping: float = 0.0) -> Array:
-        """(q,) step of what is shared.
+        """(q,) step of the common unknowns.
 
         Args: precision: (q,) of the priors.  pull: (q,) prior mean minus present value, times the precision.
         """
@@ -79,11 +82,11 @@ class Eliminated:
         return np.asarray(np.linalg.solve(hessian, total[:-1, -1] + pull))
 
     def start_step(self, common: Array) -> Array:
-        """(n, 9) step of the first states that goes with a step (q,) of what is shared."""
+        """(n, 9) step of the first states that goes with a step (q,) of the common unknowns."""
         return np.asarray(self.solved[..., -1] - self.solved[..., :-1] @ common)
 
 
-def by_track(gram: Array, track: NDArray[np.int64]) -> Array:
+def by_track(gram: Array, track: Index) -> Array:
     """(t, c, c) sums of inner products (n, c, c) over the stretches of each track."""
     names, index = np.unique(track, return_inverse=True)
     total = np.zeros((len(names), *gram.shape[1:]))

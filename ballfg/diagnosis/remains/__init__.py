@@ -1,1 +1,1 @@
-"""What is left after the search: patterns, drift, and fallbacks without a name."""
+"""Tests for patterns that remain after the search, and descriptions of them without a cause."""

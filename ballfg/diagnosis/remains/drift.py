@@ -1,27 +1,25 @@
-"""Do the declared coefficients stay what they are from the first track of a recording to the last?
+"""A test for declared coefficients that change from the first track of a recording to the last.
 
-Another table, another ball, another day: tracks of several sessions in one dataset contradict each other, though none
-of them shows a pattern of its own. The block's columns are those of the declared coefficients, times the number of
+Another table, another ball or another day: tracks of several sessions in one dataset contradict each other, though none
+of them shows a pattern of its own. The columns of the block are those of the declared coefficients, times the number of
 the track.
 """
 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
 from ballfg.diagnosis.remains.patterns import Block
+from ballfg.diagnosis.result import Array
 
-RECORDING = "recording"
-"""Kind of the block."""
-
-Array = NDArray[np.float64]
+DRIFT = "recording"
+"""Kind of the block, as in reports."""
 
 
-def recording_block(fit: Fit, system: System) -> Block | None:
-    """One column for each free coefficient: falling short by its prior's spread at first, exceeding it by that at last.
+def drift_block(fit: Fit, system: System) -> Block | None:
+    """One column for each free coefficient: one prior sigma below its value at the first track, one above at the last.
 
     Args: system: of the fit, linearised at its minimum.
     Returns: None if there is nothing free, or one track only.
@@ -32,20 +30,12 @@ def recording_block(fit: Fit, system: System) -> Block | None:
         return None
     order = 2.0 * (number - number.min()) / np.ptp(number) - 1.0
     sigmas = np.array([c.sigma for c in free.values()])
-    return Block(
-        kind=RECORDING,
-        quantities=tuple(free),
-        axes=("",),
-        values=np.eye(len(free)),
-        columns=order[:, None, None] * system.by_common[..., : len(free)] * sigmas,
-    )
+    columns = order[:, None, None] * system.by_common[..., : len(free)] * sigmas
+    return Block(DRIFT, quantities=tuple(free), axes=("",), values=np.eye(len(free)), columns=columns)
 
 
-def drift(fit: Fit, block: Block, strengths: Array) -> str:
-    """In words, which coefficient changes by how much.
-
-    Args: strengths: (1, f) of the block's columns.
-    """
+def describe_drift(fit: Fit, block: Block, strengths: Array) -> str:
+    """The coefficient that changes most and its values, in words; strengths: (1, f) of the block's columns."""
     most = int(np.argmax(np.abs(strengths[0])))
     name, coefficient = block.quantities[most], fit.problem.free[block.quantities[most]]
     change = np.array((-1.0, 1.0)) * strengths[0, most] * coefficient.sigma

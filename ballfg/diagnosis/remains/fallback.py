@@ -1,6 +1,6 @@
-"""When no named effect explains what is left: a description that predicts better, without a name.
+"""A fallback for patterns that no named effect explains: a description that predicts better, without a name.
 
-First a few generic terms, which a person can read; only if those do not help, a network that corrects the model.
+A few generic terms come first, because people can read them. Only if they do not help, a network corrects the model.
 """
 
 from __future__ import annotations
@@ -10,22 +10,15 @@ from typing import cast
 
 import numpy as np
 
+from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.fit.process_noise import with_process_noise
 from ballfg.diagnosis.remains.sparse import SparseTerms, fit_with_terms, sparse_terms
 from ballfg.diagnosis.result import Errors, Fallback
-from ballfg.diagnosis.search.calibrated import calibrated_model
-from ballfg.diagnosis.search.evaluation import JudgedTrack
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.networks.architecture import Architecture
-from ballfg.dynamics.networks.learned import LearnedModel, build
-from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
-from ballfg.estimation.configure import dataset_settings, dataset_surfaces
+from ballfg.diagnosis.search.process_noise import calibrated_model, with_process_noise
+from ballfg.dynamics import AnalyticModel, Architecture, BallModel, LearnedModel, SpinEmbedding, build
+from ballfg.estimation import Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.measurement.as_measured import plainly_measured
 from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
-from ballfg.estimation.settings import Settings
-from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.learning.config.training import LossConfig, OptimizerConfig, TrainConfig
 from ballfg.learning.end_to_end.end_to_end import EndToEnd
 from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
@@ -36,50 +29,55 @@ from ballfg.progress import unwatched
 from ballfg.tracks import Dataset, Track
 
 HELPS = 0.9
-"""A fallback must reduce the prediction error on the judging half to this share of what it is without."""
+"""A fallback must reduce the prediction error on the held-out half to this share of the error without it."""
 OBSERVED = 0.4
-"""Share of a typical track that the network's estimates see; it learns to predict the rest."""
+"""Share of a typical track that the estimates see in training; the network learns to predict the rest."""
 VALIDATES = 5
 """One track of so many decides at which epoch the network is best."""
 LEAST_LEARNED = 10
-"""Fewer shots than this make no network that predicts others."""
+"""From fewer shots no network learns to predict others."""
 EPOCHS = 30
-"""About a minute for 25 tracks."""
+"""Epochs of the training: about a minute for 25 tracks."""
 POSITION_SCALE = 0.03
-"""m, prediction error beyond which a track's part in the loss grows only linearly: a few must not rule the network."""
-
-Judge = Callable[[BallModel], Errors]
-"""Errors of a model's predictions on the judging half."""
+"""m, prediction error beyond which a track's part in the loss grows only linearly, so that no few tracks dominate."""
 
 
 def fallback(
-    before: Fit, embedding: SpinEmbedding, dataset: Dataset, tracks: Sequence[Track], now: Errors, judge: Judge
+    before: Fit,
+    embedding: SpinEmbedding,
+    dataset: Dataset,
+    tracks: Sequence[Track],
+    now: Errors,
+    evaluate: Callable[[BallModel], Errors],
 ) -> Fallback | None:
-    """What explains the rest without naming it; None if nothing predicts better.
+    """A description of the rest without a name; None if nothing predicts better.
 
     Args:
-        before: of an `AnalyticModel`, on the finding half.
+        before: the fit so far, on the search half.
         embedding: names its launcher settings.
-        dataset: where the tracks come from.  tracks: of the finding half.
-        now: errors of the model as it is, on the judging half.
+        dataset: the origin of the tracks.
+        tracks: of the search half.
+        now: errors of the model so far, on the held-out half.
+        evaluate: errors of a model's predictions on the held-out half.
     """
     most = HELPS * now.prediction_rmse_mm
-    parts = [JudgedTrack(track, np.zeros(0)) for track in tracks]
+    parts = [EvaluationTrack(track, np.zeros(0)) for track in tracks]
     terms = sparse_terms(before)
     if terms is not None:
         after = fit_with_terms(before, terms)
-        model = with_process_noise(calibrated_model(after, embedding), parts, dataset, 1).model
-        errors = judge(model)
+        model = with_process_noise(calibrated_model(after, embedding), parts, dataset).model
+        errors = evaluate(model)
         if errors.prediction_rmse_mm < most:
             return Fallback("sparse terms", describe(terms, after), now, errors, model)
-    base = with_process_noise(calibrated_model(before, embedding), parts, dataset, 1).model
+    base = with_process_noise(calibrated_model(before, embedding), parts, dataset).model
     network = learned_residual(base, dataset, tracks)
     if network is None:
         return None
-    errors = judge(network)
+    errors = evaluate(network)
     if errors.prediction_rmse_mm >= most:
         return None
-    words = f"{network.architecture.kind}, {_size(network)} parameters"
+    size = sum(p.numel() for p in (*network.flight.parameters(), *network.contact.parameters()))
+    words = f"{network.architecture.kind}, {size} parameters"
     return Fallback("learned residual", words, now, errors, network)
 
 
@@ -90,10 +88,19 @@ def describe(terms: SparseTerms, after: Fit) -> str:
     return ", ".join(f"{name.split('.', 1)[1]} = {value:.3g} {units[name].unit}" for name, value in values.items())
 
 
-def learned_residual(base: AnalyticModel, dataset: Dataset, tracks: Sequence[Track]) -> LearnedModel | None:
-    """A network that corrects a model, trained end to end on tracks; None if they are too few or the training fails.
+def learned_residual(
+    base: AnalyticModel, dataset: Dataset, tracks: Sequence[Track], *, epochs: int = EPOCHS
+) -> LearnedModel | None:
+    """A network that corrects a model, trained end to end on tracks.
 
-    Args: base: calibrated; its noise and launcher stay.
+    Args:
+        base: calibrated; its noise and launcher stay.
+        dataset: the origin of the tracks.
+        tracks: to learn from.
+        epochs: of the training.
+
+    Returns:
+        The corrected model; None if there are too few tracks or the training fails.
     """
     tracks, settings = _as_happened(base, dataset, tracks)
     if len(tracks) < LEAST_LEARNED:
@@ -109,14 +116,14 @@ def learned_residual(base: AnalyticModel, dataset: Dataset, tracks: Sequence[Tra
     noise = NoiseScales(settings.process, position=settings.position_scale, learned=False)
     loss = LossConfig(position_scale=POSITION_SCALE)
     trainee = EndToEnd(shots, Learnables(model, launcher, noise), loss)
-    if not _trained(trainee, len(shots), TrainConfig(optimizer=OptimizerConfig(epochs=EPOCHS), loss=loss)):
+    if not _trained(trainee, len(shots), TrainConfig(optimizer=OptimizerConfig(epochs=epochs), loss=loss)):
         return None
     model.base, model.trained = base, base.trained
     return model.requires_grad_(False)
 
 
 def _as_happened(base: AnalyticModel, dataset: Dataset, tracks: Sequence[Track]) -> tuple[list[Track], Settings]:
-    """Tracks without what the model's measurement did to them, those of which it can be undone, and their settings."""
+    """Tracks with the model's measurement effects undone, where that is possible, and the settings for them."""
     settings = dataset_settings(dataset, base)
     if base.measures_plainly:
         return list(tracks), settings
@@ -138,8 +145,3 @@ def _trained(trainee: EndToEnd, count: int, config: TrainConfig) -> bool:
         return False
     training.take_best()
     return True
-
-
-def _size(model: LearnedModel) -> int:
-    own = (*model.flight.parameters(), *model.contact.parameters())
-    return sum(p.numel() for p in own)

@@ -1,8 +1,8 @@
-"""Is anything left that has a pattern, and where does it live? Tests that need no name for it.
+"""Tests for any pattern that is left, whatever its cause, and where it lives.
 
-Each block of patterns (module `patterns`) is tested as a candidate effect is: scores of its columns with
-states and declared coefficients projected out, tracks as independent units. Of a large block only the directions that
-the data show best are tested, chosen before anything is known of the residuals.
+Each block of patterns (module `patterns`) is tested as a candidate effect is: by the scores of its columns, with states
+and declared coefficients projected out and tracks as independent units. Of a large block only the directions that the
+data show best are tested; the residuals have no part in choosing them.
 """
 
 from __future__ import annotations
@@ -10,99 +10,98 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ballfg.diagnosis.fit.problem import Fit, common_precision, linearise
-from ballfg.diagnosis.fit.system import System, by_track
-from ballfg.diagnosis.remains.clustered import Pattern, judge_patterns
-from ballfg.diagnosis.remains.drift import RECORDING, drift, recording_block
-from ballfg.diagnosis.remains.patterns import EVERYWHERE, PLAUSIBLE, UNIT, Block, blocks_of
-from ballfg.diagnosis.remains.whiteness import Whiteness, whiteness
-from ballfg.diagnosis.result import GenericTest
-from ballfg.diagnosis.search.label_check import LABEL, LabelCheck, check_labels
-from ballfg.diagnosis.search.signatures import Signatures
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.system import System
+from ballfg.diagnosis.remains.drift import DRIFT, describe_drift, drift_block
+from ballfg.diagnosis.remains.label_check import LABEL, check_labels
+from ballfg.diagnosis.remains.patterns import EVERYWHERE, PLAUSIBLE, Block, blocks_of
+from ballfg.diagnosis.remains.whiteness import whiteness
+from ballfg.diagnosis.result import Array, GenericTest
+from ballfg.diagnosis.search.score import pattern_tests
+from ballfg.diagnosis.search.signatures import signatures_of
 
 ALARM = 0.005
 """Probability that any of the tests of a fit that lacks nothing raises an alarm: p-values below it are alarms."""
 TRACKS_PER_DIRECTION = 4
 """Tracks for each direction of a block that is tested: their scatter must tell the directions' covariance."""
 LEAST_INFORMATION = 1.0
-"""Of a direction that is tested: the data tell its strength to the size of a pattern that is large in practice."""
+"""Least information of a direction that is tested: its strength is known to the size of a pattern large in practice."""
 MOST_SEEN = 95.0
 """Percentile over the data that "up to" means."""
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
-class _Tested:
-    """The outcome for one block: where it lives, and the test in its leading directions."""
+class _Test:
+    """One test of one fit.
 
-    block: Block
+    Attributes:
+        kind: as in `GenericTest`.
+        quantities: of the block, in words; none for other tests.
+        where: place of the pattern, in words.
+        p_value: not corrected for the number of tests.
+        size: of the pattern, whose ratio to that at the start is its share.
+    """
+
+    kind: str
+    quantities: tuple[str, ...]
     where: str
-    pattern: Pattern
+    p_value: float
+    size: float
 
 
 def generic_tests(fit: Fit, reference: Fit | None = None) -> tuple[GenericTest, ...]:
-    """All tests of a fit, p-values corrected for their number, the least probable first.
+    """All tests of a fit, p-values corrected for their number.
 
-    Args: reference: the fit at the start, to which shares refer; None: this one.
+    Args:
+        fit: of the model so far.
+        reference: the fit of the declared model, to which shares refer; None: `fit` itself.
+
+    Returns:
+        The tests, the least probable first.
     """
-    now = _examine(fit)
-    start = now if reference is None or reference is fit else _examine(reference)
-    quieter = 1.0 if reference is None else _noise_square(fit) / _noise_square(reference)
-    count = len(now.found) + 1 + (now.labels is not None)
-    tests = [_generic(tested, _of_block(start.found, tested.block), quieter, count) for tested in now.found]
-    tests.append(_time(now.drift, start.drift, count))
-    if now.labels is not None and start.labels is not None:
-        tests.append(_label(now.labels, start.labels, count))
-    return tuple(sorted(tests, key=lambda t: t.p_value))
+    tests = _tests_of(fit)
+    first = tests if reference is None or reference is fit else _tests_of(reference)
+    sizes = {(test.kind, test.quantities): test.size for test in first}
+    found = []
+    for test in tests:
+        whole = max(test.size, sizes.get((test.kind, test.quantities), 0.0))
+        share = test.size / whole if whole > 0.0 else 0.0
+        found.append(GenericTest(test.kind, test.where, min(1.0, len(tests) * test.p_value), share))
+    return tuple(sorted(found, key=lambda t: t.p_value))
 
 
-def _noise_square(fit: Fit) -> float:
-    """Mean square of the noise's scale, by which residuals are whitened: shares are of residuals that are not."""
-    return float((fit.noise.position**2).mean())
+def _tests_of(fit: Fit) -> list[_Test]:
+    system = fit.linearised()
+    drifting, drift, labels = drift_block(fit, system), whiteness(fit, system), check_labels(fit, system)
+    tests = _block_tests(fit, system, [*blocks_of(fit), *([] if drifting is None else [drifting])])
+    tests.append(_Test("time", (), drift.where, drift.p_value, drift.drift**2))
+    if labels is not None:
+        tests.append(_Test(LABEL, (), labels.where, labels.p_value, float(len(labels.contradicted))))
+    return tests
 
 
-@dataclass(frozen=True)
-class _Examined:
-    """All tests of one fit."""
-
-    found: list[_Tested]
-    drift: Whiteness
-    labels: LabelCheck | None
-
-
-def _examine(fit: Fit) -> _Examined:
-    system = linearise(fit.problem, fit.unknowns, fit.noise, fit.predicted)
-    drifting = recording_block(fit, system)
-    blocks = [*blocks_of(fit), *([] if drifting is None else [drifting])]
-    columns = np.concatenate((system.by_common, *(block.columns for block in blocks)), axis=-1)
-    whole = System(system.residual, system.by_start, columns)
-    gram = by_track(whole.eliminated().gram, fit.problem.stretches.track)
-    signatures = Signatures(gram, common_precision(fit.problem), system.by_common.shape[-1])
-    return _Examined(_tested(fit, signatures, blocks), whiteness(fit, system), check_labels(fit, system))
-
-
-def _tested(fit: Fit, signatures: Signatures, blocks: list[Block]) -> list[_Tested]:
-    """Every block that the data show at all."""
+def _block_tests(fit: Fit, system: System, blocks: list[Block]) -> list[_Test]:
+    """Tests of all blocks that the data show at all."""
+    signatures = signatures_of(fit, system, np.concatenate([block.columns for block in blocks], axis=-1))
     efficient = signatures.efficient()
-    information = efficient.total
-    score, at = efficient.score.sum(axis=0), 0
+    information, score, at = efficient.total, efficient.score.sum(axis=0), 0
     seen: list[tuple[Block, str]] = []
     directions: list[Array] = []
     for block in blocks:
-        own = slice(at, at + block.columns.shape[-1])
-        at = own.stop
+        own = slice(at, at := at + block.columns.shape[-1])
         turn = _leading(information[own, own], signatures.tracks, own, len(score))
         if turn.shape[1]:
             strengths = np.linalg.solve(information[own, own] + np.eye(own.stop - own.start), score[own])
             strengths = strengths.reshape(len(block.axes), -1)
-            words = drift(fit, block, strengths) if block.kind == RECORDING else where(block, strengths)
+            words = describe_drift(fit, block, strengths) if block.kind == DRIFT else where(block, strengths)
             seen.append((block, words))
             directions.append(turn)
-    patterns = judge_patterns(signatures, directions)
-    return [_Tested(*of, pattern) for of, pattern in zip(seen, patterns, strict=True)]
+    noise = float((fit.noise.position**2).mean())  # shares are of residuals that are not whitened
+    return [
+        _Test(block.kind, block.quantities, words, p.p_value, noise * max(0.0, p.explained - p.rank))
+        for (block, words), p in zip(seen, pattern_tests(signatures, directions), strict=True)
+    ]
 
 
 def _leading(information: Array, tracks: int, own: slice, count: int) -> Array:
@@ -115,56 +114,17 @@ def _leading(information: Array, tracks: int, own: slice, count: int) -> Array:
     return turn
 
 
-def _of_block(found: list[_Tested], block: Block) -> _Tested | None:
-    same = [t for t in found if (t.block.kind, t.block.quantities) == (block.kind, block.quantities)]
-    return same[0] if same else None
-
-
-def _generic(tested: _Tested, start: _Tested | None, quieter: float, count: int) -> GenericTest:
-    left = quieter * max(0.0, tested.pattern.explained - tested.pattern.rank)
-    first = max(left, 0.0 if start is None else start.pattern.explained - start.pattern.rank)
-    return GenericTest(
-        name=tested.block.kind,
-        where=tested.where,
-        p_value=min(1.0, count * tested.pattern.p_value),
-        share=left / first if first > 0.0 else 0.0,
-    )
-
-
 def where(block: Block, strengths: Array) -> str:
-    """In words, where a block's pattern lives.
-
-    Args: strengths: (3, f) of its columns, in units of what is plausible.
-    """
+    """The place of a block's pattern, in words; strengths: (3, f) of its columns, in units of plausible sizes."""
     pattern = PLAUSIBLE[block.kind] * strengths @ block.values.T  # (3, m)
     axis = int(np.argmax((pattern**2).mean(axis=1)))
     share = strengths[axis] ** 2 * (block.values**2).mean(axis=0)
     name = block.quantities[int(np.argmax(share))]
     size = float(np.percentile(np.abs(pattern[axis]), MOST_SEEN))
-    what = {"flight": "acceleration", "contact": "velocity after a contact", "measurement": "error of position"}
+    what, unit, factor = {
+        "flight": ("acceleration", "m/s^2", 1.0),
+        "contact": ("velocity after a contact", "m/s", 1.0),
+        "measurement": ("error of position", "mm", 1e3),
+    }[block.kind]
     depends = f"is off {EVERYWHERE}" if name == EVERYWHERE else f"depends on {name}"
-    return f"{block.kind}: {what[block.kind]} {block.axes[axis]} {depends}, up to {_amount(block.kind, size)}"
-
-
-def _amount(kind: str, size: float) -> str:
-    return f"{1e3 * size:.2g} mm" if kind == "measurement" else f"{size:.2g} {UNIT[kind]}"
-
-
-def _time(drift: Whiteness, start: Whiteness, count: int) -> GenericTest:
-    whole = max(drift.drift, start.drift)
-    return GenericTest(
-        name="time",
-        where=f"time: samples within {1e3 * drift.reach:.0f} ms err alike, by {1e3 * drift.drift:.2g} mm",
-        p_value=min(1.0, count * drift.p_value),
-        share=(drift.drift / whole) ** 2 if whole > 0.0 else 0.0,
-    )
-
-
-def _label(labels: LabelCheck, start: LabelCheck, count: int) -> GenericTest:
-    now, first = len(labels.contradicted), len(start.contradicted)
-    return GenericTest(
-        name=LABEL,
-        where=labels.where,
-        p_value=min(1.0, count * labels.p_value),
-        share=now / max(now, first) if now else 0.0,
-    )
+    return f"{block.kind}: {what} {block.axes[axis]} {depends}, up to {factor * size:.2g} {unit}"

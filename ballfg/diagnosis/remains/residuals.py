@@ -1,35 +1,32 @@
-"""What a fit leaves, in three kinds: accelerations in flight, kicks at contacts, errors of the measured positions.
+"""Residuals of a fit, in three kinds: accelerations in flight, kicks at contacts, errors of the measured positions.
 
-The first two are what a smoother would invent: free accelerations in short bins and free kicks after contacts, all
-at once with the first state of their stretch, under the priors of a white process noise.
+The first two are those that a smoother would find: free accelerations in short bins and free kicks after contacts, all
+estimated at once with the first state of their stretch, under the priors of a white process noise.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ballfg.diagnosis.fit.problem import Fit, linearise
-from ballfg.diagnosis.fit.response import Along, ArcResponse, along, responses, weighted
-from ballfg.diagnosis.result import ContactResiduals, FlightResiduals, MeasurementResiduals, Residuals
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.response import ArcResponse, FittedPath, fitted_path, responses, weighted
+from ballfg.diagnosis.result import Array, ContactResiduals, FlightResiduals, MeasurementResiduals, Residuals
 from ballfg.state import STATE_DIM
 
 BIN = 0.04
 """s, about how long an acceleration stays the same: a bin never reaches across a contact."""
 ACCELERATION = 0.6
-"""m/s^2/sqrt(Hz), density of the white acceleration that a bin may hold: 3 m/s^2 over 40 ms. A steady force is then
-seen damped by a sixth to a third on arcs of 0.3 s; a wider prior damps less, and shows more noise."""
+"""m/s^2/sqrt(Hz), density of the white acceleration that a bin may hold: 3 m/s^2 over 40 ms. A steady force then
+appears damped by a sixth to a third on arcs of 0.3 s. A wider prior damps less and shows more noise."""
 CONTACT_VELOCITY, CONTACT_SPIN = 0.2, 20.0
 """m/s and rad/s, priors of the kicks after a contact, per axis."""
 
-Array = NDArray[np.float64]
 _Row = tuple[Any, ...]
-"""A row of residuals: the stretch's number and what its kind has beside it."""
+"""A row of residuals: the number of the stretch, then the fields of its kind."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +34,10 @@ class _Piece:
     """Free kicks of one arc of one stretch: three columns for each of b bins, then six for a contact before the arc.
 
     Attributes:
-        columns: (m, d) whitened answers.  sigma: (d,) priors.
-        times: (b,) s.  states: (b, 9).
+        columns: (m, d) whitened responses.
+        sigma: (d,) priors.
+        times: (b,) s.
+        states: (b, 9).
         contact: None for a first arc; else number of the contact, its time, the state before it.
     """
 
@@ -48,21 +47,17 @@ class _Piece:
     states: Array
     contact: tuple[int, float, Array] | None
 
-    def flights(self, row: int, value: Array, covariance: Array) -> Iterator[_Row]:
-        """Rows of `FlightResiduals` from the piece's part (d,) and (d, d) of what was invented."""
-        for b, (time, state) in enumerate(zip(self.times, self.states, strict=True)):
-            own = slice(3 * b, 3 * b + 3)
-            yield row, time, state, value[own], covariance[own, own]
-
-    def contacts(self, row: int, value: Array, covariance: Array) -> Iterator[_Row]:
-        """Rows of `ContactResiduals`, one or none."""
-        if self.contact is not None:
-            yield row, *self.contact, value[-6:], covariance[-6:, -6:]
-
 
 def residuals_of(fit: Fit) -> Residuals:
-    """The residuals of a fit."""
-    path, system = along(fit), linearise(fit.problem, fit.unknowns, fit.noise, fit.predicted)
+    """The residuals of a fit.
+
+    Args:
+        fit: at its minimum.
+
+    Returns:
+        Accelerations in flight, kicks at contacts and errors of positions, with their covariances.
+    """
+    path, system = fitted_path(fit), fit.linearised()
     pieces: dict[int, list[_Piece]] = defaultdict(list)
     for arc in responses(fit, path):
         for row, piece in zip(arc.rows.tolist(), _pieces(fit, arc), strict=True):
@@ -70,12 +65,15 @@ def residuals_of(fit: Fit) -> Residuals:
     flights: list[_Row] = []
     contacts: list[_Row] = []
     for row, own in pieces.items():
-        value, covariance = _invented(system.residual[row], system.by_start[row], own)
+        value, covariance = _posterior(system.residual[row], system.by_start[row], own)
         end = 0
         for piece in own:
-            part = slice(end, end := end + len(piece.sigma))
-            flights += piece.flights(row, value[part], covariance[part, part])
-            contacts += piece.contacts(row, value[part], covariance[part, part])
+            for time, state in zip(piece.times, piece.states, strict=True):
+                part = slice(end, end := end + 3)
+                flights.append((row, time, state, value[part], covariance[part, part]))
+            if piece.contact is not None:
+                part = slice(end, end := end + 6)
+                contacts.append((row, *piece.contact, value[part], covariance[part, part]))
     return Residuals(fit.problem.stretches.names, _flight(flights), _contact(contacts), _measurement(fit, path))
 
 
@@ -87,7 +85,7 @@ def _pieces(fit: Fit, arc: ArcResponse) -> list[_Piece]:
     width = int(counts.max())
     indicator = (number[..., None] == np.arange(width)).astype(np.float64)
     acceleration = np.einsum("mqb,ac->mqabc", indicator, np.eye(3)).reshape(m, q, 3, 3 * width)
-    columns = weighted(fit, arc.answer(acceleration), arc.rows)
+    columns = weighted(fit, arc.response_to(acceleration), arc.rows)
     kicks = weighted(fit, arc.kicks, arc.rows)
     pieces = []
     for i, count in enumerate(counts.tolist()):
@@ -106,7 +104,7 @@ def _pieces(fit: Fit, arc: ArcResponse) -> list[_Piece]:
     return pieces
 
 
-def _invented(residual: Array, by_start: Array, pieces: list[_Piece]) -> tuple[Array, Array]:
+def _posterior(residual: Array, by_start: Array, pieces: list[_Piece]) -> tuple[Array, Array]:
     """Posterior mean (d,) and covariance (d, d) of all kicks of a stretch, its first state adapting."""
     columns = np.concatenate([by_start, *(piece.columns for piece in pieces)], axis=1)
     sigma = np.concatenate([piece.sigma for piece in pieces])
@@ -129,17 +127,14 @@ def _contact(found: list[_Row]) -> ContactResiduals:
     return ContactResiduals(stretch, number, times, incoming, kick[:, :3], kick[:, 3:], covariance)
 
 
-def _measurement(fit: Fit, path: Along) -> MeasurementResiduals:
-    stretches = fit.problem.stretches
-    used = stretches.used.numpy()
-    times = path.times.T.numpy()
-    since = since_contact(times, path.contacts)
+def _measurement(fit: Fit, path: FittedPath) -> MeasurementResiduals:
+    used, times = fit.problem.stretches.used.numpy(), path.times.T.numpy()
     return MeasurementResiduals(
         stretch=np.nonzero(used)[0],
         times=times[used],
         states=path.states[used],
-        since_contact=since[used],
-        position=(stretches.positions.numpy() - fit.predicted.positions)[used],
+        since_contact=since_contact(times, path.motion.contacts.numpy())[used],
+        position=(fit.problem.stretches.positions.numpy() - fit.predicted.positions)[used],
         sigma=fit.sigmas[used],
     )
 

@@ -1,7 +1,7 @@
-"""A sparse regression over generic terms: few of them, chosen one by one, that explain what no named effect does.
+"""A sparse regression over generic terms: a few terms, chosen one by one, that describe an effect without a name.
 
 Forward selection on projected Gram matrices: each step takes the term that explains most beside those chosen, until
-none is worth its penalty; then terms that later ones made superfluous are dropped. Source: J. Chen and Z. Chen 2008,
+none is worth its penalty. Terms that later ones made superfluous are then dropped. Source: J. Chen and Z. Chen 2008,
 "Extended Bayesian information criteria for model selection with large model spaces", with gamma = 1.
 """
 
@@ -11,28 +11,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ballfg.diagnosis.fit.columns import signatures
-from ballfg.diagnosis.fit.fit import fit
+from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.result import Array
 from ballfg.diagnosis.search.candidates import with_hypothesis
 from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.effect import Effect
+from ballfg.diagnosis.search.signatures import hypothesis_signatures
 from ballfg.dynamics.effects.registry import GENERIC
 
 MOST_TERMS = 12
-"""More describe noise, and no person reads them."""
+"""More terms describe noise, and nobody reads them."""
 LEAST_LEFT = 1e-6
 """Share of a term's information that must be its own beside the terms chosen before."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class SparseTerms:
-    """Terms that were chosen.
+    """Chosen terms.
 
     Attributes:
         hypotheses: the generic effects that hold them, their strengths the chosen terms only.
@@ -46,12 +42,16 @@ class SparseTerms:
 
 
 def sparse_terms(before: Fit) -> SparseTerms | None:
-    """The terms that a fit lacks; None where none is worth its penalty.
+    """The generic terms that a fit lacks.
 
-    Args: before: of an `AnalyticModel`.
+    Args:
+        before: the fit so far.
+
+    Returns:
+        The terms; None where none is worth its penalty.
     """
     library = _library(before)
-    found, _ = signatures(before, library)
+    found, _ = hypothesis_signatures(before, library)
     efficient = found.efficient()
     loose = np.concatenate([[c.sigma for c in h.free().values()] for h in library])
     information = efficient.total + np.diag(loose**-2.0)
@@ -79,15 +79,16 @@ def fit_with_terms(before: Fit, terms: SparseTerms) -> Fit:
     listed = problem.free
     start = {n: float(np.clip(v, listed[n].low, listed[n].high)) for n, v in terms.estimates.items()}
     unknowns = replace(before.unknowns, values={**before.unknowns.values, **start})
-    return fit(problem, unknowns, before.noise)
+    return fit_problem(problem, unknowns, before.noise)
 
 
 def select(information: Array, score: Array, penalty: float) -> list[int]:
     """Indices of the terms worth their penalty, in the order chosen.
 
     Args:
-        information: (p, p).  score: (p,).
-        penalty: what a term must explain, as twice a log likelihood.
+        information: (p, p).
+        score: (p,).
+        penalty: least that a term must explain, as twice a log likelihood.
     """
     chosen: list[int] = []
     while len(chosen) < MOST_TERMS:
@@ -100,7 +101,7 @@ def select(information: Array, score: Array, penalty: float) -> list[int]:
 
 
 def _gains(information: Array, score: Array, chosen: list[int]) -> Array:
-    """(p,) what each further term would explain beside those chosen; zero for those."""
+    """(p,) squared residual that each further term would explain beside those chosen; zero for the chosen ones."""
     across = information[:, chosen]
     solved = np.linalg.solve(information[np.ix_(chosen, chosen)], across.T) if chosen else np.zeros((0, len(score)))
     left = score - solved.T @ score[chosen]
@@ -123,18 +124,13 @@ def _pruned(information: Array, score: Array, penalty: float, chosen: list[int])
 
 def _library(before: Fit) -> list[Hypothesis]:
     """All generic terms about the middle of the data; those of contacts only where there are contacts."""
-    stretches, model = before.problem.stretches, before.problem.model
-    assert isinstance(model, AnalyticModel)
+    stretches = before.problem.stretches
     positions = stretches.positions.numpy()[stretches.used.numpy()]
     middle = dict(zip(("center_x", "center_y", "center_z"), np.median(positions, axis=0).tolist(), strict=True))
-    bounces = bool(stretches.heights.isfinite().any())
-    effects = [e for e in GENERIC.values() if (e.kind != "bounce" or bounces) and not has_effect(model, e.name)]
-    return [Hypothesis(effect, _shape(effect, middle), _strengths(effect)) for effect in effects]
-
-
-def _shape(effect: type[Effect], middle: Mapping[str, float]) -> dict[str, float]:
-    return {c.name: middle[c.name] for c in effect.coefficients if c.name in middle}
-
-
-def _strengths(effect: type[Effect]) -> tuple[str, ...]:
-    return tuple(c.name for c in effect.coefficients if c.absent is not None)
+    bounces, listed = bool(stretches.heights.isfinite().any()), []
+    for effect in GENERIC.values():
+        if (effect.kind != "bounce" or bounces) and not has_effect(before.problem.model, effect.name):
+            shape = {c.name: middle[c.name] for c in effect.coefficients if c.name in middle}
+            strengths = tuple(c.name for c in effect.coefficients if c.absent is not None)
+            listed.append(Hypothesis(effect, shape, strengths))
+    return listed

@@ -1,9 +1,9 @@
-"""Whether residuals drift along the tracks: neighbouring samples err alike where the motion is not what the model says.
+"""A test of whiteness along the tracks: neighbouring samples err alike where the motion differs from the model.
 
-Residuals of a good fit are not white themselves: r = M e, M what the projection onto everything fitted leaves of white
-noise e. For a kernel W over pairs of different samples, U = r'(W + c) r over the stretch's own mean square, with c =
--tr(M W) / tr(M), has mean zero whatever the noise's scale on that stretch, and cumulants that are traces of powers of
-M (W + c). Their sum over stretches is compared with the gamma distribution of the same first three cumulants.
+Residuals of a good fit are not white themselves: r = M e, with white noise e and the projection M that the fit leaves.
+For a kernel W over pairs of different samples, U = r'(W + c) r over the stretch's own mean square, with c = -tr(M W) /
+tr(M), has mean zero whatever the scale of the noise on that stretch, and cumulants that are traces of powers of
+M (W + c). The sum of U over stretches is compared with the gamma distribution of the same first three cumulants.
 """
 
 from __future__ import annotations
@@ -11,18 +11,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-from ballfg.diagnosis.fit.problem import Fit, common_precision
+from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
+from ballfg.diagnosis.result import Array, Mask
 
 REACHES = (0.02, 0.06, 0.18)
-"""s. Widths of the Gaussian kernels in the time between two samples: from a contact's trace to a force on an arc."""
+"""s. Widths of the Gaussian kernels in the time between two samples: from the size of a contact to that of an arc."""
 LEAST_WEIGHT = 0.5
-"""Samples of a smaller robust weight are outliers: their products say nothing of drift."""
-
-Array = NDArray[np.float64]
+"""Samples of a smaller robust weight are outliers: their products say nothing about drift."""
 
 
 @dataclass(frozen=True)
@@ -32,9 +30,9 @@ class Whiteness:
     Attributes:
         p_value: one-sided, corrected for the number of reaches.
         reach: s, of the kernel that shows most.
-        drift: m, root of the error's mean product over such pairs: what neighbouring samples have in common.
-        explained: for each reach, the sum of U.  spread: its standard deviation without drift.
-        nis: (3,) mean squared residual along x, y, z over the stated noise, per degree of freedom.
+        drift: m, root of the mean product of the errors of such pairs: the part that neighbouring samples share.
+        explained: for each reach, the sum of U.
+        spread: for each reach, the standard deviation of that sum without drift.
     """
 
     p_value: float
@@ -42,14 +40,15 @@ class Whiteness:
     drift: float
     explained: Array
     spread: Array
-    nis: Array
+
+    @property
+    def where(self) -> str:
+        """The time and size of the common error, in words."""
+        return f"time: samples within {1e3 * self.reach:.0f} ms err alike, by {1e3 * self.drift:.2g} mm"
 
 
 def whiteness(fit: Fit, system: System) -> Whiteness:
-    """The test of a fit for drift along its tracks.
-
-    Args: system: of the fit, linearised at its minimum.
-    """
+    """The test of a fit for drift along its tracks; system: of the fit, linearised at its minimum."""
     stretches = fit.problem.stretches
     n, k = stretches.times.shape
     kept = stretches.used.numpy() & (fit.robust.samples >= LEAST_WEIGHT)
@@ -60,35 +59,34 @@ def whiteness(fit: Fit, system: System) -> Whiteness:
     sums, spreads, p_values, products = [], [], [], []
     for reach in REACHES:
         kernel = _kernel(stretches.times.numpy(), kept, reach)
-        total, variance, third = _summed(residual, taken.reshape(n, k, -1), kept, kernel)
+        total, variance, third = _summed(residual, taken, kept, kernel)
         sums.append(total)
         spreads.append(np.sqrt(variance))
-        p_values.append(_gamma_tail(total, variance, third))
+        p_values.append(float(stats.pearson3.sf(total / np.sqrt(variance), third / variance**1.5)))
         products.append(total / (3.0 * kernel.sum()))
     most = int(np.argmin(p_values))
     sigma = float(np.sqrt((fit.sigmas[stretches.used.numpy()] ** 2).mean()))
-    freedom = kept.sum() - (taken**2).sum(axis=(0, 1, 3))
     return Whiteness(
         p_value=min(1.0, len(REACHES) * p_values[most]),
         reach=REACHES[most],
         drift=sigma * float(np.sqrt(max(0.0, products[most]))),
         explained=np.array(sums),
         spread=np.array(spreads),
-        nis=fit.noise.position**2 * (residual**2).sum(axis=(0, 1)) / freedom,
     )
 
 
-def _summed(residual: Array, taken: Array, kept: NDArray[np.bool_], kernel: Array) -> tuple[float, float, float]:
+def _summed(residual: Array, taken: Array, kept: Mask, kernel: Array) -> tuple[float, float, float]:
     """Sum of U over stretches, its variance and third cumulant without drift.
 
     Args:
-        residual: (n, k, 3).  taken: (n, k, 3 d) directions that the fit takes up.
+        residual: (n, k, 3).
+        taken: (n, k, 3, d) directions that the fit takes up.
+        kept: (n, k) samples that count.
         kernel: (n, k, k).
     """
     n, k, _ = residual.shape
-    flat = taken.reshape(n, k, 3, -1)
-    once = np.einsum("nst,ntad->nsad", kernel, flat)
-    rows, moved = flat.reshape(n, 3 * k, -1), once.reshape(n, 3 * k, -1)
+    once = np.einsum("nst,ntad->nsad", kernel, taken)
+    rows, moved = taken.reshape(n, 3 * k, -1), once.reshape(n, 3 * k, -1)
     inner = rows.swapaxes(-1, -2) @ moved
     squared = moved.swapaxes(-1, -2) @ moved
     cubed = moved.swapaxes(-1, -2) @ np.einsum("nst,ntad->nsad", kernel, once).reshape(n, 3 * k, -1)
@@ -103,27 +101,18 @@ def _summed(residual: Array, taken: Array, kept: NDArray[np.bool_], kernel: Arra
     scale = (residual**2).sum(axis=(1, 2)) / freedom
     products = residual @ residual.swapaxes(-1, -2)
     sums = (kernel * products).sum(axis=(1, 2)) / scale + c * freedom
-    uneven = _unevenness(kernel, products, scale)
-    return float(sums.sum()), uneven * float(variance.sum()), uneven**1.5 * float(skew.sum())
-
-
-def _unevenness(kernel: Array, products: Array, scale: Array) -> float:
-    """By how much noise that differs from sample to sample (jitter on a fast ball) raises the variance; at least 1."""
+    # noise that differs from sample to sample (jitter on a fast ball) raises the variance
     seen = (kernel**2 * products**2).sum(axis=(1, 2)) / scale**2
-    return max(1.0, float(seen.sum() / (3.0 * (kernel**2).sum())))
+    uneven = max(1.0, float(seen.sum() / (3.0 * (kernel**2).sum())))
+    return float(sums.sum()), uneven * float(variance.sum()), uneven**1.5 * float(skew.sum())
 
 
 def _trace(matrices: Array) -> Array:
     return np.asarray(np.trace(matrices, axis1=-2, axis2=-1))
 
 
-def _gamma_tail(value: float, variance: float, third: float) -> float:
-    """Probability of a larger value, mean zero."""
-    return float(stats.pearson3.sf(value / np.sqrt(variance), third / variance**1.5))
-
-
-def _without(system: System, samples: NDArray[np.bool_]) -> System:
-    """The system less some samples (n, k): outliers that pulled at the fit, though weakly, would look like drift."""
+def _without(system: System, samples: Mask) -> System:
+    """The system without some samples (n, k): outliers, which pull at the fit a little, would look like drift."""
     rows = np.ones(system.residual.shape)
     rows[:, : 3 * samples.shape[1]] -= np.repeat(samples, 3, axis=1)
     return System(system.residual * rows, system.by_start * rows[..., None], system.by_common * rows[..., None])
@@ -137,13 +126,13 @@ def _absorbed(fit: Fit, system: System, shared: Array) -> Array:
     Args: shared: (n, m, q) columns of what all share, first states projected out.
     """
     own, _ = np.linalg.qr(system.by_start)
-    precision = (shared.swapaxes(-1, -2) @ shared).sum(axis=0) + np.diag(common_precision(fit.problem))
+    precision = (shared.swapaxes(-1, -2) @ shared).sum(axis=0) + np.diag(fit.problem.common_precision)
     root = np.linalg.inv(np.linalg.cholesky(precision)).T
     rows = system.residual.shape[1] - 3
     return np.concatenate((own[:, :rows], (shared @ root)[:, :rows]), axis=-1)
 
 
-def _kernel(times: Array, kept: NDArray[np.bool_], reach: float) -> Array:
+def _kernel(times: Array, kept: Mask, reach: float) -> Array:
     """(n, k, k) weights of pairs of different samples."""
     apart = (times[:, :, None] - times[:, None, :]) / reach
     weight = np.exp(-0.5 * apart**2) * (kept[:, :, None] & kept[:, None, :])

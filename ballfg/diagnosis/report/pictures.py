@@ -1,12 +1,12 @@
-"""Pictures of a diagnosis: what the fit leaves in flight, at contacts and in the measurements, and what it brings.
+"""Pictures of a diagnosis: residuals in flight, at contacts and in the measurements; errors; the rounds.
 
-Each function draws one figure; none touches the state of pyplot. Where a model was changed, `before` and `after` stand
-side by side or in one panel, always with the same axes.
+Each function draws one figure without pyplot. Where a model was changed, `before` and `after` stand side by side or in
+one panel, always with the same axes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -14,21 +14,21 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
-from ballfg.diagnosis.remains.binned import at_contact, binned, in_flight, slip_speed
+from ballfg.diagnosis.report.binned import at_contact, binned, in_flight, slip_speed
 from ballfg.diagnosis.result import (
+    Array,
     Candidate,
-    ContactResiduals,
     Errors,
-    FlightResiduals,
-    MeasurementResiduals,
+    Index,
+    Outcome,
     Residuals,
-    Standing,
 )
-from ballfg.state import SPIN, VELOCITY
+from ballfg.state import SPIN, VELOCITY, VZ
 
-Array = NDArray[np.float64]
 Series = Mapping[str, Residuals]
-"""Residuals by what the legend calls them: `before` and `after`, or one alone."""
+"""Residuals by their name in the legend: `before` and `after`, or one alone."""
+Parts = tuple[Mapping[str, Array], Array, Array, Index]
+"""Conditions by name, components of a residual, their standard deviations, and numbers of stretches."""
 
 BEFORE, AFTER, GREY = "#d55e00", "#0072b2", "#8c8c8c"
 """Okabe and Ito's vermilion and blue: they differ for every kind of colour vision."""
@@ -36,16 +36,16 @@ AXIS_COLOURS = ("#0072b2", "#e69f00", "#009e73")
 IN_FLIGHT = ("along the flight", "across, to the left", "across, upwards")
 AT_CONTACT = ("along the ground", "to the left", "up")
 LARGEST_WHITENED = 4.0
-"""Whitened residuals beyond it count as it in means: one outlier must not hide a pattern of all the others."""
+"""Whitened residuals are limited to it in means, so that one outlier hides no pattern of all the others."""
 SHOWN_SHARE = 0.98
-"""Of the single points that the axes hold; the others lie outside."""
+"""Share of the single points that lie within the axes."""
 LEAST_EXPLAINED = 0.3
-"""Below it what a candidate explains is all the same: chance alone brings about 1."""
+"""Least squared residual that is drawn: chance alone explains about 1."""
 NAMED = 6
 """Candidates of the first round that the picture of the rounds names, beside those added later."""
 LINES_OF_TEXT = 18
-"""That fit above each other beside the picture of the rounds."""
-MARKED = {Standing.ADDED: ("added", AFTER), Standing.ALIKE: ("alike", BEFORE)}
+"""Lines that fit above each other beside the picture of the rounds."""
+MARKED = {Outcome.ADDED: ("added", AFTER), Outcome.ALIKE: ("alike", BEFORE)}
 """Word and colour of the candidates that stand out there."""
 
 
@@ -64,32 +64,24 @@ def flight_in_time(series: Series) -> Figure:
 
 def flight_against(series: Series) -> Figure:
     """The same against speed, height and spin."""
-    figure, panels = _grid(3, 3, (10.5, 6.2))
-    for label, residuals in series.items():
-        flight = residuals.flight
-        for column, (name, against) in zip(panels.T, _conditions(flight).items(), strict=True):
-            _means(column, against, *in_flight(flight), flight.stretch, label)
-            column[-1].set_xlabel(name)
+
+    def parts(residuals: Residuals) -> Parts:
+        flight, states = residuals.flight, residuals.flight.states
+        conditions = {
+            "speed, m/s": np.linalg.norm(states[:, VELOCITY], axis=-1),
+            "height, m": states[:, 2],
+            "spin, rad/s": np.linalg.norm(states[:, SPIN], axis=-1),
+        }
+        return conditions, *in_flight(flight), flight.stretch
+
+    figure, panels = _against(series, parts, (10.5, 6.2))
     _name_rows(panels, IN_FLIGHT, "m/s²")
-    _legend(panels[0, 0], series)
     figure.suptitle("Acceleration that the model lacks, against the state: mean ± standard error", size=11)
     return figure
 
 
-def _conditions(flight: FlightResiduals) -> dict[str, Array]:
-    states = flight.states
-    return {
-        "speed, m/s": np.linalg.norm(states[:, VELOCITY], axis=-1),
-        "height, m": states[:, 2],
-        "spin, rad/s": np.linalg.norm(states[:, SPIN], axis=-1),
-    }
-
-
 def contacts(series: Series, radius: float) -> Figure:
-    """Outgoing minus predicted velocity at contacts against the normal speed and the slip of the ball.
-
-    Args: radius: m, of the ball.
-    """
+    """Outgoing minus predicted velocity at contacts against the normal speed and the slip; radius: m, of the ball."""
     count = len(series)
     figure, panels = _grid(3, 2 * count, (max(8.2, 5.9 * count), 6.2))
     points = []
@@ -97,7 +89,9 @@ def contacts(series: Series, radius: float) -> Figure:
         contact = residuals.contact
         values, sigmas = at_contact(contact)
         points.append(values)
-        for j, (name, against) in enumerate(_impacts(contact, radius).items()):
+        slip = slip_speed(contact.incoming, radius)
+        impacts = {"incoming normal speed, m/s": -contact.incoming[:, VZ], "incoming slip, m/s": slip}
+        for j, (name, against) in enumerate(impacts.items()):
             column = panels[:, j * count + i]
             for axes, component in zip(column, values.T, strict=True):
                 axes.plot(against, component, ".", color=GREY, markersize=3, alpha=0.45, zorder=1)
@@ -115,32 +109,23 @@ def contacts(series: Series, radius: float) -> Figure:
     return figure
 
 
-def _impacts(contact: ContactResiduals, radius: float) -> dict[str, Array]:
-    return {
-        "incoming normal speed, m/s": -contact.incoming[:, 5],
-        "incoming slip, m/s": slip_speed(contact.incoming, radius),
-    }
-
-
 def measurements(series: Series) -> Figure:
     """Whitened position residuals against time, place and speed."""
-    figure, panels = _grid(3, 5, (13.0, 6.0))
-    for label, residuals in series.items():
+
+    def parts(residuals: Residuals) -> Parts:
         measured = residuals.measurement
         values = np.clip(measured.position / measured.sigma, -LARGEST_WHITENED, LARGEST_WHITENED)
-        for column, (name, against) in zip(panels.T, _places(measured).items(), strict=True):
-            _means(column, against, values, np.ones_like(values), measured.stretch, label)
-            column[-1].set_xlabel(name)
+        conditions = {
+            "time since launch or hit, s": measured.times,
+            **{f"{name}, m": measured.states[:, i] for i, name in enumerate("xyz")},
+            "speed, m/s": np.linalg.norm(measured.states[:, VELOCITY], axis=-1),
+        }
+        return conditions, values, np.ones_like(values), measured.stretch
+
+    figure, panels = _against(series, parts, (13.0, 6.0))
     _name_rows(panels, tuple(f"residual {a}" for a in "xyz"), "sigma")
-    _legend(panels[0, 0], series)
     figure.suptitle("Measured minus fitted position over its noise: mean ± standard error", size=11)
     return figure
-
-
-def _places(measured: MeasurementResiduals) -> dict[str, Array]:
-    places = {f"{name}, m": measured.states[:, i] for i, name in zip(range(3), "xyz", strict=True)}
-    speed = np.linalg.norm(measured.states[:, VELOCITY], axis=-1)
-    return {"time since launch or hit, s": measured.times, **places, "speed, m/s": speed}
 
 
 def histogram(series: Series) -> Figure:
@@ -162,7 +147,7 @@ def histogram(series: Series) -> Figure:
 
 
 def errors_by_track(before: Errors, after: Errors) -> Figure:
-    """Each judging track's prediction error before and after, joined by a line; the diamonds pool all tracks."""
+    """Prediction error of each held-out track before and after, joined by a line; the diamonds pool all tracks."""
     figure, panels = _grid(1, 1, (4.6, 4.2))
     axes = panels[0, 0]
     pairs = np.stack((before.by_track, after.by_track), axis=-1)
@@ -185,24 +170,24 @@ def errors_by_track(before: Errors, after: Errors) -> Figure:
 
 
 def ranking(rounds: Sequence[Sequence[Candidate]]) -> Figure:
-    """What each candidate explains, round after round: an added effect takes along what only resembled it."""
+    """The squared residual that each candidate explains, round after round."""
     figure, panels = _grid(1, 1, (7.6, 4.2))
     axes = panels[0, 0]
-    standing = {c.name: c.standing for row in reversed(rounds) for c in row}
-    standing |= {c.name: c.standing for row in rounds for c in row if c.standing is Standing.ADDED}
+    outcome = {c.name: c.outcome for row in reversed(rounds) for c in row}
+    outcome |= {c.name: c.outcome for row in rounds for c in row if c.outcome is Outcome.ADDED}
     lines: dict[str, list[tuple[int, float]]] = {}
     for i, row in enumerate(rounds):
         for c in row:
-            if c.standing is not Standing.INVISIBLE:
+            if c.outcome is not Outcome.INVISIBLE:
                 lines.setdefault(c.name, []).append((i + 1, max(c.explained, LEAST_EXPLAINED)))
     for name, line in lines.items():
-        _, colour = MARKED.get(standing[name], ("", GREY))
-        front = 2 + (standing[name] in MARKED) + (standing[name] is Standing.ADDED)
+        _, colour = MARKED.get(outcome[name], ("", GREY))
+        front = 2 + (outcome[name] in MARKED) + (outcome[name] is Outcome.ADDED)
         axes.plot(*zip(*line, strict=True), "o-", color=colour, markersize=5, linewidth=1.2, zorder=front)
     first = [c.name for c in rounds[0] if c.name in lines]
-    named = first[:NAMED] + [name for name in first[NAMED:] if standing[name] is Standing.ADDED]
+    named = first[:NAMED] + [name for name in first[NAMED:] if outcome[name] is Outcome.ADDED]
     for name, height in _apart({name: lines[name][0][1] for name in named}).items():
-        word, colour = MARKED.get(standing[name], ("", "black"))
+        word, colour = MARKED.get(outcome[name], ("", "black"))
         axes.plot((0.95, 1.0), (height, lines[name][0][1]), color=GREY, linewidth=0.6, zorder=1)
         axes.text(0.93, height, f"{name}, {word}" if word else name, ha="right", va="center", size=9, color=colour)
     axes.set(yscale="log", xlim=(0.2, len(rounds) + 0.3), xlabel="round", ylabel="squared whitened residual explained")
@@ -233,9 +218,23 @@ def _grid(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, N
     return figure, panels
 
 
-def _means(
-    column: Iterable[Axes], against: Array, values: Array, sigmas: Array, stretch: NDArray[np.int64], label: str
-) -> None:
+def _against(
+    series: Series, parts: Callable[[Residuals], Parts], size: tuple[float, float]
+) -> tuple[Figure, NDArray[np.object_]]:
+    """A figure with three components of a residual, one a row, against conditions, one a column."""
+    made = {label: parts(residuals) for label, residuals in series.items()}
+    names = list(next(iter(made.values()))[0])
+    figure, panels = _grid(3, len(names), size)
+    for label, (conditions, values, sigmas, stretch) in made.items():
+        for column, name in zip(panels.T, names, strict=True):
+            _means(column, conditions[name], values, sigmas, stretch, label)
+            column[-1].set_xlabel(name)
+    if len(series) > 1:
+        panels[0, 0].legend(fontsize="small")
+    return figure, panels
+
+
+def _means(column: Iterable[Axes], against: Array, values: Array, sigmas: Array, stretch: Index, label: str) -> None:
     """Three components of a residual, one in each panel of a column, as means over bins."""
     colour = BEFORE if label == "before" else AFTER
     for axes, component, sigma in zip(column, values.T, sigmas.T, strict=True):
@@ -255,8 +254,3 @@ def _means(
 def _name_rows(panels: NDArray[np.object_], names: Sequence[str], unit: str) -> None:
     for axes, name in zip(panels[:, 0], names, strict=True):
         axes.set_ylabel(f"{name}, {unit}")
-
-
-def _legend(axes: Axes, series: Series) -> None:
-    if len(series) > 1:
-        axes.legend(fontsize="small")

@@ -9,14 +9,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
+
 from ballfg.diagnosis.report.page import page
-from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Fallback, Finding, GenericTest, Value
+from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Fallback, Value
 from ballfg.dynamics import save_model
 from ballfg.files.destination import check_replaceable
 from ballfg.files.whole_folder import whole_folder
 
 REPORT: Final = "report.json"
-"""Written last: where it is, the others are whole."""
+"""Written last, so that the other files are complete where it exists."""
 PAGE: Final = "report.html"
 MODEL: Final = "model.yaml"
 
@@ -24,10 +26,13 @@ MODEL: Final = "model.yaml"
 def write_report(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> None:
     """Write `report.json`, `report.html` and `model.yaml` into a folder.
 
-    Everything is made in a hidden folder and moved at the end: a new folder appears at once, an earlier report is
-    replaced file by file. Other files of the folder stay.
+    The files are made in a folder beside it and moved at the end. A new folder thus appears at once; an earlier report
+    is replaced file by file. Other files of the folder stay.
 
-    Args: out: new, empty or with an earlier report; its parent must exist.
+    Args:
+        diagnosis: to report.
+        out: folder, new, empty or with an earlier report; its parent must exist.
+
     Raises:
         ValueError: if `out` is a file or holds other things than a report.
         FileNotFoundError: if its parent does not exist.
@@ -42,7 +47,7 @@ def write_report(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> None:
 
 
 def check_report_folder(folder: Path) -> None:
-    """Refuse a folder that holds something that must not be lost.
+    """Refuse a folder whose content must not be lost.
 
     Raises:
         ValueError: if it is a file or a folder with other content than an earlier report.
@@ -52,9 +57,9 @@ def check_report_folder(folder: Path) -> None:
 
 
 def content(diagnosis: Diagnosis) -> dict[str, Any]:
-    """What `report.json` holds, with null for numbers that there are not.
+    """The content of `report.json`, with null for missing numbers.
 
-    It has no times and no paths: the same diagnosis gives the same bytes.
+    It has no times and no paths, so that the same diagnosis gives the same bytes.
     """
     left = diagnosis.unexplained
     plain: dict[str, Any] = _plain(
@@ -62,7 +67,7 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
             "verdict": diagnosis.verdict.value,
             "sentence": diagnosis.sentence,
             "dataset": diagnosis.dataset,
-            "effects": [_finding(finding) for finding in diagnosis.findings],
+            "effects": [vars(f) | {"parameters": _values(f.parameters)} for f in diagnosis.findings],
             "error": {
                 "before": _errors(diagnosis.before),
                 "after": _errors(diagnosis.after),
@@ -72,7 +77,7 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
             "unexplained": {
                 "where": left.where,
                 "share_of_residual": left.share_of_residual,
-                "tests": [_test(test) for test in left.tests],
+                "tests": [vars(test) for test in left.tests],
                 "fallback": None if left.fallback is None else _fallback(left.fallback),
             },
             "calibrated": _values(diagnosis.calibrated),
@@ -84,26 +89,11 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
     return plain
 
 
-def _finding(finding: Finding) -> dict[str, Any]:
-    return {
-        "name": finding.name,
-        "kind": finding.kind,
-        "parameters": _values(finding.parameters),
-        "p_value": finding.p_value,
-        "delta_bic": finding.delta_bic,
-        "indistinguishable_from": finding.indistinguishable_from,
-        "held_out_gain": finding.held_out_gain,
-        "held_out_p": finding.held_out_p,
-        "sentence": finding.sentence,
-        "decide": finding.decide,
-    }
-
-
 def _candidate(candidate: Candidate) -> dict[str, Any]:
     return {
         "name": candidate.name,
         "kind": candidate.kind,
-        "standing": candidate.standing.value,
+        "standing": candidate.outcome.value,
         "explained": candidate.explained,
         "p_value": candidate.p_value,
         "delta_bic": candidate.delta_bic,
@@ -112,41 +102,25 @@ def _candidate(candidate: Candidate) -> dict[str, Any]:
 
 
 def _errors(errors: Errors) -> dict[str, Any]:
-    return {
-        "prediction_rmse_mm": errors.prediction_rmse_mm,
-        "apex_rmse_mm": errors.apex_rmse_mm,
-        "nis": errors.nis,
-        "log_likelihood": errors.log_likelihood,
-        "by_track_mm": errors.by_track.tolist(),
-    }
-
-
-def _test(test: GenericTest) -> dict[str, Any]:
-    return {"name": test.name, "where": test.where, "p_value": test.p_value, "share": test.share}
+    named = {"by_track": "by_track_mm"}
+    return {named.get(name, name): value for name, value in vars(errors).items()}
 
 
 def _fallback(fallback: Fallback) -> dict[str, Any]:
-    return {
-        "kind": fallback.kind,
-        "description": fallback.description,
-        "error": {"before": _errors(fallback.before), "after": _errors(fallback.after)},
-    }
+    error = {"before": _errors(fallback.before), "after": _errors(fallback.after)}
+    return {"kind": fallback.kind, "description": fallback.description, "error": error}
 
 
 def _values(values: Mapping[str, Value]) -> dict[str, Any]:
-    """Each with value, sigma and unit, and with what was declared where something was."""
-    return {
-        name: {"value": v.value, "sigma": v.sigma, "unit": v.unit}
-        | ({} if v.declared is None else {"declared": v.declared})
-        for name, v in values.items()
-    }
+    """Each with value, sigma and unit, and with the declared value where there is one."""
+    return {name: {k: v for k, v in vars(value).items() if v is not None} for name, value in values.items()}
 
 
 def _plain(value: Any) -> Any:
     """The same for strict JSON: no NaN, no infinity, no numpy."""
     if isinstance(value, Mapping):
         return {str(name): _plain(item) for name, item in value.items()}
-    if isinstance(value, list | tuple):
+    if isinstance(value, list | tuple | np.ndarray):
         return [_plain(item) for item in value]
     if value is None or isinstance(value, str | int):
         return value

@@ -1,4 +1,4 @@
-"""Numbers as a person reads them: as many digits as are known, with their unit."""
+"""Numbers for people, with as many digits as are known and their unit, and the answer in one sentence."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from collections.abc import Mapping, Sequence
 from ballfg.diagnosis.result import Finding, Unexplained, Value, Verdict
 
 NONE = "–"
-"""What stands for a number that there is not."""
+"""Stands for a missing number."""
 MOST_DECIMALS = 6
-"""A number that needs more is written with a power of ten."""
+"""A number that needs more decimals is written with a power of ten."""
 LEAST_PROBABILITY = 1e-99
-"""Below it the distribution that a probability was read from is a mere convention."""
+"""Smaller probabilities depend on tails of distributions that nobody knows."""
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -66,15 +66,11 @@ def sentence(verdict: Verdict, findings: Sequence[Finding], left: Unexplained) -
     """The answer of a diagnosis in one sentence."""
     if verdict is Verdict.NOTHING:
         return "Nothing is lacking that these tracks could show: what the model leaves is noise."
-    named = joined(tuple(f"{_or_others(f)} ({listed(f.parameters)})" for f in findings))
+    names = [" or ".join((f.name, *f.indistinguishable_from)) for f in findings]
+    named = joined(tuple(f"{n} ({listed(f.parameters)})" for n, f in zip(names, findings, strict=True)))
     if verdict is Verdict.FOUND:
         return f"The model lacks {named}; with {'it' if len(findings) == 1 else 'them'} what is left is noise."
     if not findings:
         return f"Something is lacking that no effect of the catalogue explains: {left.where}."
     share = f"{100 * left.share_of_residual:.0f} %"
     return f"Something is lacking: {named} would explain a part; {share} of a pattern stays unexplained: {left.where}."
-
-
-def _or_others(finding: Finding) -> str:
-    """The finding's name, with those that could stand in its place."""
-    return " or ".join((finding.name, *finding.indistinguishable_from))

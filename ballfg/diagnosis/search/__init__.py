@@ -1,1 +1,1 @@
-"""The search: candidate effects scored, refitted and judged, one after the other."""
+"""The search: candidate effects are scored, refitted and evaluated, one after the other."""

@@ -1,4 +1,4 @@
-"""One round of the search: score every hypothesis, refit the leading ones, choose by what the refit says."""
+"""One round of the search: score every hypothesis, refit the leading ones, compare them by their refits."""
 
 from __future__ import annotations
 
@@ -7,27 +7,24 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy import stats
 
-from ballfg.diagnosis.fit.columns import signatures
-from ballfg.diagnosis.fit.fit import fit
-from ballfg.diagnosis.fit.label_frames import FRAMES
-from ballfg.diagnosis.fit.problem import Fit, Problem, linearise
+from ballfg.diagnosis.fit.fit import fit_problem
+from ballfg.diagnosis.fit.problem import Fit, Problem
+from ballfg.diagnosis.result import Array
 from ballfg.diagnosis.search.hypothesis import Hypothesis, with_effects
+from ballfg.diagnosis.search.label_frames import FRAMES
 from ballfg.diagnosis.search.score import Score, score_tests
-from ballfg.dynamics.analytic import AnalyticModel
+from ballfg.diagnosis.search.signatures import hypothesis_signatures
 from ballfg.state import SPIN
 
-Array = NDArray[np.float64]
-
 ALARM = 0.05
-"""Probability that a hypothesis passes the score tests of one round by chance. It must then also help on the judging
+"""Probability that a hypothesis passes the score tests of one round by chance. It must then also help on the held-out
 half (`loop.CONFIRMED`), so that both together happen by chance in one round of 400."""
 MOST_REFITS = 6
 """Hypotheses that are refitted in a round."""
-SEARCHED = 2.0 * float(np.log(FRAMES - 1))
-"""What a label frame costs in BIC: it was chosen among so many others."""
+FRAME_CHOICE = 2.0 * float(np.log(FRAMES - 1))
+"""Cost of a label frame in BIC: it was chosen among so many others."""
 LEADING = 0.5
 """A hypothesis that explains less than this share of the best one's is not refitted."""
 
@@ -40,13 +37,18 @@ class Scored:
     score: Score | None
     p_value: float
 
+    @property
+    def explained(self) -> float:
+        """Squared whitened residual that the hypothesis would explain; below zero where it cannot be seen."""
+        return -1.0 if self.score is None else self.score.explained
+
 
 @dataclass(frozen=True)
 class Refit:
     """A hypothesis in the model, everything fitted again.
 
     Attributes:
-        scored: what called for it.
+        scored: the hypothesis and its score test.
         fit: the minimum, at the noise of the fit before.
         delta_bic: BIC minus that of the fit before; negative is better.
     """
@@ -55,23 +57,30 @@ class Refit:
     fit: Fit
     delta_bic: float
 
+    @property
+    def name(self) -> str:
+        """Name of the effect."""
+        return self.scored.hypothesis.name
+
 
 def score_all(before: Fit, candidates: Sequence[Hypothesis]) -> list[Scored]:
-    """Score tests of all hypotheses, the one that explains most first; invisible ones last."""
+    """Score tests of all hypotheses.
+
+    Args:
+        before: the fit without any of them.
+        candidates: the hypotheses; those without strengths are left out.
+
+    Returns:
+        The tests, the hypothesis that explains most first and those that the data cannot show last.
+    """
     testable = [h for h in candidates if h.strengths]
     if not testable:
         return []
-    found, chosen = signatures(before, testable)
     scored = []
-    for hypothesis, score in zip(testable, score_tests(found, chosen), strict=True):
+    for hypothesis, score in zip(testable, score_tests(*hypothesis_signatures(before, testable)), strict=True):
         p_value = 1.0 if score is None else min(1.0, score.p_value * len(testable))
         scored.append(Scored(hypothesis, score, p_value))
-    return sorted(scored, key=explained, reverse=True)
-
-
-def explained(scored: Scored) -> float:
-    """Squared whitened residual that a hypothesis would explain; below zero where it cannot be seen."""
-    return -1.0 if scored.score is None else scored.score.explained
+    return sorted(scored, key=lambda s: s.explained, reverse=True)
 
 
 def shortlist(scored: Sequence[Scored]) -> list[Scored]:
@@ -81,45 +90,49 @@ def shortlist(scored: Sequence[Scored]) -> list[Scored]:
         if candidate.score is not None and candidate.p_value < ALARM:
             best.setdefault(candidate.hypothesis.name, candidate)
     listed = list(best.values())[:MOST_REFITS]
-    first = listed[0].score if listed else None
-    return [s for s in listed if s.score and first and s.score.explained >= LEADING * first.explained]
+    return [s for s in listed if s.explained >= LEADING * listed[0].explained]
 
 
 def refit(before: Fit, scored: Scored) -> Refit:
-    """The joint fit with a hypothesis in the model, from where it is absent: the first step goes where its score says.
+    """The joint fit with a hypothesis in the model, started where it is absent.
 
     An effect that balls usually have (friction, say) is also started at its usual strength, for its absence may be a
     minimum of its own: without friction, spins are fitted that friction contradicts.
+
+    Args:
+        before: the fit without the hypothesis.
+        scored: the hypothesis and its score test.
+
+    Returns:
+        The better of the fits.
     """
     hypothesis, problem = scored.hypothesis, with_hypothesis(before.problem, scored.hypothesis)
     parameters = dict(problem.model.named_parameters())
     absent = {name: float(parameters[name]) for name in hypothesis.free()}
-    listed = {hypothesis.parameter(c.name): c.default for c in hypothesis.effect.coefficients}
-    usual = {name: listed[name] if name in hypothesis.columns else value for name, value in absent.items()}
-    tried = [
-        _from(before, hypothesis, problem, values) for values in ([absent] if usual == absent else [absent, usual])
-    ]
+    usual = absent | {hypothesis.parameter(n): hypothesis.coefficients[n].default for n in hypothesis.strengths}
+    tried = [_started_at(before, hypothesis, problem, absent)]
+    if usual != absent:
+        tried.append(_started_at(before, hypothesis, problem, usual))
     after = min(tried, key=lambda fitted: fitted.cost)
-    chosen = 0.0 if hypothesis.strengths else SEARCHED
+    chosen = 0.0 if hypothesis.strengths else FRAME_CHOICE
     return Refit(scored, after, delta_bic(before, after) + chosen)
 
 
-def _from(before: Fit, hypothesis: Hypothesis, problem: Problem, values: Mapping[str, float]) -> Fit:
-    """The fit of a problem with a hypothesis in it, started where the fit before ended, and at some values of it."""
+def _started_at(before: Fit, hypothesis: Hypothesis, problem: Problem, values: Mapping[str, float]) -> Fit:
+    """The fit of a problem with a hypothesis in it, started from the fit before and some values of the hypothesis."""
     unknowns = replace(before.unknowns, values={**before.unknowns.values, **values})
     if hypothesis.shape and not hypothesis.strengths:
         unknowns = replace(unknowns, starts=_starts_with_labels(problem, unknowns.starts))
-    return fit(problem, unknowns, before.noise, settle_noise=False)
+    return fit_problem(problem, unknowns, before.noise, settle_noise=False)
 
 
 def with_hypothesis(problem: Problem, hypothesis: Hypothesis) -> Problem:
     """The problem with an effect in its model and the effect's coefficients free."""
-    assert isinstance(problem.model, AnalyticModel)
     return replace(problem, model=hypothesis.added_to(problem.model), free={**problem.free, **hypothesis.free()})
 
 
 def _starts_with_labels(problem: Problem, starts: Array) -> Array:
-    """First states whose spins are what the labels mean to a model that reads them in another frame."""
+    """First states whose spins are the labels as a model reads them that takes them in another frame."""
     with torch.no_grad():
         offset = problem.model.labelled(torch.zeros(3, dtype=torch.float64)).numpy()
         read = problem.model.labelled(torch.eye(3, dtype=torch.float64)).numpy() - offset  # rows M e_i
@@ -129,39 +142,37 @@ def _starts_with_labels(problem: Problem, starts: Array) -> Array:
 
 
 def refit_driven(before: Fit, hypothesis: Hypothesis) -> Refit:
-    """The fit with an effect that multiplies spins nobody labelled.
+    """The fit with an effect that multiplies unlabelled spins, tested by the ratio of marginal likelihoods.
 
-    A coefficient times a spin of mean zero has no slope at zero. With the coefficient at its usual value the spins
-    have one: launcher settings and single shots find theirs, and the ratio of marginal likelihoods is the test. They
-    find theirs first, at that value: spins that only bounces had told may have the wrong sign, and the coefficient
-    would take it over.
+    A coefficient times a spin of mean zero has no slope at zero. With the coefficient at its usual value there is one,
+    and launcher settings and single shots find their spins. They do so first, with the coefficient held: bounces alone
+    may have given spins the wrong sign, and a free coefficient would take that sign over.
     """
-    assert isinstance(before.problem.model, AnalyticModel)
-    listed = {hypothesis.parameter(c.name): c for c in hypothesis.effect.coefficients}
+    listed = {hypothesis.parameter(n): c for n, c in hypothesis.coefficients.items()}
     free = {**before.problem.free, **{name: listed[name] for name in hypothesis.columns}}
     model = with_effects(before.problem.model, hypothesis.effect())
-    problem = replace(before.problem, model=model, free=free)
-    usual = fit(replace(problem, free=before.problem.free), before.unknowns, before.noise, settle_noise=False)
+    problem = replace(before.problem, model=model)
+    held = fit_problem(problem, before.unknowns, before.noise, settle_noise=False)
     values = {name: c.default for name, c in listed.items()}
-    unknowns = replace(usual.unknowns, values={**usual.unknowns.values, **values})
-    after = fit(problem, unknowns, before.noise, settle_noise=False)
+    unknowns = replace(held.unknowns, values={**held.unknowns.values, **values})
+    after = fit_problem(replace(problem, free=free), unknowns, before.noise, settle_noise=False)
     taken = 2.0 * (_narrowness(after) - _narrowness(before))
     freedom = 3 * problem.stretches.settings.shape[1] + len(hypothesis.columns)
     return _by_likelihood(before, after, hypothesis, taken, freedom)
 
 
 def refit_usual(before: Fit, hypothesis: Hypothesis) -> Refit:
-    """The fit with an effect that balls usually have, whatever its score says.
+    """The fit with an effect that balls usually have, whatever its score test says.
 
-    From its absence to its usual strength is a long way, on which a slope at absence may say nothing: without friction
-    a ball keeps its spin through a bounce, and nothing tells what friction would do to the spin that was fitted to it.
+    The usual strength is far from absence, where a slope may say nothing. Without friction, for instance, a ball keeps
+    its spin through a bounce, and nothing tells how friction would change the spin that was fitted to it.
     """
     after = refit(before, Scored(hypothesis, None, 1.0)).fit
     return _by_likelihood(before, after, hypothesis, 0.0, len(hypothesis.columns))
 
 
 def _by_likelihood(before: Fit, after: Fit, hypothesis: Hypothesis, taken: float, freedom: int) -> Refit:
-    """A refit that its likelihood ratio judges, less what is `taken` for spins that became free."""
+    """A refit tested by its likelihood ratio, less the part `taken` by spins that became free."""
     gain = 2.0 * (before.cost - after.cost) - taken
     estimate = np.array([after.unknowns.values[name] for name in hypothesis.columns])
     p_value = float(stats.chi2.sf(max(gain, 0.0), freedom))
@@ -170,16 +181,16 @@ def _by_likelihood(before: Fit, after: Fit, hypothesis: Hypothesis, taken: float
 
 
 def _narrowness(fitted: Fit) -> float:
-    """Half the log determinant of what is known of first states: with the cost their Laplace marginal likelihood.
+    """Half the log determinant of the information on first states. With the cost it gives the marginal likelihood.
 
-    With a lift every spin is a degree of freedom of its flight, which fits noise too; this is what that costs.
+    With a lift every spin is a degree of freedom of its flight, which fits noise too. This term is its price, by
+    Laplace's approximation.
     """
-    by_start = linearise(fitted.problem, fitted.unknowns, fitted.noise, fitted.predicted).by_start
-    return 0.5 * float(np.linalg.slogdet(by_start.swapaxes(-1, -2) @ by_start)[1].sum())
+    return 0.5 * float(np.linalg.slogdet(fitted.linearised().start_information)[1].sum())
 
 
 def delta_bic(before: Fit, after: Fit) -> float:
-    """BIC of one fit minus that of another at the same noise; what is counted are tracks, the independent units."""
+    """BIC of one fit minus that of another at the same noise, counted in tracks: they are the independent units."""
     more = len(after.problem.free) - len(before.problem.free)
     tracks = len(np.unique(before.problem.stretches.track))
     return 2.0 * (after.cost - before.cost) + more * float(np.log(tracks))

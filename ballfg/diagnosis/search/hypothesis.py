@@ -5,19 +5,23 @@ from __future__ import annotations
 import copy
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import cast
 
-from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.effect import Coefficient, Effect
-from ballfg.dynamics.scene import Scene
+import numpy as np
+
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.dynamics import AnalyticModel, Coefficient, Effect
+from ballfg.dynamics.scene import Scene, Vector
 
 SECTION = {"flight": "flight", "bounce": "contact", "measurement": "measurement"}
 """Attribute of the model that holds the effects of a kind."""
 LOOSE = 10.0
-"""By how much the prior of a hypothesis' coefficient is wider than the effect says: the data are to decide."""
-
+"""Factor by which the prior of a hypothesis' coefficient is wider than the effect declares: the data are to decide."""
 INEXACT = 0.02
-"""Spread of a coefficient that is taken to be exact, as a share of its value: a wrong clock or length shows so in g."""
+"""Spread of a coefficient that is declared as exact, as a share of its value: a wrong clock or length shows so in g."""
+LEAST_GAP = 1e-4
+"""s. Stamps nearer together tell no speed."""
 
 
 @dataclass(frozen=True)
@@ -36,8 +40,13 @@ class Hypothesis:
 
     @property
     def name(self) -> str:
-        """Of the effect."""
+        """Name of the effect."""
         return self.effect.name
+
+    @cached_property
+    def coefficients(self) -> dict[str, Coefficient]:
+        """Coefficients of the effect, by name."""
+        return {c.name: c for c in self.effect.coefficients}
 
     def parameter(self, coefficient: str) -> str:
         """Its name among the model's parameters."""
@@ -51,21 +60,17 @@ class Hypothesis:
     @property
     def usual(self) -> bool:
         """Whether balls usually have the effect: its nominal strength is not zero, and its absence far from it."""
-        listed = {c.name: c for c in self.effect.coefficients}
-        return any(listed[n].default != listed[n].absent for n in self.strengths)
+        return any(self.coefficients[n].default != self.coefficients[n].absent for n in self.strengths)
 
     def strain(self, values: Mapping[str, float]) -> float:
-        """By how many standard deviations of its prior the furthest strength is from its usual value.
-
-        Args: values: by parameter name.
-        """
-        listed = {c.name: c for c in self.effect.coefficients}
+        """Prior standard deviations between the furthest strength and its usual value; values: by parameter name."""
+        listed = self.coefficients
         far = (abs(values[self.parameter(n)] - listed[n].default) / _spread(listed[n]) for n in self.strengths)
         return max(far, default=0.0)
 
     def free(self) -> dict[str, Coefficient]:
-        """What a refit estimates beside what was free before: strengths, and shapes that are uncertain."""
-        listed = {c.name: c for c in self.effect.coefficients}
+        """Coefficients that a refit estimates in addition: strengths, and shapes that are uncertain."""
+        listed = self.coefficients
         loose = {self.parameter(n): replace(listed[n], sigma=LOOSE * _spread(listed[n])) for n in self.strengths}
         formed = {self.parameter(n): listed[n] for n in self.shape if listed[n].absent is None and listed[n].sigma > 0}
         return loose | formed
@@ -74,8 +79,7 @@ class Hypothesis:
         """The model with the effect in it, its strengths absent; the model itself where it has the effect already."""
         if has_effect(model, self.name):
             return model
-        listed = {c.name: c for c in self.effect.coefficients}
-        absent = {n: cast(float, listed[n].absent) for n in self.strengths}
+        absent = {n: cast(float, self.coefficients[n].absent) for n in self.strengths}
         return with_effects(model, self.effect(**{**self.shape, **absent}))
 
 
@@ -107,31 +111,62 @@ def without_effect(model: AnalyticModel, name: str) -> AnalyticModel:
 
 
 def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effect]]) -> list[Hypothesis]:
-    """Everything that the model may lack and that could act in these data.
+    """All effects that the model may lack and that could act in these data.
 
-    That is each effect of the catalogue that it does not have and whose needs it meets, in each shape that the scene
-    suggests; and each effect that it has with coefficients taken to be exact.
+    An effect of the catalogue that the model lacks, and whose needs it meets, is listed in each shape that the scene
+    suggests. An effect that the model has is listed with the coefficients that are declared as exact.
 
     Args:
-        model: as declared so far.  scene: what the data span.  catalogue: effects by class.
+        model: as declared so far.
+        scene: extent of the data.
+        catalogue: effects by class.
+
+    Returns:
+        The hypotheses, in the order of the catalogue.
     """
     listed: list[Hypothesis] = []
     for effect in catalogue:
         if has_effect(model, effect.name):
             exact = tuple(c.name for c in effect.coefficients if c.sigma == 0.0 and c.absent is not None)
             listed += [Hypothesis(effect, {}, exact)] if exact else []
-        elif all(has_effect(model, needed) for needed in effect.needs) and _applies(effect, scene):
+            continue
+        bounces = effect.kind != "bounce" or scene.contacts > 0
+        labels = not effect.name.startswith("spin_label") or scene.labels > 0
+        if bounces and labels and all(has_effect(model, needed) for needed in effect.needs):
             strengths = tuple(c.name for c in effect.coefficients if c.absent is not None)
             listed += [Hypothesis(effect, shape, strengths) for shape in effect.shapes(scene)]
     return listed
 
 
-def _applies(effect: type[Effect], scene: Scene) -> bool:
-    if effect.kind == "bounce":
-        return scene.contacts > 0
-    return scene.labels > 0 or not effect.name.startswith("spin_label")
+def scene_of(fit: Fit) -> Scene:
+    """The extent of the stretches of a fit: places, speeds, impacts and spin labels.
 
+    Args:
+        fit: of a model to the stretches.
 
-def declared_free(model: AnalyticModel) -> dict[str, Coefficient]:
-    """Coefficients that a fit of the declared model estimates: those whose prior leaves room."""
-    return {n: c for n, c in model.declared_coefficients().items() if c.sigma > 0.0 and c.absent is not None}
+    Returns:
+        The scene, in m and m/s.
+    """
+    stretches = fit.problem.stretches
+    used = stretches.used.numpy()
+    positions, times = stretches.positions.numpy()[used], stretches.times.numpy()
+    gaps = np.maximum(np.gradient(times, axis=1), LEAST_GAP)[..., None]
+    velocities = np.gradient(fit.predicted.positions, axis=1) / gaps
+    impacts = [
+        -velocities[i, max(0, int(np.searchsorted(times[i], time)) - 2), 2]  # no difference spans the contact there
+        for i, row in enumerate(fit.predicted.contacts)
+        for time in row[np.isfinite(row)]
+    ]
+    low, high, middle = (
+        cast(Vector, tuple(place.tolist()))
+        for place in (positions.min(axis=0), positions.max(axis=0), np.median(positions, axis=0))
+    )
+    return Scene(
+        low,
+        high,
+        middle,
+        float(np.median(np.linalg.norm(velocities[used], axis=-1))),
+        float(np.median(impacts)) if impacts else float("nan"),
+        len(impacts),
+        int(stretches.labelled.sum()),
+    )

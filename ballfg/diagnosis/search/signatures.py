@@ -1,13 +1,20 @@
-"""Inner products of projected columns, track by track: all that tests of candidate effects need of the data."""
+"""Signatures of hypotheses: the change of the samples by each absent coefficient, with states projected out.
+
+Tests of candidate effects need only the inner products of these columns, track by track.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.sensitivity import sensitivity
+from ballfg.diagnosis.fit.system import System, by_track
+from ballfg.diagnosis.result import Array
+from ballfg.diagnosis.search.hypothesis import Hypothesis
 
 LEAST_SHARE = 1e-8
 """Share of a column's length that must survive projection: less is rounding, and the effect cannot be seen at all."""
@@ -49,7 +56,8 @@ class Efficient:
     """Scores of p columns on t tracks.
 
     Attributes:
-        score: (t, p).  information: (t, p, p).
+        score: (t, p).
+        information: (t, p, p).
         prior: (p, p) information that the priors of common columns leave.
         raw: (p,) squared length of each column before common columns were projected out.
     """
@@ -77,3 +85,59 @@ def visible_directions(information: Array, raw: Array) -> Array:
     length = np.sqrt(np.maximum(raw, LEAST_SHARE * raw.max()))
     value, vector = np.linalg.eigh(information / np.outer(length, length))
     return np.asarray(vector[:, value > LEAST_SHARE] / length[:, None])
+
+
+def signatures_of(fit: Fit, system: System, columns: Array) -> Signatures:
+    """Inner products of the common columns of a fit and of further columns (n, m, p); system: the fit's, linearised."""
+    whole = System(system.residual, system.by_start, np.concatenate((system.by_common, columns), axis=-1))
+    gram = by_track(whole.eliminated().gram, fit.problem.stretches.track)
+    return Signatures(gram, fit.problem.common_precision, system.by_common.shape[-1])
+
+
+def hypothesis_signatures(fit: Fit, candidates: Sequence[Hypothesis]) -> tuple[Signatures, list[list[int]]]:
+    """Inner products of all columns on each track, and the numbers of the candidate columns of each hypothesis."""
+    ends = np.cumsum([len(hypothesis.strengths) for hypothesis in candidates]).tolist()
+    chosen = [list(range(end - len(h.strengths), end)) for end, h in zip(ends, candidates, strict=True)]
+    return signatures_of(fit, fit.linearised(), _columns(fit, candidates)), chosen
+
+
+def _columns(fit: Fit, candidates: Sequence[Hypothesis]) -> Array:
+    """Columns of all candidates, in their order.
+
+    Those that act on the ball are computed together, and so are those that act on its measurement. The latter need
+    states at further moments, which is expensive where rows are many.
+    """
+    parts: dict[int, Array] = {}
+    for late in (False, True):
+        group = [i for i, h in enumerate(candidates) if (h.effect.kind == "measurement") is late]
+        if group:
+            ends = np.cumsum([len(candidates[i].strengths) for i in group])[:-1]
+            own = np.split(hypothesis_columns(fit, [candidates[i] for i in group]), ends, axis=-1)
+            parts |= dict(zip(group, own, strict=True))
+    return np.concatenate([parts[i] for i in range(len(candidates))], axis=-1)
+
+
+def hypothesis_columns(fit: Fit, group: Sequence[Hypothesis]) -> Array:
+    """(n, m, p) whitened, weighted derivatives of the samples by the strengths of hypotheses.
+
+    One model holds all of them. Each is absent, so that none sees another.
+    """
+    model = fit.problem.model
+    for hypothesis in group:
+        model = hypothesis.added_to(model)
+    own = [{h.parameter(n): v for n, v in h.shape.items()} for h in group]
+    names = [name for h in group for name in h.columns]
+    parameters = dict(model.named_parameters())
+    values = {name: float(parameters[name]) for name in [*names, *(n for shape in own for n in shape)]}
+    derivative = sensitivity(
+        model,
+        fit.problem.stretches,
+        fit.unknowns.starts,
+        {**values, **fit.unknowns.values},
+        names,
+        by_start=False,
+        shapes=[shape for h, shape in zip(group, own, strict=True) for _ in h.strengths],
+    )
+    scale = np.sqrt(fit.robust.spins) * fit.problem.stretches.labelled / fit.noise.label
+    labels = derivative.labels * scale[:, None, None]
+    return np.concatenate((fit.position_rows(derivative.positions), labels), axis=1)

@@ -20,11 +20,9 @@ from ballfg.benchmarks.diagnosis.ideal import (
     save_ideal,
 )
 from ballfg.benchmarks.diagnosis.limit import median, power_curve, share
-from ballfg.diagnosis.fit.fit import fit, followed, start_from
+from ballfg.diagnosis.fit.fit import fit_model
 from ballfg.diagnosis.fit.holdout import launcher_labels
-from ballfg.diagnosis.fit.problem import Problem
 from ballfg.diagnosis.fit.stretches import stretches_of
-from ballfg.diagnosis.search.hypothesis import declared_free
 from ballfg.diagnosis.search.signatures import visible_directions
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces
 
@@ -114,8 +112,7 @@ def test_noncentrality_is_what_the_declared_model_leaves_of_exact_tracks(
     settings, tracks = dataset_settings(dataset, model), list(dataset)
     smoother = Smoother(model, dataset_surfaces(dataset), settings)
     stretches = stretches_of(smoother, tracks, launcher_labels(dataset, tracks, settings))
-    problem = Problem(model, followed(model, stretches), declared_free(model))
-    left = fit(problem, *start_from(problem, settings.spin_label_noise, settings.spin_prior), settle_noise=False)
+    left = fit_model(model, stretches, settings, settle_noise=False)
     assert 2.0 * left.cost == pytest.approx(size**2 * ideal.information, rel=0.05)
 
 

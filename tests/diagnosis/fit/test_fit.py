@@ -9,18 +9,16 @@ import pytest
 import torch
 from scipy.optimize import least_squares
 
-from ballfg.diagnosis.fit.fit import fit, followed, objective, start_from
+from ballfg.diagnosis.fit.fit import first_guess, fit_problem, reachable
 from ballfg.diagnosis.fit.problem import (
-    LABEL_CAUCHY,
+    LABEL_LOSS,
+    Fit,
     Noise,
     Problem,
     Unknowns,
-    common_precision,
+    declared_free,
     launch_axes,
-    linearise,
 )
-from ballfg.diagnosis.fit.sensitivity import predict
-from ballfg.diagnosis.search.hypothesis import declared_free
 from ballfg.dynamics.effect import Coefficient
 from ballfg.dynamics.model import substitute
 from ballfg.dynamics.motion.paths import paths
@@ -45,7 +43,7 @@ def dense_residual(problem, noise, surfaces):
         position = (stretches.positions - motion[..., :3]).numpy() / (stretches.sigmas.numpy() * noise.position)
         spin = (stretches.labels.numpy() - starts[:, 6:].numpy()) / noise.label
         square = np.maximum((spin**2).sum(-1, keepdims=True), 1e-12)
-        spin = spin * np.sqrt(LABEL_CAUCHY**2 * np.log1p(square / LABEL_CAUCHY**2) / square)  # its square is the loss
+        spin = spin * np.sqrt(2.0 * LABEL_LOSS.value(np.sqrt(square)) / square)  # its square is the loss
         return np.concatenate((position.ravel(), spin.ravel(), (values - centre) / sigma))
 
     return residual
@@ -56,8 +54,8 @@ def test_the_minimum_is_that_of_a_dense_solver(make_ball, make_launches, make_sh
     model = make_ball(drag={"k": 0.11})
     data = make_shots(model, make_launches(3, 11), 11, rate=40.0, duration=0.5, noise=0.0015).stretches
     problem = Problem(make_ball(), data, FREE)
-    unknowns, _ = start_from(problem, NOISE.label, NOISE.spin)
-    found = fit(problem, unknowns, NOISE, settle_noise=False)
+    unknowns, _ = first_guess(problem, NOISE.label, NOISE.spin)
+    found = fit_problem(problem, unknowns, NOISE, settle_noise=False)
     assert bool((found.robust.samples == 1.0).all())
     residual = dense_residual(problem, NOISE, surfaces)
     start = np.concatenate((unknowns.starts.ravel(), list(unknowns.values.values())))
@@ -90,7 +88,7 @@ def test_a_launcher_is_learned_in_the_axes_of_the_launch(unlabelled_fit):
 
 
 def test_spins_that_nobody_labelled_come_out(unlabelled_fit, unlabelled):
-    system = linearise(unlabelled_fit.problem, unlabelled_fit.unknowns, unlabelled_fit.noise, unlabelled_fit.predicted)
+    system = unlabelled_fit.linearised()
     covariance = np.linalg.inv(system.by_start.swapaxes(-1, -2) @ system.by_start)[:, 6:, 6:]
     off = unlabelled_fit.unknowns.starts[:, 6:] - unlabelled.states[:, 6:].numpy()
     square = (off * np.linalg.solve(covariance, off[..., None])[..., 0]).sum()
@@ -100,8 +98,8 @@ def test_spins_that_nobody_labelled_come_out(unlabelled_fit, unlabelled):
 def test_at_the_minimum_the_gradient_is_zero(unlabelled_fit):
     """Of the objective itself, launch directions included, along each common unknown: by central differences."""
     found = unlabelled_fit
-    system = linearise(found.problem, found.unknowns, found.noise, found.predicted)
-    information = system.eliminated().gram.sum(0)[:-1, :-1] + np.diag(common_precision(found.problem))
+    system = found.linearised()
+    information = system.eliminated().gram.sum(0)[:-1, :-1] + np.diag(found.problem.common_precision)
     q = len(found.problem.free)
     for i in range(q + 3):
         size = 1e-2 / np.sqrt(information[i, i])
@@ -118,8 +116,7 @@ def cost_beside(found, index, step):
     else:
         launcher.ravel()[index - len(names)] += step
     moved = Unknowns(found.unknowns.starts, values, launcher)
-    predicted = predict(found.problem.model, found.problem.stretches, moved.starts, values)
-    return objective(found.problem, moved, found.noise, predicted)
+    return Fit.at(found.problem, moved, found.noise).cost
 
 
 def test_noise_of_each_axis_is_estimated(make_ball, make_launches, make_shots, make_fit):
@@ -131,7 +128,7 @@ def test_noise_of_each_axis_is_estimated(make_ball, make_launches, make_shots, m
 
 
 def test_noise_stays_where_asked(calm_fit):
-    again = fit(calm_fit.problem, calm_fit.unknowns, calm_fit.noise, settle_noise=False)
+    again = fit_problem(calm_fit.problem, calm_fit.unknowns, calm_fit.noise, settle_noise=False)
     assert again.noise is calm_fit.noise
     assert again.cost <= calm_fit.cost
     assert again.cost == pytest.approx(calm_fit.cost, rel=1e-4)
@@ -139,7 +136,7 @@ def test_noise_stays_where_asked(calm_fit):
 
 def test_declared_coefficients_are_found(calm_fit, make_ball):
     """Within four standard deviations; the fit knows friction hardly beyond its prior."""
-    total = linearise(calm_fit.problem, calm_fit.unknowns, calm_fit.noise, calm_fit.predicted).eliminated().gram.sum(0)
+    total = calm_fit.linearised().eliminated().gram.sum(0)
     q = len(calm_fit.problem.free)
     sigma = np.sqrt(np.diagonal(np.linalg.inv(total[:q, :q] + np.diag(calm_fit.problem.precisions))))
     truth = dict(make_ball().named_parameters())
@@ -152,13 +149,16 @@ def test_coefficients_stay_within_their_bounds(make_ball, make_launches, make_sh
     data = make_shots(make_ball(drag={"k": 0.2}), make_launches(3, 14), 14, duration=0.4).stretches
     free = {"flight.drag.k": replace(FREE["flight.drag.k"], sigma=1.0, high=0.15)}
     problem = Problem(make_ball(), data, free)
-    assert fit(problem, *start_from(problem, 4.0, 60.0), settle_noise=False).unknowns.values["flight.drag.k"] == 0.15
+    assert (
+        fit_problem(problem, *first_guess(problem, 4.0, 60.0), settle_noise=False).unknowns.values["flight.drag.k"]
+        == 0.15
+    )
 
 
 def test_what_is_shared_stays_where_only_first_states_are_asked_for(calm_fit):
     values = {name: 1.02 * value for name, value in calm_fit.unknowns.values.items()}
     problem = replace(calm_fit.problem, shared=False)
-    found = fit(problem, replace(calm_fit.unknowns, values=values), calm_fit.noise, settle_noise=False)
+    found = fit_problem(problem, replace(calm_fit.unknowns, values=values), calm_fit.noise, settle_noise=False)
     assert found.unknowns.values == pytest.approx(values, rel=1e-15)
     assert found.cost > calm_fit.cost
 
@@ -180,20 +180,19 @@ def one_lost(make_ball, make_launches, make_shots):
     return replace(data, starts=starts)
 
 
-def test_stretches_that_miss_a_contact_are_not_followed(make_ball, one_lost):
-    assert followed(make_ball(), one_lost).names == ("000", "002")
+def test_stretches_that_miss_a_contact_are_not_reachable(make_ball, one_lost):
+    assert reachable(make_ball(), one_lost).names == ("000", "002")
 
 
 def test_an_objective_with_a_missed_contact_is_infinite(make_ball, one_lost):
     problem = Problem(make_ball(), one_lost, declared_free(make_ball()))
-    unknowns, noise = start_from(problem, 4.0, 60.0)
-    predicted = predict(problem.model, one_lost, unknowns.starts, unknowns.values)
-    assert objective(problem, unknowns, noise, predicted) == np.inf
+    unknowns, noise = first_guess(problem, 4.0, 60.0)
+    assert Fit.at(problem, unknowns, noise).cost == np.inf
 
 
 def test_a_fit_that_starts_with_a_missed_contact_stays_there(make_ball, one_lost):
     problem = Problem(make_ball(), one_lost, declared_free(make_ball()))
-    unknowns, noise = start_from(problem, 4.0, 60.0)
-    found = fit(problem, unknowns, noise, settle_noise=False)
+    unknowns, noise = first_guess(problem, 4.0, 60.0)
+    found = fit_problem(problem, unknowns, noise, settle_noise=False)
     assert found.cost == np.inf
     assert found.unknowns is unknowns

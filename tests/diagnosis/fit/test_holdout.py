@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.diagnosis.fit import holdout as module
-from ballfg.diagnosis.fit.holdout import halves_of, launcher_labels
+from ballfg.diagnosis.fit.holdout import _chosen, hold_out, launcher_labels
 from ballfg.dynamics import nominal_model
 from ballfg.estimation.configure import dataset_settings
 from ballfg.simulation import SimulationConfig, write_simulation
@@ -35,16 +34,16 @@ def dataset(tmp_path_factory):
 @pytest.fixture(scope="module")
 def split(dataset):
     said = []
-    return halves_of(dataset, nominal_model(), 1, said.append), said
+    return hold_out(dataset, nominal_model(), 1, said.append), said
 
 
 def test_every_second_track_finds_and_the_others_judge(split, dataset):
-    halves, said = split
-    assert set(halves.finding.names) == set(dataset.names[::2])
-    assert set(halves.judging.names) == set(dataset.names[1::2])
-    assert [j.track.name for j in halves.found_on] == dataset.names[::2]
-    assert [j.track.name for j in halves.judged] == dataset.names[1::2]
-    assert halves.excluded == ()
+    holdout, said = split
+    assert set(holdout.search.names) == set(dataset.names[::2])
+    assert set(holdout.held_out.names) == set(dataset.names[1::2])
+    assert [j.track.name for j in holdout.search_tracks] == dataset.names[::2]
+    assert [j.track.name for j in holdout.held_out_tracks] == dataset.names[1::2]
+    assert holdout.excluded == ()
     assert said == ["estimating 8 tracks"]
 
 
@@ -53,27 +52,27 @@ def test_noise_that_is_louder_than_stated_is_no_outlier(tmp_path):
     louder = written(tmp_path / "louder", noise=MeasurementNoise(position=0.006, dropout=0.0, outliers=0.0, jitter=0.0))
     info = replace(louder.info, position_noise=0.003)
     write_dataset(tmp_path / "misjudged", info, iter(louder), "csv")
-    misjudged = halves_of(read_dataset(tmp_path / "misjudged"), nominal_model(), 1, lambda line: None)
-    right = halves_of(louder, nominal_model(), 1, lambda line: None)
-    assert int(misjudged.finding.used.sum()) >= 0.99 * int(right.finding.used.sum())
-    stated = misjudged.finding.sigmas[misjudged.finding.used]
+    misjudged = hold_out(read_dataset(tmp_path / "misjudged"), nominal_model(), 1, lambda line: None)
+    right = hold_out(louder, nominal_model(), 1, lambda line: None)
+    assert int(misjudged.search.used.sum()) >= 0.99 * int(right.search.used.sum())
+    stated = misjudged.search.sigmas[misjudged.search.used]
     assert torch.allclose(stated, torch.full_like(stated, 0.003), rtol=1e-9)
 
 
 def test_outliers_have_no_part(split, dataset):
-    halves, _ = split
+    holdout, _ = split
     truth = {track.name: track for track in dataset}
-    for judged in halves.judged:
-        whole = truth[judged.track.name]
-        assert len(judged.track) < len(whole)
-        assert set(judged.track.times) <= set(whole.times)
-        jumps = np.abs(np.diff(judged.track.positions, axis=0)).max()
+    for part in holdout.held_out_tracks:
+        whole = truth[part.track.name]
+        assert len(part.track) < len(whole)
+        assert set(part.track.times) <= set(whole.times)
+        jumps = np.abs(np.diff(part.track.positions, axis=0)).max()
         assert jumps < 0.15  # no more than 6 m/s over a frame and a dropped one; an outlier jumps by 0.2 m
 
 
 def test_what_is_fitted_are_labelled_flights(split):
-    halves, _ = split
-    for stretches in (halves.finding, halves.judging):
+    holdout, _ = split
+    for stretches in (holdout.search, holdout.held_out):
         first = np.array([stretches.names.index(n) for n in dict.fromkeys(stretches.names)])
         assert stretches.labelled[first].mean() >= 0.5  # an outlier as first sample takes the label with it
         assert (stretches.settings == 0.0).all()  # a label of its own tells more
@@ -81,22 +80,21 @@ def test_what_is_fitted_are_labelled_flights(split):
 
 
 def test_bounces_of_judged_tracks_lie_in_them(split):
-    halves, _ = split
-    for judged in halves.judged:
-        assert (np.diff(judged.bounces) > 0).all()
-        assert (judged.bounces <= judged.track.times[-1]).all()
-    assert sum(len(j.bounces) for j in halves.judged) > 0
+    holdout, _ = split
+    for part in holdout.held_out_tracks:
+        assert (np.diff(part.bounces) > 0).all()
+        assert (part.bounces <= part.track.times[-1]).all()
+    assert sum(len(j.bounces) for j in holdout.held_out_tracks) > 0
 
 
 def test_too_few_tracks(tmp_path):
     few = written(tmp_path / "few", tracks=5)
     with pytest.raises(ValueError, match=r"at least 6 tracks, half to find with and half to judge by; got 5\. Record"):
-        halves_of(few, nominal_model(), 1, lambda line: None)
+        hold_out(few, nominal_model(), 1, lambda line: None)
 
 
-def test_of_many_tracks_some_are_looked_at(dataset, monkeypatch):
-    monkeypatch.setattr(module, "MOST_TRACKS", 6)
-    tracks, excluded = module._chosen(dataset)
+def test_of_many_tracks_some_are_looked_at(dataset):
+    tracks, excluded = _chosen(dataset, 6)
     assert len(tracks) == 6
     assert (tracks[0].name, tracks[-1].name) == (dataset.names[0], dataset.names[-1])
     assert excluded == ["of 8 tracks 6, evenly spread, were looked at"]

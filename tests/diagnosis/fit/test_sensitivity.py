@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ballfg.diagnosis.fit import sensitivity as module
 from ballfg.diagnosis.fit.sensitivity import predict, sensitivity
 from ballfg.dynamics import EFFECTS
 from ballfg.dynamics.motion.paths import paths
@@ -112,12 +111,11 @@ def test_prediction_is_the_motion_as_measured(make_ball, stretches, surfaces):
     assert np.array_equal(np.isnan(found.contacts), stretches.heights.isnan().numpy())
 
 
-def test_directions_in_parts_are_the_same(make_ball, stretches, monkeypatch):
+def test_directions_in_parts_are_the_same(make_ball, stretches):
     values = {"flight.drag.k": 0.1, "contact.restitution.e": 0.9}
     starts = stretches.starts.numpy()
     whole = sensitivity(make_ball(), stretches, starts, values, tuple(values))
-    monkeypatch.setattr(module, "MOST_ROWS", 12)
-    parts = sensitivity(make_ball(), stretches, starts, values, tuple(values))
+    parts = sensitivity(make_ball(), stretches, starts, values, tuple(values), most_rows=12)
     np.testing.assert_allclose(parts.positions, whole.positions, rtol=0, atol=1e-9)
     assert np.array_equal(parts.labels, whole.labels)
 

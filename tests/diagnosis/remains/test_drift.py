@@ -6,10 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
-from ballfg.diagnosis.fit.problem import linearise
-from ballfg.diagnosis.remains.drift import RECORDING, recording_block
+from ballfg.diagnosis.fit.stretches import joined
+from ballfg.diagnosis.remains.drift import DRIFT, drift_block
 from ballfg.diagnosis.remains.generic import ALARM, generic_tests
 
 COUNT = 20
@@ -22,21 +21,11 @@ def two_sessions(make_ball, make_launches, make_shots, make_fit):
         make_shots(make_ball(restitution={"e": e}), make_launches(COUNT // 2, seed), seed).stretches
         for e, seed in ((0.95, 31), (0.87, 32))
     ]
-    together = type(parts[0])(
-        names=tuple(f"{i:03d}" for i in range(COUNT)),
-        track=np.arange(COUNT),
-        settings=np.concatenate([p.settings for p in parts]),
-        **{
-            name: torch.cat([getattr(p, name)[:, :width] for p in parts])
-            for name in ("times", "positions", "sigmas", "starts", "heights", "contacts", "labels")
-            for width in [min(getattr(p, name).shape[1] for p in parts)]
-        },
-    )
-    return make_fit(make_ball(), together)
+    return make_fit(make_ball(), replace(joined(parts), track=np.arange(COUNT)))
 
 
 def recording_test(fit):
-    (found,) = [t for t in generic_tests(fit) if t.name == RECORDING]
+    (found,) = [t for t in generic_tests(fit) if t.name == DRIFT]
     return found
 
 
@@ -52,8 +41,8 @@ def test_one_session_is_silent(calm_fit):
 
 
 def test_columns_are_those_of_the_coefficients_from_minus_to_plus_one_sigma(calm_fit):
-    system = linearise(calm_fit.problem, calm_fit.unknowns, calm_fit.noise, calm_fit.predicted)
-    block = recording_block(calm_fit, system)
+    system = calm_fit.linearised()
+    block = drift_block(calm_fit, system)
     free = calm_fit.problem.free
     assert block.quantities == tuple(free)
     sigmas = np.array([c.sigma for c in free.values()])
@@ -67,5 +56,5 @@ def test_one_track_tells_nothing_of_changes(calm_fit):
     alone = replace(
         calm_fit, problem=replace(calm_fit.problem, stretches=replace(stretches, track=np.zeros_like(stretches.track)))
     )
-    system = linearise(calm_fit.problem, calm_fit.unknowns, calm_fit.noise, calm_fit.predicted)
-    assert recording_block(alone, system) is None
+    system = calm_fit.linearised()
+    assert drift_block(alone, system) is None

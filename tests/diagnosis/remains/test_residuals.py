@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.diagnosis.fit.columns import hypothesis_columns
-from ballfg.diagnosis.fit.fit import fit, start_from
-from ballfg.diagnosis.fit.problem import Problem
-from ballfg.diagnosis.fit.response import along, responses, weighted
+from ballfg.diagnosis.fit.response import fitted_path, responses, weighted
 from ballfg.diagnosis.fit.shooting import shoot
 from ballfg.diagnosis.remains.residuals import ACCELERATION, BIN, residuals_of, since_contact
 from ballfg.diagnosis.search.hypothesis import Hypothesis
-from ballfg.dynamics import EFFECTS, AnalyticModel
+from ballfg.diagnosis.search.signatures import hypothesis_columns
 from ballfg.dynamics.effect import Flight
 from ballfg.dynamics.effects.generic import (
     MOTION_TERMS,
@@ -32,19 +29,14 @@ TRACKS = 10
 
 
 @pytest.fixture(scope="module")
-def fixed_fit(make_launches, make_shots):
+def fixed_fit(make_known_ball, make_known_fit, make_launches, make_shots):
     """The fit of a ball with nothing free to tracks of a ball that has further effects."""
 
     def fit_of(*effects, bounces=True):
-        declared = ("gravity", "drag", "magnus", "restitution")
-        known = AnalyticModel([EFFECTS[name]() for name in declared]).requires_grad_(False)
-        truth = AnalyticModel([*(EFFECTS[name]() for name in declared), *effects]).requires_grad_(False)
         starts = make_launches(TRACKS, 7)
         if not bounces:
             starts[:, 5] += 5.0
-        stretches = make_shots(truth, starts, 7).stretches
-        unknowns, noise = start_from(problem := Problem(known, stretches, {}), 4.0, 60.0)
-        return fit(problem, unknowns, noise, settle_noise=False)
+        return make_known_fit(make_shots(make_known_ball(*effects), starts, 7).stretches)
 
     return fit_of
 
@@ -61,24 +53,24 @@ def left(plain):
 
 def test_answers_to_forces_are_the_derivatives_by_the_generic_effect(plain):
     strengths = tuple(c.name for c in GenericFlight.coefficients if c.absent is not None)
-    wanted = hypothesis_columns(plain, Hypothesis(GenericFlight, {}, strengths))
+    wanted = hypothesis_columns(plain, [Hypothesis(GenericFlight, {}, strengths)])
     found = np.zeros_like(wanted)
     centre, reference = torch.tensor((1.4, 0.0, 1.0), dtype=torch.float64), torch.tensor(5.0, dtype=torch.float64)
-    for arc in responses(plain, along(plain)):
+    for arc in responses(plain, fitted_path(plain)):
         flight = Flight(torch.from_numpy(arc.nodes), 0.02)
         axes, place = flight_axes(flight.velocity), flight.position - centre
         world = torch.einsum("ac,mqt->mqcat", torch.eye(3, dtype=torch.float64), place_terms(place))
         own = torch.einsum("mqac,mqt->mqcat", axes, motion_terms(flight, axes, place, reference))
         assert (world.shape[-1], own.shape[-1]) == (len(PLACE_TERMS), len(MOTION_TERMS))
         found[arc.rows] += weighted(
-            plain, arc.answer(torch.cat((world.flatten(-2), own.flatten(-2)), -1).numpy()), arc.rows
+            plain, arc.response_to(torch.cat((world.flatten(-2), own.flatten(-2)), -1).numpy()), arc.rows
         )
     # nodes 10 ms apart: the midpoint rule's error, largest where the term changes fastest
     assert (np.abs(found - wanted).max((0, 1)) / np.abs(wanted).max((0, 1))).max() < 1e-3
 
 
 def test_kicks_move_later_samples_as_a_shot_from_there_does(plain):
-    path, stretches = along(plain), plain.problem.stretches
+    path, stretches = fitted_path(plain), plain.problem.stretches
     arc = path.motion.arcs[1]
     (after,) = (found for found in responses(plain, path) if found.number == 1)
     step, rows = 1e-4, arc.rows

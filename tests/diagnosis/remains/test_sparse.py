@@ -7,16 +7,10 @@ import itertools
 import numpy as np
 import pytest
 
-from ballfg.diagnosis.fit.fit import fit, start_from
-from ballfg.diagnosis.fit.problem import Problem
+from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.remains.fallback import describe
 from ballfg.diagnosis.remains.sparse import MOST_TERMS, fit_with_terms, select, sparse_terms
-from ballfg.diagnosis.search.calibrated import values_of
 from ballfg.dynamics import AnalyticModel, model_from_dict, model_to_dict
-from ballfg.dynamics.effects.bounce.restitution import Restitution
-from ballfg.dynamics.effects.flight.drag import Drag
-from ballfg.dynamics.effects.flight.gravity import Gravity
-from ballfg.dynamics.effects.flight.magnus import Magnus
 from ballfg.dynamics.effects.generic import GenericFlight
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # torch's own
@@ -24,23 +18,14 @@ FORCE = {"y_one": 0.5, "x_x": -0.6}
 PENALTY = 12.0
 
 
-def ball(*effects):
-    return AnalyticModel([Gravity(), Drag(), Magnus(), Restitution(), *effects]).requires_grad_(False)
-
-
-def fitted(model, stretches):
-    unknowns, noise = start_from(problem := Problem(model, stretches, {}), 4.0, 60.0)
-    return fit(problem, unknowns, noise, settle_noise=False)
+@pytest.fixture(scope="module")
+def pushed(make_known_ball, make_known_fit, make_launches, make_shots):
+    return make_known_fit(make_shots(make_known_ball(GenericFlight(**FORCE)), make_launches(12, 5), 5).stretches)
 
 
 @pytest.fixture(scope="module")
-def pushed(make_launches, make_shots):
-    return fitted(ball(), make_shots(ball(GenericFlight(**FORCE)), make_launches(12, 5), 5).stretches)
-
-
-@pytest.fixture(scope="module")
-def calm(make_launches, make_shots):
-    return fitted(ball(), make_shots(ball(), make_launches(12, 6), 6).stretches)
+def calm(make_known_ball, make_known_fit, make_launches, make_shots):
+    return make_known_fit(make_shots(make_known_ball(), make_launches(12, 6), 6).stretches)
 
 
 def regression(strengths, seed, *, alike=0.0):

@@ -9,8 +9,8 @@ from matplotlib.container import ErrorbarContainer
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
-from ballfg.diagnosis.remains.binned import binned, in_flight, motion_axes, slip_speed, turned
 from ballfg.diagnosis.report import pictures
+from ballfg.diagnosis.report.binned import binned, in_flight, motion_axes, slip_speed, turned
 from ballfg.diagnosis.report.wording import change, fixed, joined, listed, number, plus_minus, probability
 from ballfg.diagnosis.result import Errors, Value
 from tests.diagnosis.made_diagnosis import WIND, errors, found, residuals, rounds
@@ -153,7 +153,7 @@ def test_rounds_name_the_added_one_and_leave_the_invisible_out() -> None:
     heights = np.log([text.get_position()[1] for text in axes.texts])
     assert (np.diff(heights) > 0.3).all()
     lines = [line for line in axes.lines if line.get_marker() == "o"]
-    assert len(lines) == sum(c.standing.value != "cannot be seen in these data" for c in rounds()[0])
+    assert len(lines) == sum(c.outcome.value != "cannot be seen in these data" for c in rounds()[0])
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,6 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[str]:
         return picture(Figure(figsize=(0.1, 0.1)), caption)
 
     monkeypatch.setattr("ballfg.diagnosis.report.page.picture", blank)
-    monkeypatch.setattr("ballfg.diagnosis.report.evidence.picture", blank)
     return captions
 
 
@@ -136,15 +135,15 @@ def test_the_page_says_what_was_found(found_page: Page) -> None:
         "Cannot be told from gust_region.",
         "These data cannot tell wind and gust_region apart. What would decide it:",
         "wind: Shoot in the opposite direction, or across",
-        "25 tracks served to find, 25 others to judge.",
+        "25 tracks were searched, 25 others were held out.",
         "flight.drag.k 0.12 0.1213 ± 0.0011 1/m",
         "shot 7 has no free flight of 10 samples.",
-        "12.1 → – nothing to judge by",
+        "12.1 → – nothing to compare",
     ):
         spaced = re.sub(r"\s+", "", words)
         assert spaced in found_page.text.replace(" ", ""), words
     shown = found_page.text[found_page.text.index("What these data cannot show") :]
-    assert shown.index("spin_label_scale") < shown.index("wind_shear") < shown.index("The numbers of the model")
+    assert shown.index("spin_label_scale") < shown.index("wind_shear") < shown.index("Coefficients and noise")
 
 
 def test_pages_without_a_finding(drawn: list[str]) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.diagnosis.search.calibrated import values_of
+from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.search.candidates import (
     ALARM,
     LEADING,

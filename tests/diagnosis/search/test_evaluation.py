@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.search.candidates import refit, score_all
-from ballfg.diagnosis.search.evaluation import JudgedTrack, held_out, prediction_errors
+from ballfg.diagnosis.search.evaluation import held_out_gain, prediction_errors
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.settings import Settings
@@ -31,20 +32,20 @@ def with_wind(windy_fit):
 
 
 def test_the_true_effect_helps_on_other_tracks(windy_fit, with_wind, others):
-    found = held_out(windy_fit, with_wind, others[0])
+    found = held_out_gain(windy_fit, with_wind, others[0])
     assert found.gain > 5.0
     assert found.p_value < 0.05
 
 
 def test_an_idle_effect_does_not(calm_fit, others):
     after = refit(calm_fit, score_all(calm_fit, [WIND])[0]).fit
-    found = held_out(calm_fit, after, others[1])
+    found = held_out_gain(calm_fit, after, others[1])
     assert abs(found.gain) < 1.0
     assert found.p_value > 0.05
 
 
 def test_a_fit_gains_nothing_over_itself(calm_fit, others):
-    found = held_out(calm_fit, calm_fit, others[1])
+    found = held_out_gain(calm_fit, calm_fit, others[1])
     assert found.gain == 0.0
     assert found.p_value == 1.0
 
@@ -52,8 +53,8 @@ def test_a_fit_gains_nothing_over_itself(calm_fit, others):
 def test_stretches_of_one_track_are_one_observation(windy_fit, with_wind, others):
     """Each track twice: the mean gain of a track doubles, its scatter between tracks too."""
     some = others[0].take(np.arange(6))
-    once = held_out(windy_fit, with_wind, some)
-    twice = held_out(windy_fit, with_wind, some.take(np.tile(np.arange(6), 2)))
+    once = held_out_gain(windy_fit, with_wind, some)
+    twice = held_out_gain(windy_fit, with_wind, some.take(np.tile(np.arange(6), 2)))
     assert twice.gain == pytest.approx(2 * once.gain, rel=1e-3)
     # as two tracks each the logarithm would double
     assert np.log(twice.p_value) == pytest.approx(np.log(once.p_value), rel=0.2)
@@ -66,16 +67,16 @@ def test_nothing_to_predict(make_ball, surfaces):
 
 def test_errors_of_predictions(make_ball, make_launches, make_shots, surfaces):
     data = make_shots(make_ball(), make_launches(4, 53), 53, duration=0.5).stretches
-    judged = [
-        JudgedTrack(
+    tracks = [
+        EvaluationTrack(
             Track(name, data.times[i].numpy(), data.positions[i].numpy(), labels=labels_of(data.labels[i].tolist())),
             data.contacts[i][~data.contacts[i].isnan()].numpy(),
         )
         for i, name in enumerate(data.names)
     ]
     settings = Settings(position_noise=(0.003,) * 3, spin_label_noise=4.0)
-    right = prediction_errors(make_ball(), judged, surfaces, settings, 1)
-    wrong = prediction_errors(make_ball(drag={"k": 0.3}), judged, surfaces, settings, 1)
+    right = prediction_errors(make_ball(), tracks, surfaces, settings, 1)
+    wrong = prediction_errors(make_ball(drag={"k": 0.3}), tracks, surfaces, settings, 1)
     assert right.by_track.shape == (4,)
     assert 0.003 * np.sqrt(3) * 0.5e3 < right.prediction_rmse_mm < 15.0
     assert 0.3 < right.nis < 2.0

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ballfg.diagnosis.fit.problem import declared_free
 from ballfg.diagnosis.fit.sensitivity import predict
 from ballfg.diagnosis.search.hypothesis import (
     LOOSE,
     Hypothesis,
-    declared_free,
     effects_of,
     has_effect,
     hypotheses,

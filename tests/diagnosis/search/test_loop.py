@@ -7,20 +7,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ballfg.diagnosis.fit.process_noise import Predicting
-from ballfg.diagnosis.result import Errors, Standing
-from ballfg.diagnosis.search import loop
-from ballfg.diagnosis.search.hypothesis import declared_free, has_effect, without_effect
-from ballfg.diagnosis.search.loop import search_effects
+from ballfg.diagnosis.fit.problem import declared_free
+from ballfg.diagnosis.result import Errors, Outcome
+from ballfg.diagnosis.search.hypothesis import has_effect, without_effect
+from ballfg.diagnosis.search.loop import SearchLoop
+from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.settings import Settings
 
 CATALOGUE = [EFFECTS[name] for name in ("gravity", "wind", "table_tilt", "spin_decay")]
 
 
-def halves(finding, judging):
-    """What of a dataset's halves the search asks for."""
-    return SimpleNamespace(finding=finding, judging=judging, settings=Settings(spin_label_noise=4.0))
+def holdout(search, held_out):
+    """The part of a holdout that the search asks for."""
+    return SimpleNamespace(search=search, held_out=held_out, settings=Settings(spin_label_noise=4.0))
 
 
 def shots(make_ball, make_launches, make_shots, seed, **truth):
@@ -29,7 +29,11 @@ def shots(make_ball, make_launches, make_shots, seed, **truth):
 
 def predicting(fitted, rmse):
     """A fit that predicts with some error, in mm: the search asks for no more."""
-    return Predicting(fitted.problem.model, Errors(rmse, rmse, 1.0, 0.0, np.array([rmse])))
+    return PredictiveModel(fitted.problem.model, Errors(rmse, rmse, 1.0, 0.0, np.array([rmse])))
+
+
+def unwatched(line):
+    """Nobody watches."""
 
 
 def predicts_well(fitted):
@@ -42,7 +46,7 @@ def tilted(make_ball, make_launches, make_shots):
     truth = {"table_tilt": {"x": 0.02, "y": 0.0}}
     data = (shots(make_ball, make_launches, make_shots, seed, **truth) for seed in (71, 72))
     said = []
-    search = search_effects(halves(*data), make_ball(), CATALOGUE, predicts_well, said.append)
+    search = SearchLoop(holdout(*data), CATALOGUE, predicts_well, said.append).run(make_ball())
     return search.first, search, said
 
 
@@ -75,8 +79,8 @@ def test_every_round_ranks_every_candidate(tilted):
     assert len(search.rounds) == 2
     first, second = ({c.name: c for c in rows} for rows in search.rounds)
     assert set(first) == {"gravity", "wind", "table_tilt", "spin_decay"}
-    assert first["table_tilt"].standing is Standing.ADDED
-    assert Standing.ADDED not in {c.standing for c in second.values()}
+    assert first["table_tilt"].outcome is Outcome.ADDED
+    assert Outcome.ADDED not in {c.outcome for c in second.values()}
     assert "table_tilt" not in second
     explained = [c.explained for c in search.rounds[0]]
     assert explained == sorted(explained, reverse=True)
@@ -85,8 +89,8 @@ def test_every_round_ranks_every_candidate(tilted):
 
 def test_nothing_is_added_where_nothing_is(make_ball, make_launches, make_shots):
     data = (shots(make_ball, make_launches, make_shots, seed) for seed in (73, 74))
-    search = search_effects(halves(*data), make_ball(), CATALOGUE, predicts_well, lambda line: None)
-    assert search.findings == []
+    search = SearchLoop(holdout(*data), CATALOGUE, predicts_well, unwatched).run(make_ball())
+    assert search.findings == ()
     assert search.fit is search.first
     assert len(search.rounds) == 1
 
@@ -98,11 +102,11 @@ def test_what_predicts_worse_is_not_added(make_ball, make_launches, make_shots):
     def predict(fitted):
         return predicting(fitted, 15.0 if has_effect(fitted.problem.model, "table_tilt") else 10.0)
 
-    search = search_effects(halves(*data), make_ball(), [EFFECTS["table_tilt"]], predict, lambda line: None)
-    assert search.findings == []
+    search = SearchLoop(holdout(*data), [EFFECTS["table_tilt"]], predict, unwatched).run(make_ball())
+    assert search.findings == ()
     assert search.fit is search.first
     (row,) = search.rounds[0]
-    assert row.standing is Standing.MISLEADING
+    assert row.outcome is Outcome.MISLEADING
     assert row.delta_bic < -20.0
 
 
@@ -110,17 +114,17 @@ def test_what_balls_usually_have_is_found_though_no_score_calls(make_ball, make_
     """Friction, left out: its score at absence says little, and its absence is a minimum of its own."""
     data = (shots(make_ball, make_launches, make_shots, seed) for seed in (75, 76))
     declared = without_effect(make_ball(), "friction")
-    search = search_effects(halves(*data), declared, [EFFECTS["friction"]], predicts_well, lambda line: None)
+    search = SearchLoop(holdout(*data), [EFFECTS["friction"]], predicts_well, unwatched).run(declared)
     (finding,) = search.findings
     assert finding.name == "friction"
     assert abs(finding.parameters["mu"].value - 0.25) < 4 * finding.parameters["mu"].sigma
 
 
-def test_what_would_have_to_be_implausibly_strong_is_not_added(make_ball, make_launches, make_shots, monkeypatch):
+def test_what_would_have_to_be_implausibly_strong_is_not_added(make_ball, make_launches, make_shots):
     """The tilt found is 1.1 degrees, 4 prior sigmas: beyond what counts as plausible here."""
     data = (shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.02, "y": 0.0}) for seed in (71, 72))
-    monkeypatch.setattr(loop, "BEYOND", 3.0)
-    search = search_effects(halves(*data), make_ball(), [EFFECTS["table_tilt"]], predicts_well, lambda line: None)
-    assert search.findings == []
+    loop = SearchLoop(holdout(*data), [EFFECTS["table_tilt"]], predicts_well, unwatched, plausible=3.0)
+    search = loop.run(make_ball())
+    assert search.findings == ()
     (row,) = search.rounds[0]
-    assert row.standing is Standing.IMPLAUSIBLE
+    assert row.outcome is Outcome.IMPLAUSIBLE

@@ -1,9 +1,9 @@
-"""Do spin labels contradict the flights they belong to?
+"""A test for spin labels that contradict their flights.
 
-A label is compared with the spin that the flight alone shows, the label left out: the squared distance over both their
-uncertainties is a chi-square with three degrees of freedom. Noise that is stated too small raises the distances of all
-tracks, which a common scale takes up; a label that stands out among the others belongs to another shot, or was measured
-wrongly. Where most are off by several times their noise, no misjudged noise explains that: labels and model disagree.
+A label is compared with the spin that the flight alone shows. The squared distance over both uncertainties is a
+chi-square with three degrees of freedom. Noise that is stated too small raises the distances of all tracks, which a
+common scale corrects. A label that stands out among the others belongs to another shot, or was measured wrongly. Where
+most labels are off by several times their noise, no misjudged noise explains that: labels and model disagree.
 """
 
 from __future__ import annotations
@@ -11,27 +11,25 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy import stats
 
-from ballfg.diagnosis.fit.problem import Fit, whitened_spins
+from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
+from ballfg.diagnosis.result import Array, Index
 from ballfg.state import SPIN, STATE_DIM
 
 LABEL = "label"
 """Kind of the test."""
 LEAST_LABELS = 6
-"""With fewer there is no telling which of them stand out."""
+"""With fewer labels none can be said to stand out."""
 OPEN_SPIN = 2000.0
 """rad/s. Prior of each component of a spin that the flight does not show: twice the fastest strokes."""
 STANDS_OUT = 0.005
 """Probability, corrected for the number of labels, below which a label is counted as contradicted."""
 FAR = 9.0
-"""Square of the multiple of its noise by which a label must be off to count where most are: three times."""
+"""Square of the distance, in multiples of its noise, beyond which a label counts where most are off: three times."""
 MISJUDGED = 1.3**2
 """Square of the factor by which a stated noise may be wrong without anything else being wrong."""
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -39,8 +37,8 @@ class LabelCheck:
     """The test.
 
     Attributes:
-        p_value: of the label that stands out most, corrected for the number of labels, or that most are far off.
-        contradicted: names of the tracks whose labels stand out or, where most are, are far off, the worst first.
+        p_value: of the label that stands out most, corrected for the number of labels; or of so many far labels.
+        contradicted: tracks whose labels stand out or, where most labels are far off, all far ones; the worst first.
         labels: how many there are.
         typical: rad/s, median distance of a contradicted label from the spin that the flight shows.
     """
@@ -61,10 +59,7 @@ class LabelCheck:
 
 
 def check_labels(fit: Fit, system: System) -> LabelCheck | None:
-    """The test of a fit; None where there are too few labels.
-
-    Args: system: of the fit, linearised at its minimum.
-    """
+    """The test of a fit; None where there are too few labels; system: of the fit, linearised at its minimum."""
     rows = np.flatnonzero(fit.problem.stretches.labelled)
     if len(rows) < LEAST_LABELS:
         return None
@@ -85,20 +80,16 @@ def check_labels(fit: Fit, system: System) -> LabelCheck | None:
     )
 
 
-def _distances(fit: Fit, system: System, rows: NDArray[np.int64]) -> tuple[Array, Array]:
-    """Squared distance (m,) of each label from the spin its flight shows, over their noise; and in rad/s."""
-    weight = np.sqrt(fit.robust.spins[rows])[:, None]
-    about = whitened_spins(fit.problem, fit.unknowns, fit.noise, fit.predicted)[rows]
-    by_start = system.by_start[rows]
-    labels = by_start[:, -3:] / weight[..., None]
-    flight, residual = by_start[:, :-3], system.residual[rows, :-3]
+def _distances(fit: Fit, system: System, rows: Index) -> tuple[Array, Array]:
+    """Squared distance (m,) of each label from the spin that its flight shows, over their noise; and in rad/s."""
+    labels = system.by_start[rows, -3:] / np.sqrt(fit.robust.spins[rows])[:, None, None]
+    flight, residual = system.by_start[rows, :-3], system.residual[rows, :-3]
     information = flight.swapaxes(-1, -2) @ flight
     spin = np.arange(STATE_DIM)[SPIN]
     information[:, spin, spin] += OPEN_SPIN**-2
-    solved = np.linalg.solve(
-        information, np.concatenate((flight.swapaxes(-1, -2) @ residual[..., None], labels.swapaxes(-1, -2)), axis=-1)
-    )
-    left = about - (labels @ solved[..., :1])[..., 0]
+    pulled = np.concatenate((flight.swapaxes(-1, -2) @ residual[..., None], labels.swapaxes(-1, -2)), axis=-1)
+    solved = np.linalg.solve(information, pulled)
+    left = fit.whitened_spins[rows] - (labels @ solved[..., :1])[..., 0]
     covariance = np.eye(3) + labels @ solved[..., 1:]
     distance = (left * np.linalg.solve(covariance, left[..., None])[..., 0]).sum(axis=-1)
     return distance, fit.noise.label * np.linalg.norm(left, axis=-1)

@@ -9,9 +9,8 @@ import pytest
 import torch
 from scipy import stats
 
-from ballfg.diagnosis.fit.problem import linearise
 from ballfg.diagnosis.remains.generic import generic_tests
-from ballfg.diagnosis.search.label_check import LEAST_LABELS, _distances, check_labels
+from ballfg.diagnosis.remains.label_check import LEAST_LABELS, _distances, check_labels
 
 pytestmark = pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # torch's own
 TRACKS, LABEL_NOISE = 24, 4.0
@@ -23,12 +22,12 @@ def shots(make_ball, make_launches, make_shots):
 
 
 def checked(fit):
-    return check_labels(fit, linearise(fit.problem, fit.unknowns, fit.noise, fit.predicted))
+    return check_labels(fit, fit.linearised())
 
 
 def test_distances_are_chi_square(make_ball, make_fit, shots) -> None:
     fit = make_fit(make_ball(), shots, settle_noise=False)
-    system = linearise(fit.problem, fit.unknowns, fit.noise, fit.predicted)
+    system = fit.linearised()
     distance, _ = _distances(fit, system, np.arange(TRACKS))
     assert stats.kstest(distance, stats.chi2(3).cdf).pvalue > 0.01
     found = checked(fit)

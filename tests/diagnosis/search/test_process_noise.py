@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.diagnosis.fit.problem import launch_axes, linearise
-from ballfg.diagnosis.search.calibrated import calibrated_model, values_of
+from ballfg.diagnosis.fit.fit import values_of
+from ballfg.diagnosis.fit.problem import launch_axes
+from ballfg.diagnosis.search.process_noise import calibrated_model
 from ballfg.dynamics import load_model, save_model
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 
@@ -48,7 +49,7 @@ def test_the_launcher_tells_the_spins_of_the_fit(unlabelled):
 
 def test_standard_deviations_are_those_of_the_whole_problem(calm_fit):
     """Of the dense information matrix with every first state in it."""
-    system = linearise(calm_fit.problem, calm_fit.unknowns, calm_fit.noise, calm_fit.predicted)
+    system = calm_fit.linearised()
     n, m, q = system.by_common.shape
     dense = np.zeros((n * m, 9 * n + q))
     for i in range(n):

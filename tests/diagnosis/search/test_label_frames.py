@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.diagnosis.fit.label_frames import FRAMES_FITTED, frame_hypotheses
 from ballfg.diagnosis.search.candidates import Scored, refit
 from ballfg.diagnosis.search.hypothesis import Hypothesis
+from ballfg.diagnosis.search.label_frames import FRAMES_FITTED, frame_hypotheses
 from ballfg.dynamics.effects.measurement.spin_labels import SpinLabelFrame, signed_permutations
 
 GENERAL = Hypothesis(SpinLabelFrame, {}, tuple(c.name for c in SpinLabelFrame.coefficients))

@@ -1,7 +1,8 @@
-"""Spin labels in other axes or with other signs: not a small change that a score could measure, but one of 48.
+"""Spin labels in other axes or with other signs: one of 48 frames, too large a change for a score test.
 
-Spins are estimated from the flights alone, without labels and with the declared coefficients (those fitted to wrong
-labels would be wrong too); the frames in which the labels agree with them best are then fitted in full.
+Spins are estimated from the flights alone, without labels and with the declared coefficients, because coefficients
+fitted to wrong labels would be wrong too. The frames in which the labels agree best with these spins are then fitted in
+full.
 """
 
 from __future__ import annotations
@@ -10,15 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from ballfg.diagnosis.fit.fit import fit
-from ballfg.diagnosis.fit.problem import LABEL_CAUCHY, Fit, linearise
+from ballfg.diagnosis.fit.fit import fit_problem
+from ballfg.diagnosis.fit.problem import LABEL_LOSS, Fit
+from ballfg.diagnosis.result import Array
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.dynamics.effects.measurement.spin_labels import signed_permutations
 from ballfg.state import SPIN
-
-Array = NDArray[np.float64]
 
 UNLABELLED_SPIN = 200.0
 """rad/s, prior of a spin about zero while labels are set aside."""
@@ -37,8 +36,10 @@ def frame_hypotheses(before: Fit, general: Hypothesis) -> list[Hypothesis]:
     frames = signed_permutations().numpy()[1:]
     costs = [_disagreement(labels, spins, covariances, frame, before.noise.label) for frame in frames]
     best = np.argsort(costs)[:FRAMES_FITTED]
-    names = [c.name for c in general.effect.coefficients]
-    return [Hypothesis(general.effect, dict(zip(names, frames[i].ravel().tolist(), strict=True))) for i in best]
+    return [
+        Hypothesis(general.effect, dict(zip(general.coefficients, frames[i].ravel().tolist(), strict=True)))
+        for i in best
+    ]
 
 
 def _spins_without_labels(before: Fit) -> tuple[Array, Array, Array]:
@@ -49,9 +50,8 @@ def _spins_without_labels(before: Fit) -> tuple[Array, Array, Array]:
     declared = dict(zip(problem.free, problem.centres.tolist(), strict=True))
     unknowns = replace(before.unknowns, starts=before.unknowns.starts[problem.stretches.labelled], values=declared)
     alone = replace(problem, stretches=bare, shared=False)
-    result = fit(alone, unknowns, replace(before.noise, spin=UNLABELLED_SPIN), settle_noise=False)
-    by_start = linearise(result.problem, result.unknowns, result.noise, result.predicted).by_start
-    covariances = np.linalg.inv(by_start.swapaxes(-1, -2) @ by_start)[:, SPIN, SPIN]
+    result = fit_problem(alone, unknowns, replace(before.noise, spin=UNLABELLED_SPIN), settle_noise=False)
+    covariances = np.linalg.inv(result.linearised().start_information)[:, SPIN, SPIN]
     return result.unknowns.starts[:, SPIN], np.asarray(covariances), labelled.labels.numpy()
 
 
@@ -60,5 +60,5 @@ def _disagreement(labels: Array, spins: Array, covariances: Array, frame: Array,
     covariance = frame @ covariances @ frame.T + noise**2 * np.eye(3)
     apart = labels - spins @ frame.T
     square = (apart * np.linalg.solve(covariance, apart[..., None])[..., 0]).sum(axis=-1)
-    robust = LABEL_CAUCHY**2 * np.log1p(square / LABEL_CAUCHY**2) + np.linalg.slogdet(covariance)[1]
+    robust = 2.0 * LABEL_LOSS.value(np.sqrt(square)) + np.linalg.slogdet(covariance)[1]
     return float(robust.sum())

@@ -1,23 +1,22 @@
-"""What the pictures of residuals are made of: residuals in the axes of the motion, and their means over bins."""
+"""Residuals in the axes of the motion, and their means over bins, for the pictures."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
 
-from ballfg.diagnosis.result import ContactResiduals, FlightResiduals
+from ballfg.diagnosis.result import Array, ContactResiduals, FlightResiduals, Index
+from ballfg.dynamics.motion.impact import slip_velocity
 from ballfg.state import SPIN, VELOCITY
 
-Array = NDArray[np.float64]
-
 MOST_BINS, LEAST_BINS = 12, 3
-"""Of equal counts."""
+"""Limits of the number of bins, which hold equal counts."""
 STRETCHES_A_BIN = 6
-"""Where there are few stretches there are fewer bins, so that a mean is still one of several."""
+"""Few stretches make few bins, so that each mean is over several stretches."""
 LEAST_STRETCHES = 3
-"""A bin of fewer has no standard error worth a bar."""
+"""A bin of fewer stretches has no standard error worth showing."""
 STEEP = 1e-6
 """Horizontal share of a velocity below which it is vertical: its direction along the ground is then that of x."""
 
@@ -62,18 +61,20 @@ def at_contact(residuals: ContactResiduals) -> tuple[Array, Array]:
 
 def slip_speed(states: Array, radius: float) -> Array:
     """(m,) m/s at which the lowest point of a ball of `radius` m slides over the ground."""
-    velocity, spin = states[:, VELOCITY], states[:, SPIN]
-    return np.asarray(np.hypot(velocity[:, 0] - radius * spin[:, 1], velocity[:, 1] + radius * spin[:, 0]))
+    velocity, spin = torch.from_numpy(states[:, VELOCITY]), torch.from_numpy(states[:, SPIN])
+    return slip_velocity(velocity, spin, radius).norm(dim=-1).numpy()
 
 
-def binned(against: Array, values: Array, sigmas: Array, stretch: NDArray[np.int64]) -> Bins:
+def binned(against: Array, values: Array, sigmas: Array, stretch: Index) -> Bins:
     """Weighted means of values over bins of equal counts.
 
     Args:
-        against: (m,) what is cut into bins.
-        values: (m,) and their standard deviations `sigmas`, which give the weights.
-        stretch: (m,) number of the stretch: those of one stretch hang together and count as one.
-    Returns: the bins with enough stretches. The standard errors come from the scatter between stretches alone.
+        against: (m,) quantity that is cut into bins.
+        values, sigmas: (m,) and their standard deviations, which give the weights.
+        stretch: (m,) number of the stretch: values of one stretch are correlated and count as one.
+
+    Returns:
+        The bins with enough stretches. The standard errors come from the scatter between stretches alone.
     """
     rows: list[tuple[float, float, float]] = []
     if len(against):
