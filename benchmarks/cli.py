@@ -60,7 +60,7 @@ def estimators(
 
     Example: ballfg-bench estimators --data data/aimy --out results/aimy
     """
-    from ballfg.benchmarks.estimators.run import FULL, QUICK, run_dataset, run_synthetic
+    from ballfg.benchmarks.estimators.suite import FULL, QUICK, run_dataset, run_synthetic
 
     results = _start("estimators", [] if data is None else [data], quick, seed)
     size, processes = QUICK if quick else FULL, jobs or default_jobs()
@@ -81,7 +81,7 @@ def cameras(out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jo
 
     Example: ballfg-bench cameras --out results/cameras
     """
-    from ballfg.benchmarks.cameras.run import FULL, QUICK, run_cameras
+    from ballfg.benchmarks.cameras.suite import FULL, QUICK, run_cameras
 
     results = _start("cameras", [], quick, seed)
     pictures = run_cameras(results, _folder(out), QUICK if quick else FULL, jobs or default_jobs())
@@ -106,7 +106,7 @@ def dynamics(
 
     Example: ballfg-bench dynamics --quick --out results/dynamics
     """
-    from ballfg.benchmarks.dynamics.run import FULL, QUICK, Measured, run_dynamics
+    from ballfg.benchmarks.dynamics.suite import FULL, QUICK, Measured, run_dynamics
 
     if transfer is not None and not data:
         raise ValueError("--transfer needs a model trained on measured tracks; got no --data. Give it, once or more.")
@@ -134,7 +134,7 @@ def loop(
 
     Example: ballfg-bench loop --data data/aimy --out results/loop
     """
-    from ballfg.benchmarks.diagnosis.run import FULL, QUICK, run_loop
+    from ballfg.benchmarks.diagnosis.suite import FULL, QUICK, run_loop
 
     results = _start("loop", data or [], quick, seed)
     for folder in data or []:
@@ -151,7 +151,7 @@ def speed(data: Data = None, out: Out = Path("results"), quick: Quick = False, s
 
     Example: ballfg-bench speed --out results/speed
     """
-    from ballfg.benchmarks.speed.run import run_speed
+    from ballfg.benchmarks.speed.suite import run_speed
 
     results = _start("speed", [] if data is None else [data], quick, seed)
     run_speed(results, None if data is None else _open(data), quick)

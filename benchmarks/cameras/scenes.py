@@ -11,8 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.benchmarks.metrics import nees
-from ballfg.cli.progress import progress
+from ballfg.benchmarks.metrics import nees, root_mean_square
 from ballfg.simulation.cameras import table_rig
 from ballfg.simulation.scene import Flight, Recording, SceneConfig, free_running, record, write_scene
 from ballfg.vision.association.clock import nearest
@@ -86,26 +85,19 @@ class Filmed:
     tracking: Tracking
 
 
-def film(scenario: Scenario, *, quiet: bool = False) -> Filmed:
-    """Draws a scenario into videos, with progress if not quiet, and tracks the balls in them; the videos go again."""
+def film(scenario: Scenario) -> Filmed:
+    """Draws a scenario into videos and tracks the balls in them; the videos are deleted again."""
     recording = scenario.recording()
     with TemporaryDirectory() as folder:
         scene = Path(folder) / "scene"
-        draw(recording, scene, "" if quiet else scenario.name)
+        write_scene(scene, recording)
+        names = [camera.name for camera in recording.cameras]
         found = detect_all(
-            {camera.name: scene / f"{camera.name}.mp4" for camera in recording.cameras},
-            stamps={camera.name: scene / f"{camera.name}_stamps.csv" for camera in recording.cameras},
+            {name: scene / f"{name}.mp4" for name in names},
+            stamps={name: scene / f"{name}_stamps.csv" for name in names},
         )
     detections = tuple(found.values())
     return Filmed(scenario, recording, detections, track_detections(detections, recording.cameras))
-
-
-def draw(recording: Recording, folder: Path, name: str) -> None:
-    """Writes a recording's videos and stamps; with progress, if it has a name to be shown by."""
-    if name:
-        write_scene(folder, recording, watch=lambda drawn: progress(drawn, recording.image_count, f"frames of {name}"))
-    else:
-        write_scene(folder, recording)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +124,7 @@ class Judged:
     @property
     def rmse(self) -> float:
         """M, root mean square distance."""
-        return float(np.sqrt((self.errors**2).sum(axis=1).mean()))
+        return root_mean_square(self.errors)
 
 
 def judge(filmed: Filmed) -> Judged:
@@ -155,16 +147,8 @@ def judge(filmed: Filmed) -> Judged:
         points = np.sort(np.concatenate(at[name]))
         seen += len(times)
         found += int((_distance(times, points) < SAME_FRAME / recording.config.rate).sum())
-    return Judged(
-        np.concatenate(errors),
-        np.concatenate(squares),
-        false,
-        seen,
-        found,
-        len(filmed.tracking.balls),
-        mixed,
-        len(recording.flights),
-    )
+    tracks, balls = len(filmed.tracking.balls), len(recording.flights)
+    return Judged(np.concatenate(errors), np.concatenate(squares), false, seen, found, tracks, mixed, balls)
 
 
 def truth_at(flight: Flight, times: Array) -> Array:
@@ -197,11 +181,8 @@ def _frames_with_ball(recording: Recording) -> Iterator[tuple[str, Array]]:
             for camera, frames, passages in zip(recording.cameras, recording.frames, recording.passages, strict=True)
         ]
         most = int(np.argmax([len(t) for t in times]))
-        shared = all(
-            clock.phase == recording.clock(recording.cameras[0].name).phase
-            for clock in (recording.clock(camera.name) for camera in recording.cameras)
-        )
-        if shared:
+        phases = {recording.clock(camera.name).phase for camera in recording.cameras}
+        if len(phases) == 1:
             stamps, views = np.unique(np.round(np.concatenate(times), 6), return_counts=True)
             yield flight.name, np.asarray(stamps[views >= 2], dtype=np.float64)
         else:

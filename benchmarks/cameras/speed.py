@@ -1,24 +1,24 @@
-"""What tracking costs: three video streams through detection and association, and live updates from sightings."""
+"""Times of tracking: three video streams through detection and association, and live updates from sightings."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
 from joblib.externals.loky import get_reusable_executor
-from numpy.typing import NDArray
 
 from ballfg.benchmarks.cameras.clocks import sighted
-from ballfg.benchmarks.cameras.scenes import Filmed, Scenario, draw
+from ballfg.benchmarks.cameras.scenes import Filmed, Scenario
+from ballfg.benchmarks.speed.stopwatch import milliseconds
+from ballfg.cli.progress import progress
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Online, uncertain
+from ballfg.simulation.scene import write_scene
 from ballfg.vision import Camera, Detections, detect_all, track_detections
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -46,9 +46,10 @@ def stream_times(scenario: Scenario, runs: int) -> list[StreamTimes]:
     recording = scenario.recording()
     with TemporaryDirectory() as folder:
         scene = Path(folder) / "scene"
-        draw(recording, scene, f"{scenario.name}, timed")
+        images = f"frames of {scenario.name}, timed"
+        write_scene(scene, recording, watch=lambda drawn: progress(drawn, recording.image_count, images))
         videos = {camera.name: scene / f"{camera.name}.mp4" for camera in recording.cameras}
-        return [_timed(videos, recording.cameras) for _ in range(runs)]
+        return [_timed(videos, recording.cameras) for _ in progress(range(runs), runs, "runs timed")]
 
 
 def _timed(videos: dict[str, Path], cameras: Sequence[Camera]) -> StreamTimes:
@@ -61,14 +62,14 @@ def _timed(videos: dict[str, Path], cameras: Sequence[Camera]) -> StreamTimes:
     return StreamTimes(min(len(d.frames) for d in found.values()), searched - start, end - searched)
 
 
-def push_times(filmed: Filmed) -> Array:
-    """(n,) ms, of each sighting that the online estimator takes in, those of all balls."""
+def push_times(filmed: Filmed) -> list[float]:
+    """Milliseconds of each sighting that the online estimator takes in, those of all balls."""
     settings, taken = uncertain(nominal_model()), []
-    for track in sighted(filmed):
+    tracks = sighted(filmed)
+    for track in progress(tracks, len(tracks), "balls pushed online"):
         online = Online(nominal_model(), filmed.recording.config.ball.surfaces, settings, cameras=track.cameras)
         seen = track.sightings
         for camera, at, pixel, covariance in zip(seen.camera, seen.times, seen.pixels, seen.covariances, strict=True):
-            start = time.perf_counter()
-            online.push_sighting(float(at), seen.cameras[camera], pixel, covariance)
-            taken.append(1e3 * (time.perf_counter() - start))
-    return np.array(taken)
+            push = partial(online.push_sighting, float(at), seen.cameras[camera], pixel, covariance)
+            taken.append(milliseconds(push))
+    return taken

@@ -27,7 +27,7 @@ import torch
 from numpy.typing import NDArray
 
 from ballfg.benchmarks.dynamics.task import Shot, Task
-from ballfg.benchmarks.synthetic import gaussian_settings
+from ballfg.benchmarks.estimators.protocols import gaussian_settings
 from ballfg.dynamics import BallModel, Surfaces, contact_time
 from ballfg.estimation import Launcher
 from ballfg.factors.noise import ProcessNoise

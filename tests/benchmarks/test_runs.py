@@ -8,12 +8,12 @@ import pytest
 import torch
 
 from ballfg.benchmarks.estimators.measured import WHOLE, Measured, _add_smoothing, prediction_rmse
-from ballfg.benchmarks.estimators.run import Size, describe, run_synthetic
+from ballfg.benchmarks.estimators.suite import Size, describe, run_synthetic
 from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.speed import run as speed
 from ballfg.benchmarks.speed.network import GRAVITY, fitted_network, parameter_count
-from ballfg.benchmarks.speed.run import problem_model, run_speed
-from ballfg.benchmarks.synthetic import fair_protocol
+from ballfg.benchmarks.speed.suite import problem_model, run_speed
+from ballfg.benchmarks.estimators.protocols import fair_protocol
 from ballfg.estimation import Estimate, Status
 from ballfg.prediction import TrackPrediction
 

@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.estimators.step_noise import StepNoise
-from ballfg.benchmarks.synthetic import AT_BOUNCE, FAIR_NOISE, PAPER_NOISE, fair_protocol, paper_protocol
+from ballfg.benchmarks.gaussian_settings import StepNoise
+from ballfg.benchmarks.estimators.protocols import AT_BOUNCE, FAIR_NOISE, PAPER_NOISE, fair_protocol, paper_protocol
 from ballfg.state import POSITION, VZ
 
 

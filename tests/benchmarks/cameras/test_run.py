@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.cameras.calibration import TURN, nudges, turned
+from ballfg.benchmarks.cameras.turned import TURN, nudges, turned
 from ballfg.benchmarks.cameras.clocks import clocks, compare
-from ballfg.benchmarks.cameras.run import FACTORS, NAIVE, _add_points, _add_velocities
+from ballfg.benchmarks.cameras.suite import FACTORS, NAIVE, _add_points, _add_velocities
 from ballfg.benchmarks.cameras.scenes import Filmed, Scenario, judge, scenarios, truth_at
 from ballfg.benchmarks.results import Results
 from ballfg.simulation.scene import Clock, Recording

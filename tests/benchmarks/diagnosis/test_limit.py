@@ -19,7 +19,7 @@ from ballfg.benchmarks.diagnosis.ideal import (
     read_ideal,
     save_ideal,
 )
-from ballfg.benchmarks.diagnosis.limit import median, power_curve, share
+from ballfg.benchmarks.diagnosis.power_curve import median, power_curve, share
 from ballfg.diagnosis.fit.fit import fit, followed, start_from
 from ballfg.diagnosis.fit.holdout import launcher_labels
 from ballfg.diagnosis.fit.problem import Problem

@@ -12,8 +12,8 @@ from ballfg.benchmarks.diagnosis.cases import QUICK, Case, Plan, Recording, nami
 from ballfg.benchmarks.diagnosis.ideal import Ideal
 from ballfg.benchmarks.diagnosis.record import Found, Ranked, Record, case_digest, read_record, record_of
 from ballfg.benchmarks.diagnosis.rows import ALL, FAILED, HIDDEN, detectable
-from ballfg.benchmarks.diagnosis.run import add_all, all_cases, run_loop
-from ballfg.benchmarks.diagnosis.truth import planted_free
+from ballfg.benchmarks.diagnosis.suite import add_all, all_cases, run_loop
+from ballfg.benchmarks.diagnosis.true_model import planted_free
 from ballfg.benchmarks.diagnosis.verdicts import alarmed, complete, honest, named, right
 from ballfg.benchmarks.results import Results
 from tests.diagnosis.made_diagnosis import found, unexplained

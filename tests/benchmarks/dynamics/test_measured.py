@@ -10,7 +10,7 @@ import pytest
 from ballfg.benchmarks.dynamics.contenders import Job, adapting_contender, nominal_contender
 from ballfg.benchmarks.dynamics.measured import measured_task, measured_tasks
 from ballfg.benchmarks.dynamics.record import job_digest, task_digest
-from ballfg.benchmarks.dynamics.run import Measured, Plan, collect, judged, record_path, run_dynamics
+from ballfg.benchmarks.dynamics.suite import Measured, Plan, collect, judged, record_path, run_dynamics
 from ballfg.benchmarks.dynamics.task import Shot, Task
 from ballfg.benchmarks.dynamics.trained import config_of, trained_contender
 from ballfg.benchmarks.estimators.measured import run_measured

@@ -13,7 +13,7 @@ from ballfg.benchmarks.dynamics.fan import fan_of
 from ballfg.benchmarks.dynamics.measured import measured_shot
 from ballfg.benchmarks.dynamics.record import read_record, task_digest
 from ballfg.benchmarks.dynamics.rows import add_rows
-from ballfg.benchmarks.dynamics.run import Plan, collect, run_dynamics
+from ballfg.benchmarks.dynamics.suite import Plan, collect, run_dynamics
 from ballfg.benchmarks.dynamics.truth import synthetic_task
 from ballfg.benchmarks.results import Results
 from ballfg.estimation import Estimate, Status

@@ -18,7 +18,7 @@ from ballfg.benchmarks.dynamics.truth import (
     synthetic_task,
 )
 from ballfg.dynamics import nominal_model
-from ballfg.dynamics.motion import rollout
+from ballfg.dynamics import rollout
 from ballfg.state import POSITION, VELOCITY
 from ballfg.tracks import read_dataset
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from ballfg.benchmarks.estimators.consistency import add_consistency
-from ballfg.benchmarks.estimators.protocols import add_rows
+from ballfg.benchmarks.estimators.synthetic_rows import add_rows
 from ballfg.benchmarks.estimators.scoring import Candidate, Scores, every, judged, score_track, score_tracks, sums
 from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.synthetic import Case
+from ballfg.benchmarks.estimators.protocols import Case
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation import Estimate, Estimator, Settings, Status
 from ballfg.state import VELOCITY

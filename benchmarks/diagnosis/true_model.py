@@ -1,4 +1,4 @@
-"""What a diagnosis could have reached: the true model, fitted to the same half and judged on the same other half."""
+"""The error that a diagnosis could reach: that of the true model, fitted and judged on the same halves of the tracks."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def true_errors(case: Case, dataset: Dataset) -> Errors:
     Args: case: with planted effects of the catalogue and one session.  dataset: its tracks.
     """
     truth, declared = actual_model(case), declared_model(case, dataset.info.ball.radius)
-    halves = halves_of(dataset, declared, 1, _unwatched)  # as the diagnosis has them: both are judged by the same
+    halves = halves_of(dataset, declared, 1, lambda line: None)  # the diagnosis splits in the same way
     moving = plainly_measured(truth)
     smoother = Smoother(moving, halves.surfaces, dataset_settings(dataset, moving))
     finding = stretches_of(smoother, [part.track for part in halves.found_on], halves.launcher)
@@ -45,7 +45,7 @@ def true_errors(case: Case, dataset: Dataset) -> Errors:
 
 
 def planted_free(case: Case) -> dict[str, Coefficient]:
-    """What a fit with the planted effects estimates beside what is declared, by parameter name."""
+    """The coefficients of the planted effects that a fit estimates beside the declared ones, by parameter name."""
     free: dict[str, Coefficient] = {}
     for name in case.planted:
         free |= PLANTS[name].hypothesis().free()
@@ -62,7 +62,3 @@ def _with_labelled_spins(model: AnalyticModel, stretches: Stretches) -> Stretche
     labelled = torch.from_numpy(stretches.labelled)
     starts[labelled, SPIN] = spins[labelled]
     return replace(stretches, starts=starts)
-
-
-def _unwatched(line: str) -> None:
-    """Nobody watches."""

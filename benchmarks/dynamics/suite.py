@@ -1,0 +1,114 @@
+"""The suite of `ballfg-bench dynamics`: every method learns from the same shots and predicts the same others."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from ballfg.benchmarks.dynamics.jobs import collect_records
+from ballfg.benchmarks.dynamics.measured import measured_tasks
+from ballfg.benchmarks.dynamics.methods import METHODS
+from ballfg.benchmarks.dynamics.rows import add_rows
+from ballfg.benchmarks.dynamics.task import Task
+from ballfg.benchmarks.dynamics.truth import TRACKS, synthetic_task
+from ballfg.benchmarks.results import Results
+from ballfg.benchmarks.resumable import RUNS_FOLDER
+from ballfg.tracks import Dataset
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is computed.
+
+    Attributes:
+        tracks: synthetic ones.
+        measured: measured tracks at most; None for all.
+        seeds: how often each trained method is trained.
+        quick: train just enough to see that everything works.
+    """
+
+    tracks: int
+    measured: int | None
+    seeds: int
+    quick: bool
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Measured tracks.
+
+    Attributes:
+        datasets: one model learns from all of them; it is judged on each.
+        transfer: the models are judged on it, but learn nothing from it; None for none.
+        transfer_tracks: how many of its first tracks; None for all.
+    """
+
+    datasets: Sequence[Dataset]
+    transfer: Dataset | None = None
+    transfer_tracks: int | None = None
+
+
+FULL: Final = Plan(tracks=TRACKS, measured=None, seeds=3, quick=False)
+QUICK: Final = Plan(tracks=60, measured=24, seeds=1, quick=True)
+
+
+def run_dynamics(
+    results: Results, data: Measured | None, out: Path, plan: Plan, jobs: int, methods: Sequence[str] = tuple(METHODS)
+) -> list[Path]:
+    """Train, judge, and add the rows.
+
+    Whatever is finished is kept in `out`: a run that was stopped goes on where it was.
+
+    Args:
+        results: gets the rows.
+        data: measured tracks; None for synthetic ones.
+        out: an existing folder.
+        plan: how much.
+        jobs: processes.
+        methods: names in `METHODS`; those that do not take part on such tracks are passed over.
+    Returns: the pictures written.
+    """
+    from ballfg.benchmarks.dynamics.pictures import apex_picture, fan_picture, rmse_picture
+
+    tasks = _tasks(results.seed, data, plan, jobs)
+    for task in tasks:
+        print(describe(task))
+    seeds = range(results.seed, results.seed + plan.seeds)
+    of_tasks = collect_records(tasks, methods, seeds, out / RUNS_FOLDER, jobs, quick=plan.quick)
+    pictures = []
+    for task, records in zip(tasks, of_tasks, strict=True):
+        for _, group in groupby(records, key=lambda record: record.method):
+            add_rows(results, task, list(group))
+        ending = "" if len(tasks) == 1 else "_" + re.sub(r"\W+", "_", task.case)
+        pictures.append(rmse_picture(results.rows, task, out / f"dynamics_rmse{ending}.png"))
+        if any(row.metric.startswith("apex") for row in results.rows if row.case == task.case):
+            pictures.append(apex_picture(results.rows, task, out / f"dynamics_apex{ending}.png"))
+        if any(record.fan is not None for record in records):
+            pictures.append(fan_picture(records, task.surfaces.table_height, out / f"dynamics_fan{ending}.png"))
+    return pictures
+
+
+def _tasks(seed: int, data: Measured | None, plan: Plan, jobs: int) -> list[Task]:
+    if data is None:
+        return [synthetic_task(seed, plan.tracks)]
+    transfer_tracks = min(data.transfer_tracks or sys.maxsize, plan.measured or sys.maxsize)
+    return measured_tasks(data.datasets, data.transfer, jobs, plan.measured, transfer_tracks)
+
+
+def describe(task: Task) -> str:
+    """One line about the tracks."""
+    shots = [*task.train, *task.validation]
+    bounces = np.bincount([len(shot.bounces) for shot in shots]).tolist()
+    with_bounces = ", ".join(f"{count} with {number}" for number, count in enumerate(bounces) if count)
+    samples = np.median([shot.observed for shot in shots])
+    return (
+        f"{task.case}: {len(task.train)} tracks to learn from, {len(task.validation)} to judge by "
+        f"(bounces: {with_bounces}); {samples:.0f} samples observed"
+    )
