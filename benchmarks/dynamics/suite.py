@@ -60,7 +60,7 @@ QUICK: Final = Plan(tracks=60, measured=24, seeds=1, quick=True)
 
 
 def run_dynamics(
-    results: Results, data: Measured | None, out: Path, plan: Plan, jobs: int, methods: Sequence[str] = tuple(METHODS)
+    results: Results, data: Measured | None, out: Path, plan: Plan, jobs: int, methods: Sequence[str] | None = None
 ) -> list[Path]:
     """Train, judge, and add the rows.
 
@@ -72,16 +72,20 @@ def run_dynamics(
         out: an existing folder.
         plan: how much.
         jobs: processes.
-        methods: names in `METHODS`; those that do not take part on such tracks are passed over.
+        methods: names in `METHODS`, None for all; those that do not take part on such tracks are passed over.
     Returns: the pictures written.
+    Raises: ValueError: if a method's name is unknown.
     """
     from ballfg.benchmarks.dynamics.pictures import apex_picture, fan_picture, rmse_picture
 
+    for name in methods or ():
+        if name not in METHODS:
+            raise ValueError(f"--method must be one of {', '.join(METHODS)}; got '{name}'. Choose one of them.")
     tasks = _tasks(results.seed, data, plan, jobs)
     for task in tasks:
         print(describe(task))
     seeds = range(results.seed, results.seed + plan.seeds)
-    of_tasks = collect_records(tasks, methods, seeds, out / RUNS_FOLDER, jobs, quick=plan.quick)
+    of_tasks = collect_records(tasks, methods or tuple(METHODS), seeds, out / RUNS_FOLDER, jobs, quick=plan.quick)
     pictures = []
     for task, records in zip(tasks, of_tasks, strict=True):
         for _, group in groupby(records, key=lambda record: record.method):

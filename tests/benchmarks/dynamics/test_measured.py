@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from ballfg.benchmarks.dynamics.contenders import Job, adapting_contender, nominal_contender
+from ballfg.benchmarks.dynamics.jobs import collect_records, judged, record_path
 from ballfg.benchmarks.dynamics.measured import measured_task, measured_tasks
 from ballfg.benchmarks.dynamics.record import job_digest, task_digest
-from ballfg.benchmarks.dynamics.suite import Measured, Plan, collect, judged, record_path, run_dynamics
+from ballfg.benchmarks.dynamics.suite import Measured, Plan, run_dynamics
 from ballfg.benchmarks.dynamics.task import Shot, Task
 from ballfg.benchmarks.dynamics.trained import config_of, trained_contender
 from ballfg.benchmarks.estimators.measured import run_measured
@@ -96,7 +97,7 @@ def test_nothing_finished_is_repeated_and_another_recipe_is_refused(
     tasks = measured_tasks(data.datasets, data.transfer, 1, None, data.transfer_tracks)
     runs = small[1] / "runs"
     stamps = {path: path.stat().st_mtime_ns for path in runs.glob("*.json")}
-    collect(tasks, SMALL, 0, runs, 1, ("nominal", "analytic+mnn"))
+    collect_records(tasks, ("nominal", "analytic+mnn"), [0], runs, 1, quick=True)
     assert {path: path.stat().st_mtime_ns for path in runs.glob("*.json")} == stamps
     job = Job(tuple(tasks), "analytic+mnn", 0, runs / "analytic+mnn-0", quick=False)
     with pytest.raises(ValueError, match="must be a training of these tracks by this recipe"):
@@ -179,6 +180,7 @@ def test_the_command_refuses_a_transfer_without_training(tmp_path: Path, capsys:
     for words, message in (
         (["--transfer", "x"], "--transfer needs a model trained on measured tracks"),
         (["--data", "x", "--transfer-tracks", "5"], "--transfer-tracks is of --transfer"),
+        (["--method", "mpl"], "--method must be one of truth, nominal"),
     ):
         with pytest.raises(SystemExit) as ended:
             run(["dynamics", *words, "--out", str(tmp_path)])
@@ -186,19 +188,17 @@ def test_the_command_refuses_a_transfer_without_training(tmp_path: Path, capsys:
         assert message in capsys.readouterr().err
 
 
-def test_the_command_names_all_its_datasets(data: Measured, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_names_all_its_datasets(data: Measured, tmp_path: Path) -> None:
     from ballfg.benchmarks.cli import run
-    from ballfg.benchmarks.dynamics import run as dynamics
 
-    monkeypatch.setattr(dynamics, "METHODS", {"nominal": dynamics.METHODS["nominal"]})
-    monkeypatch.setattr(dynamics.run_dynamics, "__defaults__", (("nominal",),))
     assert data.transfer is not None
     words = [word for one in data.datasets for word in ("--data", str(one.path))]
-    words += ["--transfer", str(data.transfer.path), "--transfer-tracks", "2", "--jobs", "1", "--out", str(tmp_path)]
+    words += ["--transfer", str(data.transfer.path), "--transfer-tracks", "2", "--method", "nominal"]
+    words += ["--jobs", "1", "--out", str(tmp_path)]
     with pytest.raises(SystemExit) as ended:
         run(["dynamics", *words])
     assert ended.value.code == 0
     content = json.loads((tmp_path / "results.json").read_text())
-    expected = "ballfg-bench dynamics --data first --data second --transfer other --transfer-tracks 2 --seed 0"
-    assert content["command"] == expected
+    expected = "ballfg-bench dynamics --data first --data second --transfer other --transfer-tracks 2"
+    assert content["command"] == f"{expected} --method nominal --seed 0"
     assert {row["case"] for row in content["rows"]} == {"first", "second", "other"}

@@ -17,8 +17,7 @@ from ballfg.benchmarks.dynamics.truth import (
     split,
     synthetic_task,
 )
-from ballfg.dynamics import nominal_model
-from ballfg.dynamics import rollout
+from ballfg.dynamics import nominal_model, rollout
 from ballfg.state import POSITION, VELOCITY
 from ballfg.tracks import read_dataset
 
