@@ -21,28 +21,31 @@ if TYPE_CHECKING:
 
 app = typer.Typer(name="ballfg-bench", add_completion=False, pretty_exceptions_enable=False)
 
-Data = Annotated[Path | None, typer.Option("--data", help="Dataset of measured tracks; without it synthetic tracks.")]
+Data = Annotated[Path | None, typer.Option("--data", help="Dataset of measured tracks; synthetic tracks by default.")]
 Datasets = Annotated[
     list[Path] | None,
-    typer.Option("--data", help="Dataset of measured tracks; repeatable; without it synthetic tracks."),
+    typer.Option("--data", help="Dataset of measured tracks; may be repeated; synthetic tracks by default."),
 ]
 Beside = Annotated[
-    list[Path] | None, typer.Option("--data", help="Dataset of measured tracks beside the simulated ones; repeatable.")
+    list[Path] | None,
+    typer.Option("--data", help="Dataset of measured tracks in addition; may be repeated."),
 ]
 Timed = Annotated[
     Path | None, typer.Option("--data", help="Dataset whose tracks are timed in addition to the fixed problem.")
 ]
 Transfer = Annotated[Path | None, typer.Option(help="Dataset on which the models are judged without learning from it.")]
 TransferTracks = Annotated[
-    int | None, typer.Option(min=1, help="Number of tracks, the first ones, of the --transfer dataset; all without it.")
+    int | None, typer.Option(min=1, help="Number of tracks, the first ones, of the --transfer dataset; all by default.")
 ]
 Methods = Annotated[
-    list[str] | None, typer.Option("--method", help="Name of a method that is compared; repeatable; all without it.")
+    list[str] | None,
+    typer.Option("--method", help="Name of a compared method; may be repeated; all by default."),
 ]
 Out = Annotated[Path, typer.Option("--out", help="Folder for results.json and pictures.")]
 Quick = Annotated[bool, typer.Option("--quick", help="A quick look at few tracks or runs, not a measurement.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
-Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Number of processes; one per core without it.")]
+Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Number of processes.", show_default="one per core")]
+EVERY_CORE = default_jobs()
 
 
 @app.callback(invoke_without_command=True)
@@ -54,7 +57,7 @@ def _root(context: typer.Context) -> None:
 
 @app.command()
 def estimators(
-    data: Data = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = None
+    data: Data = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = EVERY_CORE
 ) -> None:
     """Comparison of sliding window, EKF, RTS, online estimator and smoother on the same tracks.
 
@@ -66,17 +69,17 @@ def estimators(
     from ballfg.benchmarks.estimators.suite import FULL, QUICK, run_dataset, run_synthetic
 
     results = _start("estimators", [] if data is None else [data], quick, seed)
-    size, processes = QUICK if quick else FULL, jobs or default_jobs()
+    size = QUICK if quick else FULL
     if data is None:
-        pictures = run_synthetic(results, _folder(out), size, processes)
+        pictures = run_synthetic(results, _folder(out), size, jobs)
     else:
-        dataset = _open(data)
-        pictures = run_dataset(results, dataset, _folder(out), size, processes)
+        dataset = _open(data)  # before the folder: a wrong path leaves nothing behind
+        pictures = run_dataset(results, dataset, _folder(out), size, jobs)
     _finish(results, out, pictures)
 
 
 @app.command()
-def cameras(out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = None) -> None:
+def cameras(out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = EVERY_CORE) -> None:
     """Tracking from rendered videos of three cameras: points, velocities and clocks against the truth.
 
     The recordings have one shutter or three, one ball or two, dropped frames, a clock that is late, and a camera that
@@ -87,7 +90,7 @@ def cameras(out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jo
     from ballfg.benchmarks.cameras.suite import FULL, QUICK, run_cameras
 
     results = _start("cameras", [], quick, seed)
-    _finish(results, out, run_cameras(results, _folder(out), QUICK if quick else FULL, jobs or default_jobs()))
+    _finish(results, out, run_cameras(results, _folder(out), QUICK if quick else FULL, jobs))
 
 
 @app.command()
@@ -99,7 +102,7 @@ def dynamics(
     out: Out = Path("results"),
     quick: Quick = False,
     seed: Seed = 0,
-    jobs: Jobs = None,
+    jobs: Jobs = EVERY_CORE,
 ) -> None:
     """Comparison of dynamics models that are trained on the same tracks and predict the same others.
 
@@ -109,7 +112,8 @@ def dynamics(
 
     Example: ballfg-bench dynamics --quick --out results/dynamics
     """
-    from ballfg.benchmarks.dynamics.suite import FULL, QUICK, Measured, run_dynamics
+    from ballfg.benchmarks.dynamics.measured import Measured
+    from ballfg.benchmarks.dynamics.suite import FULL, QUICK, run_dynamics
 
     if transfer is not None and not data:
         raise ValueError("--transfer needs a model trained on measured tracks; got no --data. Give it, once or more.")
@@ -121,13 +125,13 @@ def dynamics(
     results = _start("dynamics", data or [], quick, seed, words)
     other = None if transfer is None else _open(transfer)
     measured = Measured([_open(one) for one in data], other, transfer_tracks) if data else None
-    plan, processes = QUICK if quick else FULL, jobs or default_jobs()
-    _finish(results, out, run_dynamics(results, measured, _folder(out), plan, processes, method))
+    plan = QUICK if quick else FULL
+    _finish(results, out, run_dynamics(results, measured, _folder(out), plan, jobs, method))
 
 
 @app.command()
 def loop(
-    data: Beside = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = None
+    data: Beside = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = EVERY_CORE
 ) -> None:
     """Test of the diagnosis: planted effects that it names, false alarms, and models that it repairs.
 
@@ -144,7 +148,7 @@ def loop(
     results = _start("loop", data or [], quick, seed)
     for folder in data or []:
         _open(folder)  # a bad one is better known now than hours later
-    _finish(results, out, run_loop(results, data or [], _folder(out), QUICK if quick else FULL, jobs or default_jobs()))
+    _finish(results, out, run_loop(results, data or [], _folder(out), QUICK if quick else FULL, jobs))
 
 
 @app.command()

@@ -6,14 +6,12 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.benchmarks.metrics import Array
 from ballfg.estimation import Settings
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
-
-Array = NDArray[np.float64]
 
 
 def gaussian_settings(

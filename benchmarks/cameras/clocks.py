@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.benchmarks.cameras.scenes import Filmed, truth_at
+from ballfg.benchmarks.metrics import Array
 from ballfg.cli.progress import progress
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import (
@@ -28,8 +29,6 @@ from ballfg.state import POSITION, VELOCITY, VZ
 from ballfg.tracks import Track
 from ballfg.vision import Camera, SeenBall, triangulate
 from ballfg.vision.association.clock import nearest
-
-Array = NDArray[np.float64]
 
 NEAR_BOUNCE: Final = 1.0
 """Frame intervals about a bounce that do not count: a stamp's velocity is before it or after it by chance."""

@@ -16,13 +16,14 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import optimize, stats
 
 from ballfg.benchmarks.diagnosis.cases import Case, Recording, planted_case
 from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.record import case_digest
+from ballfg.benchmarks.metrics import Array
 from ballfg.benchmarks.resumable import read_record, write_record
 from ballfg.diagnosis.fit.columns import signatures
 from ballfg.diagnosis.fit.fit import fit, followed, start_from
@@ -34,8 +35,6 @@ from ballfg.diagnosis.search.hypothesis import declared_free
 from ballfg.diagnosis.search.loop import CONFIRMED
 from ballfg.diagnosis.search.signatures import visible_directions
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces
-
-Array = NDArray[np.float64]
 
 LEVEL = ALARM * CONFIRMED
 """False-alarm rate of one round of the loop: both of its tests must err."""

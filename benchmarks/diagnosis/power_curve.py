@@ -6,10 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import optimize, special
 
-Array = NDArray[np.float64]
+from ballfg.benchmarks.metrics import Array
 
 NAMED = 0.9
 """Share of seeds from which on an effect of some size counts as named."""

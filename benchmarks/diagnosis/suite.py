@@ -34,18 +34,12 @@ def run_loop(
     run: Callable[[Case], Record] = run_case,
     ideal: Callable[[Case], Ideal] = ideal_of,
 ) -> list[Path]:
-    """Plant, diagnose, judge, and add the rows.
-
-    Whatever is finished is kept in `out`: a run that was stopped goes on where it was.
+    """Plant, diagnose, judge, and add the rows. Finished cases are kept: a run that was stopped goes on where it was.
 
     Args:
-        results: gets the rows.
         data: folders of measured tracks, for the part that needs some.
         out: an existing folder.
-        plan: how much.
-        jobs: processes.
-        run: makes the record of a case.
-        ideal: computes the ideal test of a case.
+        run: makes the record of a case.  ideal: computes the ideal test of a case.
     Returns: the pictures written.
     """
     from ballfg.benchmarks.diagnosis.pictures import confusion_picture, power_picture, repair_picture

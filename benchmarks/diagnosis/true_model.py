@@ -1,4 +1,4 @@
-"""The error that a diagnosis could reach: that of the true model, fitted and judged on the same halves of the tracks."""
+"""The error that a diagnosis could reach: that of the true model, on the same halves of the tracks."""
 
 from __future__ import annotations
 

@@ -9,9 +9,9 @@ from typing import Final, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ballfg.benchmarks.dynamics.task import Task
+from ballfg.benchmarks.metrics import Array
 from ballfg.dynamics import BallModel, Surfaces, nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.motion.paths import paths
@@ -20,8 +20,6 @@ from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import Belief, Propagator
 from ballfg.state import POSITION
 from ballfg.tracks import Track
-
-Array = NDArray[np.float64]
 
 BLOCK: Final = 64
 """Tracks that are rolled out together."""

@@ -11,17 +11,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
-from numpy.typing import NDArray
 
 from ballfg.benchmarks.dynamics.record import Record
 from ballfg.benchmarks.dynamics.task import APEXES, Task
 from ballfg.benchmarks.estimators.measured import HORIZON
+from ballfg.benchmarks.metrics import Array
 from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, curve, save
 from ballfg.benchmarks.results import Row
 from ballfg.simulation import SETTING_LEVELS
 from ballfg.simulation.launcher import TABLE_LENGTH, TABLE_WIDTH
-
-Array = NDArray[np.float64]
 
 COLOURS: Final = {
     "truth": "#bdbdbd",

@@ -10,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.benchmarks.dynamics.task import Shot
-from ballfg.benchmarks.metrics import square_norms
+from ballfg.benchmarks.metrics import Array, square_norms
 from ballfg.prediction.apexes import FLIGHTS, flight_bounds, path_apex
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

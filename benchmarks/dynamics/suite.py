@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -13,14 +12,13 @@ from typing import Final
 import numpy as np
 
 from ballfg.benchmarks.dynamics.jobs import collect_records
-from ballfg.benchmarks.dynamics.measured import measured_tasks
+from ballfg.benchmarks.dynamics.measured import Measured, measured_tasks
 from ballfg.benchmarks.dynamics.methods import METHODS
 from ballfg.benchmarks.dynamics.rows import add_rows
 from ballfg.benchmarks.dynamics.task import Task
 from ballfg.benchmarks.dynamics.truth import TRACKS, synthetic_task
 from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.resumable import RUNS_FOLDER
-from ballfg.tracks import Dataset
 
 
 @dataclass(frozen=True)
@@ -40,21 +38,6 @@ class Plan:
     quick: bool
 
 
-@dataclass(frozen=True)
-class Measured:
-    """Measured tracks.
-
-    Attributes:
-        datasets: one model learns from all of them; it is judged on each.
-        transfer: the models are judged on it, but learn nothing from it; None for none.
-        transfer_tracks: how many of its first tracks; None for all.
-    """
-
-    datasets: Sequence[Dataset]
-    transfer: Dataset | None = None
-    transfer_tracks: int | None = None
-
-
 FULL: Final = Plan(tracks=TRACKS, measured=None, seeds=3, quick=False)
 QUICK: Final = Plan(tracks=60, measured=24, seeds=1, quick=True)
 
@@ -62,16 +45,11 @@ QUICK: Final = Plan(tracks=60, measured=24, seeds=1, quick=True)
 def run_dynamics(
     results: Results, data: Measured | None, out: Path, plan: Plan, jobs: int, methods: Sequence[str] | None = None
 ) -> list[Path]:
-    """Train, judge, and add the rows.
-
-    Whatever is finished is kept in `out`: a run that was stopped goes on where it was.
+    """Train, judge, and add the rows. Finished methods are kept in `out`: a run that was stopped goes on where it was.
 
     Args:
-        results: gets the rows.
         data: measured tracks; None for synthetic ones.
         out: an existing folder.
-        plan: how much.
-        jobs: processes.
         methods: names in `METHODS`, None for all; those that do not take part on such tracks are passed over.
     Returns: the pictures written.
     Raises: ValueError: if a method's name is unknown.
@@ -81,7 +59,7 @@ def run_dynamics(
     for name in methods or ():
         if name not in METHODS:
             raise ValueError(f"--method must be one of {', '.join(METHODS)}; got '{name}'. Choose one of them.")
-    tasks = _tasks(results.seed, data, plan, jobs)
+    tasks = [synthetic_task(results.seed, plan.tracks)] if data is None else measured_tasks(data, jobs, plan.measured)
     for task in tasks:
         print(describe(task))
     seeds = range(results.seed, results.seed + plan.seeds)
@@ -97,13 +75,6 @@ def run_dynamics(
         if any(record.fan is not None for record in records):
             pictures.append(fan_picture(records, task.surfaces.table_height, out / f"dynamics_fan{ending}.png"))
     return pictures
-
-
-def _tasks(seed: int, data: Measured | None, plan: Plan, jobs: int) -> list[Task]:
-    if data is None:
-        return [synthetic_task(seed, plan.tracks)]
-    transfer_tracks = min(data.transfer_tracks or sys.maxsize, plan.measured or sys.maxsize)
-    return measured_tasks(data.datasets, data.transfer, jobs, plan.measured, transfer_tracks)
 
 
 def describe(task: Task) -> str:

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job
 from ballfg.benchmarks.dynamics.recipes import content_of, kind_of
 from ballfg.benchmarks.dynamics.record import task_digest
 from ballfg.benchmarks.dynamics.task import Task
+from ballfg.benchmarks.metrics import Array
 from ballfg.dynamics import BallModel, load_model
 from ballfg.estimation import Settings
 from ballfg.estimation.configure import launcher_of, learned_process
@@ -27,7 +27,6 @@ from ballfg.learning.sequence.build import load_sequence
 from ballfg.learning.sequence.predictor import SequencePredictor
 from ballfg.tracks import Track
 
-Array = NDArray[np.float64]
 T = TypeVar("T")
 
 

@@ -8,10 +8,9 @@ from functools import partial
 from itertools import islice, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ballfg.benchmarks.estimators.scoring import LEVELS, sums_and_counts
-from ballfg.benchmarks.metrics import Statistic, bootstrap, inside, pooled_mean, quantile, root_mean_square
+from ballfg.benchmarks.metrics import Array, Statistic, bootstrap, inside, pooled_mean, quantile, root_mean_square
 from ballfg.benchmarks.results import CURVE_MARK, Results
 from ballfg.cli.progress import progress
 from ballfg.dynamics import BallModel, nominal_model
@@ -27,8 +26,6 @@ from ballfg.estimation import (
 from ballfg.estimation.segmentation import Quality
 from ballfg.prediction import TrackPrediction, predict_tracks
 from ballfg.tracks import Dataset
-
-Array = NDArray[np.float64]
 
 OBSERVE = 0.25
 """s of each track that the estimators see."""

@@ -11,6 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from ballfg.benchmarks.gaussian_settings import StepNoise, gaussian_settings
+from ballfg.benchmarks.metrics import Array
 from ballfg.dynamics import BallModel, Surfaces, contact_time, nominal_model, rollout
 from ballfg.estimation import Estimator, ExtendedKalmanFilter, Online, Settings, SlidingWindow, Smoother
 from ballfg.factors.noise import ProcessNoise
@@ -18,8 +19,6 @@ from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate, tabl
 from ballfg.simulation import ProcessNoise as TrueProcessNoise
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ
 from ballfg.tracks import SPIN_LABELS, Track
-
-Array = NDArray[np.float64]
 
 PAPER_SAMPLES = 80
 PAPER_RATE = 100.0

@@ -10,13 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.benchmarks.estimators.protocols import Candidate, Case
-from ballfg.benchmarks.metrics import inside, nees, square_norms
+from ballfg.benchmarks.metrics import Array, inside, nees, square_norms
 from ballfg.benchmarks.resumable import in_processes
 from ballfg.estimation import Status
 from ballfg.estimation.filters.sliding_window import WINDOW
 from ballfg.state import POSITION, SPIN, VELOCITY
-
-Array = NDArray[np.float64]
 
 LEVELS = (0.5, 0.9)
 """Of the intervals whose coverage is reported."""
