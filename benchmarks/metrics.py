@@ -74,17 +74,17 @@ def share(outcomes: Sequence[bool]) -> Figure:
     return Figure(sum(outcomes) / len(outcomes), float(interval.low), float(interval.high))
 
 
-def median_and_range(values: ArrayLike) -> Figure:
+def median_and_range(values: Sequence[float]) -> Figure:
     """The median of some values (n,), with the lowest and the highest one.
 
     Raises: ValueError: if there is no value.
     """
-    if not np.size(values):
+    if not values:
         raise ValueError("values must not be empty; got none. Measure something first.")
-    return Figure(float(np.median(values)), float(np.min(values)), float(np.max(values)))
+    return Figure(float(np.median(values)), min(values), max(values))
 
 
-def median_and_quartiles(values: ArrayLike) -> Figure:
+def median_and_quartiles(values: Sequence[float]) -> Figure:
     """The median of some values (n,), with their lower and upper quartile."""
     low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
     return Figure(float(middle), float(low), float(high))

@@ -101,14 +101,15 @@ def _draw_shares(axes: Axes, shares: np.ndarray) -> None:
 
 def repair_picture(rows: Sequence[Row], path: Path) -> Path:
     """Prediction error over that of the true model, by effect: with the declared and with the corrected model."""
-    found = [row for row in rows if row.case == "repair" and row.metric != ALL and row.low is not None]
+    found = [row for row in rows if row.case == "repair" and row.metric != ALL]
     names = list(dict.fromkeys(row.metric for row in found))
     figure, axes = plt.subplots(figsize=(8, 0.3 * len(names) + 1.6), layout="constrained")
     for column, colour in (("before / true", ORANGE), ("after / true", BLUE)):
         own = [row for row in found if row.method == column]
         places = [names.index(row.metric) for row in own]
-        axes.hlines(places, [row.low for row in own], [row.high for row in own], color=colour, linewidth=1.2)
-        axes.plot([row.value for row in own], places, "o", color=colour, markersize=5, label=column)
+        ratios = np.array([(row.value, row.low, row.high) for row in own], dtype=np.float64).reshape(-1, 3)
+        axes.hlines(places, ratios[:, 1], ratios[:, 2], color=colour, linewidth=1.2)
+        axes.plot(ratios[:, 0], places, "o", color=colour, markersize=5, label=column)
     axes.axvline(1.0, color="black", linewidth=0.8)
     axes.set_yticks(range(len(names)), names, fontsize="small")
     axes.invert_yaxis()

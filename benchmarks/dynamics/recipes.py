@@ -57,13 +57,13 @@ def kind_of(method: str) -> str:
 def content_of(method: str, quick: bool, measured: bool) -> dict[str, Any]:
     """The config of a method. Those of one family differ in `kind` and in the augmentation that it implies."""
     kind = kind_of(method)
-    common = {"kind": kind, "split": {"by": "label"}, "workers": 1}
+    common: dict[str, Any] = {"kind": kind, "split": {"by": "label"}, "workers": 1}
     epochs = {"epochs": QUICK_EPOCHS} if quick else {}
     if kind in SEQUENCES:
         cold = {"warm_start_epochs": 0} if quick else {}
         return common | {"optimizer": SEQUENCE_OPTIMIZERS[kind] | epochs | cold}
     content = common | (MEASURED if measured else SIMULATED)
     content["optimizer"] = content["optimizer"] | epochs
-    architecture = {"residual": True} if method == RESIDUAL else {}
+    architecture: dict[str, Any] = {"residual": True} if method == RESIDUAL else {}
     architecture |= {"pretrain": QUICK_PRETRAIN} if quick and kind in NETWORKS else {}
     return content | ({"architecture": architecture} if architecture else {})

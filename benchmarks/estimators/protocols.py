@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from ballfg.benchmarks.gaussian_settings import StepNoise, gaussian_settings
 from ballfg.benchmarks.metrics import Array
+from ballfg.cli.progress import progress
 from ballfg.dynamics import BallModel, Surfaces, contact_time, nominal_model, rollout
 from ballfg.estimation import Estimator, ExtendedKalmanFilter, Online, Settings, SlidingWindow, Smoother
 from ballfg.factors.noise import ProcessNoise
@@ -154,7 +155,7 @@ def fair_protocol(count: int, seed: int, name: str = "fair") -> Protocol:
     )
     tracks = [
         Case(s.track, s.true_states, away_from_bounces(s.true_times, s.true_states, kind.model, kind.surfaces))
-        for s in simulate(config)
+        for s in progress(simulate(config), count, "tracks simulated")
     ]
     settings = gaussian_settings(FAIR_NOISE, process, FAIR_SPIN_NOISE)
     given = (kind.model, kind.surfaces, settings)
