@@ -30,6 +30,8 @@ from ballfg.tracks import Track
 from ballfg.vision import Camera, SeenBall, triangulate
 from ballfg.vision.association.clock import nearest
 
+NAIVE, FACTORS = "smoother, as if synchronised", "smoother, camera factors"
+"""Two of the ways to estimate, which are compared with each other."""
 NEAR_BOUNCE: Final = 1.0
 """Frame intervals about a bounce that do not count: a stamp's velocity is before it or after it by chance."""
 BLIND: Final = 20.0
@@ -67,13 +69,13 @@ def compare(filmed: Filmed) -> dict[str, Velocities]:
     """
     rate, cameras = filmed.recording.config.rate, filmed.recording.cameras
     ways: dict[str, Callable[[], list[Estimate]]] = {
-        "smoother, as if synchronised": lambda: _from_points(
+        NAIVE: lambda: _from_points(
             filmed, [_as_if_synchronised(ball, cameras, rate) for ball in filmed.tracking.balls]
         ),
         "smoother, interpolated": lambda: _from_points(
             filmed, [(ball.times, ball.points) for ball in filmed.tracking.balls]
         ),
-        "smoother, camera factors": lambda: _from_sightings(filmed, Smoother),
+        FACTORS: lambda: _from_sightings(filmed, Smoother),
         "online, camera factors": lambda: _from_sightings(filmed, Online),
     }
     return {name: _judged(filmed, ways[name]()) for name in progress(ways, len(ways), "ways of estimating compared")}

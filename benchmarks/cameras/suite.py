@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.benchmarks.cameras.clocks import Velocities, clocks, compare
+from ballfg.benchmarks.cameras.clocks import FACTORS, NAIVE, Velocities, clocks, compare
 from ballfg.benchmarks.cameras.scenes import Filmed, Judged, Scenario, film, judge, scenarios
 from ballfg.benchmarks.cameras.speed import push_times, stream_times
 from ballfg.benchmarks.cameras.turned import AXES, TURN, Turn, turns
@@ -22,7 +22,6 @@ from ballfg.simulation.scene import Clock
 
 LATE: Final = {"right": 0.004}
 """s, by which cameras' stamps are late in the recordings whose clocks are to be found."""
-NAIVE, FACTORS = "smoother, as if synchronised", "smoother, camera factors"
 
 
 @dataclass(frozen=True)

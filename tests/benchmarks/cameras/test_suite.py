@@ -7,9 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.cameras.clocks import clocks, compare
+from ballfg.benchmarks.cameras.clocks import FACTORS, NAIVE, clocks, compare
 from ballfg.benchmarks.cameras.scenes import Filmed, Scenario, judge, scenarios, truth_at
-from ballfg.benchmarks.cameras.suite import FACTORS, NAIVE, add_points, add_velocities
+from ballfg.benchmarks.cameras.suite import add_points, add_velocities
 from ballfg.benchmarks.cameras.turned import TURN, turned, turns
 from ballfg.benchmarks.results import Results
 from ballfg.simulation.scene import Clock, Recording
