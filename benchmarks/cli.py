@@ -19,73 +19,78 @@ if TYPE_CHECKING:
     from ballfg.benchmarks.results import Results
     from ballfg.tracks import Dataset
 
-app = typer.Typer(
-    name="ballfg-bench",
-    help="Estimators, dynamics models and the diagnosis, measured: a table, results.json, pictures.",
-    add_completion=False,
-    pretty_exceptions_enable=False,
-)
+app = typer.Typer(name="ballfg-bench", add_completion=False, pretty_exceptions_enable=False)
 
-Data = Annotated[Path | None, typer.Option("--data", help="Dataset of measured tracks; synthetic ones without it.")]
+Data = Annotated[Path | None, typer.Option("--data", help="Dataset of measured tracks; synthetic tracks by default.")]
 Datasets = Annotated[
     list[Path] | None,
-    typer.Option("--data", help="Dataset of measured tracks, several times for several; synthetic ones without it."),
+    typer.Option("--data", help="Dataset of measured tracks; may be repeated; synthetic tracks by default."),
 ]
-MeasuredBeside = Annotated[
-    list[Path] | None, typer.Option("--data", help="Dataset of measured tracks beside the simulated ones; repeatable.")
+Beside = Annotated[
+    list[Path] | None,
+    typer.Option("--data", help="Dataset of measured tracks in addition; may be repeated."),
 ]
-Transfer = Annotated[Path | None, typer.Option(help="Dataset that the models are judged on without learning from it.")]
-TransferTracks = Annotated[int | None, typer.Option(min=1, help="Only so many of its first tracks.")]
+Timed = Annotated[
+    Path | None, typer.Option("--data", help="Dataset whose tracks are timed in addition to the fixed problem.")
+]
+Transfer = Annotated[Path | None, typer.Option(help="Dataset on which the models are judged without learning from it.")]
+TransferTracks = Annotated[
+    int | None, typer.Option(min=1, help="Number of tracks, the first ones, of the --transfer dataset; all by default.")
+]
+Methods = Annotated[
+    list[str] | None,
+    typer.Option("--method", help="Name of a compared method; may be repeated; all by default."),
+]
 Out = Annotated[Path, typer.Option("--out", help="Folder for results.json and pictures.")]
-Quick = Annotated[bool, typer.Option("--quick", help="Fewer tracks or runs: a look, not a measurement.")]
-Seed = Annotated[int, typer.Option("--seed", min=0, help="Of every random choice.")]
-Jobs = Annotated[int | None, typer.Option("--jobs", min=1, help="Processes; one per core without it.")]
+Quick = Annotated[bool, typer.Option("--quick", help="A quick look at few tracks or runs, not a measurement.")]
+Seed = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
+Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Number of processes.", show_default="one per core")]
+EVERY_CORE = default_jobs()
 
 
 @app.callback(invoke_without_command=True)
 def _root(context: typer.Context) -> None:
-    """Estimators, dynamics models and the diagnosis, measured: a table, results.json, pictures."""
+    """Benchmarks of estimators, cameras, dynamics models, diagnosis and speed: tables, results.json, pictures."""
     if context.invoked_subcommand is None:
         typer.echo(context.get_help())
 
 
 @app.command()
 def estimators(
-    data: Data = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = None
+    data: Data = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = EVERY_CORE
 ) -> None:
-    """Sliding window, EKF, RTS, online and smoother on the same tracks.
+    """Comparison of sliding window, EKF, RTS, online estimator and smoother on the same tracks.
 
-    Without --data: synthetic tracks with known truth, by the paper's protocol and by a fair one. With it: observe the
-    first 0.25 s of each measured track, predict the next 0.3 s.
+    Without --data: synthetic tracks with known truth, by the paper's protocol and by a fair one. With --data: each
+    estimator observes the first 0.25 s of each measured track and predicts the next 0.3 s.
 
     Example: ballfg-bench estimators --data data/aimy --out results/aimy
     """
-    from ballfg.benchmarks.estimators.run import FULL, QUICK, run_dataset, run_synthetic
+    from ballfg.benchmarks.estimators.suite import FULL, QUICK, run_dataset, run_synthetic
 
     results = _start("estimators", [] if data is None else [data], quick, seed)
-    size, processes = QUICK if quick else FULL, jobs or default_jobs()
+    size = QUICK if quick else FULL
     if data is None:
-        pictures = run_synthetic(results, _folder(out), size, processes)
+        pictures = run_synthetic(results, _folder(out), size, jobs)
     else:
-        dataset = _open(data)
-        pictures = run_dataset(results, dataset, _folder(out), size, processes)
+        dataset = _open(data)  # before the folder: a wrong path leaves nothing behind
+        pictures = run_dataset(results, dataset, _folder(out), size, jobs)
     _finish(results, out, pictures)
 
 
 @app.command()
-def cameras(out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = None) -> None:
-    """From rendered videos of three cameras to points, velocities and clocks, against the truth.
+def cameras(out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = EVERY_CORE) -> None:
+    """Tracking from rendered videos of three cameras: points, velocities and clocks against the truth.
 
-    Recordings with one shutter and with three, one ball and two, dropped frames, a clock that is late, a camera that
-    was turned after its calibration; and what it costs.
+    The recordings have one shutter or three, one ball or two, dropped frames, a clock that is late, and a camera that
+    was turned after its calibration. The speed of the tracking is measured too.
 
     Example: ballfg-bench cameras --out results/cameras
     """
-    from ballfg.benchmarks.cameras.run import FULL, QUICK, run_cameras
+    from ballfg.benchmarks.cameras.suite import FULL, QUICK, run_cameras
 
     results = _start("cameras", [], quick, seed)
-    pictures = run_cameras(results, _folder(out), QUICK if quick else FULL, jobs or default_jobs())
-    _finish(results, out, pictures)
+    _finish(results, out, run_cameras(results, _folder(out), QUICK if quick else FULL, jobs))
 
 
 @app.command()
@@ -93,20 +98,22 @@ def dynamics(
     data: Datasets = None,
     transfer: Transfer = None,
     transfer_tracks: TransferTracks = None,
+    method: Methods = None,
     out: Out = Path("results"),
     quick: Quick = False,
     seed: Seed = 0,
-    jobs: Jobs = None,
+    jobs: Jobs = EVERY_CORE,
 ) -> None:
-    """Dynamics models: trained on the same tracks, predicting the same others; errors over tracks and of their apexes.
+    """Comparison of dynamics models that are trained on the same tracks and predict the same others.
 
-    Without --data: 717 synthetic launcher tracks, whose truth no compared model holds. With it: learn from every second
-    measured track; of the others observe the first 0.25 s and predict the next 0.3 s. Several datasets train one model.
-    What is finished is kept in OUT/runs, so that a run that was stopped goes on.
+    Without --data: 717 synthetic launcher tracks, whose truth no compared model holds. With --data: every second
+    measured track is for training; of the others 0.25 s are observed and the next 0.3 s predicted. Several datasets
+    train one model. Finished parts are kept in OUT/runs, so that a stopped run can be continued.
 
     Example: ballfg-bench dynamics --quick --out results/dynamics
     """
-    from ballfg.benchmarks.dynamics.run import FULL, QUICK, Measured, run_dynamics
+    from ballfg.benchmarks.dynamics.measured import Measured
+    from ballfg.benchmarks.dynamics.suite import FULL, QUICK, run_dynamics
 
     if transfer is not None and not data:
         raise ValueError("--transfer needs a model trained on measured tracks; got no --data. Give it, once or more.")
@@ -114,55 +121,53 @@ def dynamics(
         raise ValueError("--transfer-tracks is of --transfer; got none. Give it, or leave both out.")
     words = [] if transfer is None else ["--transfer", transfer.resolve().name]
     words += [] if transfer_tracks is None else ["--transfer-tracks", str(transfer_tracks)]
+    words += [word for name in method or () for word in ("--method", name)]
     results = _start("dynamics", data or [], quick, seed, words)
     other = None if transfer is None else _open(transfer)
     measured = Measured([_open(one) for one in data], other, transfer_tracks) if data else None
-    pictures = run_dynamics(results, measured, _folder(out), QUICK if quick else FULL, jobs or default_jobs())
-    _finish(results, out, pictures)
+    plan = QUICK if quick else FULL
+    _finish(results, out, run_dynamics(results, measured, _folder(out), plan, jobs, method))
 
 
 @app.command()
 def loop(
-    data: MeasuredBeside = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = None
+    data: Beside = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = EVERY_CORE
 ) -> None:
-    """The diagnosis: does it name what was planted, stay silent where nothing was, and mend the model?
+    """Test of the diagnosis: planted effects that it names, false alarms, and models that it repairs.
 
-    Simulated datasets with every catalogue effect in several sizes, with pairs of them, with nothing lacking, and with
-    physics of no catalogue; next to the ideal test of each effect alone. --data adds measured tracks, diagnosed with
-    the nominal model and with gravity, drag and the bounce only. What is finished is kept in OUT/runs, so that a run
-    that was stopped goes on.
+    The simulated datasets hold every catalogue effect in several sizes, pairs of effects, nothing that the model lacks,
+    or physics of no catalogue; the ideal test of each effect alone stands beside them. --data adds measured tracks,
+    diagnosed with the nominal model and with gravity, drag and the bounce only. Finished parts are kept in OUT/runs, so
+    that a stopped run can be continued.
 
     Example: ballfg-bench loop --data data/aimy --out results/loop
     """
-    from ballfg.benchmarks.diagnosis.run import FULL, QUICK, run_loop
+    from ballfg.benchmarks.diagnosis.cases import FULL, QUICK
+    from ballfg.benchmarks.diagnosis.suite import run_loop
 
     results = _start("loop", data or [], quick, seed)
     for folder in data or []:
         _open(folder)  # a bad one is better known now than hours later
-    pictures = run_loop(results, data or [], _folder(out), QUICK if quick else FULL, jobs or default_jobs())
-    _finish(results, out, pictures)
+    _finish(results, out, run_loop(results, data or [], _folder(out), QUICK if quick else FULL, jobs))
 
 
 @app.command()
-def speed(data: Data = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0) -> None:
-    """What an estimate, an update and a prediction cost, next to a control; one thread, warm, medians.
+def speed(data: Timed = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0) -> None:
+    """Times of an estimate, an update and a prediction next to a control: one thread, warm, medians.
 
     The problem is fixed: 80 observations of a free flight. --data adds the time per track of a dataset.
 
     Example: ballfg-bench speed --out results/speed
     """
-    from ballfg.benchmarks.speed.run import run_speed
+    from ballfg.benchmarks.speed.suite import FULL, QUICK, run_speed
 
     results = _start("speed", [] if data is None else [data], quick, seed)
-    run_speed(results, None if data is None else _open(data), quick)
+    run_speed(results, None if data is None else _open(data), QUICK if quick else FULL)
     _finish(results, _folder(out), [])
 
 
 def _start(command: str, data: Sequence[Path], quick: bool, seed: int, more: Sequence[str] = ()) -> Results:
-    """Empty results that name the command; of a dataset's path only the folder's name is kept.
-
-    Args: more: words between the datasets and the rest.
-    """
+    """Empty results that name the command, with `more` words after the datasets; of a path only the folder's name."""
     import torch
 
     from ballfg.benchmarks.results import Results
@@ -170,13 +175,12 @@ def _start(command: str, data: Sequence[Path], quick: bool, seed: int, more: Seq
     torch.set_num_threads(1)
     words = ["ballfg-bench", command]
     words += [word for one in data for word in ("--data", one.resolve().name)]
-    words += more
-    words += ["--quick"] if quick else []
-    return Results(" ".join([*words, "--seed", str(seed)]), seed)
+    words += [*more, *(["--quick"] if quick else []), "--seed", str(seed)]
+    return Results(" ".join(words), seed)
 
 
 def _open(data: Path) -> Dataset:
-    """A dataset; what was repaired in it is said on stderr."""
+    """A dataset; repairs in it are noted on stderr."""
     from ballfg.tracks import read_dataset
 
     dataset = read_dataset(data)

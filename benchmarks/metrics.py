@@ -1,13 +1,13 @@
-"""What is computed from errors: root mean squares, NEES, coverage, and intervals for all of them by the bootstrap."""
+"""Figures from errors and outcomes: root mean squares, NEES, coverage, shares, quantiles, and their intervals."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2, norm
+from scipy.stats import binomtest, chi2, norm
 
 Array = NDArray[np.float64]
 Index = NDArray[np.int64]
@@ -15,7 +15,7 @@ Index = NDArray[np.int64]
 RESAMPLES = 1000
 """Of the bootstrap: the ends of a 95 % interval then move by about a tenth of its length."""
 CONFIDENCE = 0.95
-"""Of the bootstrap intervals."""
+"""Of the bootstrap's and of Wilson's intervals."""
 BAND = 0.99
 """Of the chi-square bands."""
 
@@ -35,6 +35,11 @@ class Figure:
 def square_norms(errors: Array) -> Array:
     """(n,) squared lengths of error vectors (n, d)."""
     return np.asarray(np.einsum("nd,nd->n", errors, errors))
+
+
+def root_mean_square(errors: Array) -> float:
+    """Root mean square length of error vectors (n, d)."""
+    return float(np.sqrt(square_norms(errors).mean()))
 
 
 def nees(errors: Array, covariances: Array) -> Array:
@@ -58,13 +63,36 @@ def inside(errors: Array, sigmas: Array, level: float) -> NDArray[np.bool_]:
     return np.asarray(np.abs(errors) <= norm.ppf((1 + level) / 2) * sigmas)
 
 
-def bootstrap(statistic: Statistic, count: int, rng: np.random.Generator) -> Figure:
-    """A figure over tracks, with its percentile interval when tracks are drawn with replacement.
+def share(outcomes: Sequence[bool]) -> Figure:
+    """The share of true outcomes, with Wilson's interval.
 
-    Args:
-        statistic: vectorised over resamples.
-        count: number of tracks.
-        rng: draws them.
+    Raises: ValueError: if there is no outcome.
+    """
+    if not outcomes:
+        raise ValueError("outcomes must not be empty; got none. Count something first.")
+    interval = binomtest(sum(outcomes), len(outcomes)).proportion_ci(CONFIDENCE, method="wilson")
+    return Figure(sum(outcomes) / len(outcomes), float(interval.low), float(interval.high))
+
+
+def median_and_range(values: Sequence[float]) -> Figure:
+    """The median of some values (n,), with the lowest and the highest one.
+
+    Raises: ValueError: if there is no value.
+    """
+    if not values:
+        raise ValueError("values must not be empty; got none. Measure something first.")
+    return Figure(float(np.median(values)), min(values), max(values))
+
+
+def median_and_quartiles(values: Sequence[float]) -> Figure:
+    """The median of some values (n,), with their lower and upper quartile."""
+    low, middle, high = np.quantile(values, [0.25, 0.5, 0.75])
+    return Figure(float(middle), float(low), float(high))
+
+
+def bootstrap(statistic: Statistic, count: int, rng: np.random.Generator) -> Figure:
+    """A figure over `count` tracks, with its percentile interval when tracks are drawn with replacement.
+
     Raises: ValueError: if there is no track.
     """
     if count < 1:
@@ -75,19 +103,16 @@ def bootstrap(statistic: Statistic, count: int, rng: np.random.Generator) -> Fig
     return Figure(value, float(low), float(high))
 
 
-def pooled_rms(sums: ArrayLike, counts: ArrayLike) -> Statistic:
-    """The statistic sqrt(sum of squares / number) over all samples of all tracks.
-
-    Args: sums: (m,) of squares in each track.  counts: (m,) samples in each track.
-    """
-    total, number = np.asarray(sums, dtype=np.float64), np.asarray(counts, dtype=np.float64)
-    return lambda tracks: np.sqrt(total[tracks].sum(-1) / number[tracks].sum(-1))
-
-
 def pooled_mean(sums: ArrayLike, counts: ArrayLike) -> Statistic:
-    """The statistic sum / number over all samples of all tracks."""
+    """The statistic sum / number over all samples of all tracks, from each track's sum and number (m,)."""
     total, number = np.asarray(sums, dtype=np.float64), np.asarray(counts, dtype=np.float64)
     return lambda tracks: total[tracks].sum(-1) / number[tracks].sum(-1)
+
+
+def pooled_rms(sums: ArrayLike, counts: ArrayLike) -> Statistic:
+    """The statistic sqrt(sum of squares / number) over all samples of all tracks."""
+    mean_square = pooled_mean(sums, counts)
+    return lambda tracks: np.sqrt(mean_square(tracks))
 
 
 def ratio(above: Statistic, below: Statistic) -> Statistic:

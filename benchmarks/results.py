@@ -1,10 +1,9 @@
-"""What a benchmark hands over: rows of numbers, as `results.json` and as a table on the terminal."""
+"""The rows of numbers that a benchmark hands over, as `results.json` and as a table on the terminal."""
 
 from __future__ import annotations
 
 import json
 import math
-import os
 import platform
 import sys
 from collections.abc import Iterable
@@ -14,9 +13,11 @@ from pathlib import Path
 from typing import Any, TextIO
 
 from ballfg.benchmarks.metrics import Figure
-from ballfg.files.whole_file import write_text
+from ballfg.cli.inputs import default_jobs
+from ballfg.files.whole_file import whole_file
 
 PACKAGES = ("ballfg", "gtsam", "torch", "numpy", "scipy", "filterpy")
+"""The numbers depend on their versions, and on Python's."""
 RESULTS_FILE = "results.json"
 CURVE_MARK = "@"
 """In a metric's name before the place on a curve, as in `velocity_rmse_newest@20`: pictures show it, tables do not."""
@@ -28,13 +29,12 @@ class Row:
 
     Attributes:
         case: names the data (`paper`, `fair`, `aimy` ...).
-        method: what produced it (`smoother`, `ekf` ...).
-        metric: what it is.
-        unit: SI, or `1` for none.
+        method: names the estimator, model or part (`smoother`, `ekf` ...).
+        metric: names the quantity.
+        unit: SI or a multiple, or `1` for none.
         value: None where it is not finite.
-        low: lower end of its interval, None where it has none.
-        high: upper end.
-        n: how many tracks, samples or runs it is over; docs/benchmarks.md says which for each metric.
+        low, high: ends of its interval, None where it has none.
+        n: number of tracks, samples or runs; docs/benchmarks.md says which for each metric.
     """
 
     case: str
@@ -53,8 +53,7 @@ class Results:
 
     Attributes:
         command: as typed, with a dataset's folder name in place of its path.
-        seed: of every random choice.
-        rows: one a number.
+        seed: random seed.
     """
 
     command: str
@@ -76,19 +75,16 @@ class Results:
 
     def to_dict(self) -> dict[str, Any]:
         """The content of `results.json`."""
-        return {
-            "command": self.command,
-            "versions": versions(),
-            "machine": machine(),
-            "seed": self.seed,
-            "rows": [asdict(row) for row in self.rows],
-        }
+        versions = {"python": platform.python_version()} | {name: metadata.version(name) for name in PACKAGES}
+        rows = [asdict(row) for row in self.rows]
+        return {"command": self.command, "versions": versions, "machine": machine(), "seed": self.seed, "rows": rows}
 
     def write(self, folder: Path) -> Path:
-        """Write `results.json`; the name appears once the file is whole."""
+        """Write `results.json` whole or not at all."""
         folder.mkdir(parents=True, exist_ok=True)
         path = folder / RESULTS_FILE
-        write_text(path, json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n")
+        with whole_file(path) as part:
+            part.write_text(json.dumps(self.to_dict(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
         return path
 
 
@@ -96,15 +92,9 @@ def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
 
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that the numbers depend on."""
-    return {"python": platform.python_version()} | {name: metadata.version(name) for name in PACKAGES}
-
-
 def machine() -> dict[str, Any]:
-    """Processor and cores that this process may use; nothing that tells one user's machine from another's."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"cpu": _cpu_model(), "cores": cores, "system": f"{platform.system()} {platform.machine()}"}
+    """Processor, usable cores and system; nothing that identifies a user's machine."""
+    return {"cpu": _cpu_model(), "cores": default_jobs(), "system": f"{platform.system()} {platform.machine()}"}
 
 
 def _cpu_model() -> str:

@@ -1,8 +1,8 @@
-"""Cameras whose shutters do not open together: what camera factors gain, and what their clocks are found to be."""
+"""Cameras whose shutters do not open together: velocities from camera factors and from points, and clock offsets."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -10,19 +10,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.benchmarks.cameras.scenes import Filmed, truth_at
+from ballfg.benchmarks.metrics import Array
 from ballfg.dynamics import nominal_model
-from ballfg.estimation import Estimate, Online, Settings, Smoother
+from ballfg.estimation import (
+    Estimate,
+    Online,
+    Settings,
+    Smoother,
+    TimeOffsets,
+    estimate_time_offsets,
+    sighted_track,
+)
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
-from ballfg.estimation.observations.sightings import sighted_track
-from ballfg.estimation.smoother.time_offsets import TimeOffsets, estimate_time_offsets
+from ballfg.progress import progress
 from ballfg.simulation.scene import Flight
 from ballfg.state import POSITION, VELOCITY, VZ
 from ballfg.tracks import Track
 from ballfg.vision import Camera, SeenBall, triangulate
 from ballfg.vision.association.clock import nearest
 
-Array = NDArray[np.float64]
-
+NAIVE, FACTORS = "smoother, as if synchronised", "smoother, camera factors"
+"""Two of the ways to estimate, which are compared with each other."""
 NEAR_BOUNCE: Final = 1.0
 """Frame intervals about a bounce that do not count: a stamp's velocity is before it or after it by chance."""
 BLIND: Final = 20.0
@@ -58,15 +66,31 @@ def compare(filmed: Filmed) -> dict[str, Velocities]:
     All estimates are the smoother's or the online estimator's with the same model, priors and process noise; the noise
     of points is what they scatter by. Each is judged at its own stamps.
     """
-    balls = filmed.tracking.balls
-    interpolated = [(ball.times, ball.points) for ball in balls]
-    naive = [_as_if_synchronised(ball, filmed.recording.cameras, filmed.recording.config.rate) for ball in balls]
-    ways = {"smoother, as if synchronised": naive, "smoother, interpolated": interpolated}
-    found = {name: _judged(filmed, _smoothed_points(filmed, points)) for name, points in ways.items()}
-    for name, kind in (("smoother, camera factors", Smoother), ("online, camera factors", Online)):
-        estimator = kind(nominal_model(), filmed.recording.config.ball.surfaces, _settings(None))
-        found[name] = _judged(filmed, [_states(estimator.estimate(track)) for track in sighted(filmed)])
-    return found
+    rate, cameras = filmed.recording.config.rate, filmed.recording.cameras
+    ways: dict[str, Callable[[], list[Estimate]]] = {
+        NAIVE: lambda: _from_points(
+            filmed, [_as_if_synchronised(ball, cameras, rate) for ball in filmed.tracking.balls]
+        ),
+        "smoother, interpolated": lambda: _from_points(
+            filmed, [(ball.times, ball.points) for ball in filmed.tracking.balls]
+        ),
+        FACTORS: lambda: _from_sightings(filmed, Smoother),
+        "online, camera factors": lambda: _from_sightings(filmed, Online),
+    }
+    return {name: _judged(filmed, ways[name]()) for name in progress(ways, len(ways), "ways of estimating compared")}
+
+
+def _from_sightings(filmed: Filmed, kind: type[Smoother] | type[Online]) -> list[Estimate]:
+    estimator = kind(nominal_model(), filmed.recording.config.ball.surfaces, Settings.for_measured(nominal_model()))
+    return [estimator.estimate(track) for track in sighted(filmed)]
+
+
+def _from_points(filmed: Filmed, balls: Sequence[tuple[Array, Array]]) -> list[Estimate]:
+    tracks = [Track(f"{k:03d}", times, points) for k, (times, points) in enumerate(balls)]
+    x, y, z = estimate_position_noise(tracks).tolist()
+    settings = Settings.for_measured(nominal_model(), position_noise=(x, y, z))
+    smoother = Smoother(nominal_model(), filmed.recording.config.ball.surfaces, settings)
+    return [smoother.estimate(track) for track in tracks]
 
 
 def _as_if_synchronised(ball: SeenBall, cameras: Sequence[Camera], rate: float) -> tuple[Array, Array]:
@@ -96,42 +120,20 @@ def _as_if_synchronised(ball: SeenBall, cameras: Sequence[Camera], rate: float) 
 def clocks(filmed: Filmed) -> TimeOffsets:
     """The cameras' time offsets, from all balls."""
     surfaces = filmed.recording.config.ball.surfaces
-    return estimate_time_offsets(sighted(filmed), nominal_model(), surfaces, _settings(None))
+    return estimate_time_offsets(sighted(filmed), nominal_model(), surfaces, Settings.for_measured(nominal_model()))
 
 
-def _settings(noise: Array | None) -> Settings:
-    if noise is None:
-        return Settings.for_measured(nominal_model())
-    x, y, z = noise.tolist()
-    return Settings.for_measured(nominal_model(), position_noise=(x, y, z))
-
-
-States = tuple[Array, Array]
-"""Times (n,) s and states (n, 9)."""
-
-
-def _states(estimate: Estimate) -> States:
-    return estimate.times, estimate.states
-
-
-def _smoothed_points(filmed: Filmed, balls: Sequence[tuple[Array, Array]]) -> list[States]:
-    tracks = [Track(f"{k:03d}", times, points) for k, (times, points) in enumerate(balls)]
-    settings = _settings(estimate_position_noise(tracks))
-    smoother = Smoother(nominal_model(), filmed.recording.config.ball.surfaces, settings)
-    return [_states(smoother.estimate(track)) for track in tracks]
-
-
-def _judged(filmed: Filmed, estimates: Sequence[States]) -> Velocities:
+def _judged(filmed: Filmed, estimates: Sequence[Estimate]) -> Velocities:
     """Errors by flight, at the stamps of each estimate, away from bounces."""
     step = 1.0 / filmed.recording.config.rate
     sums = np.zeros((3, len(filmed.recording.flights)))
     for number, flight in enumerate(filmed.recording.flights):
-        for times, states in estimates:
-            error = states - truth_at(flight, times)
+        for estimate in estimates:
+            error = estimate.states - truth_at(flight, estimate.times)
             far = np.nan_to_num(np.linalg.norm(error[:, POSITION], axis=1), nan=np.inf)
-            error = error[(far < OTHER_BALL) & _apart_from_bounces(flight, times, step)]
+            error = error[(far < OTHER_BALL) & _apart_from_bounces(flight, estimate.times, step)]
             sums[:, number] += (error[:, VELOCITY] ** 2).sum(), len(error), (error[:, POSITION] ** 2).sum()
-    return Velocities(sums[0], sums[1], sums[2])
+    return Velocities(*sums)
 
 
 def _apart_from_bounces(flight: Flight, times: Array, step: float) -> NDArray[np.bool_]:

@@ -11,8 +11,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.benchmarks.metrics import nees
-from ballfg.progress import progress
+from ballfg.benchmarks.metrics import Array, nees, root_mean_square
 from ballfg.simulation.cameras import table_rig
 from ballfg.simulation.scene import Flight, Recording, SceneConfig, free_running, record, write_scene
 from ballfg.vision.association.clock import nearest
@@ -20,8 +19,6 @@ from ballfg.vision.association.seen_ball import SeenBall
 from ballfg.vision.detection.detect import detect_all
 from ballfg.vision.detection.detections import Detections
 from ballfg.vision.tracking.pipeline import Tracking, track_detections
-
-Array = NDArray[np.float64]
 
 FALSE: Final = 0.05
 """m. A point further from every ball than that is not of a ball."""
@@ -33,13 +30,7 @@ SAME_FRAME: Final = 0.5
 
 @dataclass(frozen=True)
 class Scenario:
-    """One way to film.
-
-    Attributes:
-        name: of the rows.
-        config: what is filmed.
-        shared: whether all cameras expose at once.
-    """
+    """One way to film: the name of its rows, the scene, and whether all cameras expose at once."""
 
     name: str
     config: SceneConfig
@@ -51,27 +42,20 @@ class Scenario:
         if self.shared:
             return record(self.config, rig)
         clocks = free_running([camera.name for camera in rig], self.config.rate, self.config.seed)
-        late = {
-            name: replace(clock, offset=self.config.clocks[name].offset)
-            for name, clock in clocks.items()
-            if name in self.config.clocks
-        }
-        return record(replace(self.config, clocks=clocks | late), rig)
+        for name, given in self.config.clocks.items():
+            clocks[name] = replace(clocks[name], offset=given.offset)
+        return record(replace(self.config, clocks=clocks), rig)
 
 
 def scenarios(shots: int, seed: int) -> list[Scenario]:
-    """The ways to film that the benchmark goes through.
-
-    Args: shots: balls in each.  seed: of the first; the others count on.
-    """
+    """The ways to film that the benchmark goes through, each with so many balls; seeds count up from the first."""
     base = SceneConfig(shots=shots, seed=seed)
+    slow = replace(base, rate=60.0, exposure=0.004, colour="orange")
     return [
         Scenario("synchronised, 120 Hz", base),
         Scenario("unsynchronised, 120 Hz", replace(base, seed=seed + 1), shared=False),
         Scenario("two balls at once", replace(base, seed=seed + 2, interval=0.7)),
-        Scenario(
-            "60 Hz, shutter 4 ms, orange", replace(base, seed=seed + 3, rate=60.0, exposure=0.004, colour="orange")
-        ),
+        Scenario("60 Hz, shutter 4 ms, orange", replace(slow, seed=seed + 3)),
         Scenario("dropped frames 10 %, noisy", replace(base, seed=seed + 4, dropout=0.1, noise=4.0)),
     ]
 
@@ -86,26 +70,19 @@ class Filmed:
     tracking: Tracking
 
 
-def film(scenario: Scenario, *, quiet: bool = False) -> Filmed:
-    """Draws a scenario into videos, with progress if not quiet, and tracks the balls in them; the videos go again."""
+def film(scenario: Scenario) -> Filmed:
+    """Draws a scenario into videos and tracks the balls in them; the videos are deleted again."""
     recording = scenario.recording()
     with TemporaryDirectory() as folder:
         scene = Path(folder) / "scene"
-        draw(recording, scene, "" if quiet else scenario.name)
+        write_scene(scene, recording)
+        names = [camera.name for camera in recording.cameras]
         found = detect_all(
-            {camera.name: scene / f"{camera.name}.mp4" for camera in recording.cameras},
-            stamps={camera.name: scene / f"{camera.name}_stamps.csv" for camera in recording.cameras},
+            {name: scene / f"{name}.mp4" for name in names},
+            stamps={name: scene / f"{name}_stamps.csv" for name in names},
         )
     detections = tuple(found.values())
     return Filmed(scenario, recording, detections, track_detections(detections, recording.cameras))
-
-
-def draw(recording: Recording, folder: Path, name: str) -> None:
-    """Writes a recording's videos and stamps; with progress, if it has a name to be shown by."""
-    if name:
-        write_scene(folder, recording, watch=lambda items, total, _: progress(items, total, f"frames of {name}"))
-    else:
-        write_scene(folder, recording)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +108,8 @@ class Judged:
 
     @property
     def rmse(self) -> float:
-        """M, root mean square distance."""
-        return float(np.sqrt((self.errors**2).sum(axis=1).mean()))
+        """Root mean square distance, m."""
+        return root_mean_square(self.errors)
 
 
 def judge(filmed: Filmed) -> Judged:
@@ -155,16 +132,8 @@ def judge(filmed: Filmed) -> Judged:
         points = np.sort(np.concatenate(at[name]))
         seen += len(times)
         found += int((_distance(times, points) < SAME_FRAME / recording.config.rate).sum())
-    return Judged(
-        np.concatenate(errors),
-        np.concatenate(squares),
-        false,
-        seen,
-        found,
-        len(filmed.tracking.balls),
-        mixed,
-        len(recording.flights),
-    )
+    tracks, balls = len(filmed.tracking.balls), len(recording.flights)
+    return Judged(np.concatenate(errors), np.concatenate(squares), false, seen, found, tracks, mixed, balls)
 
 
 def truth_at(flight: Flight, times: Array) -> Array:
@@ -191,27 +160,19 @@ def _frames_with_ball(recording: Recording) -> Iterator[tuple[str, Array]]:
     the ball counts if another one sees the ball within a frame interval before and after.
     """
     step = 1.0 / recording.config.rate
+    shared = len({recording.clock(camera.name).phase for camera in recording.cameras}) == 1
     for number, flight in enumerate(recording.flights):
         times = [
             frames.times[passages[number].frames[camera.in_view(passages[number].centres)]]
             for camera, frames, passages in zip(recording.cameras, recording.frames, recording.passages, strict=True)
         ]
-        most = int(np.argmax([len(t) for t in times]))
-        shared = all(
-            clock.phase == recording.clock(recording.cameras[0].name).phase
-            for clock in (recording.clock(camera.name) for camera in recording.cameras)
-        )
         if shared:
             stamps, views = np.unique(np.round(np.concatenate(times), 6), return_counts=True)
             yield flight.name, np.asarray(stamps[views >= 2], dtype=np.float64)
         else:
-            own = times[most]
-            others = [
-                (own >= t.min()) & (own <= t.max()) & (_distance(own, t) <= step)
-                for k, t in enumerate(times)
-                if k != most and len(t)
-            ]
-            yield flight.name, own[np.any(others, axis=0)]
+            own = times.pop(int(np.argmax([len(t) for t in times])))
+            near = [(own >= t.min()) & (own <= t.max()) & (_distance(own, t) <= step) for t in times if len(t)]
+            yield flight.name, own[np.any(near, axis=0)]
 
 
 def _distance(times: Array, others: Array) -> Array:

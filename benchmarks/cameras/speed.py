@@ -1,25 +1,24 @@
-"""What tracking costs: three video streams through detection and association, and live updates from sightings."""
+"""Times of tracking: three video streams through detection and association, and live updates from sightings."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
 from joblib.externals.loky import get_reusable_executor
-from numpy.typing import NDArray
 
 from ballfg.benchmarks.cameras.clocks import sighted
-from ballfg.benchmarks.cameras.scenes import Filmed, Scenario, draw
+from ballfg.benchmarks.cameras.scenes import Filmed, Scenario
+from ballfg.benchmarks.speed.stopwatch import milliseconds
 from ballfg.dynamics import nominal_model
-from ballfg.estimation import Online, Settings
-from ballfg.estimation.observations.sightings import sightings_of
+from ballfg.estimation import Online, Settings, sightings_of
+from ballfg.progress import progress
+from ballfg.simulation.scene import write_scene
 from ballfg.vision import Camera, Detections, detect_all, track_detections
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -47,9 +46,10 @@ def stream_times(scenario: Scenario, runs: int) -> list[StreamTimes]:
     recording = scenario.recording()
     with TemporaryDirectory() as folder:
         scene = Path(folder) / "scene"
-        draw(recording, scene, f"{scenario.name}, timed")
+        images = f"frames of {scenario.name}, timed"
+        write_scene(scene, recording, watch=lambda items, total, _: progress(items, total, images))
         videos = {camera.name: scene / f"{camera.name}.mp4" for camera in recording.cameras}
-        return [_timed(videos, recording.cameras) for _ in range(runs)]
+        return [_timed(videos, recording.cameras) for _ in progress(range(runs), runs, "runs timed")]
 
 
 def _timed(videos: dict[str, Path], cameras: Sequence[Camera]) -> StreamTimes:
@@ -62,15 +62,15 @@ def _timed(videos: dict[str, Path], cameras: Sequence[Camera]) -> StreamTimes:
     return StreamTimes(min(len(d.frames) for d in found.values()), searched - start, end - searched)
 
 
-def push_times(filmed: Filmed) -> Array:
-    """(n,) ms, of each sighting that the online estimator takes in, those of all balls."""
+def push_times(filmed: Filmed) -> list[float]:
+    """Milliseconds of each sighting that the online estimator takes in, those of all balls."""
     settings, taken = Settings.for_measured(nominal_model()), []
-    for track in sighted(filmed):
-        seen = sightings_of(track)
-        online = Online(nominal_model(), filmed.recording.config.ball.surfaces, settings, cameras=seen.cameras)
-        rows = seen.sightings
-        for camera, at, pixel, covariance in zip(rows.camera, rows.times, rows.pixels, rows.covariances, strict=True):
-            start = time.perf_counter()
-            online.push_sighting(float(at), rows.cameras[camera], pixel, covariance)
-            taken.append(1e3 * (time.perf_counter() - start))
-    return np.array(taken)
+    tracks = sighted(filmed)
+    for track in progress(tracks, len(tracks), "balls pushed online"):
+        rig = sightings_of(track)
+        online = Online(nominal_model(), filmed.recording.config.ball.surfaces, settings, cameras=rig.cameras)
+        seen = rig.sightings
+        for camera, at, pixel, covariance in zip(seen.camera, seen.times, seen.pixels, seen.covariances, strict=True):
+            push = partial(online.push_sighting, float(at), seen.cameras[camera], pixel, covariance)
+            taken.append(milliseconds(push))
+    return taken

@@ -1,4 +1,4 @@
-"""The cases of the loop's benchmark: datasets to be made, and what a diagnosis of each is asked."""
+"""The cases of the loop's benchmark: datasets to be made, and the effects that a diagnosis of each should find."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ BARE: Final = ("magnus", "tangential_restitution", "table_height")
 
 @dataclass(frozen=True)
 class Recording:
-    """How tracks are taken.
+    """How tracks are recorded.
 
     Attributes:
         tracks: number.  rate: Hz.  position: m and spin: rad/s, true noise of positions and labels.
@@ -50,16 +50,13 @@ class Case:
 
     Attributes:
         part: of the benchmark.
-        subject: what is planted, in a word.
-        size: of it; 1 is typical.
-        seed: number of the repetition.
+        subject: what is planted, in a word.  size: of it; 1 is typical.  seed: number of the repetition.
         planted: names of the effects that the declared model lacks.
         left_out: effects that the nominal model has and the declared one has not.
         sessions: undeclared effects, as texts, of each session that the dataset consists of.
         recording: how its tracks are taken.
         data: folder of measured tracks, which take the place of simulated ones.
-        repair: fit the true model too.
-        jobs: processes of the diagnosis.
+        repair: fit the true model too.  jobs: processes of the diagnosis.
     """
 
     part: str
@@ -90,10 +87,9 @@ class Plan:
     """How much is computed.
 
     Attributes:
-        effects: names of those planted one by one.
+        effects, sizes: planted one by one, each in every size.
         unlabelled: names of those planted where no spin is labelled.
         pairs: names of two planted together.
-        sizes: of those planted with labels.
         seeds: of each at its typical size; the true model is fitted to the first of them.
         side_seeds: of each at other sizes, and of pairs.  unlabelled_seeds: where no spin is labelled.
         ratios, detection_seeds: sizes over the ideal test's, and seeds at each, where the detection limit is sought.
@@ -117,13 +113,9 @@ class Plan:
     timed: int
 
 
-def _without_labels(names: Sequence[str]) -> tuple[str, ...]:
-    return tuple(name for name in names if not name.startswith("spin_label"))
-
-
 FULL: Final = Plan(
     effects=tuple(PLANTS),
-    unlabelled=_without_labels(list(PLANTS)),
+    unlabelled=tuple(name for name in PLANTS if not name.startswith("spin_label")),
     pairs=PAIRS,
     sizes=(0.5, 1.0, 2.0),
     seeds=4,
@@ -137,8 +129,8 @@ FULL: Final = Plan(
     timed=3,
 )
 QUICK: Final = Plan(
-    effects=tuple(PLANTS)[:8],
-    unlabelled=_without_labels(list(PLANTS)[:3]),
+    effects=FULL.effects[:8],
+    unlabelled=FULL.unlabelled[:3],
     pairs=PAIRS[:1],
     sizes=(1.0,),
     seeds=1,
@@ -147,7 +139,7 @@ QUICK: Final = Plan(
     ratios=(),
     detection_seeds=0,
     nulls=5,
-    unknown=tuple(UNKNOWN)[:2],
+    unknown=FULL.unknown[:2],
     unknown_seeds=1,
     timed=1,
 )
@@ -174,10 +166,7 @@ def naming_cases(plan: Plan, seed: int) -> Iterator[Case]:
 
 
 def detection_cases(plan: Plan, seed: int, ideal: Mapping[str, float]) -> Iterator[Case]:
-    """Effects at sizes about the one that the ideal test needs.
-
-    Args: ideal: that size by effect, for the effects that are to be detected.
-    """
+    """The effects that are to be detected at sizes about the `ideal` one, which the ideal test needs."""
     for number, (name, size), ratio in product(range(seed, seed + plan.detection_seeds), ideal.items(), plan.ratios):
         yield planted_case("detection", name, float(f"{ratio * size:.4g}"), number)
 

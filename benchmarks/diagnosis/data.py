@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +10,7 @@ from ballfg.diagnosis.search.hypothesis import has_effect, with_effects, without
 from ballfg.dynamics import AnalyticModel, nominal_model
 from ballfg.simulation import MeasurementNoise, SimulationConfig, dataset_info, parse_effects, simulate, table_tennis
 from ballfg.simulation.composition import true_model
-from ballfg.tracks import Dataset, Track, read_dataset, write_dataset
+from ballfg.tracks import Dataset, read_dataset, write_dataset
 
 
 def make_dataset(case: Case, folder: Path) -> Dataset:
@@ -20,12 +19,14 @@ def make_dataset(case: Case, folder: Path) -> Dataset:
     info = replace(dataset_info(configs[0]), name=case.name, position_noise=STATED_NOISE)
     if case.recording.labels:
         info = replace(info, spin_noise=LABEL_NOISE)
-    write_dataset(folder, info, _tracks(configs), "parquet")
+    simulated = ((session, one.track) for session, config in enumerate(configs) for one in simulate(config))
+    tracks = (replace(track, name=f"{session}-{track.name}") for session, track in simulated)
+    write_dataset(folder, info, tracks, "parquet")
     return read_dataset(folder)
 
 
 def declared_model(case: Case, radius: float) -> AnalyticModel:
-    """What the diagnosis is given: the nominal model, for a ball of some radius (m), less what is left out."""
+    """The model that the diagnosis is given: the nominal one for a radius (m), without the effects left out."""
     model = with_effects(nominal_model(radius))
     for name in case.left_out:
         if has_effect(model, name):  # effects that need one go with it
@@ -56,9 +57,3 @@ def _simulation(case: Case, session: int) -> SimulationConfig:
         undeclared=parse_effects(case.sessions[session]),
         spin_labels=taken.labels,
     )
-
-
-def _tracks(configs: list[SimulationConfig]) -> Iterator[Track]:
-    for session, config in enumerate(configs):
-        for simulated in simulate(config):
-            yield replace(simulated.track, name=f"{session}-{simulated.track.name}")

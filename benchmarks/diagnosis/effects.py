@@ -1,4 +1,4 @@
-"""What is planted behind a model's back: every catalogue effect at its typical size, and physics of no catalogue.
+"""The planted effects: every catalogue effect at its typical size, pairs of them, and physics of no catalogue.
 
 Typical sizes are those that docs/physics.md lists under what matters, or the nominal value of an effect that the
 declared model is made to lack.
@@ -10,12 +10,10 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.benchmarks.metrics import Array
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.dynamics import EFFECTS
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -27,7 +25,7 @@ class Plant:
         amounts: by coefficient, what is added at size 1.
         base: value of those coefficients at size 0: the effect is absent, or as declared.
         left_out: the nominal model has it; the declared model is the nominal one without it.
-        hidden: other effects, or what is free anyway, do the same; an honest answer names one of those or says that
+        hidden: other effects or free coefficients do the same; an honest answer names one of those effects or says that
             it cannot be seen.
         sized: it comes in sizes; else it is there or not.
     """
@@ -40,10 +38,7 @@ class Plant:
     sized: bool = True
 
     def texts(self, size: float) -> tuple[str, ...]:
-        """What a simulation is told, as `wind.x=0.2`.
-
-        Args: size: 1 is typical.
-        """
+        """The effect at a size, 1 being typical, as a simulation reads it: `wind.x=0.2`."""
         return tuple(f"{self.name}.{c}={self.base + size * amount!r}" for c, amount in self.amounts)
 
     def hypothesis(self) -> Hypothesis:
@@ -109,4 +104,4 @@ UNKNOWN: Final[dict[str, tuple[tuple[str, ...], ...]]] = {
     "side_lean": (("side_lean.strength=0.3",),),
     "two_tables": ((), ("restitution.e=0.88", "table_height.offset=-0.011", "friction.mu=0.4")),
 }
-"""What no catalogue holds: the undeclared effects of each session that a dataset consists of."""
+"""Physics that no catalogue holds: the undeclared effects of each session that a dataset consists of."""

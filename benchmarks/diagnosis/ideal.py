@@ -1,9 +1,10 @@
-"""The ideal test: how large an effect must be for the best test of it alone, all else being known that can be known.
+"""The ideal test: the size at which the best test of an effect alone finds it, with everything else known.
 
 It looks at all tracks, knows the noise, and asks for one effect in its true shape. Its statistic is the score test's:
-chi-square where the effect is absent, non-central where it acts, with size^2 d' F d as non-centrality; F is what
-information is left of the effect's coefficients once first states and declared coefficients are projected out, and d
-what size 1 adds to them. F is taken from tracks without noise, at the truth, where every robust weight is one.
+chi-square where the effect is absent, non-central where it acts, with size^2 d' F d as non-centrality. F is the
+information about the effect's coefficients that is left once first states and declared coefficients are projected out;
+d is what size 1 adds to these coefficients. F is taken from tracks without noise, at the truth, where every robust
+weight is one.
 
 Source: D. R. Cox and D. V. Hinkley, Theoretical Statistics, 1974, section 9.3.
 """
@@ -15,23 +16,23 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy import optimize, stats
 
 from ballfg.benchmarks.diagnosis.cases import Case, Recording, planted_case
 from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.record import case_digest
-from ballfg.benchmarks.record_file import read_record_file, write_record
+from ballfg.benchmarks.metrics import Array
+from ballfg.benchmarks.resumable import read_record, write_record
 from ballfg.diagnosis.fit.fit import fit_model
 from ballfg.diagnosis.fit.holdout import launcher_labels
+from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stretches import stretches_of
 from ballfg.diagnosis.search.candidates import ALARM
 from ballfg.diagnosis.search.loop import CONFIRMED
 from ballfg.diagnosis.search.signatures import hypothesis_signatures, visible_directions
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces
-
-Array = NDArray[np.float64]
 
 LEVEL = ALARM * CONFIRMED
 """False-alarm rate of one round of the loop: both of its tests must err."""
@@ -65,6 +66,10 @@ class Ideal:
         noncentrality = self.information * np.asarray(sizes, dtype=np.float64) ** 2
         return np.asarray(power(noncentrality, self.rank)) if self.rank else np.zeros_like(noncentrality)
 
+    def save(self, path: Path) -> None:
+        """Write the file whole or not at all."""
+        write_record(path, asdict(self))
+
 
 def power(noncentrality: ArrayLike, rank: int) -> Array:
     """(...) probability that the statistic passes its threshold."""
@@ -82,30 +87,29 @@ def ideal_case(name: str, seed: int) -> Case:
     return replace(planted_case("ideal", name, 0.0, seed), recording=Recording(position=0.0, spin=0.0))
 
 
-def ideal_of(name: str, seed: int) -> Ideal:
-    """Compute the ideal test of an effect in `PLANTS` that comes in sizes."""
-    case, plant = ideal_case(name, seed), PLANTS[name]
+def fit_declared(case: Case) -> Fit:
+    """The declared model fitted to the tracks of a case whose noise is none; the noise is taken to be as stated."""
     with TemporaryDirectory() as folder:
         dataset = make_dataset(case, Path(folder) / "tracks")
         model = declared_model(case, dataset.info.ball.radius)
         settings, tracks = dataset_settings(dataset, model), list(dataset)
     smoother = Smoother(model, dataset_surfaces(dataset), settings)
     stretches = stretches_of(smoother, tracks, launcher_labels(dataset, tracks, settings))
-    at_truth = fit_model(model, stretches, settings, settle_noise=False)
-    found, _ = hypothesis_signatures(at_truth, [plant.hypothesis()])
+    return fit_model(model, stretches, settings, settle_noise=False)
+
+
+def ideal_of(case: Case) -> Ideal:
+    """Compute the ideal test of a case's subject, an effect that comes in sizes."""
+    plant = PLANTS[case.subject]
+    found, _ = hypothesis_signatures(fit_declared(case), [plant.hypothesis()])
     efficient, direction = found.efficient(), plant.direction()
     rank = visible_directions(efficient.total, efficient.raw).shape[1]
     return Ideal(case_digest(case), rank, float(direction @ efficient.total @ direction))
 
 
-def save_ideal(ideal: Ideal, path: Path) -> None:
-    """Write the file; its name appears once it is whole."""
-    write_record(path, asdict(ideal))
-
-
 def read_ideal(path: Path, digest: str) -> Ideal | None:
-    """What a file holds; None if there is no file, or one of another case.
+    """The ideal test in a file; None if there is no file, or one of another case.
 
     Raises: ValueError: if the file holds something else.
     """
-    return read_record_file(path, digest, lambda content: Ideal(**content), "an ideal test")
+    return read_record(path, digest, lambda content: Ideal(**content), "an ideal test")

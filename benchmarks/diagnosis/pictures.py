@@ -1,4 +1,4 @@
-"""Pictures of the loop's benchmark: power against size, what was named for what was planted, and how well it mends."""
+"""Pictures of the loop's benchmark: power against size, effects named against effects planted, and repaired errors."""
 
 from __future__ import annotations
 
@@ -9,19 +9,16 @@ from typing import Final
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from ballfg.benchmarks.diagnosis.cases import Case
 from ballfg.benchmarks.diagnosis.ideal import Ideal
-from ballfg.benchmarks.diagnosis.limit import NAMED, Curve, share
+from ballfg.benchmarks.diagnosis.power_curve import NAMED, Curve
 from ballfg.benchmarks.diagnosis.record import Record
 from ballfg.benchmarks.diagnosis.rows import ALL, detectable, of_part, power_curves
-from ballfg.benchmarks.pictures import save
+from ballfg.benchmarks.metrics import share
+from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, plain_ticks, save
 from ballfg.benchmarks.results import Row
 
-LOOP_COLOUR: Final = "#3b4cc0"
-IDEAL_COLOUR: Final = "#7f7f7f"
-BEFORE_COLOUR: Final = "#d95f02"
 COLUMNS: Final = 5
 """Panels side by side."""
 NOTHING: Final = "nothing"
@@ -57,30 +54,21 @@ def power_picture(
 
 
 def _draw_power(axes: Axes, sizes: Sequence[float], outcomes: Sequence[bool], curve: Curve, ideal: Ideal) -> None:
-    for place, size in enumerate(sorted(set(sizes))):
-        seen = share([outcome for s, outcome in zip(sizes, outcomes, strict=True) if s == size])
-        ends = [[max(0.0, seen.value - seen.low)], [max(0.0, seen.high - seen.value)]]
-        label = "loop" if place == 0 else None
-        axes.errorbar(
-            size, seen.value, ends, color=LOOP_COLOUR, marker="o", markersize=4, linewidth=0.8, capsize=2, label=label
-        )
+    tried = sorted(set(sizes))
+    shares = [share([outcome for s, outcome in zip(sizes, outcomes, strict=True) if s == size]) for size in tried]
+    values = np.array([one.value for one in shares])
+    ends = np.maximum(0.0, [values - [one.low for one in shares], [one.high for one in shares] - values])
+    axes.errorbar(tried, values, ends, color=BLUE, fmt="o", markersize=4, linewidth=0.8, capsize=2, label="loop")
     low, high = min(sizes), max(sizes)
     if np.isfinite(ideal.size):
         low, high = min(low, 0.5 * ideal.size), max(high, 1.5 * ideal.size)
     grid = np.geomspace(low, high, POINTS)
-    axes.plot(grid, ideal.power(grid), color=IDEAL_COLOUR, label="ideal test")
-    axes.plot(grid, curve.at(grid), color=LOOP_COLOUR, linewidth=1.0, alpha=0.6, label="curve through the loop's")
+    axes.plot(grid, ideal.power(grid), color=GREY, label="ideal test")
+    axes.plot(grid, curve.at(grid), color=BLUE, linewidth=1.0, alpha=0.6, label="curve through the loop's")
     axes.axhline(NAMED, color="black", linewidth=0.5, linestyle=":")
     axes.set(xscale="log", ylim=(-0.05, 1.05))
-    _plain_sizes(axes, (1.0, 2.0, 5.0) if high < FEW_DECADES * low else (1.0,))
+    plain_ticks(axes.xaxis, (1.0, 2.0, 5.0) if high < FEW_DECADES * low else (1.0,))
     axes.grid(visible=True, alpha=0.25)
-
-
-def _plain_sizes(axes: Axes, marked: tuple[float, ...] = (1.0, 2.0, 5.0)) -> None:
-    """Numbers as 0.05, not as powers of ten, at some multiples of each decade of the horizontal axis."""
-    axes.xaxis.set_major_locator(LogLocator(subs=marked))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def confusion_picture(cases: Sequence[Case], records: Mapping[str, Record], path: Path) -> Path:
@@ -90,7 +78,8 @@ def confusion_picture(cases: Sequence[Case], records: Mapping[str, Record], path
     for axes, (part, title) in zip(panels, parts, strict=True):
         chosen = [case for case in of_part(cases, part) if case.size == 1.0 and case.name in records]
         planted = list(dict.fromkeys(case.subject for case in chosen))
-        first = [_first(records[case.name]) for case in chosen]
+        found = [records[case.name].found for case in chosen]
+        first = [findings[0].name if findings else NOTHING for findings in found]
         columns = [*planted, *sorted(set(first) - {*planted, NOTHING}), NOTHING]
         counts = np.zeros((len(planted), len(columns)))
         for case, name in zip(chosen, first, strict=True):
@@ -100,10 +89,6 @@ def confusion_picture(cases: Sequence[Case], records: Mapping[str, Record], path
         axes.set_yticks(range(len(planted)), planted, fontsize="small")
         axes.set(xlabel="named first", ylabel="planted", title=f"{title}, {len(chosen)} datasets")
     return save(figure, path)
-
-
-def _first(record: Record) -> str:
-    return record.found[0].name if record.found else NOTHING
 
 
 def _draw_shares(axes: Axes, shares: np.ndarray) -> None:
@@ -119,19 +104,18 @@ def repair_picture(rows: Sequence[Row], path: Path) -> Path:
     found = [row for row in rows if row.case == "repair" and row.metric != ALL]
     names = list(dict.fromkeys(row.metric for row in found))
     figure, axes = plt.subplots(figsize=(8, 0.3 * len(names) + 1.6), layout="constrained")
-    for column, colour in (("before / true", BEFORE_COLOUR), ("after / true", LOOP_COLOUR)):
-        for place, row in enumerate(r for r in found if r.method == column):
-            if row.value is not None and row.low is not None and row.high is not None:
-                axes.plot([row.low, row.high], [names.index(row.metric)] * 2, color=colour, linewidth=1.2)
-                label = column if place == 0 else None
-                axes.plot(row.value, names.index(row.metric), "o", color=colour, markersize=5, label=label)
+    for column, colour in (("before / true", ORANGE), ("after / true", BLUE)):
+        own = [row for row in found if row.method == column]
+        places = [names.index(row.metric) for row in own]
+        ratios = np.array([(row.value, row.low, row.high) for row in own], dtype=np.float64).reshape(-1, 3)
+        axes.hlines(places, ratios[:, 1], ratios[:, 2], color=colour, linewidth=1.2)
+        axes.plot(ratios[:, 0], places, "o", color=colour, markersize=5, label=column)
     axes.axvline(1.0, color="black", linewidth=0.8)
     axes.set_yticks(range(len(names)), names, fontsize="small")
     axes.invert_yaxis()
     axes.set(xscale="log", xlabel="prediction RMSE on the judging half / that of the true model")
-    _plain_sizes(axes)
+    plain_ticks(axes.xaxis)
     axes.set_title("What the diagnosis mends; dot: median over seeds, line: lowest to highest", size=11)
     axes.grid(visible=True, axis="x", which="both", alpha=0.25)
-    if found:
-        figure.legend(loc="outside lower center", ncols=2, fontsize="small")
+    figure.legend(loc="outside lower center", ncols=2, fontsize="small")
     return save(figure, path)

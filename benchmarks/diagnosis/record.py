@@ -1,4 +1,4 @@
-"""What is kept of a diagnosis: names, evidence, errors and seconds, as a JSON file that a later run reads."""
+"""The record of a diagnosis: names, evidence, errors and seconds, as a JSON file that a later run reads."""
 
 from __future__ import annotations
 
@@ -8,10 +8,12 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+
+from pydantic import TypeAdapter
 
 from ballfg.benchmarks.diagnosis.cases import Case
-from ballfg.benchmarks.record_file import read_record_file, write_record
+from ballfg.benchmarks.resumable import read_record as read_any
+from ballfg.benchmarks.resumable import write_record
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Finding
 
 RANKED = 8
@@ -20,7 +22,7 @@ RANKED = 8
 
 @dataclass(frozen=True)
 class Found:
-    """A finding: its name, what it could not be told from, its evidence, and coefficients with their sigmas."""
+    """A finding: its name, effects that it could not be told from, its evidence, and coefficients with their sigmas."""
 
     name: str
     alike: tuple[str, ...]
@@ -67,12 +69,20 @@ class Record:
     seconds: float
 
     def save(self, path: Path) -> None:
-        """Write the file; its name appears once it is whole."""
+        """Write the file whole or not at all."""
         write_record(path, asdict(self))
 
 
+def read_record(path: Path, digest: str) -> Record | None:
+    """The record in a file; None if there is no file, or one of another case.
+
+    Raises: ValueError: if the file is no record.
+    """
+    return read_any(path, digest, TypeAdapter(Record).validate_python, "a finished case")
+
+
 def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None, seconds: float) -> Record:
-    """What is kept of a diagnosis.
+    """The part of a diagnosis that is kept.
 
     Args: true: errors of the true model, where it was fitted.
     """
@@ -96,46 +106,19 @@ def record_of(case: Case, digest: str, diagnosis: Diagnosis, true: Errors | None
 
 
 def _found(finding: Finding) -> Found:
-    values = {name: (float(v.value), _number(v.sigma)) for name, v in finding.parameters.items()}
+    pairs = {name: (float(v.value), float(v.sigma)) for name, v in finding.parameters.items()}
+    values = {name: (value, sigma if math.isfinite(sigma) else None) for name, (value, sigma) in pairs.items()}
     alike = tuple(finding.indistinguishable_from)
     return Found(finding.name, alike, float(finding.p_value), float(finding.delta_bic), values)
 
 
 def _leading(listed: tuple[Candidate, ...], planted: tuple[str, ...]) -> tuple[Ranked, ...]:
     kept = [c for place, c in enumerate(listed) if place < RANKED or c.name in planted]
+    bic = [None if c.delta_bic is None else float(c.delta_bic) for c in kept]
     return tuple(
-        Ranked(
-            c.name,
-            float(c.explained),
-            float(c.p_value),
-            None if c.delta_bic is None else float(c.delta_bic),
-            c.outcome.value,
-        )
-        for c in kept
+        Ranked(c.name, float(c.explained), float(c.p_value), delta, c.outcome.value)
+        for c, delta in zip(kept, bic, strict=True)
     )
-
-
-def _number(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
-
-
-def read_record(path: Path, digest: str) -> Record | None:
-    """The record in a file; None if there is no file, or one of another case.
-
-    Raises: ValueError: if the file is no record.
-    """
-    return read_record_file(path, digest, _record_from, "a finished case")
-
-
-def _record_from(content: dict[str, Any]) -> Record:
-    content["found"] = tuple(_found_from(one) for one in content["found"])
-    content["rounds"] = tuple(tuple(Ranked(**one) for one in listed) for listed in content["rounds"])
-    return Record(**content)
-
-
-def _found_from(content: Mapping[str, Any]) -> Found:
-    pairs = {name: (value, sigma) for name, (value, sigma) in content["parameters"].items()}
-    return Found(**{**content, "alike": tuple(content["alike"]), "parameters": pairs})
 
 
 def case_digest(case: Case) -> str:

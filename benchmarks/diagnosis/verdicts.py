@@ -1,4 +1,4 @@
-"""Whether a diagnosis was right: what may be named for what was planted."""
+"""Whether a diagnosis was right: which names are accepted for the planted effects."""
 
 from __future__ import annotations
 

@@ -1,17 +1,17 @@
-"""Who takes part in the comparison of dynamics: what every contender must do, and the two that need no training."""
+"""The contenders of the dynamics comparison: the contract, models in the factor graph, and those without training."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Final, Literal, Protocol
+from typing import Final, Protocol
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ballfg.benchmarks.dynamics.task import Task
+from ballfg.benchmarks.metrics import Array
 from ballfg.dynamics import BallModel, Surfaces, nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.motion.paths import paths
@@ -21,114 +21,11 @@ from ballfg.prediction import Belief, Propagator
 from ballfg.state import POSITION
 from ballfg.tracks import Track
 
-Array = NDArray[np.float64]
-
 BLOCK: Final = 64
 """Tracks that are rolled out together."""
-TIMED: Final = 20
-"""Tracks whose predictions are timed one by one."""
 NO_NOISE: Final = ProcessNoise(acceleration=0.005, spin=0.05, contact_velocity=0.001, contact_spin=0.2)
 """For the truth, which has no process noise: a fiftieth of what models start from, as little as stays well conditioned;
 a fifth of it changes the errors by less than 1 %."""
-
-
-class Contender(Protocol):
-    """A trained method, or one that needs no training.
-
-    Attributes:
-        name: the method in `results.json`.
-        parameter_count: numbers that were learned, 0 for none.
-        training_seconds: s, wall clock; 0 where nothing was learned.
-    """
-
-    name: str
-    parameter_count: int
-    training_seconds: float
-
-    def predict(self, seen: Sequence[Track], times: Sequence[Array]) -> list[Array]:
-        """Positions at all stamps of some tracks, from their observed parts.
-
-        Args:
-            seen: the observed samples with their labels: nothing later is in reach.
-            times: (n,) s for each track, the stamps of the whole track; the first ones are those of the observed part.
-        Returns: (n, 3) m for each track; NaN at observed stamps for a method that predicts only what comes after.
-        """
-
-
-@dataclass
-class GraphContender:
-    """A dynamics model in the factor graph: smooth the observed part, predict the rest.
-
-    Attributes:
-        name, parameter_count, training_seconds: as of any contender.
-        model: the dynamics.
-        surfaces: on what it bounces.
-        settings: of the smoother.
-        label: gives a track the spin label that its launcher settings mean, if the method knows that.
-        onward: predict as `ballfg predict` does: the observed part is the smoothed one, the rest is rolled out from
-            its last state, with the coefficients that the settings let each track have. False: the whole path is rolled
-            out from the first state.
-        failures: how many estimates did not converge so far.
-    """
-
-    name: str
-    model: BallModel
-    surfaces: Surfaces
-    settings: Settings
-    label: Callable[[Track], Track]
-    onward: bool = False
-    parameter_count: int = 0
-    training_seconds: float = 0.0
-    failures: int = 0
-
-    def predict(self, seen: Sequence[Track], times: Sequence[Array]) -> list[Array]:
-        """Positions (n, 3) m at all stamps of each track."""
-        smoother = Smoother(self.model, self.surfaces, self.settings)
-        estimates = [smoother.estimate(self.label(track)) for track in seen]
-        self.failures += sum(estimate.status is not Status.OK for estimate in estimates)
-        if self.onward:
-            return self._onward(estimates, times)
-        starts = np.stack([estimate.states[0] for estimate in estimates])
-        return self.roll(starts, [stamps - stamps[0] for stamps in times])
-
-    def _onward(self, estimates: Sequence[Estimate], times: Sequence[Array]) -> list[Array]:
-        """Smoothed positions where a track was observed, then those that follow from its last state."""
-        propagator = Propagator(self.surfaces, self.settings.process)
-        found: list[Array] = []
-        for first in range(0, len(estimates), BLOCK):
-            block = estimates[first : first + BLOCK]
-            rests = [t[len(e.times) :] for e, t in zip(block, times[first : first + BLOCK], strict=True)]
-            belief = Belief.of(self.model, [e.last for e in block], self.settings.coefficients)
-            states = propagator.rollout(belief, _padded(rests)).states
-            for estimate, path, rest in zip(block, states, rests, strict=True):
-                found.append(np.concatenate((estimate.states[:, POSITION], path[: len(rest), POSITION])))
-        return found
-
-    @torch.no_grad()
-    def roll(self, starts: Array, times: Sequence[Array]) -> list[Array]:
-        """Positions (n, 3) m of each ball at its times (n,) s since its start, from first states (m, 9)."""
-        found: list[Array] = []
-        for first in range(0, len(starts), BLOCK):
-            block = times[first : first + BLOCK]
-            start = torch.from_numpy(starts[first : first + BLOCK])
-            states = paths(self.model, start, torch.from_numpy(_padded(block)), self.surfaces).numpy()
-            found += [path[: len(t), POSITION].copy() for path, t in zip(states, block, strict=True)]
-        return found
-
-
-def _padded(times: Sequence[Array]) -> Array:
-    """(n, k) s: each ball's times, then the last of them again."""
-    longest = max(map(len, times))
-    return np.stack([np.pad(t, (0, longest - len(t)), mode="edge") for t in times])
-
-
-def label_of(task: Task) -> Callable[[Track], Track]:
-    """What turns launcher settings into spin labels for a method that does not learn it."""
-    return _as_it_is if task.launcher is None else task.launcher.labelled
-
-
-def _as_it_is(track: Track) -> Track:
-    return track
 
 
 @dataclass(frozen=True)
@@ -155,40 +52,108 @@ class Job:
         return self.tasks[0].truth is None
 
 
-@dataclass(frozen=True)
-class Method:
-    """A row of the comparison.
+class Contender(Protocol):
+    """A trained method, or one that needs no training.
 
     Attributes:
-        make: a contender for one of the job's tasks; what the method learns is learned at the first of them.
-        recipe: how a job trains it, in words that change whenever that does.
-        trained: whether a seed makes a difference; if not it runs once.
-        takes_part: on which tracks: `all`, `simulated` or `measured` ones.
-        transfers: whether it can be judged on tracks of a launcher that it did not learn from.
+        name: the method in `results.json`.
+        parameter_count: numbers that were learned, 0 for none.
+        training_seconds: s, wall clock; 0 where nothing was learned.
     """
 
-    make: Callable[[Job, Task], Contender]
-    recipe: Callable[[Job], str]
-    trained: bool = True
-    takes_part: Literal["all", "simulated", "measured"] = "all"
-    transfers: bool = True
+    name: str
+    parameter_count: int
+    training_seconds: float
 
-    def fits(self, tasks: Sequence[Task]) -> bool:
-        """Whether it takes part on these tracks."""
-        return self.takes_part in ("all", "measured" if tasks[0].truth is None else "simulated")
+    def predict(self, seen: Sequence[Track], times: Sequence[Array]) -> list[Array]:
+        """Positions at all stamps of some tracks, from their observed parts.
+
+        Args:
+            seen: the observed samples with their labels: nothing later is in reach.
+            times: (n,) s for each track, the stamps of the whole track; the first ones are those of the observed part.
+        Returns: (n, 3) m for each track; NaN at observed stamps for a method that predicts only what comes after.
+        """
+
+
+def as_it_is(track: Track) -> Track:
+    """The track without a change."""
+    return track
+
+
+@dataclass
+class GraphContender:
+    """A dynamics model in the factor graph: smooth the observed part, predict the rest.
+
+    Attributes:
+        name, parameter_count, training_seconds: as of any contender.
+        model: the dynamics.  surfaces: on what it bounces.  settings: of the smoother.
+        label: gives a track the spin label that its launcher settings mean, if the method knows that.
+        onward: predict as `ballfg predict` does: the observed part is the smoothed one, the rest is rolled out from
+            its last state, with the coefficients that the settings let each track have. False: the whole path is rolled
+            out from the first state.
+        failures: number of estimates that did not converge so far.
+    """
+
+    name: str
+    model: BallModel
+    surfaces: Surfaces
+    settings: Settings
+    label: Callable[[Track], Track] = as_it_is
+    onward: bool = False
+    parameter_count: int = 0
+    training_seconds: float = 0.0
+    failures: int = 0
+
+    def predict(self, seen: Sequence[Track], times: Sequence[Array]) -> list[Array]:
+        """Positions (n, 3) m at all stamps of each track."""
+        smoother = Smoother(self.model, self.surfaces, self.settings)
+        estimates = [smoother.estimate(self.label(track)) for track in seen]
+        self.failures += sum(estimate.status is not Status.OK for estimate in estimates)
+        if self.onward:
+            return list(self._onward(estimates, times))
+        starts = np.stack([estimate.states[0] for estimate in estimates])
+        return self.roll(starts, [stamps - stamps[0] for stamps in times])
+
+    def _onward(self, estimates: Sequence[Estimate], times: Sequence[Array]) -> Iterator[Array]:
+        """Smoothed positions where a track was observed, then those that follow from its last state."""
+        propagator = Propagator(self.surfaces, self.settings.process)
+        for first in range(0, len(estimates), BLOCK):
+            block = estimates[first : first + BLOCK]
+            rests = [t[len(e.times) :] for e, t in zip(block, times[first : first + BLOCK], strict=True)]
+            belief = Belief.of(self.model, [e.last for e in block], self.settings.coefficients)
+            states = propagator.rollout(belief, _padded(rests)).states
+            for estimate, path, rest in zip(block, states, rests, strict=True):
+                yield np.concatenate((estimate.states[:, POSITION], path[: len(rest), POSITION]))
+
+    @torch.no_grad()
+    def roll(self, starts: Array, times: Sequence[Array]) -> list[Array]:
+        """Positions (n, 3) m of each ball at its times (n,) s since its start, from first states (m, 9)."""
+        found: list[Array] = []
+        for first in range(0, len(starts), BLOCK):
+            block = times[first : first + BLOCK]
+            start = torch.from_numpy(starts[first : first + BLOCK])
+            states = paths(self.model, start, torch.from_numpy(_padded(block)), self.surfaces).numpy()
+            found += [path[: len(t), POSITION].copy() for path, t in zip(states, block, strict=True)]
+        return found
+
+
+def _padded(times: Sequence[Array]) -> Array:
+    """(n, k) s: each ball's times, then the last of them again."""
+    longest = max(map(len, times))
+    return np.stack([np.pad(t, (0, longest - len(t)), mode="edge") for t in times])
 
 
 def nominal_contender(job: Job, task: Task) -> GraphContender:
-    """The nominal analytic model: what one has before any data."""
+    """The nominal analytic model: what one has before any data. It is told what launcher settings mean for the spin."""
+    label = as_it_is if task.launcher is None else task.launcher.labelled
     model = nominal_model(task.info.ball.radius)
-    return GraphContender(job.method, model, task.surfaces, task.settings, label_of(task), job.measured)
+    return GraphContender(job.method, model, task.surfaces, task.settings, label, job.measured)
 
 
 def adapting_contender(job: Job, task: Task) -> GraphContender:
     """The nominal model with coefficients that are estimated with each track, as `ballfg predict` has it."""
     contender = nominal_contender(job, task)
-    contender.settings = replace(task.settings, coefficients=coefficient_sigmas(contender.model))
-    return contender
+    return replace(contender, settings=replace(task.settings, coefficients=coefficient_sigmas(contender.model)))
 
 
 def truth_contender(job: Job, task: Task) -> GraphContender:
@@ -201,4 +166,4 @@ def truth_contender(job: Job, task: Task) -> GraphContender:
             f"method '{job.method}' needs simulated tracks; got measured ones ({task.case}). Leave it out."
         )
     settings = replace(task.settings, process=NO_NOISE)
-    return GraphContender(job.method, task.truth, task.surfaces, settings, label_of(task))
+    return replace(nominal_contender(job, task), model=task.truth, settings=settings)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ballfg.benchmarks.dynamics.contenders import GraphContender
+from ballfg.benchmarks.metrics import Array
 from ballfg.simulation import SETTING_LEVELS, table_tennis
 from ballfg.simulation.settings import Settings
+from ballfg.state import POSITION, SPIN, VELOCITY
 from ballfg.tracks import Track
-
-Array = NDArray[np.float64]
 
 SPEED_LEVEL: Final = 11
 """The launcher's middle velocity level."""
@@ -49,34 +47,23 @@ class Fan:
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> Fan:
-        """What `to_json` gave."""
-        return cls(
-            **{
-                name: {int(level): np.array(path) for level, path in content[name].items()}
-                for name in ("topspin", "sidespin")
-            }
-        )
+        """The fan that `to_json` wrote."""
+        return cls(**{name: {int(k): np.array(path) for k, path in group.items()} for name, group in content.items()})
 
 
 def fan_of(contender: GraphContender) -> Fan:
     """The paths of all levels of topspin, and of all levels of sidespin, from the launcher's middle shot."""
-    shots = list(_settings())
-    start = _launch()
-    states = np.tile(start, (len(shots), 1))
-    for row, (topspin, sidespin) in zip(states, shots, strict=True):
-        row[6:] = _spin(contender, start, topspin, sidespin)
+    return Fan(_paths(contender, "topspin"), _paths(contender, "sidespin"))
+
+
+def _paths(contender: GraphContender, setting: str) -> dict[int, Array]:
+    """The paths by the levels of one setting, the other one being zero."""
+    levels, start = SETTING_LEVELS[setting], _launch()
+    states = np.tile(start, (len(levels), 1))
+    for row, level in zip(states, levels, strict=True):
+        row[SPIN] = _spin(contender, start, {setting: float(level)})
     times = np.arange(round(DURATION * RATE) + 1) / RATE
-    paths = dict(zip(shots, contender.roll(states, [times] * len(shots)), strict=True))
-    return Fan(
-        topspin={level: paths[level, 0] for level in SETTING_LEVELS["topspin"]},
-        sidespin={level: paths[0, level] for level in SETTING_LEVELS["sidespin"]},
-    )
-
-
-def _settings() -> Iterator[tuple[int, int]]:
-    """Pairs of topspin and sidespin, each once."""
-    yield from ((level, 0) for level in SETTING_LEVELS["topspin"])
-    yield from ((0, level) for level in SETTING_LEVELS["sidespin"] if level)
+    return dict(zip(levels, contender.roll(states, [times] * len(levels)), strict=True))
 
 
 def _launch() -> Array:
@@ -88,11 +75,11 @@ def _launch() -> Array:
     return np.asarray(launcher.launch(settings, kind.surfaces.table_height, np.random.default_rng(0))[0].numpy())
 
 
-def _spin(contender: GraphContender, start: Array, topspin: int, sidespin: int) -> Array:
-    """(3,) rad/s, what the contender takes launcher settings to mean for a launch."""
+def _spin(contender: GraphContender, start: Array, settings: dict[str, float]) -> Array:
+    """(3,) rad/s, the spin that launcher settings mean to the contender for a launch."""
     times = np.arange(STRAIGHT) / RATE
-    positions = start[:3] + times[:, None] * start[3:6]
-    labels = {"topspin": float(topspin), "sidespin": float(sidespin), "speed": float(SPEED_LEVEL)}
+    positions = start[POSITION] + times[:, None] * start[VELOCITY]
+    labels = {"topspin": 0.0, "sidespin": 0.0, "speed": float(SPEED_LEVEL)} | settings
     launch = contender.label(Track("launch", times, positions, labels=labels))
     label = contender.settings.spin_label(launch)
     return np.zeros(3) if label is None else label.spin

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Final
 
 import numpy as np
@@ -21,33 +22,40 @@ LEAST_OBSERVED: Final = 10
 STAMP_TOLERANCE: Final = 1e-9
 """s. A stamp this little after the end of a part belongs to it."""
 
-
 GROUP: Final = "group"
 """The label of a launcher and its setting. Tracks without it are one group of their dataset's name."""
 
 
-def measured_tasks(
-    datasets: Sequence[Dataset], transfer: Dataset | None, jobs: int, tracks: int | None, transfer_tracks: int | None
-) -> list[Task]:
-    """A task for each dataset.
+@dataclass(frozen=True)
+class Measured:
+    """Measured tracks.
 
-    Args:
-        datasets: to learn from together, and to be judged by.
-        transfer: to be judged by only; None for none.
-        jobs: processes for the smoothing.
-        tracks: how many of the first ones of each dataset; None for all.
-        transfer_tracks: the same of the dataset to be judged by only.
+    Attributes:
+        datasets: one model learns from all of them; it is judged on each.
+        transfer: the models are judged on it, but learn nothing from it; None for none.
+        transfer_tracks: how many of its first tracks; None for all.
+    """
+
+    datasets: Sequence[Dataset]
+    transfer: Dataset | None = None
+    transfer_tracks: int | None = None
+
+
+def measured_tasks(data: Measured, jobs: int, most: int | None) -> list[Task]:
+    """A task for each dataset, of at most so many of its first tracks (None: all).
+
     Raises: ValueError: if two have the same name, or they are of different balls, or have too few tracks.
     """
-    every = [*datasets, *([] if transfer is None else [transfer])]
+    every = [*data.datasets, *([] if data.transfer is None else [data.transfer])]
     names, radii = [d.info.name for d in every], {d.info.ball.radius for d in every}
     if len(set(names)) < len(names):
         raise ValueError(f"datasets must have names that differ; got {', '.join(names)}. Rename one in dataset.yaml.")
     if len(radii) > 1:
         raise ValueError(f"datasets must be of one kind of ball; got radii {sorted(radii)} m. Compare them apart.")
-    tasks = [measured_task(dataset, jobs, tracks) for dataset in datasets]
-    if transfer is not None:
-        tasks.append(measured_task(transfer, jobs, transfer_tracks, learn=False))
+    tasks = [measured_task(dataset, jobs, most) for dataset in data.datasets]
+    if data.transfer is not None:
+        limits = [limit for limit in (data.transfer_tracks, most) if limit is not None]
+        tasks.append(measured_task(data.transfer, jobs, min(limits, default=None), learn=False))
     return tasks
 
 
@@ -59,15 +67,13 @@ def measured_task(dataset: Dataset, jobs: int, tracks: int | None = None, *, lea
     out.
 
     Args:
-        dataset: measured tracks.
-        jobs: processes for the smoothing.
         tracks: how many of the first ones; None for all.
         learn: False: all shots are to judge by.
     Raises: ValueError: if too few tracks are left.
     """
     model = nominal_model(dataset.info.ball.radius)
     given, surfaces = dataset_settings(dataset, model), dataset_surfaces(dataset)
-    listed = [track for track, _ in zip(dataset, range(tracks or len(dataset)), strict=False)]
+    listed = list(islice(dataset, tracks))
     found = estimate_tracks(Smoother(model, surfaces, given), listed, len(listed), jobs)
     smoothed = progress(found, len(listed), "tracks smoothed for their bounces")
     made = [measured_shot(_grouped(t, dataset), estimate) for t, estimate in zip(listed, smoothed, strict=True)]
@@ -98,10 +104,7 @@ def _grouped(track: Track, dataset: Dataset) -> Track:
 
 
 def measured_shot(track: Track, estimate: Estimate) -> Shot | None:
-    """A measured track up to its first hit; None if nothing is left to predict.
-
-    Args: track: as measured.  estimate: of the whole track.
-    """
+    """A measured track up to the first hit that its estimate has; None if nothing is left to predict."""
     last = int(estimate.hits[0]) if len(estimate.hits) else len(track) - 1
     track = track.until(float(track.times[last]))
     since = track.times - track.times[0]

@@ -1,22 +1,42 @@
-"""The rows of the dynamics comparison."""
+"""The methods of the dynamics comparison."""
 
 from __future__ import annotations
 
-from typing import Final
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Final, Literal
 
 from ballfg.benchmarks.dynamics.contenders import (
+    Contender,
     Job,
-    Method,
     adapting_contender,
     nominal_contender,
     truth_contender,
 )
 from ballfg.benchmarks.dynamics.recipes import RESIDUAL
-from ballfg.benchmarks.dynamics.trained import recipe, trained_contender
+from ballfg.benchmarks.dynamics.task import Task
+from ballfg.benchmarks.dynamics.trained import trained_contender
 
 
-def _untrained(job: Job) -> str:
-    return "untrained"
+@dataclass(frozen=True)
+class Method:
+    """A row of the comparison.
+
+    Attributes:
+        make: a contender for one of the job's tasks; what the method learns is learned at the first of them.
+        trained: whether a seed makes a difference; if not it runs once.
+        takes_part: on which tracks: `all`, `simulated` or `measured` ones.
+        transfers: whether it can be judged on tracks of a launcher that it did not learn from.
+    """
+
+    make: Callable[[Job, Task], Contender]
+    trained: bool = True
+    takes_part: Literal["all", "simulated", "measured"] = "all"
+    transfers: bool = True
+
+    def fits(self, tasks: Sequence[Task]) -> bool:
+        """Whether it takes part on these tracks."""
+        return self.takes_part in ("all", "measured" if tasks[0].truth is None else "simulated")
 
 
 SEQUENCES: Final = ("lstm+aug", "diffusion+aug")
@@ -25,11 +45,11 @@ TRAINED: Final = (*SEQUENCES, "a-tune+aug", "mlp+aug", "mlp+gs", "skip+gs", "mnn
 """As in the paper's table."""
 
 METHODS: Final = {
-    "truth": Method(truth_contender, _untrained, trained=False, takes_part="simulated"),
-    "nominal": Method(nominal_contender, _untrained, trained=False),
-    "nominal+track": Method(adapting_contender, _untrained, trained=False, takes_part="measured"),
-    **{name: Method(trained_contender, recipe, transfers=name not in SEQUENCES) for name in TRAINED},
-    RESIDUAL: Method(trained_contender, recipe, takes_part="measured"),
+    "truth": Method(truth_contender, trained=False, takes_part="simulated"),
+    "nominal": Method(nominal_contender, trained=False),
+    "nominal+track": Method(adapting_contender, trained=False, takes_part="measured"),
+    **{name: Method(trained_contender, transfers=name not in SEQUENCES) for name in TRAINED},
+    RESIDUAL: Method(trained_contender, takes_part="measured"),
 }
 """Every method by name, in the order of the table: controls, then those that learn. `nominal+track` is the nominal
 model with coefficients of each track's own, `analytic+mnn` the nominal model with a network that corrects it."""

@@ -6,9 +6,9 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from ballfg.benchmarks.dynamics.contenders import TIMED
-from ballfg.benchmarks.dynamics.metrics import PathScore, pooled_rmse
+from ballfg.benchmarks.dynamics.jobs import TIMED
 from ballfg.benchmarks.dynamics.record import Record
+from ballfg.benchmarks.dynamics.scoring import PathScore, pooled_rmse
 from ballfg.benchmarks.dynamics.task import APEXES, Task
 from ballfg.benchmarks.metrics import Figure
 from ballfg.benchmarks.results import CURVE_MARK, Results
@@ -20,24 +20,20 @@ def add_rows(results: Results, task: Task, records: Sequence[Record]) -> None:
     Figures that a method does not have are left out: one that predicts only what comes after the observed part has no
     error over the whole track.
     """
-    case, measured = task.case, task.truth is None
-    by_seed = {
-        record.seed: {name: (unit, value, n) for name, unit, value, n in figures(record, measured)}
-        for record in records
-    }
-    method, first = records[0].method, next(iter(by_seed.values()))
-    for name, (unit, _, n) in first.items():
-        values = [found[name][1] for found in by_seed.values()]
-        several = len(values) > 1
-        figure = Figure(float(np.mean(values)), min(values), max(values)) if several else float(values[0])
-        results.add(case, method, name, unit, figure, n)
-        if several:
-            for seed, value in zip(by_seed, values, strict=True):
-                results.add(case, method, f"{name}{CURVE_MARK}{seed}", unit, value, n)
+    method, measured = records[0].method, task.truth is None
+    by_seed = [{figure[0]: figure for figure in figures(record, measured)} for record in records]
+    for name, (_, unit, value, n) in by_seed[0].items():
+        values = [found[name][2] for found in by_seed]
+        if len(values) == 1:
+            results.add(task.case, method, name, unit, float(value), n)
+            continue
+        results.add(task.case, method, name, unit, Figure(float(np.mean(values)), min(values), max(values)), n)
+        for record, one in zip(records, values, strict=True):
+            results.add(task.case, method, f"{name}{CURVE_MARK}{record.seed}", unit, one, n)
 
 
 def figures(record: Record, measured: bool) -> Iterator[tuple[str, str, float, int]]:
-    """Metric, unit, value and number of tracks of everything that is said about one contender.
+    """Metric, unit, value and number of tracks of every figure of one contender.
 
     On measured tracks `prediction_rmse_median` is the figure of `ballfg-bench estimators --data`, in its unit.
     """

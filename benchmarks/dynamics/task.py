@@ -1,4 +1,4 @@
-"""What the dynamics models are compared on: shots to train on, shots to judge by, and what everyone is told."""
+"""The tracks of the dynamics comparison: shots to train on, shots to judge by, and the settings that all models get."""
 
 from __future__ import annotations
 
@@ -7,14 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ballfg.benchmarks.metrics import Array
 from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation import Launcher, Settings
 from ballfg.tracks import DatasetInfo, Track, write_dataset
-
-Array = NDArray[np.float64]
 
 APEXES: Final = ("before_1", "1_2", "2_3")
 """The flights whose highest point is judged: before the first bounce, between the first two, between the next two."""
@@ -81,14 +77,11 @@ class Task:
     validation: tuple[Shot, ...]
 
     def write(self, folder: Path, *, validate: bool = True) -> None:
-        """Write the tracks of both parts as a dataset whose label `split` says train, validation or test.
+        """Write the tracks of both parts into a new folder, as a dataset with a label `split`.
 
-        The shots to judge by are tests, which no training looks at.
+        The shots to judge by are tests, which no training looks at. With `validate`, one in ten of the others decides
+        which weights are kept; without it all of them train, and the last weights are kept.
 
-        Args:
-            folder: is made.
-            validate: one in ten of the shots to learn from validates: it decides which weights are kept. False: all of
-                them train, and the last weights are kept.
         Raises: FileNotFoundError: if the folder's parent does not exist.
         """
         last = VALIDATE_ONE_IN - 1

@@ -1,4 +1,4 @@
-"""The trained contenders: one training config each, equal in everything that is not the method."""
+"""The trained contenders: models in the factor graph, and sequence models."""
 
 from __future__ import annotations
 
@@ -6,20 +6,20 @@ from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job
-from ballfg.benchmarks.dynamics.recipes import RESIDUAL, measured_content
+from ballfg.benchmarks.dynamics.recipes import content_of, kind_of
 from ballfg.benchmarks.dynamics.record import task_digest
 from ballfg.benchmarks.dynamics.task import Task
+from ballfg.benchmarks.metrics import Array
 from ballfg.dynamics import BallModel, load_model
 from ballfg.estimation import Settings
 from ballfg.estimation.configure import launcher_of, learned_process
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.kinds import NETWORKS, SEQUENCES
+from ballfg.learning.kinds import SEQUENCES
 from ballfg.learning.run.metrics import read_metrics
 from ballfg.learning.run.run_folder import METRICS, MODEL
 from ballfg.learning.run.training import run_training
@@ -28,29 +28,7 @@ from ballfg.learning.sequence.trainee import FOLDER
 from ballfg.progress import unwatched
 from ballfg.tracks import Track
 
-Array = NDArray[np.float64]
-
-OPTIMIZER: Final[dict[str, Any]] = {"learning_rate": 2e-3, "batch": 32, "epochs": 20, "clip": 5.0, "noise_step": 40.0}
-"""Of all models in the factor graph."""
-SEQUENCE_OPTIMIZERS: Final[dict[str, dict[str, Any]]] = {
-    "lstm": {"learning_rate": 3e-3, "batch": 16, "epochs": 150, "warm_start_epochs": 5},
-    "diffusion": {"learning_rate": 1e-3, "batch": 16, "epochs": 120, "warm_start_epochs": 5},
-}
-"""Of the sequence models, each the best of a few that were tried on the judging tracks: that favours them."""
-QUICK_EPOCHS: Final = 2
-QUICK_PRETRAIN: Final = 60
-ERROR_SCALE: Final = 0.05
-"""m. Errors beyond it count linearly: one wild track must not decide a step."""
-LIKELIHOOD: Final = 0.01
-"""Weight of the likelihood from which the noise is learned: as much as the errors count at 1 to 2 cm."""
-NOISE: Final = {
-    "acceleration": 0.3,
-    "spin": 1.0,
-    "contact_velocity": 0.05,
-    "contact_tangential": 0.1,
-    "contact_spin": 10.0,
-}
-"""Process noise that all models in the factor graph start from."""
+T = TypeVar("T")
 
 
 def trained_contender(job: Job, task: Task) -> Contender:
@@ -74,18 +52,22 @@ def trained_contender(job: Job, task: Task) -> Contender:
         model=model,
         surfaces=task.surfaces,
         settings=learned_settings(task, model),
-        label=_as_it_is,
         onward=job.measured,
         parameter_count=_learned_numbers(model),
         training_seconds=seconds,
     )
 
 
+def recipe(job: Job) -> str:
+    """How a job's method is trained, in words that change whenever that does."""
+    return repr(content_of(job.method, job.quick, job.measured))
+
+
 def _written(job: Job) -> list[Path]:
     """The datasets that a job learns from, written into its folder if they are not there yet.
 
-    The folder says what it is of: a training that was stopped goes on only with what it began with. Measured shots are
-    too few to spare some for a choice among epochs; sequence models learn their shots by heart and need that choice.
+    A digest in the folder identifies them: a stopped training goes on only with the tracks that it began with. Measured
+    shots are too few to spare some for a choice among epochs; sequence models learn their shots by heart and need it.
     """
     learned = [task for task in job.tasks if task.train]
     names = ["data"] if len(learned) == 1 else [f"data-{number}" for number in range(len(learned))]
@@ -105,47 +87,15 @@ def _written(job: Job) -> list[Path]:
 
 
 def config_of(job: Job, data: Sequence[Path]) -> TrainConfig:
-    """The training of a job."""
-    first = job.tasks[0]
-    content = content_of(job.method, job.quick, job.measured)
-    labels = {"labels": first.launcher_labels}
+    """The training of a job on its written datasets."""
+    first, content = job.tasks[0], content_of(job.method, job.quick, job.measured)
     given = {
         "seed": job.seed,
         "data": [str(folder) for folder in data],
         "observe": dict(first.observe),
-        "launcher": content.get("launcher", {}) | labels,
+        "launcher": content.get("launcher", {}) | {"labels": first.launcher_labels},
     }
     return TrainConfig.model_validate(content | given)
-
-
-def recipe(job: Job) -> str:
-    """How a job's method is trained, as text."""
-    return repr(content_of(job.method, job.quick, job.measured))
-
-
-def content_of(method: str, quick: bool, measured: bool) -> dict[str, Any]:
-    """The config of a method. Those of one family differ in `kind` and in the augmentation that it implies."""
-    kind = kind_of(method)
-    common = {"kind": kind, "split": {"by": "label"}, "workers": 1}
-    epochs = {"epochs": QUICK_EPOCHS} if quick else {}
-    if kind in SEQUENCES:
-        return common | {
-            "optimizer": SEQUENCE_OPTIMIZERS[kind] | ({"epochs": QUICK_EPOCHS, "warm_start_epochs": 0} if quick else {})
-        }
-    if measured:
-        content = measured_content(method, common)
-    else:
-        loss = {"position_scale": ERROR_SCALE, "likelihood": LIKELIHOOD}
-        content = common | {"optimizer": OPTIMIZER, "loss": loss, "noise": NOISE}
-    content["optimizer"] = content["optimizer"] | epochs
-    if quick and kind in NETWORKS:
-        content["architecture"] = content.get("architecture", {}) | {"pretrain": QUICK_PRETRAIN}
-    return content
-
-
-def kind_of(method: str) -> str:
-    """The kind of a method in a training config."""
-    return "mnn+gs" if method == RESIDUAL else method.removesuffix("+aug")
 
 
 def learned_settings(task: Task, model: BallModel) -> Settings:
@@ -187,7 +137,3 @@ class SequenceContender:
             seen, counts, [stamps[count:] for stamps, count in zip(times, counts, strict=True)]
         )
         return [np.concatenate((np.full((count, 3), np.nan), rest)) for count, rest in zip(counts, rests, strict=True)]
-
-
-def _as_it_is(track: Track) -> Track:
-    return track

@@ -24,14 +24,15 @@ from typing import Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ballfg.benchmarks.dynamics.task import Shot, Task
-from ballfg.benchmarks.synthetic import gaussian_settings
+from ballfg.benchmarks.estimators.protocols import gaussian_settings
+from ballfg.benchmarks.metrics import Array
 from ballfg.dynamics import BallModel, Surfaces, contact_time
 from ballfg.estimation import Launcher
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.apexes import true_apexes
+from ballfg.progress import progress
 from ballfg.simulation import (
     MeasurementNoise,
     SimulatedTrack,
@@ -43,8 +44,6 @@ from ballfg.simulation import (
 )
 from ballfg.simulation.composition import true_model
 from ballfg.state import POSITION, VZ
-
-Array = NDArray[np.float64]
 
 CASE: Final = "synthetic"
 TRACKS: Final = 717
@@ -78,45 +77,33 @@ _SPLIT_STREAM: Final = 6
 """Keeps the draw of the split apart from other draws of the same seed."""
 
 
-def simulation(seed: int, tracks: int = TRACKS) -> SimulationConfig:
-    """The simulation behind the task: launcher settings as labels, no spin, no process noise."""
-    kind = table_tennis()
-    launcher = kind.launcher.with_fields({"duration": (MOST_SAMPLES - 1) / RATE})
-    return SimulationConfig(
-        tracks=tracks,
-        rate=RATE,
-        seed=seed,
-        ball=replace(kind, launcher=launcher),
-        noise=MeasurementNoise(position=NOISE),
-        undeclared=parse_effects(EFFECTS),
-        spin_labels=False,
-    )
-
-
 def synthetic_task(seed: int, tracks: int = TRACKS) -> Task:
-    """Synthetic tracks with their truth, parted by the seed.
+    """Synthetic tracks with their truth; the seed decides launches, noise and split.
 
-    Args:
-        seed: of launches, noise and split.
-        tracks: how many.
     Raises: ValueError: if fewer than two tracks are asked for.
     """
     if tracks < 2:
         raise ValueError(f"tracks must be at least 2, one to train on and one to judge by; got {tracks}. Raise it.")
-    config = simulation(seed, tracks)
-    kind = config.ball
+    kind = table_tennis()
+    config = SimulationConfig(
+        tracks=tracks,
+        rate=RATE,
+        seed=seed,
+        ball=replace(kind, launcher=kind.launcher.with_fields({"duration": (MOST_SAMPLES - 1) / RATE})),
+        noise=MeasurementNoise(position=NOISE),
+        undeclared=parse_effects(EFFECTS),
+        spin_labels=False,  # launcher settings are the labels
+    )
     model = true_model(kind.model, config.undeclared)
-    shots = [true_shot(made, model, kind.surfaces) for made in simulate(config)]
+    shots = [true_shot(made, model, kind.surfaces) for made in progress(simulate(config), tracks, "tracks simulated")]
     train, validation = split(len(shots), seed)
-    # the tracks end where a ball goes beside the table, so that its edges need not be told
-    surfaces = Surfaces.table_tennis(kind.surfaces.table_height)
-    launcher = Launcher.of_levels(kind.launcher.topspin_scale, kind.launcher.sidespin_scale, LABEL_NOISE)
     return Task(
         case=CASE,
         info=replace(dataset_info(config), name=CASE),
-        surfaces=surfaces,
+        # the tracks end where a ball goes beside the table, so that its edges need not be told
+        surfaces=Surfaces.table_tennis(kind.surfaces.table_height),
         settings=gaussian_settings(NOISE, ProcessNoise(), LABEL_NOISE),
-        launcher=launcher,
+        launcher=Launcher.of_levels(kind.launcher.topspin_scale, kind.launcher.sidespin_scale, LABEL_NOISE),
         launcher_labels=("topspin", "sidespin"),
         observe={"samples": OBSERVED},
         truth=model,
@@ -155,10 +142,7 @@ def true_shot(made: SimulatedTrack, model: BallModel, surfaces: Surfaces) -> Sho
 
 @torch.no_grad()
 def true_bounces(times: Array, states: Array, model: BallModel, surfaces: Surfaces) -> Array:
-    """(b,) s, the contacts of a true motion, by flying each state before a bounce on to the surface.
-
-    Args: times: (n,) s.  states: (n, 9).  model: how it moves.  surfaces: on what it bounces.
-    """
+    """(b,) s, the contacts of a true motion (n, 9), by flying each state before a bounce on to the surface."""
     rows = np.flatnonzero((states[:-1, VZ] < 0.0) & (states[1:, VZ] > 0.0))
     before = torch.from_numpy(states[rows])
     tau = contact_time(model, before, surfaces.height_below(before)).numpy()

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import partial
+from itertools import islice, pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ballfg.benchmarks.metrics import Statistic, bootstrap, inside, pooled_mean, quantile, square_norms
+from ballfg.benchmarks.estimators.scoring import LEVELS, sums_and_counts
+from ballfg.benchmarks.metrics import Array, Statistic, bootstrap, inside, pooled_mean, quantile, root_mean_square
 from ballfg.benchmarks.results import CURVE_MARK, Results
 from ballfg.dynamics import BallModel, nominal_model
 from ballfg.estimation import (
@@ -27,34 +28,32 @@ from ballfg.estimation.segmentation import Quality
 from ballfg.progress import progress
 from ballfg.tracks import Dataset
 
-Array = NDArray[np.float64]
-
 OBSERVE = 0.25
 """s of each track that the estimators see."""
 HORIZON = 0.3
 """s that are predicted after it."""
 END = 0.05
 """s at the end of the horizon over which `prediction_end_error` is taken."""
-LEVELS = (0.5, 0.9)
 CALIBRATION = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 """Nominal levels of the calibration curve."""
+QUARTILES = {"median": 0.5, "lower_quartile": 0.25, "upper_quartile": 0.75}
 BINS = np.linspace(0.0, HORIZON, 13)
 """s, edges of the error-growth curve."""
 WHOLE = "smoother (whole tracks)"
-"""The method in `results.json` of what is said about smoothing without prediction."""
+"""The method in `results.json` of rows about smoothing without prediction."""
 WITHIN = 5.0
 """Standard deviations within which a whitened innovation is explained."""
 
 
 @dataclass(frozen=True)
 class Measured:
-    """What the estimators made of a dataset.
+    """The estimates and predictions of a dataset's tracks.
 
     Attributes:
         name: of the dataset.
         predictions: by method, of the tracks that last longer than the observed part.
         smoothed: the smoother's estimates of the whole tracks.
-        unseen: how many tracks end within the observed part.
+        unseen: number of tracks that end within the observed part.
     """
 
     name: str
@@ -64,86 +63,76 @@ class Measured:
 
 
 def run_measured(results: Results, dataset: Dataset, tracks: int | None, jobs: int) -> Measured:
-    """Estimate, predict, and add the rows.
+    """Estimate and predict the first tracks of a dataset (None: all of them), and add the rows.
 
     Nominal model, noise as the dataset states it or as its tracks show it: nothing is fitted to a single track's
     later part, nor to labels.
-
-    Args:
-        results: gets the rows.
-        dataset: measured tracks.
-        tracks: how many of the first ones; None for all.
-        jobs: processes.
     """
     model: BallModel = nominal_model(dataset.info.ball.radius)
     settings, surfaces = dataset_settings(dataset, model), dataset_surfaces(dataset)
-    listed = [track for track, _ in zip(dataset, range(tracks or len(dataset)), strict=False)]
+    listed = list(islice(dataset, tracks))
     predictions = {}
     for method in ESTIMATORS:
         estimator = make_estimator(method, model, surfaces, settings)
         made = predict_tracks(estimator, listed, len(listed), OBSERVE, horizon=HORIZON, jobs=jobs)
         predictions[method] = [p for p in progress(made, len(listed), f"tracks predicted ({method})") if len(p.times)]
-    smoother = make_estimator("smoother", model, surfaces, settings)
-    smoothed = list(
-        progress(estimate_tracks(smoother, listed, len(listed), jobs), len(listed), "whole tracks smoothed")
-    )
+    made_whole = estimate_tracks(make_estimator("smoother", model, surfaces, settings), listed, len(listed), jobs)
+    smoothed = list(progress(made_whole, len(listed), "whole tracks smoothed"))
     measured = Measured(dataset.info.name, predictions, smoothed, len(listed) - len(predictions["smoother"]))
     _add_predictions(results, measured)
     _add_smoothing(results, measured)
     return measured
 
 
+def _error(prediction: TrackPrediction, after: float = 0.0, until: float = np.inf) -> float:
+    """m: root mean square distance between measured and predicted positions in a span (s) since the last observed one.
+
+    NaN where nothing was measured in it.
+    """
+    elapsed = prediction.times - prediction.estimate.times[-1]
+    within = (elapsed > after) & (elapsed <= until)
+    errors = (prediction.measured - prediction.positions)[within]
+    return root_mean_square(errors) if len(errors) else float("nan")
+
+
 def prediction_rmse(prediction: TrackPrediction) -> float:
     """m: root mean square distance between measured and predicted positions of one track."""
-    return float(np.sqrt(square_norms(prediction.measured - prediction.positions).mean()))
-
-
-def elapsed(prediction: TrackPrediction) -> Array:
-    """(k,) s since the last observed sample."""
-    return prediction.times - prediction.estimate.times[-1]
-
-
-def end_error(prediction: TrackPrediction) -> float:
-    """m: root mean square error over the last `END` of the horizon; NaN for a track that ends before it."""
-    late = elapsed(prediction) > HORIZON - END
-    if not late.any():
-        return float("nan")
-    return float(np.sqrt(square_norms(prediction.measured[late] - prediction.positions[late]).mean()))
+    return _error(prediction)
 
 
 def covered(predictions: Sequence[TrackPrediction], level: float, axes: slice = slice(0, 3)) -> tuple[Array, Array]:
     """For each track how many coordinates lie in the interval of a level, and how many there are."""
-    held = [inside((p.measured - p.positions)[:, axes], p.sigmas[:, axes], level) for p in predictions]
-    return np.array([float(h.sum()) for h in held]), np.array([float(h.size) for h in held])
+    return sums_and_counts([inside((p.measured - p.positions)[:, axes], p.sigmas[:, axes], level) for p in predictions])
 
 
 def _add_predictions(results: Results, measured: Measured) -> None:
     rng = np.random.default_rng([results.seed, 4])
-    case = measured.name
     for method, predictions in measured.predictions.items():
-        if not predictions:
+        n = len(predictions)
+        if not n:
             continue
+        add = partial(results.add, measured.name, method)
         for metric, unit, statistic, count in _statistics(predictions):
-            results.add(case, method, metric, unit, bootstrap(statistic, count, rng), count)
+            add(metric, unit, bootstrap(statistic, count, rng), count)
         for level in CALIBRATION:
             held, total = covered(predictions, level)
-            share = float(held.sum() / total.sum())
-            results.add(case, method, f"coverage{CURVE_MARK}{level:g}", "1", share, len(predictions))
-        _add_nis(results, case, method, [p.estimate for p in predictions])
-        failed = sum(p.status is not Status.OK for p in predictions)
-        results.add(case, method, "not_converged", "1", failed, len(predictions))
-        _add_growth(results, case, method, predictions)
+            add(f"coverage{CURVE_MARK}{level:g}", "1", float(held.sum() / total.sum()), n)
+        # chi-square with 3 degrees of freedom has the median 2.37; one outlier decides the mean
+        nis = np.concatenate([p.estimate.nis for p in predictions])
+        nis = nis[np.isfinite(nis)]
+        if len(nis):
+            add("nis_median", "1", float(np.median(nis)), len(nis))
+            add("nis_mean", "1", float(nis.mean()), len(nis))
+        add("not_converged", "1", sum(p.status is not Status.OK for p in predictions), n)
+        _add_growth(add, predictions)
 
 
 def _statistics(predictions: Sequence[TrackPrediction]) -> list[tuple[str, str, Statistic, int]]:
     """Metric, unit, statistic and number of tracks of everything that has an interval."""
     n = len(predictions)
     rmse = [1e3 * prediction_rmse(p) for p in predictions]
-    ends = [1e3 * e for e in map(end_error, predictions) if np.isfinite(e)]
-    found = [
-        (f"prediction_rmse_{name}", "mm", quantile(rmse, q), n)
-        for name, q in (("median", 0.5), ("lower_quartile", 0.25), ("upper_quartile", 0.75))
-    ]
+    found = [(f"prediction_rmse_{name}", "mm", quantile(rmse, q), n) for name, q in QUARTILES.items()]
+    ends = [1e3 * error for p in predictions if np.isfinite(error := _error(p, after=HORIZON - END))]
     if ends:
         found.append(("prediction_end_error_median", "mm", quantile(ends, 0.5), len(ends)))
     for level in LEVELS:
@@ -155,28 +144,14 @@ def _statistics(predictions: Sequence[TrackPrediction]) -> list[tuple[str, str, 
     return found
 
 
-def _add_nis(results: Results, case: str, method: str, estimates: Sequence[Estimate]) -> None:
-    """Median of the observed part's NIS: chi-square with 3 degrees has 2.37. The mean is one outlier's affair."""
-    values = np.concatenate([e.nis for e in estimates])
-    values = values[np.isfinite(values)]
-    if len(values):
-        results.add(case, method, "nis_median", "1", float(np.median(values)), len(values))
-        results.add(case, method, "nis_mean", "1", float(values.mean()), len(values))
-
-
-def _add_growth(results: Results, case: str, method: str, predictions: Sequence[TrackPrediction]) -> None:
+def _add_growth(add: Callable[..., None], predictions: Sequence[TrackPrediction]) -> None:
     """Median and quartiles over tracks of the error in each bin of the horizon."""
     for low, high in pairwise(BINS):
-        errors = []
-        for p in predictions:
-            now = (elapsed(p) > low) & (elapsed(p) <= high)
-            if now.any():
-                errors.append(float(np.sqrt(square_norms(p.measured[now] - p.positions[now]).mean())))
-        if errors:
-            lower, middle, upper = 1e3 * np.quantile(errors, [0.25, 0.5, 0.75])
-            for name, value in (("lower_quartile", lower), ("median", middle), ("upper_quartile", upper)):
+        errors = [error for p in predictions if np.isfinite(error := _error(p, low, high))]
+        for name, q in QUARTILES.items():
+            if errors:
                 metric = f"prediction_error_{name}{CURVE_MARK}{(low + high) / 2:.4g}"
-                results.add(case, method, metric, "mm", value, len(errors))
+                add(metric, "mm", float(1e3 * np.quantile(errors, q)), len(errors))
 
 
 def _add_smoothing(results: Results, measured: Measured) -> None:

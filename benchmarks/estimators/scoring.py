@@ -4,39 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from functools import partial
 
-import joblib
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from ballfg.benchmarks.metrics import inside, nees, square_norms
-from ballfg.benchmarks.synthetic import Case
-from ballfg.estimation import Estimator, Status
+from ballfg.benchmarks.estimators.protocols import Candidate, Case
+from ballfg.benchmarks.metrics import Array, inside, nees, square_norms
+from ballfg.benchmarks.resumable import in_processes
+from ballfg.estimation import Status
 from ballfg.estimation.filters.sliding_window import WINDOW
-from ballfg.progress import progress
-from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
-
-Array = NDArray[np.float64]
+from ballfg.state import POSITION, SPIN, VELOCITY
 
 LEVELS = (0.5, 0.9)
 """Of the intervals whose coverage is reported."""
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """An estimator in a comparison.
-
-    Attributes:
-        estimator: with its settings.
-        newest: how its state at the newest of k samples comes about. "pass": a state depends on no later sample, so
-            that one pass over a track gives it for every k. "anew": the first k samples are estimated for each k.
-            "none": it is not asked for.
-    """
-
-    estimator: Estimator
-    newest: Literal["pass", "anew", "none"] = "anew"
 
 
 @dataclass(frozen=True)
@@ -73,29 +54,22 @@ def score_tracks(
     """Scores of every candidate on every track.
 
     Args:
-        candidates: by method.
-        tracks: with their truth.
+        candidates: by method.  tracks: with their truth.
         counts: numbers of observations for `TrackScore.newest`.
-        jobs: processes.
-        what: for the progress line.
+        jobs: processes.  what: for the progress line.
     """
-    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator", batch_size=1)
-    scored = parallel(joblib.delayed(_score_all)(candidates, track, counts) for track in tracks)
-    per_track = list(progress(scored, len(tracks), what))
+    per_track = in_processes(partial(_score_all, candidates, counts), tracks, jobs, what)
     return {name: [scores[name] for scores in per_track] for name in candidates}
 
 
-def _score_all(candidates: Mapping[str, Candidate], case: Case, counts: Sequence[int]) -> dict[str, TrackScore]:
-    torch.set_num_threads(1)  # the processes share the cores already
+def _score_all(candidates: Mapping[str, Candidate], counts: Sequence[int], case: Case) -> dict[str, TrackScore]:
     return {name: score_track(candidate, case, counts) for name, candidate in candidates.items()}
 
 
 def score_track(candidate: Candidate, case: Case, counts: Sequence[int]) -> TrackScore:
     """Score of one estimator on one track. The estimator sees the measured track, never the truth."""
-    truth = case.true_states
     estimate = candidate.estimator.estimate(case.track)
-    errors = estimate.states - truth
-    covariances = estimate.covariances
+    errors, covariances = estimate.states - case.true_states, estimate.covariances
     speed_error = np.sqrt(square_norms(errors[:, VELOCITY]))
     return TrackScore(
         velocity=speed_error,
@@ -125,6 +99,10 @@ def _newest(candidate: Candidate, case: Case, whole: Array, counts: Sequence[int
     return found
 
 
+Selection = Callable[[TrackScore], NDArray[np.bool_]]
+"""(n,) which samples count."""
+
+
 def judged(score: TrackScore) -> NDArray[np.bool_]:
     """(n,) the samples that are judged: the sliding window is full, and no bounce is at them."""
     mask = score.away.copy()
@@ -137,28 +115,16 @@ def every(score: TrackScore) -> NDArray[np.bool_]:
     return np.ones_like(score.away)
 
 
-Selection = Callable[[TrackScore], NDArray[np.bool_]]
-"""Which samples count."""
+def sums_and_counts(values: Sequence[NDArray[np.generic]]) -> tuple[Array, Array]:
+    """(m,) the sum of each track's values, and (m,) their number."""
+    return np.array([float(v.sum()) for v in values]), np.array([float(v.size) for v in values])
 
 
-def sums(scores: Sequence[TrackScore], name: str, power: int, select: Selection = judged) -> tuple[Array, Array]:
-    """For each track the sum of a field to a power, and the number of samples.
-
-    Args:
-        scores: of one method.
-        name: field of `TrackScore`, for instance `velocity` (power 2 for an RMSE) or `nees` (power 1 for a mean).
-        power: 1 or 2.
-        select: which samples.
-    """
-    values = [getattr(score, name)[select(score)] ** power for score in scores]
-    return np.array([float(v.sum()) for v in values]), np.array([float(len(v)) for v in values])
+def pooled(scores: Sequence[TrackScore], name: str, power: int, select: Selection = judged) -> tuple[Array, Array]:
+    """For each track the sum of a field of its score to a power over the selected samples, and their number."""
+    return sums_and_counts([getattr(score, name)[select(score)] ** power for score in scores])
 
 
 def covered(scores: Sequence[TrackScore], level: int, block: slice) -> tuple[Array, Array]:
     """For each track how many components of a block lie in the interval of `LEVELS[level]`, and how many there are."""
-    values = [score.covered[level, judged(score), block] for score in scores]
-    return np.array([float(v.sum()) for v in values]), np.array([float(v.size) for v in values])
-
-
-BLOCKS = {"state": slice(0, STATE_DIM), "velocity": VELOCITY}
-"""Components whose coverage is reported."""
+    return sums_and_counts([score.covered[level, judged(score), block] for score in scores])

@@ -1,14 +1,14 @@
-"""What the gradient through an estimate costs next to the estimate: 80 observations, a network for the dynamics."""
+"""Cost of the gradient through an estimate next to the estimate: 80 observations, a network for the dynamics."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Final
 
 import torch
 
-from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.timing import Stopwatch
+from ballfg.benchmarks.speed.stopwatch import Stopwatch
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.factors.batch import Noise, Values
 from ballfg.factors.graph import BallGraph, Minimum
@@ -27,25 +27,20 @@ EXACT: Final = 1e-12
 """Tolerance of the linear solution in the reference gradient; training takes `SOLUTION_TOLERANCE`."""
 
 
-def time_gradients(
-    results: Results, case: str, model: LearnedModel, graph: BallGraph, start: Values, watch: Stopwatch
-) -> None:
+def time_gradients(watch: Stopwatch, model: LearnedModel, graph: BallGraph, start: Values) -> None:
     """Forward: from the first guess to the minimum. Backward: from a derivative by all states to one by all weights.
 
     Building the torch objective and reading GTSAM's factorisation belong to the backward pass.
     """
-    minimum = TRAINING.minimize(graph, start)
-    method_name = model.architecture.kind
-    forward = watch.time(lambda: TRAINING.minimize(graph, start))
-    results.add(case, method_name, "forward_time", "ms", forward, watch.runs)
+    minimum, kind = TRAINING.minimize(graph, start), model.architecture.kind
+    forward = watch.time(kind, "forward_time", lambda: TRAINING.minimize(graph, start))
     exact = backward(model, graph, minimum, ImplicitGradient(), EXACT)
     for name, method in METHODS.items():
-        found = backward(model, graph, minimum, method)
-        figure = watch.time(lambda method=method: backward(model, graph, minimum, method))  # type: ignore[misc]
-        row = f"{method_name}, {name}"
-        results.add(case, row, "backward_time", "ms", figure, watch.runs)
-        results.add(case, row, "backward_over_forward", "1", figure.value / forward.value, watch.runs)
-        results.add(case, row, "gradient_error", "1", float((found - exact).norm() / exact.norm()), 1)
+        row, once = f"{kind}, {name}", partial(backward, model, graph, minimum, method)
+        found = once()
+        figure = watch.time(row, "backward_time", once)
+        watch.add(row, "backward_over_forward", figure.value / forward.value, watch.runs)
+        watch.add(row, "gradient_error", float((found - exact).norm() / exact.norm()))
 
 
 def backward(
@@ -68,9 +63,5 @@ def backward(
     )
     direction = torch.cos(torch.arange(len(point), dtype=point.dtype))
     gradients = torch.autograd.grad((direction * point).sum(), weights, allow_unused=True)
-    return torch.cat(
-        [
-            torch.zeros_like(w).reshape(-1) if g is None else g.reshape(-1)
-            for w, g in zip(weights, gradients, strict=True)
-        ]
-    )
+    pairs = zip(weights, gradients, strict=True)
+    return torch.cat([(torch.zeros_like(weight) if g is None else g).reshape(-1) for weight, g in pairs])

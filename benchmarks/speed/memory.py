@@ -1,4 +1,4 @@
-"""Peak memory of `ballfg estimate` on few and on ten times as many tracks: `python -m ballfg.benchmarks.speed.memory`.
+"""Peak memory of `ballfg estimate` on some and on ten times as many tracks: `python -m ballfg.benchmarks.speed.memory`.
 
 Linux only: it reads each process's high-water mark (VmHWM) from /proc while the command runs.
 """
@@ -21,17 +21,16 @@ def main() -> None:
     """Simulate, estimate, and print the peaks and their ratio."""
     parser = argparse.ArgumentParser(prog="python -m ballfg.benchmarks.speed.memory", description=__doc__)
     parser.add_argument("--tracks", type=int, default=1000, help="the smaller number of tracks")
-    parser.add_argument("--method", default="smoother")
-    parser.add_argument("--jobs", type=int, default=2)
+    parser.add_argument("--method", default="smoother", help="name of the estimator")
+    parser.add_argument("--jobs", type=int, default=2, help="number of processes")
     options = parser.parse_args()
     peaks = []
     with tempfile.TemporaryDirectory() as folder:
         for count in (options.tracks, 10 * options.tracks):
             data = Path(folder) / f"tracks-{count}"
             _ballfg("simulate", "--out", data, "--tracks", count).wait()
-            command = _ballfg(
-                "estimate", data, "--method", options.method, "--jobs", options.jobs, "--out", f"{data}.parquet"
-            )
+            words = ("--method", options.method, "--jobs", options.jobs, "--out", f"{data}.parquet")
+            command = _ballfg("estimate", data, *words)
             parent, worker = _watch(command)
             if command.returncode != 0:
                 sys.exit(f"ballfg estimate ended with {command.returncode} on {count} tracks")
@@ -41,9 +40,9 @@ def main() -> None:
 
 
 def _ballfg(*words: object) -> subprocess.Popen[bytes]:
+    """A running command, whose progress goes to stderr."""
     code = "from ballfg.cli.main import run; run()"
-    arguments = [sys.executable, "-c", code, *map(str, words)]
-    return subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return subprocess.Popen([sys.executable, "-c", code, *map(str, words)], stdout=subprocess.DEVNULL)
 
 
 def _watch(command: subprocess.Popen[bytes]) -> tuple[float, float]:

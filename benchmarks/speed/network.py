@@ -1,4 +1,4 @@
-"""A small network in place of the aerodynamics, fitted to the analytic model: what a learned model costs."""
+"""A small network in place of the aerodynamics, fitted to the analytic model; it stands for learned models."""
 
 from __future__ import annotations
 
@@ -75,8 +75,7 @@ def fitted_network(model: AnalyticModel, iterations: int = FIT_ITERATIONS) -> Ne
     An unfitted network would make an ill-posed problem, on which a solver's time says nothing.
     """
     generator = torch.Generator().manual_seed(0)
-    layers = _random_layers(generator)
-    first, second, last = layers
+    first, second, last = layers = _random_layers(generator)
     network = nn.Sequential(first, nn.Tanh(), second, nn.Tanh(), last)
     state = torch.zeros((FIT_SAMPLES, STATE_DIM), dtype=torch.float64)
     state[:, VELOCITY] = SPEED_SCALE * torch.randn((FIT_SAMPLES, 3), generator=generator, dtype=torch.float64)

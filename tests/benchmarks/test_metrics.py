@@ -5,11 +5,13 @@ from ballfg.benchmarks.metrics import (
     bootstrap,
     chi_square_band,
     inside,
+    median_and_range,
     nees,
     pooled_mean,
     pooled_rms,
     quantile,
     ratio,
+    share,
     square_norms,
 )
 
@@ -71,3 +73,22 @@ def test_bad_arguments_are_refused() -> None:
         bootstrap(pooled_mean([], []), 0, np.random.default_rng(0))
     with pytest.raises(ValueError, match="dof and count must be positive; got 0 and 5"):
         chi_square_band(0, 5)
+
+
+def test_share_has_wilsons_interval() -> None:
+    figure = share([True] * 9 + [False])
+    assert figure.value == 0.9
+    # E. B. Wilson 1927: (p + z^2 / 2n -+ z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)
+    z, n, p = 1.959964, 10, 0.9
+    half = z * np.sqrt(p * (1 - p) / n + z**2 / (4 * n**2))
+    low, high = (p + z**2 / (2 * n) + sign * half for sign in (-1, 1))
+    assert (figure.low, figure.high) == pytest.approx((low / (1 + z**2 / n), high / (1 + z**2 / n)), rel=1e-6)
+    with pytest.raises(ValueError, match="outcomes must not be empty"):
+        share([])
+
+
+def test_median_stands_between_the_extremes() -> None:
+    figure = median_and_range([1.0, 3.0, 2.0, np.inf])
+    assert (figure.value, figure.low, figure.high) == (2.5, 1.0, np.inf)
+    with pytest.raises(ValueError, match="values must not be empty"):
+        median_and_range([])

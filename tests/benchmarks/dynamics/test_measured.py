@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from ballfg.benchmarks.dynamics.contenders import Job, adapting_contender, nominal_contender
-from ballfg.benchmarks.dynamics.measured import measured_task, measured_tasks
+from ballfg.benchmarks.dynamics.jobs import collect_records, judged, record_path
+from ballfg.benchmarks.dynamics.measured import Measured, measured_task, measured_tasks
 from ballfg.benchmarks.dynamics.record import job_digest, task_digest
-from ballfg.benchmarks.dynamics.run import Measured, Plan, collect, judged, record_path, run_dynamics
+from ballfg.benchmarks.dynamics.suite import Plan, run_dynamics
 from ballfg.benchmarks.dynamics.task import Shot, Task
 from ballfg.benchmarks.dynamics.trained import config_of, trained_contender
 from ballfg.benchmarks.estimators.measured import run_measured
@@ -93,10 +94,10 @@ def test_few_shots_all_train_unless_a_sequence_model_needs_some_to_choose_by(dat
 def test_nothing_finished_is_repeated_and_another_recipe_is_refused(
     small: tuple[Results, Path, list[Path]], data: Measured, tmp_path: Path
 ) -> None:
-    tasks = measured_tasks(data.datasets, data.transfer, 1, None, data.transfer_tracks)
+    tasks = measured_tasks(data, 1, None)
     runs = small[1] / "runs"
     stamps = {path: path.stat().st_mtime_ns for path in runs.glob("*.json")}
-    collect(tasks, SMALL, 0, runs, 1, ("nominal", "analytic+mnn"))
+    collect_records(tasks, ("nominal", "analytic+mnn"), [0], runs, 1, quick=True)
     assert {path: path.stat().st_mtime_ns for path in runs.glob("*.json")} == stamps
     job = Job(tuple(tasks), "analytic+mnn", 0, runs / "analytic+mnn-0", quick=False)
     with pytest.raises(ValueError, match="must be a training of these tracks by this recipe"):
@@ -134,7 +135,7 @@ def test_the_split_alternates_and_the_parts_last_as_told(data: Measured) -> None
 
 
 def test_transfer_is_judged_only_and_not_by_models_that_know_nothing_of_spin(data: Measured) -> None:
-    tasks = measured_tasks(data.datasets, data.transfer, 1, None, data.transfer_tracks)
+    tasks = measured_tasks(data, 1, None)
     assert [len(task.train) for task in tasks] == [3, 3, 0]
     assert [shot.track.name for shot in tasks[2].validation] == ["000", "001", "002", "003"]
     assert all(shot.seen.spin_label is not None for shot in tasks[2].validation)
@@ -146,7 +147,7 @@ def test_transfer_is_judged_only_and_not_by_models_that_know_nothing_of_spin(dat
 
 
 def test_digest_of_one_task_is_its_own_and_of_several_tells_what_was_learned(data: Measured) -> None:
-    first, second, other = measured_tasks(data.datasets, data.transfer, 1, None, data.transfer_tracks)
+    first, second, other = measured_tasks(data, 1, None)
     assert job_digest(first, (first,), "r") == task_digest(first, "r")
     assert job_digest(first, (first, other), "r") == task_digest(first, "r")
     assert len({job_digest(first, (first, second), "r"), job_digest(second, (first, second), "r")}) == 2
@@ -154,7 +155,7 @@ def test_digest_of_one_task_is_its_own_and_of_several_tells_what_was_learned(dat
 
 
 def test_all_graph_models_have_one_recipe(data: Measured) -> None:
-    tasks = tuple(measured_tasks(data.datasets, None, 1, None, None))
+    tasks = tuple(measured_tasks(Measured(data.datasets), 1, None))
     configs = {
         name: config_of(Job(tasks, name, 3, Path(), False), [Path("a"), Path("b")])
         for name in ("a-tune+aug", "mlp+aug", "mlp+gs", "mnn+gs", "analytic+mnn")
@@ -170,7 +171,7 @@ def test_all_graph_models_have_one_recipe(data: Measured) -> None:
 def test_bad_combinations_are_named(data: Measured) -> None:
     first = data.datasets[0]
     with pytest.raises(ValueError, match="must have names that differ; got first, first"):
-        measured_tasks([first], first, 1, None, None)
+        measured_tasks(Measured([first], first), 1, None)
 
 
 def test_the_command_refuses_a_transfer_without_training(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -179,6 +180,7 @@ def test_the_command_refuses_a_transfer_without_training(tmp_path: Path, capsys:
     for words, message in (
         (["--transfer", "x"], "--transfer needs a model trained on measured tracks"),
         (["--data", "x", "--transfer-tracks", "5"], "--transfer-tracks is of --transfer"),
+        (["--method", "mpl"], "--method must be one of truth, nominal"),
     ):
         with pytest.raises(SystemExit) as ended:
             run(["dynamics", *words, "--out", str(tmp_path)])
@@ -186,19 +188,17 @@ def test_the_command_refuses_a_transfer_without_training(tmp_path: Path, capsys:
         assert message in capsys.readouterr().err
 
 
-def test_the_command_names_all_its_datasets(data: Measured, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_command_names_all_its_datasets(data: Measured, tmp_path: Path) -> None:
     from ballfg.benchmarks.cli import run
-    from ballfg.benchmarks.dynamics import run as dynamics
 
-    monkeypatch.setattr(dynamics, "METHODS", {"nominal": dynamics.METHODS["nominal"]})
-    monkeypatch.setattr(dynamics.run_dynamics, "__defaults__", (("nominal",),))
     assert data.transfer is not None
     words = [word for one in data.datasets for word in ("--data", str(one.path))]
-    words += ["--transfer", str(data.transfer.path), "--transfer-tracks", "2", "--jobs", "1", "--out", str(tmp_path)]
+    words += ["--transfer", str(data.transfer.path), "--transfer-tracks", "2", "--method", "nominal"]
+    words += ["--jobs", "1", "--out", str(tmp_path)]
     with pytest.raises(SystemExit) as ended:
         run(["dynamics", *words])
     assert ended.value.code == 0
     content = json.loads((tmp_path / "results.json").read_text())
-    expected = "ballfg-bench dynamics --data first --data second --transfer other --transfer-tracks 2 --seed 0"
-    assert content["command"] == expected
+    expected = "ballfg-bench dynamics --data first --data second --transfer other --transfer-tracks 2"
+    assert content["command"] == f"{expected} --method nominal --seed 0"
     assert {row["case"] for row in content["rows"]} == {"first", "second", "other"}

@@ -3,11 +3,10 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.estimators.consistency import add_consistency
-from ballfg.benchmarks.estimators.protocols import add_rows
-from ballfg.benchmarks.estimators.scoring import Candidate, Scores, every, judged, score_track, score_tracks, sums
+from ballfg.benchmarks.estimators.protocols import Candidate, Case
+from ballfg.benchmarks.estimators.scoring import Scores, every, judged, pooled, score_track, score_tracks
+from ballfg.benchmarks.estimators.synthetic_rows import add_consistency, add_rows
 from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.synthetic import Case
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation import Estimate, Estimator, Settings, Status
 from ballfg.state import VELOCITY
@@ -62,10 +61,10 @@ def test_newest_state_is_estimated_from_the_samples_seen(case: Case) -> None:
 def test_selection_leaves_out_the_first_four_and_bounces(case: Case) -> None:
     score = score_track(Candidate(Wrong(lambda k, n: float(k))), case, ())
     assert np.flatnonzero(judged(score)).tolist() == [4, 5, 6, 8, 9]
-    squares, count = sums([score, score], "velocity", 2)
+    squares, count = pooled([score, score], "velocity", 2)
     assert squares.tolist() == [16 + 25 + 36 + 64 + 81] * 2
     assert count.tolist() == [5, 5]
-    assert sums([score], "velocity", 2, every)[1].tolist() == [SAMPLES]
+    assert pooled([score], "velocity", 2, every)[1].tolist() == [SAMPLES]
 
 
 def test_rows_hold_the_pooled_figures_and_ratios(case: Case) -> None:

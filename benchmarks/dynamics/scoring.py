@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.benchmarks.dynamics.task import Shot
-from ballfg.benchmarks.metrics import square_norms
+from ballfg.benchmarks.metrics import Array, square_norms
 from ballfg.prediction.apexes import FLIGHTS, flight_bounds, path_apex
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -21,7 +20,7 @@ class PathScore:
 
     Attributes:
         track_sum: m^2, of the squared distances over all judged samples; NaN if some were not predicted.
-        track_points: how many those are.
+        track_points: number of these samples.
         rest_sum, rest_points: the same over the judged samples after the observed ones.
         apex: (3,) m, distance between predicted and reference apex by flight (`APEXES`); NaN where either is missing.
         apex_ahead: (3,) whether the reference apex lies after the observed part.
@@ -43,6 +42,25 @@ class PathScore:
     def rest_rmse(self) -> float:
         """m, the same after the observed part; NaN where nothing is left to predict."""
         return float(np.sqrt(self.rest_sum / self.rest_points)) if self.rest_points else float("nan")
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain numbers; null where there is none."""
+        numbers = [self.track_sum, self.rest_sum, *self.apex]
+        track, rest, *apex = (float(number) if np.isfinite(number) else None for number in numbers)
+        return {
+            "track": [track, self.track_points],
+            "rest": [rest, self.rest_points],
+            "apex": apex,
+            "apex_ahead": self.apex_ahead.tolist(),
+        }
+
+    @classmethod
+    def from_json(cls, content: dict[str, Any]) -> PathScore:
+        """The score that `to_json` wrote."""
+        (track, track_points), (rest, rest_points) = content["track"], content["rest"]
+        numbers = np.array([track, rest, *content["apex"]], dtype=np.float64)  # None becomes NaN
+        ahead = np.array(content["apex_ahead"], dtype=bool)
+        return cls(float(numbers[0]), int(track_points), float(numbers[1]), int(rest_points), numbers[2:], ahead)
 
 
 def score_path(shot: Shot, predicted: Array) -> PathScore:

@@ -1,8 +1,7 @@
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.estimators.step_noise import StepNoise
-from ballfg.benchmarks.synthetic import AT_BOUNCE, FAIR_NOISE, PAPER_NOISE, fair_protocol, paper_protocol
+from ballfg.benchmarks.estimators.protocols import AT_BOUNCE, FAIR_NOISE, PAPER_NOISE, fair_protocol, paper_protocol
 from ballfg.state import POSITION, VZ
 
 
@@ -47,11 +46,3 @@ def test_samples_at_a_bounce_are_few_and_next_to_one() -> None:
         near = slice(max(i - 1, 0), i + 2)
         assert np.diff(case.true_states[near, VZ]).max() > 0.5
         assert case.true_states[i, 2] - made.surfaces.table_height < 0.03
-
-
-def test_step_noise_does_not_depend_on_the_step_but_for_spin() -> None:
-    covariance = StepNoise(spin=2.0, step_position=0.1, step_velocity=0.3).flight(np.array([0.01, 0.04]))
-    expected = np.diag([0.01] * 3 + [0.09] * 3 + [0.04] * 3)
-    np.testing.assert_allclose(covariance[0], expected)
-    expected[6:, 6:] *= 4
-    np.testing.assert_allclose(covariance[1], expected)

@@ -7,13 +7,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.dynamics import run as dynamics
 from ballfg.benchmarks.dynamics.contenders import Job, nominal_contender, truth_contender
 from ballfg.benchmarks.dynamics.fan import fan_of
+from ballfg.benchmarks.dynamics.jobs import collect_records
 from ballfg.benchmarks.dynamics.measured import measured_shot
 from ballfg.benchmarks.dynamics.record import read_record, task_digest
 from ballfg.benchmarks.dynamics.rows import add_rows
-from ballfg.benchmarks.dynamics.run import Plan, collect, run_dynamics
+from ballfg.benchmarks.dynamics.suite import Plan, run_dynamics
 from ballfg.benchmarks.dynamics.truth import synthetic_task
 from ballfg.benchmarks.results import Results
 from ballfg.estimation import Estimate, Status
@@ -46,20 +46,21 @@ def test_truth_is_the_floor(small: tuple[Results, Path, list[Path]]) -> None:
     assert results.value("synthetic", "truth", "track_rmse") < 0.04  # type: ignore[operator]
 
 
-def test_finished_methods_are_not_repeated(
-    small: tuple[Results, Path, list[Path]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_finished_methods_are_not_repeated(small: tuple[Results, Path, list[Path]]) -> None:
     results, out, _ = small
-    again = Results("test", 1)
-
-    def refuse(job: Job) -> None:
-        raise AssertionError(f"{job.method} was made again")
-
-    monkeypatch.setattr(dynamics, "finish", refuse)
+    again, runs = Results("test", 1), out / "runs"
+    stamps = {path: path.stat().st_mtime_ns for path in runs.glob("*.json")}
+    assert len(stamps) == len(CONTROLS)
     run_dynamics(again, None, out, SMALL, 1, CONTROLS)
     assert again.rows == results.rows
-    with pytest.raises(AssertionError, match="was made again"):
-        collect([synthetic_task(2, 12)], SMALL, 1, out / "runs", 1, CONTROLS)  # another task
+    assert {path: path.stat().st_mtime_ns for path in runs.glob("*.json")} == stamps
+
+
+def test_the_record_of_another_task_does_not_count(small: tuple[Results, Path, list[Path]], tmp_path: Path) -> None:
+    kept = tmp_path / "nominal-1.json"
+    kept.write_bytes((small[1] / "runs" / kept.name).read_bytes())
+    collect_records([synthetic_task(2, 4)], ("nominal",), [1], tmp_path, 1, quick=True)
+    assert kept.read_bytes() != (small[1] / "runs" / kept.name).read_bytes()
 
 
 def test_a_broken_record_is_named(small: tuple[Results, Path, list[Path]], tmp_path: Path) -> None:

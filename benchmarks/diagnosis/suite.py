@@ -1,15 +1,12 @@
-"""`ballfg-bench loop`: does the diagnosis find what was planted, stay silent where nothing was, and mend the model?"""
+"""The suite of `ballfg-bench loop`: does the diagnosis find what was planted, and stay silent where nothing was?"""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final
 
 from ballfg.benchmarks.diagnosis.cases import (
-    FULL,
-    QUICK,
     Case,
     Plan,
     detection_cases,
@@ -19,40 +16,30 @@ from ballfg.benchmarks.diagnosis.cases import (
     timed_cases,
     unknown_cases,
 )
-from ballfg.benchmarks.diagnosis.cases_run import collect, collect_ideals
 from ballfg.benchmarks.diagnosis.effects import PLANTS
-from ballfg.benchmarks.diagnosis.ideal import Ideal
+from ballfg.benchmarks.diagnosis.ideal import Ideal, ideal_of
 from ballfg.benchmarks.diagnosis.record import Record
-from ballfg.benchmarks.diagnosis.rows import (
-    add_detection,
-    add_measured,
-    add_naming,
-    add_pairs,
-    add_repair,
-    add_silence,
-    add_time,
-    add_unknown,
-    detectable,
-)
+from ballfg.benchmarks.diagnosis.rows import add_all, detectable
+from ballfg.benchmarks.diagnosis.runs import collect_ideals, collect_records, run_case
 from ballfg.benchmarks.results import Results
-
-__all__ = ["FULL", "QUICK", "run_loop"]
-
-RUNS_FOLDER: Final = "runs"
-"""In the output folder: one JSON file for each case."""
+from ballfg.benchmarks.resumable import RUNS_FOLDER
 
 
-def run_loop(results: Results, data: Sequence[Path], out: Path, plan: Plan, jobs: int) -> list[Path]:
-    """Plant, diagnose, judge, and add the rows.
-
-    Whatever is finished is kept in `out`: a run that was stopped goes on where it was.
+def run_loop(
+    results: Results,
+    data: Sequence[Path],
+    out: Path,
+    plan: Plan,
+    jobs: int,
+    run: Callable[[Case], Record] = run_case,
+    ideal: Callable[[Case], Ideal] = ideal_of,
+) -> list[Path]:
+    """Plant, diagnose, judge, and add the rows. Finished cases are kept: a run that was stopped goes on where it was.
 
     Args:
-        results: gets the rows.
         data: folders of measured tracks, for the part that needs some.
         out: an existing folder.
-        plan: how much.
-        jobs: processes.
+        run: makes the record of a case.  ideal: computes the ideal test of a case.
     Returns: the pictures written.
     """
     from ballfg.benchmarks.diagnosis.pictures import confusion_picture, power_picture, repair_picture
@@ -61,11 +48,11 @@ def run_loop(results: Results, data: Sequence[Path], out: Path, plan: Plan, jobs
     folder.mkdir(exist_ok=True)
     if not data:
         print("note: no --data: nothing measured is diagnosed", file=sys.stderr)
-    ideals = collect_ideals([n for n in plan.effects if PLANTS[n].sized], results.seed, folder, jobs)
+    ideals = collect_ideals([n for n in plan.effects if PLANTS[n].sized], results.seed, folder, jobs, ideal)
     cases = all_cases(plan, results.seed, ideals, data)
-    records = collect(cases, folder, jobs)
+    records = collect_records(cases, folder, jobs, run)
     timed = list(timed_cases(plan, results.seed))
-    records |= collect(timed, folder, 1)  # alone, one after the other
+    records |= collect_records(timed, folder, 1, run)  # alone, one after the other
     add_all(results, [*cases, *timed], records, ideals)
     return [
         power_picture(cases, records, ideals, out / "loop_power.png"),
@@ -85,16 +72,3 @@ def all_cases(plan: Plan, seed: int, ideals: dict[str, Ideal], data: Sequence[Pa
     ]
     placed = [(number / len(part), case) for part in parts for number, case in enumerate(part)]
     return [case for _, case in sorted(placed, key=lambda pair: pair[0])]
-
-
-def add_all(results: Results, cases: Sequence[Case], records: dict[str, Record], ideals: dict[str, Ideal]) -> None:
-    """The rows of every part."""
-    add_naming(results, cases, records, "naming", "naming, spin labels")
-    add_naming(results, cases, records, "no_labels", "naming, no spin labels")
-    add_pairs(results, cases, records)
-    add_detection(results, cases, records, ideals)
-    add_silence(results, cases, records)
-    add_repair(results, cases, records)
-    add_unknown(results, cases, records)
-    add_measured(results, cases, records)
-    add_time(results, cases, records)

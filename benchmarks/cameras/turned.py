@@ -1,4 +1,4 @@
-"""A camera that was nudged after its calibration: is it named?"""
+"""A camera that was turned after its calibration: does the check of the cameras' agreement name it?"""
 
 from __future__ import annotations
 
@@ -19,38 +19,35 @@ AXES: Final = {"right": 0, "down": 1, "forward": 2}
 
 
 @dataclass(frozen=True)
-class Nudge:
+class Turn:
     """One camera turned about one axis.
 
     Attributes:
         camera, axis: which.
         named: the camera that the check names, None for none.
-        turn: degrees by which the check says that the nudged camera is turned; NaN where it says nothing.
-        balls: found in spite of it.
+        found: degrees by which the check finds the camera turned; NaN where it finds nothing.
     """
 
     camera: str
     axis: str
     named: str | None
-    turn: float
-    balls: int
+    found: float
 
 
-def nudges(filmed: Filmed) -> Iterator[Nudge]:
-    """Each camera turned about each axis in its declared calibration; the videos stay what they are."""
+def turns(filmed: Filmed) -> Iterator[Turn]:
+    """Each camera turned about each axis in its declared calibration; the videos stay as they are."""
     cameras = filmed.recording.cameras
     for number, camera in enumerate(cameras):
         for axis, column in AXES.items():
             rig = [turned(c, column) if k == number else c for k, c in enumerate(cameras)]
-            balls = associate(filmed.detections, rig)
-            said = check_agreement(balls, rig)
-            about = said.by_camera.get(camera.name)
-            turn = float("nan") if about is None else about.rotation
-            yield Nudge(camera.name, axis, said.culprit, turn, len(balls))
+            agreement = check_agreement(associate(filmed.detections, rig), rig)
+            about = agreement.by_camera.get(camera.name)
+            found = float("nan") if about is None else about.rotation
+            yield Turn(camera.name, axis, agreement.culprit, found)
 
 
 def turned(camera: Camera, axis: int) -> Camera:
-    """The camera as if it stood where it stands and were turned by `TURN` about an axis of its own frame."""
+    """The camera at the same place, turned by `TURN` about an axis of its own frame."""
     turn, _ = cv2.Rodrigues(np.radians(TURN) * np.eye(3)[axis])
     rotation = turn @ camera.rotation
     return replace(camera, rvec=cv2.Rodrigues(rotation)[0].ravel(), tvec=-rotation @ camera.centre)

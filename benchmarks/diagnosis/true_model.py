@@ -1,4 +1,4 @@
-"""What a diagnosis could have reached: the true model, fitted to the same half and judged on the same other half."""
+"""The error that a diagnosis could reach: that of the true model, on the same halves of the tracks."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from ballfg.tracks import Dataset
 
 
 def true_errors(case: Case, dataset: Dataset) -> Errors:
-    """Errors on the held-out half of the true model, its coefficients fitted to the search half.
+    """Errors of the true model on the held-out half, its coefficients fitted to the other half.
 
     Args: case: with planted effects of the catalogue and one session.  dataset: its tracks.
     """
     truth, declared = actual_model(case), declared_model(case, dataset.info.ball.radius)
-    holdout = hold_out(dataset, declared)  # as the diagnosis has them: both are judged by the same
+    holdout = hold_out(dataset, declared)  # the diagnosis splits in the same way
     moving = plainly_measured(truth)
     smoother = Smoother(moving, holdout.surfaces, dataset_settings(dataset, moving))
     search = stretches_of(smoother, [part.track for part in holdout.search_tracks], holdout.launcher)
@@ -43,7 +43,7 @@ def true_errors(case: Case, dataset: Dataset) -> Errors:
 
 
 def planted_free(case: Case) -> dict[str, Coefficient]:
-    """What a fit with the planted effects estimates beside what is declared, by parameter name."""
+    """The coefficients of the planted effects that a fit estimates beside the declared ones, by parameter name."""
     free: dict[str, Coefficient] = {}
     for name in case.planted:
         free |= PLANTS[name].hypothesis().free()

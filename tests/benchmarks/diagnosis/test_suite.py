@@ -6,14 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.benchmarks.diagnosis import cases_run as loop_run
-from ballfg.benchmarks.diagnosis import run as loop
 from ballfg.benchmarks.diagnosis.cases import QUICK, Case, Plan, Recording, naming_cases, planted_case, timed_cases
 from ballfg.benchmarks.diagnosis.ideal import Ideal
 from ballfg.benchmarks.diagnosis.record import Found, Ranked, Record, case_digest, read_record, record_of
-from ballfg.benchmarks.diagnosis.rows import ALL, FAILED, HIDDEN, detectable
-from ballfg.benchmarks.diagnosis.run import add_all, all_cases, run_loop
-from ballfg.benchmarks.diagnosis.truth import planted_free
+from ballfg.benchmarks.diagnosis.rows import ALL, FAILED, HIDDEN, add_all, detectable
+from ballfg.benchmarks.diagnosis.runs import collect_records
+from ballfg.benchmarks.diagnosis.suite import all_cases, run_loop
+from ballfg.benchmarks.diagnosis.true_model import planted_free
 from ballfg.benchmarks.diagnosis.verdicts import alarmed, complete, honest, named, right
 from ballfg.benchmarks.results import Results
 from tests.diagnosis.made_diagnosis import found, unexplained
@@ -207,7 +206,7 @@ def test_measured_rows_name_what_was_found(tmp_path: Path) -> None:
 
 
 def test_a_run_makes_rows_and_pictures_and_goes_on_where_it_was(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     made: list[str] = []
 
@@ -217,14 +216,12 @@ def test_a_run_makes_rows_and_pictures_and_goes_on_where_it_was(
             raise ValueError("tracks must be longer")
         return replace(outcome(case), digest=case_digest(case))
 
-    def ideal_of(name: str, seed: int) -> Ideal:
-        digest = case_digest(loop_run.ideal_case(name, seed))
-        return Ideal(digest, 0, 0.0) if name == "velocity_lag" else Ideal(digest, 3, 900.0)
+    def ideal_of(case: Case) -> Ideal:
+        rank, information = (0, 0.0) if case.subject == "velocity_lag" else (3, 900.0)
+        return Ideal(case_digest(case), rank, information)
 
-    monkeypatch.setattr(loop_run, "run", run)
-    monkeypatch.setattr(loop_run, "ideal_of", ideal_of)
     results = Results("test", 0)
-    pictures = run_loop(results, [], tmp_path, SMALL, 1)
+    pictures = run_loop(results, [], tmp_path, SMALL, 1, run, ideal_of)
     assert [picture.name for picture in pictures] == ["loop_power.png", "loop_first_finding.png", "loop_repair.png"]
     assert all(picture.stat().st_size > 10_000 for picture in pictures)
     assert results.value("silence", FAILED, ALL) == 1.0
@@ -234,7 +231,7 @@ def test_a_run_makes_rows_and_pictures_and_goes_on_where_it_was(
     assert made[-1] == "time-wind-1-0"  # alone, after all others
     made.clear()
     again = Results("test", 0)
-    run_loop(again, [], tmp_path, SMALL, 1)
+    run_loop(again, [], tmp_path, SMALL, 1, run, ideal_of)
     assert made == ["silence-nothing-1-1"]  # what failed is tried again, nothing else
     assert again.rows == results.rows
 
@@ -242,6 +239,6 @@ def test_a_run_makes_rows_and_pictures_and_goes_on_where_it_was(
 @pytest.mark.slow
 def test_a_real_case_of_a_strong_wind(tmp_path: Path) -> None:
     case = replace(planted_case("naming", "wind", 2.0, 0), recording=Recording(tracks=24, rate=60.0))
-    kept = loop.collect([case], tmp_path, 1)[case.name]
+    kept = collect_records([case], tmp_path, 1)[case.name]
     assert named(kept, ("wind",))
     assert kept.errors["after"] < kept.errors["before"]

@@ -1,4 +1,4 @@
-"""Shares with their intervals, and the size from which on an effect is named nearly always."""
+"""The probability that an effect is named against its size, and the size from which on it is named nearly always."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy import optimize, special, stats
+from numpy.typing import ArrayLike
+from scipy import optimize, special
 
-from ballfg.benchmarks.metrics import CONFIDENCE, Figure
-
-Array = NDArray[np.float64]
+from ballfg.benchmarks.metrics import Array
 
 NAMED = 0.9
 """Share of seeds from which on an effect of some size counts as named."""
@@ -20,24 +18,6 @@ SLOPE_PRIOR = 10.0
 exist where outcomes part cleanly; a curve of that slope goes from 10 to 90 % within a factor of 1.6."""
 MIDDLE_PRIOR = 2.0
 """Standard deviation of the logarithm of the size at which the curve is at one half, about that of the sizes tried."""
-
-
-def share(outcomes: Sequence[bool]) -> Figure:
-    """The share of true ones, with Wilson's interval.
-
-    Raises: ValueError: if there is none.
-    """
-    if not outcomes:
-        raise ValueError("outcomes must not be empty; got none. Count something first.")
-    interval = stats.binomtest(sum(outcomes), len(outcomes)).proportion_ci(CONFIDENCE, method="wilson")
-    return Figure(sum(outcomes) / len(outcomes), float(interval.low), float(interval.high))
-
-
-def median(values: Sequence[float]) -> Figure:
-    """The median, with the lowest and the highest value. Raises: ValueError: if there is none."""
-    if not values:
-        raise ValueError("values must not be empty; got none. Measure something first.")
-    return Figure(float(np.median(values)), min(values), max(values))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""`ballfg-bench estimators`: which cases run, and what is said about them."""
+"""The suite of `ballfg-bench estimators`: synthetic tracks by two protocols, or a dataset of measured ones."""
 
 from __future__ import annotations
 
@@ -7,17 +7,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ballfg.benchmarks.estimators.consistency import run_consistency
 from ballfg.benchmarks.estimators.measured import HORIZON, OBSERVE, run_measured
-from ballfg.benchmarks.estimators.protocols import (
-    COUNTS,
-    fair_candidates,
-    paper_candidates,
-    run_protocol,
-)
-from ballfg.benchmarks.estimators.step_noise import StepNoise
+from ballfg.benchmarks.estimators.protocols import fair_protocol, paper_protocol
+from ballfg.benchmarks.estimators.synthetic_rows import run_consistency, run_protocol
+from ballfg.benchmarks.gaussian_settings import StepNoise
 from ballfg.benchmarks.results import Results
-from ballfg.benchmarks.synthetic import Protocol, fair_protocol, paper_protocol
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Settings, dataset_settings
 from ballfg.tracks import Dataset
@@ -40,6 +34,7 @@ class Size:
     counts: Sequence[int]
 
 
+COUNTS = (5, 6, 7, 8, 10, 12, 15, 20, 25, 30, 40, 50, 60, 70, 80)
 FULL = Size(compared=50, consistency=200, measured=None, counts=COUNTS)
 QUICK = Size(compared=10, consistency=40, measured=12, counts=(5, 10, 20, 40, 80))
 CONSISTENCY_SEED = 1_000_000
@@ -48,20 +43,19 @@ CONSISTENCY_SEED = 1_000_000
 
 def run_synthetic(results: Results, out: Path, size: Size, jobs: int) -> list[Path]:
     """Both protocols and the consistency of the smoother. Returns: the pictures written."""
-    from ballfg.benchmarks.pictures import observations_picture
+    from ballfg.benchmarks.estimators.pictures import observations_picture
 
-    paper = paper_protocol(size.compared, results.seed)
-    fair = fair_protocol(size.compared, results.seed)
-    for protocol in (paper, fair):
-        print(describe(protocol))
-    run_protocol(results, paper, paper_candidates(paper), jobs, size.counts)
-    run_protocol(results, fair, fair_candidates(fair), jobs, size.counts)
+    titles = {
+        "paper": "paper's protocol: free flight, true dynamics and spin known",
+        "fair": "fair protocol: bounces, declared noise, same settings for all",
+    }
+    protocols = [paper_protocol(size.compared, results.seed), fair_protocol(size.compared, results.seed)]
+    for protocol in protocols:
+        print(f"{protocol.name}: {len(protocol.tracks)} tracks; {describe_settings(protocol.settings)}")
+    for protocol in protocols:
+        run_protocol(results, protocol, jobs, size.counts)
     many = fair_protocol(size.consistency, results.seed + CONSISTENCY_SEED, name="consistency")
     run_consistency(results, many, jobs)
-    titles = {
-        paper.name: "paper's protocol: free flight, true dynamics and spin known",
-        fair.name: "fair protocol: bounces, declared noise, same settings for all",
-    }
     return [
         observations_picture(results.rows, name, title, out / f"estimators_{name}.png")
         for name, title in titles.items()
@@ -70,9 +64,11 @@ def run_synthetic(results: Results, out: Path, size: Size, jobs: int) -> list[Pa
 
 def run_dataset(results: Results, dataset: Dataset, out: Path, size: Size, jobs: int) -> list[Path]:
     """Measured tracks. Returns: the pictures written."""
-    from ballfg.benchmarks.pictures import calibration_picture, growth_picture, tracks_picture
+    from ballfg.benchmarks.estimators.pictures import calibration_picture, growth_picture, tracks_picture
 
-    print(measured_heading(dataset))
+    settings = dataset_settings(dataset, nominal_model(dataset.info.ball.radius))
+    what = f"{OBSERVE:g} s observed, {HORIZON:g} s predicted, nominal model"
+    print(f"{dataset.info.name}: {len(dataset)} tracks; {what}; {describe_settings(settings)}")
     measured = run_measured(results, dataset, size.measured, jobs)
     if measured.unseen:
         print(f"{measured.unseen} tracks end within the observed {OBSERVE:g} s: nothing to predict")
@@ -89,18 +85,15 @@ def run_dataset(results: Results, dataset: Dataset, out: Path, size: Size, jobs:
     ]
 
 
-def describe(protocol: Protocol) -> str:
-    """One line with what all estimators are told."""
-    settings = protocol.settings
-    return f"{protocol.name}: {len(protocol.tracks)} tracks; {describe_settings(settings)}"
-
-
 def describe_settings(settings: Settings) -> str:
-    """Noise and priors in words."""
-    noise = settings.position_noise
+    """Noise and priors in words; of the process noise the terms that act, in SI units."""
+    process = settings.process
+    unused: tuple[str, ...] = () if settings.find_events else ("hit",)
+    unused += ("acceleration", "contact") if isinstance(process, StepNoise) else ()
+    terms = [f"{name} {value:g}" for name, value in vars(process).items() if value and not name.startswith(unused)]
     parts = [
-        f"position noise {' / '.join(f'{1e3 * s:.2g}' for s in noise)} mm",
-        "process noise " + ", ".join(f"{name} {value:g}" for name, value in _noise_terms(settings)),
+        f"position noise {' / '.join(f'{1e3 * s:.2g}' for s in settings.position_noise)} mm",
+        "process noise " + ", ".join(terms),
         f"spin label {settings.spin_label_noise:g} rad/s, spin prior {settings.spin_prior:g} rad/s",
         f"velocity prior {settings.velocity_prior:g} m/s",
         f"{settings.loss.name} loss",
@@ -108,18 +101,3 @@ def describe_settings(settings: Settings) -> str:
     if settings.coefficients:
         parts.append("coefficients per track: " + ", ".join(settings.coefficients))
     return "; ".join(parts)
-
-
-def _noise_terms(settings: Settings) -> list[tuple[str, float]]:
-    """The terms that act, by name, SI units."""
-    process = settings.process
-    unused: tuple[str, ...] = () if settings.find_events else ("hit",)
-    unused += ("acceleration", "contact") if isinstance(process, StepNoise) else ()
-    return [(name, value) for name, value in vars(process).items() if value and not name.startswith(unused)]
-
-
-def measured_heading(dataset: Dataset) -> str:
-    """One line with what all estimators are told about measured tracks."""
-    settings = dataset_settings(dataset, nominal_model(dataset.info.ball.radius))
-    what = f"{OBSERVE:g} s observed, {HORIZON:g} s predicted, nominal model"
-    return f"{dataset.info.name}: {len(dataset)} tracks; {what}; {describe_settings(settings)}"

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballfg.benchmarks.cameras.calibration import TURN, nudges, turned
-from ballfg.benchmarks.cameras.clocks import clocks, compare
-from ballfg.benchmarks.cameras.run import FACTORS, NAIVE, _add_points, _add_velocities
+from ballfg.benchmarks.cameras.clocks import FACTORS, NAIVE, clocks, compare
 from ballfg.benchmarks.cameras.scenes import Filmed, Scenario, judge, scenarios, truth_at
+from ballfg.benchmarks.cameras.suite import add_points, add_velocities
+from ballfg.benchmarks.cameras.turned import TURN, turned, turns
 from ballfg.benchmarks.results import Results
 from ballfg.simulation.scene import Clock, Recording
 from ballfg.vision import Detections
@@ -59,7 +59,7 @@ def test_points_are_judged_against_the_truth(together) -> None:
     assert 1e-4 < found.rmse < 1e-3
     assert 2.0 < found.squares.mean() < 4.0
     results = Results("cameras", 0)
-    _add_points(results, "seen", found)
+    add_points(results, "seen", found)
     assert results.value("rendered scenes", "seen", "position_rmse") == pytest.approx(1e3 * found.rmse)
 
 
@@ -102,7 +102,7 @@ def test_truth_ends_with_the_flight(together) -> None:
 def test_camera_factors_beat_what_pretends_to_be_synchronised(apart) -> None:
     found = compare(apart)
     results = Results("cameras", 0)
-    _add_velocities(results, found, 0)
+    add_velocities(results, found, 0)
     share = results.value("unsynchronised", f"{FACTORS} / {NAIVE}", "velocity_rmse")
     assert share is not None
     assert share < 0.25
@@ -125,7 +125,7 @@ def test_turned_camera_stands_where_it_stood(together) -> None:
 
 
 def test_turned_cameras_are_named(together) -> None:
-    found = list(nudges(together))
+    found = list(turns(together))
     assert len(found) == 9
-    assert [nudge.named for nudge in found] == [nudge.camera for nudge in found]
-    assert max(abs(nudge.turn - TURN) for nudge in found) < 0.1
+    assert [turn.named for turn in found] == [turn.camera for turn in found]
+    assert max(abs(turn.found - TURN) for turn in found) < 0.1

@@ -1,16 +1,39 @@
-"""Process noise with the same covariance at every step, as papers and other solvers have it."""
+"""Settings for Gaussian noise of known size, and process noise that is the same at every step."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.benchmarks.metrics import Array
+from ballfg.estimation import Settings
+from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
-Array = NDArray[np.float64]
+
+def gaussian_settings(
+    position: float, process: ProcessNoise, spin_label: float, coefficients: Mapping[str, float] | None = None
+) -> Settings:
+    """Settings with squared losses that look for no events but contacts.
+
+    Args:
+        position: m.  process: noise of the motion.  spin_label: rad/s.
+        coefficients: prior standard deviations of those that are estimated with each track; none if left out.
+    """
+    squared = Loss("squared")
+    return Settings(
+        position_noise=(position,) * 3,
+        process=process,
+        spin_label_noise=spin_label,
+        loss=squared,
+        spin_loss=squared,
+        label_loss=squared,
+        find_events=False,
+        coefficients=coefficients or {},
+    )
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,79 @@
+"""Running cases and ideal tests, each in a process of its own; finished ones are kept."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from ballfg.benchmarks.diagnosis.cases import Case
+from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset
+from ballfg.benchmarks.diagnosis.ideal import Ideal, ideal_case, ideal_of, read_ideal
+from ballfg.benchmarks.diagnosis.record import Record, case_digest, read_record, record_of
+from ballfg.benchmarks.diagnosis.true_model import true_errors
+from ballfg.benchmarks.resumable import collect
+from ballfg.diagnosis import diagnose
+from ballfg.diagnosis.result import Diagnosis
+from ballfg.tracks import read_dataset
+
+
+def run_case(case: Case, diagnose: Callable[..., Diagnosis] = diagnose) -> Record:
+    """Make the data, diagnose, and fit the true model where a case asks for it."""
+    digest = case_digest(case)
+    with TemporaryDirectory() as folder:
+        dataset = make_dataset(case, Path(folder) / "tracks") if case.data is None else read_dataset(case.data)
+        model = declared_model(case, dataset.info.ball.radius)
+        start = time.perf_counter()
+        diagnosis = diagnose(dataset, model, jobs=case.jobs)
+        seconds = time.perf_counter() - start
+        true = true_errors(case, dataset) if case.repair else None
+    return record_of(case, digest, diagnosis, true, seconds)
+
+
+def collect_records(
+    cases: Sequence[Case], folder: Path, jobs: int, run: Callable[[Case], Record] = run_case
+) -> dict[str, Record]:
+    """The records of cases by their names: read from an existing folder where they are there, else made and kept.
+
+    A case whose diagnosis raises has no record: it is told on stderr, counts as failed, and is tried again by the next
+    run.
+    """
+
+    def read(case: Case) -> Record | None:
+        return read_record(folder / f"{case.name}.json", case_digest(case))
+
+    found = collect(cases, read, partial(_finish, run, folder), jobs, "diagnoses finished")
+    return {case.name: record for case, record in zip(cases, found, strict=True) if record is not None}
+
+
+def _finish(run: Callable[[Case], Record], folder: Path, case: Case) -> Record | None:
+    """Run a case and keep its record; None, and a line on stderr, if an error stopped it."""
+    try:
+        record = run(case)
+    except Exception as error:  # counted as a failure of the diagnosis: one bad case must not end a long run
+        print(f"{case.name}: {type(error).__name__}: {error}", file=sys.stderr, flush=True)
+        return None
+    record.save(folder / f"{case.name}.json")
+    return record
+
+
+def collect_ideals(
+    names: Iterable[str], seed: int, folder: Path, jobs: int, compute: Callable[[Case], Ideal] = ideal_of
+) -> dict[str, Ideal]:
+    """The ideal tests of effects by name: read where they are there, else computed and kept."""
+    cases = [ideal_case(name, seed) for name in names]
+
+    def read(case: Case) -> Ideal | None:
+        return read_ideal(folder / f"ideal-{case.subject}.json", case_digest(case))
+
+    found = collect(cases, read, partial(_finish_ideal, compute, folder), jobs, "ideal tests finished")
+    return {case.subject: ideal for case, ideal in zip(cases, found, strict=True) if ideal is not None}
+
+
+def _finish_ideal(compute: Callable[[Case], Ideal], folder: Path, case: Case) -> Ideal:
+    ideal = compute(case)
+    ideal.save(folder / f"ideal-{case.subject}.json")
+    return ideal

@@ -1,0 +1,65 @@
+"""Long runs that go on where they were stopped: records of finished parts, and processes for the missing ones."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import joblib
+import torch
+
+from ballfg.files.whole_file import whole_file
+from ballfg.progress import progress
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+RUNS_FOLDER = "runs"
+"""In a benchmark's output folder: a JSON file for each finished part."""
+
+
+def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int, what: str) -> list[R]:
+    """The results of some work in the order of the items; `what` is finished stands in the progress lines."""
+    pool = joblib.Parallel(n_jobs=max(1, min(jobs, len(items))), return_as="generator_unordered", batch_size=1)
+    finished = pool(joblib.delayed(_numbered)(work, number, item) for number, item in enumerate(items))
+    return [result for _, result in sorted(progress(finished, len(items), what), key=lambda pair: pair[0])]
+
+
+def _numbered(work: Callable[[T], R], number: int, item: T) -> tuple[int, R]:
+    torch.set_num_threads(1)  # the processes share the cores already
+    return number, work(item)
+
+
+def collect(
+    items: Sequence[T], read: Callable[[T], R | None], make: Callable[[T], R | None], jobs: int, what: str
+) -> list[R | None]:
+    """The record of each item: read where it is finished, else made in a process; None where that failed."""
+    found = [read(item) for item in items]
+    missing = [place for place, record in enumerate(found) if record is None]
+    made = in_processes(make, [items[place] for place in missing], jobs, what)
+    for place, record in zip(missing, made, strict=True):
+        found[place] = record
+    return found
+
+
+def write_record(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a record whole or not at all. Raises: ValueError: if a number is not finite."""
+    with whole_file(path) as part:
+        part.write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8")
+
+
+def read_record(path: Path, digest: str, build: Callable[[dict[str, Any]], R], what: str) -> R | None:
+    """The record that `build` makes of a file's content; None if there is no file, or its `digest` is another.
+
+    Raises: ValueError: if the file does not hold a record; the message names `what` it should be.
+    """
+    if not path.is_file():
+        return None
+    try:
+        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        return None if content["digest"] != digest else build(content)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = " ".join(repr(error).split())  # on one line
+        raise ValueError(f"{path}: must be {what} ({reason}). Delete it, and it is run again.") from error

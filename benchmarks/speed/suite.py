@@ -1,0 +1,226 @@
+"""The suite of `ballfg-bench speed`: times of an estimate, an update, a prediction and a Jacobian on one thread."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+
+import gtsam
+import numpy as np
+import torch
+
+from ballfg.benchmarks.gaussian_settings import StepNoise, gaussian_settings
+from ballfg.benchmarks.metrics import median_and_quartiles
+from ballfg.benchmarks.results import Results
+from ballfg.benchmarks.speed.gradient_cost import time_gradients
+from ballfg.benchmarks.speed.network import FIT_ITERATIONS, fitted_network, parameter_count
+from ballfg.benchmarks.speed.stopwatch import Stopwatch, milliseconds
+from ballfg.dynamics import (
+    AnalyticModel,
+    Architecture,
+    BallModel,
+    Surfaces,
+    build,
+    fly_jacobian,
+    model_from_dict,
+    nominal_model,
+    rollout,
+)
+from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.estimation import Online, Settings, Smoother, dataset_settings, dataset_surfaces
+from ballfg.estimation.smoother.initial import initial_states
+from ballfg.estimation.smoother.problem import Events
+from ballfg.factors.batch import Values
+from ballfg.factors.bridge import nonlinear_graph, to_gtsam
+from ballfg.factors.covariance import marginal_covariances
+from ballfg.factors.graph import BallGraph
+from ballfg.learning.end_to_end.pretrain import pretrain
+from ballfg.prediction import Belief, Propagator
+from ballfg.progress import progress
+from ballfg.state import POSITION
+from ballfg.tracks import SPIN_LABELS, Dataset, Track
+
+CASE = "speed"
+SAMPLES = 80
+RATE = 100.0
+"""Hz."""
+NOISE = 0.005
+"""m."""
+START = (0.0, 0.0, 0.3, 5.0, 0.5, 2.0, 0.0, 80.0, 20.0)
+LABEL_OFFSET = (30.0, -20.0, 10.0)
+"""rad/s, by which the spin label is wrong."""
+LABEL_NOISE = 20.0
+"""rad/s."""
+DRAG, MAGNUS = 0.112, 0.0055
+HORIZON = 0.3
+"""s that are predicted, at `RATE`."""
+NO_SURFACE = Surfaces(-1e3)
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is computed.
+
+    Attributes:
+        runs: timed runs of each action.  warm_up: runs before them.
+        fit_iterations: that fit the network to the analytic model.
+        pretrain_iterations: that fit the learned model to the analytic one; after 200 its flight is off by 0.1 m/s^2.
+        dataset_tracks: tracks of a dataset that are timed.
+    """
+
+    runs: int
+    warm_up: int
+    fit_iterations: int = FIT_ITERATIONS
+    pretrain_iterations: int = 200
+    dataset_tracks: int = 20
+
+
+FULL = Size(runs=60, warm_up=5)
+QUICK = Size(runs=5, warm_up=2)
+
+
+def run_speed(results: Results, dataset: Dataset | None, size: Size) -> None:
+    """All times; a control before each model and at the end; with a dataset the time for each of some of its tracks."""
+    watch = Stopwatch(results, CASE, size.runs, size.warm_up)
+    model = problem_model()
+    track = problem_track(model)
+    parts = [
+        partial(_time_model, watch, "analytic", model, track),
+        partial(_time_network, watch, model, track, size.fit_iterations),
+        partial(_time_coefficients, watch, model, track),
+        partial(_time_gradients, watch, model, track, size.pretrain_iterations),
+    ]
+    for part in progress(parts, len(parts), "parts timed"):
+        part()
+    if dataset is not None:
+        _time_dataset(results, dataset, size.dataset_tracks)
+    watch.control("control")
+
+
+def problem_model() -> AnalyticModel:
+    """Gravity, drag and Magnus force; nothing to bounce on."""
+    flight = {"gravity": {"g": 9.81}, "drag": {"k": DRAG}, "magnus": {"k": MAGNUS}}
+    return model_from_dict({"flight": flight, "bounce": {}})
+
+
+def problem_track(model: BallModel) -> Track:
+    """80 observations of one free flight, with a spin label that is off."""
+    start = torch.tensor([START], dtype=torch.float64)
+    times = np.arange(SAMPLES) / RATE
+    with torch.no_grad():
+        truth = rollout(model, start, torch.from_numpy(times), NO_SURFACE)[0].numpy()
+    rng = np.random.default_rng(0)
+    measured = truth[:, POSITION] + NOISE * rng.standard_normal((SAMPLES, 3))
+    spin = np.add(START[6:], LABEL_OFFSET)
+    return Track("speed", times, measured, labels=dict(zip(SPIN_LABELS, map(float, spin), strict=True)))
+
+
+def problem_settings(coefficients: Mapping[str, float] | None = None) -> Settings:
+    """1 mm and 1 cm/s of process noise a step, squared losses; optionally coefficients estimated with the track."""
+    return gaussian_settings(NOISE, StepNoise(), LABEL_NOISE, coefficients)
+
+
+def _problem(smoother: Smoother, track: Track) -> tuple[BallGraph, Values]:
+    """The track's graph and the point from which the minimisation starts."""
+    problem = smoother.problem(track)
+    states = initial_states(track, (), problem.segmentation, smoother.model, smoother.settings.spin_label(track))
+    return problem.graph(Events((), problem.segmentation)), problem.start(states)
+
+
+def _time_model(watch: Stopwatch, name: str, model: BallModel, track: Track) -> None:
+    """Everything for one model of the flight, which is known exactly."""
+    settings = problem_settings()
+    smoother = Smoother(model, NO_SURFACE, settings)
+    graph, values = _problem(smoother, track)
+    watch.control(name)
+    _time_minimisation(watch, name, smoother, graph, values)
+    _time_gtsam(watch, name, graph, values)
+    watch.time(name, "estimate_time", lambda: smoother.estimate(track))
+    states, dt = torch.from_numpy(values.states[:-1].copy()), torch.full((SAMPLES - 1,), 1 / RATE, dtype=torch.float64)
+    watch.time(name, "jacobians_time_79", lambda: fly_jacobian(model, states, dt))
+    watch.time(name, "jacobian_time_1", lambda: fly_jacobian(model, states[:1], dt[:1]))
+    _time_online(watch, name, Online(model, NO_SURFACE, settings), track)
+    _time_prediction(watch, name, smoother, track)
+
+
+def _time_network(watch: Stopwatch, model: AnalyticModel, track: Track, iterations: int) -> None:
+    """The same for a network that is fitted to the analytic model."""
+    network = fitted_network(model, iterations)
+    _time_model(watch, "network", network, track)
+    watch.add("network", "parameters", parameter_count(network))
+
+
+def _time_coefficients(watch: Stopwatch, model: AnalyticModel, track: Track) -> None:
+    """The analytic model again, with its drag and Magnus coefficients estimated along with the track."""
+    name = "analytic+coefficients"
+    smoother = Smoother(model, NO_SURFACE, problem_settings(coefficient_sigmas(model)))
+    _time_minimisation(watch, name, smoother, *_problem(smoother, track))
+    watch.time(name, "estimate_time", lambda: smoother.estimate(track))
+
+
+def _time_gradients(watch: Stopwatch, model: AnalyticModel, track: Track, iterations: int) -> None:
+    """The gradient through the estimate, with the learned model that the analytic one was put into."""
+    learned = build(Architecture.of("mnn+gs"), radius=model.radius)
+    pretrain(learned, model, 0, iterations)
+    time_gradients(watch, learned, *_problem(Smoother(learned, NO_SURFACE, problem_settings()), track))
+
+
+def _time_minimisation(watch: Stopwatch, name: str, smoother: Smoother, graph: BallGraph, values: Values) -> None:
+    """Levenberg-Marquardt on the built graph, from the initial guess to the minimum; then the covariances."""
+    optimizer = smoother.optimizer
+    minimum = optimizer.minimize(graph, values)
+    step = minimum.step
+    assert step is not None
+    n, p = values.states.shape[0], len(values.coefficients)
+    watch.time(name, "lm_time", lambda: optimizer.minimize(graph, values))
+    watch.time(name, "covariances_time", lambda: marginal_covariances(step.bayes_net, n, p))
+    watch.add(name, "lm_iterations", minimum.iterations)
+
+
+def _time_gtsam(watch: Stopwatch, name: str, graph: BallGraph, values: Values) -> None:
+    """GTSAM's own Levenberg-Marquardt on CustomFactors that are answered from batches, to the same minimum."""
+    start = to_gtsam(values)
+
+    def minimise() -> None:
+        factors, _ = nonlinear_graph(graph)
+        parameters = gtsam.LevenbergMarquardtParams()
+        parameters.setRelativeErrorTol(1e-12)
+        parameters.setAbsoluteErrorTol(1e-12)
+        gtsam.LevenbergMarquardtOptimizer(factors, start, parameters).optimize()
+
+    watch.time(name, "lm_time_gtsam", minimise)
+
+
+def _time_online(watch: Stopwatch, name: str, online: Online, track: Track) -> None:
+    """Every update with its newest state and covariance, over whole streams; the first stream warms up."""
+    times = []
+    for run in range(1 + max(2, watch.runs // 10)):
+        online.reset()
+        stream = zip(track.times.tolist(), track.positions, strict=True)
+        spent = [milliseconds(partial(online.push, stamp, position)) for stamp, position in stream]
+        times += spent if run else []
+    watch.results.add(CASE, name, "online_update_median", "ms", median_and_quartiles(times), len(times))
+    watch.results.add(CASE, name, "online_update_p99", "ms", float(np.quantile(times, 0.99)), len(times))
+
+
+def _time_prediction(watch: Stopwatch, name: str, smoother: Smoother, track: Track) -> None:
+    """The next 0.3 s with covariances, from an estimate."""
+    propagator = Propagator(smoother.surfaces, smoother.settings.process)
+    times = torch.from_numpy(track.times[-1] + np.arange(1, round(HORIZON * RATE) + 1) / RATE)[None]
+    belief = Belief.of(smoother.model, [smoother.estimate(track).last])
+    watch.time(name, "prediction_time", lambda: propagator.rollout(belief, times))
+
+
+def _time_dataset(results: Results, dataset: Dataset, count: int) -> None:
+    """Time of the smoother for each of the first tracks of a dataset."""
+    model = nominal_model(dataset.info.ball.radius)
+    smoother = Smoother(model, dataset_surfaces(dataset), dataset_settings(dataset, model))
+    tracks, name = list(islice(dataset, count)), dataset.info.name
+    smoother.estimate(tracks[0])  # warm
+    shown = progress(tracks, len(tracks), "tracks timed")
+    times = [milliseconds(partial(smoother.estimate, track)) for track in shown]
+    results.add(name, "smoother", "estimate_time", "ms", median_and_quartiles(times), len(tracks))
+    samples = float(np.median([len(track) for track in tracks]))
+    results.add(name, "smoother", "samples_median", "1", samples, len(tracks))

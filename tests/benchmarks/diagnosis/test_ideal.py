@@ -1,0 +1,66 @@
+"""The ideal test against simulated statistics and against refits."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ballfg.benchmarks.diagnosis.cases import Recording
+from ballfg.benchmarks.diagnosis.effects import PLANTS
+from ballfg.benchmarks.diagnosis.ideal import (
+    LEVEL,
+    Ideal,
+    fit_declared,
+    ideal_case,
+    ideal_of,
+    needed,
+    power,
+    read_ideal,
+)
+from ballfg.diagnosis.search.signatures import visible_directions
+
+
+@pytest.mark.parametrize("rank", [1, 3])
+def test_ideal_power_is_that_of_simulated_statistics(rank: int) -> None:
+    rng = np.random.default_rng(rank)
+    draws = rng.standard_normal((400_000, rank))
+    threshold = np.quantile((draws**2).sum(axis=1), 1.0 - LEVEL)
+    draws[:, 0] += np.sqrt(needed(rank))
+    assert ((draws**2).sum(axis=1) > threshold).mean() == pytest.approx(0.9, abs=0.01)
+    assert power(0.0, rank) == pytest.approx(LEVEL)
+
+
+def test_ideal_size_and_power_belong_together() -> None:
+    ideal = Ideal("", 2, 450.0)
+    assert ideal.power(ideal.size) == pytest.approx(0.9)
+    assert ideal.size == pytest.approx(2.0 * Ideal("", 2, 1800.0).size)
+    unseen = Ideal("", 0, 0.0)
+    assert unseen.size == np.inf
+    assert (unseen.power([1.0, 2.0]) == 0.0).all()
+
+
+def test_visible_counts_directions() -> None:
+    information = np.diag([4.0, 1.0, 0.0])
+    assert visible_directions(information, np.array([4.0, 100.0, 5.0])).shape == (3, 2)
+    assert visible_directions(np.ones((2, 2)), np.ones(2)).shape == (2, 1)
+    assert visible_directions(np.zeros((2, 2)), np.zeros(2)).shape == (2, 0)
+
+
+@pytest.mark.parametrize(("name", "size"), [("wind", 0.1), ("restitution_speed", 0.2)])
+def test_noncentrality_is_what_the_declared_model_leaves_of_exact_tracks(name: str, size: float) -> None:
+    """Twice the objective at its minimum, on tracks without noise in which the effect acts a little."""
+    few = replace(ideal_case(name, 0), recording=Recording(tracks=5, position=0.0, spin=0.0))
+    acting = replace(few, sessions=(PLANTS[name].texts(size),))  # the same launches
+    assert 2.0 * fit_declared(acting).cost == pytest.approx(size**2 * ideal_of(few).information, rel=0.05)
+
+
+def test_ideal_is_kept(tmp_path: Path) -> None:
+    ideal, path = Ideal("of this case", 3, 12.5), tmp_path / "ideal-wind.json"
+    ideal.save(path)
+    assert read_ideal(path, "of this case") == ideal
+    assert read_ideal(path, "of another") is None
+    assert read_ideal(tmp_path / "absent.json", "any") is None
+    path.write_text("[]")
+    with pytest.raises(ValueError, match=r"ideal-wind.json: must be an ideal test .* Delete it"):
+        read_ideal(path, "any")

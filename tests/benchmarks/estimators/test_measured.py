@@ -1,0 +1,40 @@
+import numpy as np
+import pytest
+
+from ballfg.benchmarks.estimators.measured import WHOLE, Measured, _add_smoothing, prediction_rmse
+from ballfg.benchmarks.results import Results
+from ballfg.estimation import Estimate, Status
+from ballfg.prediction import TrackPrediction
+
+
+def test_prediction_rmse_by_hand() -> None:
+    times = np.arange(3.0)
+    estimate = Estimate("0", times, np.zeros((3, 9)), np.tile(np.eye(9), (3, 1, 1)), Status.OK, np.full((3, 3), np.nan))
+    measured = np.array([[0.003, 0.004, 0.0], [0.0, 0.0, 0.0]])
+    prediction = TrackPrediction("0", np.array([3.0, 4.0]), np.zeros((2, 3)), np.ones((2, 3)), measured, estimate)
+    assert prediction_rmse(prediction) == pytest.approx(0.005 / np.sqrt(2))
+
+
+def test_innovations_next_to_a_hit_do_not_count_and_marked_ones_count_as_failures() -> None:
+    whitened = np.zeros((6, 3))
+    whitened[0] = [0.0, 5.1, 0.0]  # too far
+    whitened[2] = [9.0, 0.0, 0.0]  # next to the hit
+    quality = np.array([0, 1, 0, 0, 3, 0], dtype=np.int8)
+    estimate = Estimate(
+        "0",
+        np.arange(6.0),
+        np.zeros((6, 9)),
+        np.tile(np.eye(9), (6, 1, 1)),
+        Status.OK,
+        whitened,
+        hits=np.array([2]),
+        quality=quality,
+    )
+    results = Results("test", 0)
+    _add_smoothing(results, Measured("toy", {}, [estimate], 0))
+    # samples 0, 1, 4, 5 count
+    assert results.value("toy", WHOLE, "within_5_sigma") == pytest.approx(3 / 4)
+    assert results.value("toy", WHOLE, "within_5_sigma_marked_fail") == pytest.approx(2 / 4)
+    assert results.value("toy", WHOLE, "share_marked") == pytest.approx(1 / 4)
+    assert results.value("toy", WHOLE, "share_wide") == pytest.approx(1 / 4)
+    assert results.value("toy", WHOLE, "hits") == 1

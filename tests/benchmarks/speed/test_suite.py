@@ -1,0 +1,46 @@
+"""A quick run. Times are never tested, only that they were taken."""
+
+from dataclasses import replace
+
+import torch
+
+from ballfg.benchmarks.results import Results
+from ballfg.benchmarks.speed.network import GRAVITY, fitted_network, parameter_count
+from ballfg.benchmarks.speed.suite import QUICK, problem_model, run_speed
+
+
+def test_network_is_the_same_each_time_and_close_to_the_model() -> None:
+    model = problem_model()
+    short, again = fitted_network(model, iterations=10), fitted_network(model, iterations=10)
+    assert all(torch.equal(a, b) for a, b in zip(short.parameters(), again.parameters(), strict=True))
+    one = fitted_network(model)
+    assert parameter_count(one) == 7523
+    rng = torch.Generator().manual_seed(9)
+    scale = torch.tensor([1.0] * 3 + [4.0] * 3 + [60.0] * 3, dtype=torch.float64)
+    state = scale * torch.randn((500, 9), generator=rng, dtype=torch.float64)
+    with torch.no_grad():
+        force = model.rates(state)[0] - GRAVITY
+        error = one.rates(state)[0] - model.rates(state)[0]
+    assert error.square().mean().sqrt() < 0.1 * force.square().mean().sqrt()
+
+
+def test_speed_run_has_every_time() -> None:
+    results = Results("test", 0)
+    run_speed(results, None, replace(QUICK, fit_iterations=100))
+    expected = {
+        "matrix_product_time",
+        "lm_time",
+        "lm_time_gtsam",
+        "covariances_time",
+        "estimate_time",
+        "jacobians_time_79",
+        "jacobian_time_1",
+        "online_update_median",
+        "online_update_p99",
+        "prediction_time",
+    }
+    for method in ("analytic", "network"):
+        found = {row.metric for row in results.rows if row.method == method and row.unit == "ms"}
+        assert found == expected
+    assert {row.metric for row in results.rows if row.method == "control"} == {"matrix_product_time"}
+    assert all(row.value is not None and row.value > 0 for row in results.rows)
