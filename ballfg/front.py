@@ -88,9 +88,29 @@ def estimate(
 
 
 @overload
-def predict(known: Estimate | BallState | Track, horizon: float = ..., **options: object) -> Ahead: ...
+def predict(
+    known: Estimate | BallState | Track,
+    horizon: float = ...,
+    *,
+    observe: float = ...,
+    method: str = ...,
+    model: Model = ...,
+    surfaces: Surfaces | float | None = ...,
+    settings: Settings | None = ...,
+    jobs: int = ...,
+) -> Ahead: ...
 @overload
-def predict(known: Tracks | Folder, horizon: float = ..., **options: object) -> dict[str, TrackPrediction]: ...
+def predict(
+    known: Tracks | Folder,
+    horizon: float = ...,
+    *,
+    observe: float = ...,
+    method: str = ...,
+    model: Model = ...,
+    surfaces: Surfaces | float | None = ...,
+    settings: Settings | None = ...,
+    jobs: int = ...,
+) -> dict[str, TrackPrediction]: ...
 def predict(
     known: Estimate | BallState | Track | Tracks | Folder,
     horizon: float = 0.3,

@@ -121,10 +121,10 @@ def _inputs(data: Opened, model: Path | None) -> Inputs[Opened]:
     from ballfg.estimation import dataset_settings, dataset_surfaces
 
     torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
-    unknown = nominal_note(data.ball) if model is None else None
-    for note in [*data.notes, *([unknown] if unknown else [])]:
+    guessed = nominal_note(data.info.ball) if model is None else None
+    for note in data.notes if guessed is None else [*data.notes, guessed]:
         print(f"note: {note}", file=sys.stderr)
-    ball = nominal_model(data.ball) if model is None else load_model(model, radius=data.ball.radius)
+    ball = nominal_model(data.info.ball) if model is None else load_model(model, radius=data.info.ball.radius)
     return Inputs(data, ball, dataset_surfaces(data), dataset_settings(data, ball))
 
 

@@ -15,7 +15,7 @@ from ballfg.dynamics.model_file import model_from_dict
 from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball
 
 KNOWN_BALLS: Final[Mapping[str, Ball]] = {"table_tennis": TABLE_TENNIS, "tennis": TENNIS}
-"""The balls whose nominal model is a file of that name in `ballfg/dynamics/balls`."""
+"""The balls whose nominal model is a file of that name in `ballfg/dynamics`."""
 SPREADS: Final[Mapping[str, Mapping[str, float]]] = {"table_tennis": {}, "tennis": {"drag": 0.3, "magnus": 0.3}}
 """Prior standard deviations as shares of the values, for known balls to which those of the effects do not apply."""
 TOLERANCE: Final = 0.15
@@ -86,7 +86,7 @@ def _known_name(ball: Ball) -> str | None:
 
 
 def _known_model(name: str, radius: float) -> AnalyticModel:
-    text = resources.files("ballfg.dynamics").joinpath("balls", f"{name}.yaml").read_text(encoding="utf-8")
+    text = resources.files("ballfg.dynamics").joinpath(f"{name}.yaml").read_text(encoding="utf-8")
     model = model_from_dict(yaml.safe_load(text), radius=radius, where=f"{name}.yaml")
     _set_spread(model, SPREADS[name])
     return model

@@ -18,6 +18,7 @@ from .observations.sighted_dataset import read_sighted as read_sighted
 from .observations.sightings import CameraSightings as CameraSightings
 from .observations.sightings import in_order as in_order
 from .observations.sightings import sighted_track as sighted_track
+from .observations.sightings import sightings_of as sightings_of
 from .online.online import Online as Online
 from .reading import has_positions as has_positions
 from .reading import read as read

@@ -91,7 +91,8 @@ class Settings:
             model: gives the coefficients and their prior standard deviations.
             changes: other fields.
         """
-        return cls(**({"coefficients": coefficient_sigmas(model), "process": MEASURED} | changes))
+        usual: dict[str, Any] = {"coefficients": coefficient_sigmas(model), "process": MEASURED}
+        return cls(**(usual | changes))
 
     def spin_label(self, track: Track) -> SpinLabel | None:
         """What is known of a track's first spin: its label, else what its launcher settings say, else None."""

@@ -18,8 +18,10 @@ FloatArray = NDArray[np.float64]
 class Measurements(Protocol):
     """What a track needs to know of an observation (`ballfg.estimation.Observation`)."""
 
-    name: Any
-    """Text, the sort of the measurements."""
+    @property
+    def name(self) -> str:
+        """Of the sort of measurement."""
+        ...
 
     def taken(self, samples: NDArray[np.bool_]) -> Self:
         """The measurements of the samples (n,) bool of the track that stay."""

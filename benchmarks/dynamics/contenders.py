@@ -146,7 +146,7 @@ def _padded(times: Sequence[Array]) -> Array:
 def nominal_contender(job: Job, task: Task) -> GraphContender:
     """The nominal analytic model: what one has before any data. It is told what launcher settings mean for the spin."""
     label = as_it_is if task.launcher is None else task.launcher.labelled
-    model = nominal_model(task.info.ball.radius)
+    model = nominal_model(task.info.ball)
     return GraphContender(job.method, model, task.surfaces, task.settings, label, job.measured)
 
 

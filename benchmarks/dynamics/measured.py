@@ -71,7 +71,7 @@ def measured_task(dataset: Dataset, jobs: int, tracks: int | None = None, *, lea
         learn: False: all shots are to judge by.
     Raises: ValueError: if too few tracks are left.
     """
-    model = nominal_model(dataset.info.ball.radius)
+    model = nominal_model(dataset.info.ball)
     given, surfaces = dataset_settings(dataset, model), dataset_surfaces(dataset)
     listed = list(islice(dataset, tracks))
     found = estimate_tracks(Smoother(model, surfaces, given), listed, len(listed), jobs)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 
@@ -27,8 +26,6 @@ from ballfg.learning.sequence.predictor import SequencePredictor
 from ballfg.learning.sequence.trainee import FOLDER
 from ballfg.progress import unwatched
 from ballfg.tracks import Track
-
-T = TypeVar("T")
 
 
 def trained_contender(job: Job, task: Task) -> Contender:

@@ -68,7 +68,7 @@ def run_measured(results: Results, dataset: Dataset, tracks: int | None, jobs: i
     Nominal model, noise as the dataset states it or as its tracks show it: nothing is fitted to a single track's
     later part, nor to labels.
     """
-    model: BallModel = nominal_model(dataset.info.ball.radius)
+    model: BallModel = nominal_model(dataset.info.ball)
     settings, surfaces = dataset_settings(dataset, model), dataset_surfaces(dataset)
     listed = list(islice(dataset, tracks))
     predictions = {}

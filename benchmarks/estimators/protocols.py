@@ -16,8 +16,7 @@ from ballfg.dynamics import BallModel, Surfaces, contact_time, nominal_model, ro
 from ballfg.estimation import Estimator, ExtendedKalmanFilter, Online, Settings, SlidingWindow, Smoother
 from ballfg.factors.noise import ProcessNoise
 from ballfg.progress import progress
-from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate, table_tennis
-from ballfg.simulation import ProcessNoise as TrueProcessNoise
+from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, simulate, table_tennis
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ
 from ballfg.tracks import SPIN_LABELS, Track
 
@@ -146,7 +145,7 @@ def fair_protocol(count: int, seed: int, name: str = "fair") -> Protocol:
         seed=seed,
         ball=kind,
         noise=MeasurementNoise(position=FAIR_NOISE, spin=FAIR_SPIN_NOISE),
-        process=TrueProcessNoise(
+        process=MotionNoise(
             acceleration=process.acceleration,
             spin=process.spin,
             contact_velocity=process.contact_velocity,

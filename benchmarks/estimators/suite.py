@@ -66,7 +66,7 @@ def run_dataset(results: Results, dataset: Dataset, out: Path, size: Size, jobs:
     """Measured tracks. Returns: the pictures written."""
     from ballfg.benchmarks.estimators.pictures import calibration_picture, growth_picture, tracks_picture
 
-    settings = dataset_settings(dataset, nominal_model(dataset.info.ball.radius))
+    settings = dataset_settings(dataset, nominal_model(dataset.info.ball))
     what = f"{OBSERVE:g} s observed, {HORIZON:g} s predicted, nominal model"
     print(f"{dataset.info.name}: {len(dataset)} tracks; {what}; {describe_settings(settings)}")
     measured = run_measured(results, dataset, size.measured, jobs)

@@ -215,7 +215,7 @@ def _time_prediction(watch: Stopwatch, name: str, smoother: Smoother, track: Tra
 
 def _time_dataset(results: Results, dataset: Dataset, count: int) -> None:
     """Time of the smoother for each of the first tracks of a dataset."""
-    model = nominal_model(dataset.info.ball.radius)
+    model = nominal_model(dataset.info.ball)
     smoother = Smoother(model, dataset_surfaces(dataset), dataset_settings(dataset, model))
     tracks, name = list(islice(dataset, count)), dataset.info.name
     smoother.estimate(tracks[0])  # warm

@@ -195,7 +195,7 @@ def test_intervals_hold_as_often_as_they_say(tracks, method):
 def test_measured_tracks(name):
     """Every fourth track: 0.25 s observed, 0.3 s predicted, nominal model. A plain least-squares fit has 27 mm."""
     dataset = read_dataset(DATA / name)
-    model = nominal_model(dataset.info.ball.radius)
+    model = nominal_model(dataset.info.ball)
     smoother = make_estimator("smoother", model, dataset_surfaces(dataset), dataset_settings(dataset, model))
     some = list(dataset)[::4]
     results = [r for r in predict_tracks(smoother, some, len(some), 0.25, horizon=0.3) if len(r.times)]

@@ -19,7 +19,6 @@ from torch import Tensor
 from ballfg.diagnosis.result import Array, Index, Mask
 from ballfg.estimation import Launcher, Smoother
 from ballfg.estimation.batch import map_tracks
-from ballfg.estimation.smoother.problem import effective_sigmas
 from ballfg.tracks import Track
 
 LEAST_SAMPLES = 10
@@ -113,10 +112,9 @@ def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[Stretches
     """Each stretch of a track by itself."""
     known = launcher.settings(track)
     settings = np.zeros(len(launcher.embedding.names)) if known is None else known
-    segmentation = smoother.segment(track)
-    sigma = effective_sigmas(track, segmentation, smoother.settings)
-    solution = smoother.solve(smoother.problem(track, segmentation, sigma))
-    estimate, segmentation = smoother.result(track, sigma, solution), solution.events.segmentation
+    problem = smoother.problem(track)
+    sigma, solution = problem.sigma, smoother.solve(problem)
+    estimate, segmentation = smoother.result(problem, solution), solution.events.segmentation
     rests = [rest.first for rest in segmentation.rests]
     stretches = []
     for first, last in segmentation.segments:

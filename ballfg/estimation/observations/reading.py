@@ -187,8 +187,8 @@ class ReadingFactors(FactorBatch):
 
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, dim) whitened residuals in torch."""
-        numbers = (torch.from_numpy(a) for a in (self.values, self.sigma, self.delay))
-        return self._whitened(*numbers, inputs[0])
+        values, sigma, delay = (torch.from_numpy(a) for a in (self.values, self.sigma, self.delay))
+        return self._whitened(values, sigma, delay, inputs[0])
 
     def _whitened(self, values: Tensor, sigma: Tensor, delay: Tensor, state: Tensor) -> Tensor:
         if bool(delay.any()):

@@ -20,7 +20,7 @@ def segmented():
         dataset = read_dataset(DATA / name)
         sigma = estimate_position_noise(dataset)
         surfaces = Surfaces.table_tennis(dataset.info.table_height)
-        physics = physics_of(nominal_model(dataset.info.ball.radius))
+        physics = physics_of(nominal_model(dataset.info.ball))
         return [segment(t.times, t.positions, sigma, surfaces=surfaces, physics=physics) for t in dataset]
 
     return run

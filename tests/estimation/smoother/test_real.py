@@ -21,7 +21,7 @@ def estimates(name: str, count: int, *, shortest: bool = False) -> list[Estimate
     if not folder.is_dir():
         pytest.skip(f"no measured tracks at {folder}; set BALLFG_DATA to the folder that holds {name}")
     dataset = read_dataset(folder)
-    model = nominal_model(dataset.info.ball.radius)
+    model = nominal_model(dataset.info.ball)
     smoother = Smoother(model, dataset_surfaces(dataset), dataset_settings(dataset, model))
     tracks = sorted(dataset, key=len) if shortest else dataset
     return [smoother.estimate(track) for track in islice(iter(tracks), count)]
@@ -76,6 +76,6 @@ def test_a_contact_at_the_end_must_explain_the_track_better() -> None:
     if not (DATA / "spindoe").is_dir():
         pytest.skip(f"no measured tracks at {DATA / 'spindoe'}; set BALLFG_DATA to the folder that holds it")
     dataset = read_dataset(DATA / "spindoe")
-    model = nominal_model(dataset.info.ball.radius)
+    model = nominal_model(dataset.info.ball)
     smoother = Smoother(model, dataset_surfaces(dataset), dataset_settings(dataset, model))
     assert len(smoother.estimate(dataset.track("002")).contacts) == 1
