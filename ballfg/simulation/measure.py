@@ -69,7 +69,7 @@ def measure(
         if config.spin_labels:
             spin = model.labelled(torch.from_numpy(states[0, SPIN])).numpy() + label_noise[i]
             labels = dict(zip(SPIN_LABELS, spin.tolist(), strict=True)) | labels
-        track = Track(f"{first + i:0{width}d}", stamps[i, keep], positions[i, keep], labels=labels)
+        track = Track(stamps[i, keep], positions[i, keep], labels=labels, name=f"{first + i:0{width}d}")
         tracks.append(SimulatedTrack(track, true_times[keep], states))
     return tracks
 

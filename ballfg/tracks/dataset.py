@@ -177,4 +177,4 @@ def _check_group(source: RowSource, group: RowGroup, info: DatasetInfo, findings
 
 def _track(name: str, values: FloatArray, labels: dict[str, Label]) -> Track:
     sigmas = values[:, 4:] if values.shape[1] > 4 else None
-    return Track(name, values[:, 0], values[:, 1:4], sigmas, labels)
+    return Track(values[:, 0], values[:, 1:4], sigmas, labels, name=name)

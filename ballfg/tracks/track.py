@@ -39,9 +39,6 @@ class Track:
         is not positive, or a bad label; the message names the index. TypeError: a name that is not a str.
     """
 
-    name: str
-    """The trajectory's name, as in the column `trajectory`: "000" stays "000"."""
-
     times: FloatArray
     """(n,) s, n >= 1, strictly increasing. The origin is the data's own."""
 
@@ -53,6 +50,9 @@ class Track:
 
     labels: Mapping[str, Label] = field(default_factory=dict)
     """What is known about the shot: spin_x, spin_y, spin_z (rad/s, at the first sample), group, launcher settings."""
+
+    name: str = "track"
+    """The trajectory's name, as in the column `trajectory`: "000" stays "000"."""
 
     observations: tuple[Any, ...] = ()
     """What was measured beside the positions: `ballfg.estimation.Observation`s, one of a name."""

@@ -86,7 +86,7 @@ def _from_sightings(filmed: Filmed, kind: type[Smoother] | type[Online]) -> list
 
 
 def _from_points(filmed: Filmed, balls: Sequence[tuple[Array, Array]]) -> list[Estimate]:
-    tracks = [Track(f"{k:03d}", times, points) for k, (times, points) in enumerate(balls)]
+    tracks = [Track(times, points, name=f"{k:03d}") for k, (times, points) in enumerate(balls)]
     x, y, z = estimate_position_noise(tracks).tolist()
     settings = Settings.for_measured(nominal_model(), position_noise=(x, y, z))
     smoother = Smoother(nominal_model(), filmed.recording.config.ball.surfaces, settings)

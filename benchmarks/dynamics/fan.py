@@ -80,6 +80,6 @@ def _spin(contender: GraphContender, start: Array, settings: dict[str, float]) -
     times = np.arange(STRAIGHT) / RATE
     positions = start[POSITION] + times[:, None] * start[VELOCITY]
     labels = {"topspin": 0.0, "sidespin": 0.0, "speed": float(SPEED_LEVEL)} | settings
-    launch = contender.label(Track("launch", times, positions, labels=labels))
+    launch = contender.label(Track(times, positions, labels=labels, name="launch"))
     label = contender.settings.spin_label(launch)
     return np.zeros(3) if label is None else label.spin

@@ -129,7 +129,7 @@ def _free_flights(model: BallModel, surfaces: Surfaces, count: int, rng: np.rand
     measured = truth[..., POSITION] + PAPER_NOISE * rng.standard_normal((count, PAPER_SAMPLES, 3))
     labels = [dict(zip(SPIN_LABELS, map(float, spin), strict=True)) for spin in start[:, SPIN]]
     away = np.ones(PAPER_SAMPLES, dtype=bool)
-    return [Case(Track(f"{i:03d}", times, measured[i], labels=labels[i]), truth[i], away) for i in range(count)]
+    return [Case(Track(times, measured[i], labels=labels[i], name=f"{i:03d}"), truth[i], away) for i in range(count)]
 
 
 def fair_protocol(count: int, seed: int, name: str = "fair") -> Protocol:

@@ -114,7 +114,7 @@ def problem_track(model: BallModel) -> Track:
     rng = np.random.default_rng(0)
     measured = truth[:, POSITION] + NOISE * rng.standard_normal((SAMPLES, 3))
     spin = np.add(START[6:], LABEL_OFFSET)
-    return Track("speed", times, measured, labels=dict(zip(SPIN_LABELS, map(float, spin), strict=True)))
+    return Track(times, measured, labels=dict(zip(SPIN_LABELS, map(float, spin), strict=True)), name="speed")
 
 
 def problem_settings(coefficients: Mapping[str, float] | None = None) -> Settings:

@@ -54,7 +54,7 @@ def shot(labels=LEVELS, samples: int = 30, noise: float = 0.001) -> Track:
     with torch.no_grad():
         truth = rollout(nominal_model(), start, torch.from_numpy(times - 1.0), TABLE)[0].numpy()
     positions = truth[:, :3] + noise * np.random.default_rng(0).standard_normal((samples, 3))
-    return Track("shot", times, positions, labels=labels)
+    return Track(times, positions, labels=labels, name="shot")
 
 
 def test_a_label_from_settings_and_first_samples(launcher) -> None:
@@ -219,8 +219,8 @@ def test_levels_give_the_spin_of_the_simulated_launcher() -> None:
 
 def test_measured_labels_win_and_missing_settings_change_nothing() -> None:
     levels = Launcher.of_levels(50.0, 40.0, 4.0)
-    track = Track("a", np.arange(5) * 0.01, np.arange(15.0).reshape(5, 3) * 0.05)
+    track = Track(np.arange(5) * 0.01, np.arange(15.0).reshape(5, 3) * 0.05, name="a")
     assert levels.labelled(track) is track
     labels = {"spin_x": 1.0, "spin_y": 2.0, "spin_z": 3.0, "topspin": 1.0, "sidespin": 0.0}
-    measured = Track("a", track.times, track.positions, labels=labels)
+    measured = Track(track.times, track.positions, labels=labels, name="a")
     assert levels.labelled(measured) is measured

@@ -60,7 +60,7 @@ def test_a_track_s_own_sigmas_come_first_and_are_copied() -> None:
 
 @pytest.mark.parametrize("own", [None, np.full((4, 3), 0.01)], ids=["settings", "own"])
 def test_bad_samples_are_widened(own) -> None:
-    track = Track("t", np.arange(4.0), np.zeros((4, 3)), sigmas=own)
+    track = Track(np.arange(4.0), np.zeros((4, 3)), sigmas=own, name="t")
     quality = np.array([Quality.GOOD, Quality.WIDE, Quality.SHIFTED, Quality.OUTLIER], dtype=np.int8)
     segmentation = Segmentation((), NONE, NONE, (), quality)
     base = 0.0015 if own is None else 0.01

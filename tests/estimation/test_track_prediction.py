@@ -43,7 +43,7 @@ def simulated(count: int, samples: int = 50, dt: float = 0.01) -> list[Track]:
         state[bounced, 3:] += kick[bounced]
     times = np.arange(samples) * dt
     return [
-        Track(f"{i}", times, positions, labels=dict(zip(("spin_x", "spin_y", "spin_z"), label, strict=True)))
+        Track(times, positions, labels=dict(zip(("spin_x", "spin_y", "spin_z"), label, strict=True)), name=f"{i}")
         for i, (positions, label) in enumerate(zip(np.stack(measured, axis=1), labels, strict=True))
     ]
 
@@ -78,7 +78,7 @@ def test_tracks_of_all_lengths_and_rates_together(tracks):
     """Blocks hold tracks of other lengths and stamps: each comes out as if it were alone, in order."""
     keep = [np.arange(50), np.arange(20), np.arange(26), np.arange(27), np.r_[0:26, 40:50], np.r_[0:30, 33, 49]]
     mixed = [
-        Track(f"m{i}", t.times[k], t.positions[k], labels=t.labels)
+        Track(t.times[k], t.positions[k], labels=t.labels, name=f"m{i}")
         for i, (t, k) in enumerate(zip(tracks, keep))  # noqa: B905
     ]
     together = list(predict_tracks(estimator(), iter(mixed), len(mixed), 0.25))

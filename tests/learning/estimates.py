@@ -89,7 +89,7 @@ def measured(
             states = rollout(model, torch.tensor([start], dtype=torch.float64), since, TABLE)[0].numpy()
         positions = states[:, :3] + 0.003 * rng.standard_normal((length, 3))
         positions[length // 3, 1] += 0.009
-        tracks.append(Track(f"track {k}", times, positions, labels=LABELS[k % 3]))
+        tracks.append(Track(times, positions, labels=LABELS[k % 3], name=f"track {k}"))
     return tracks
 
 

@@ -26,7 +26,7 @@ def flown(samples: int = 60, start=START, seed: int = 0, **changes) -> Track:
     with torch.no_grad():
         truth = rollout(nominal_model(), state, torch.from_numpy(times - 2.0), TABLE)[0].numpy()
     noise = 0.002 * np.random.default_rng(seed).standard_normal((samples, 3))
-    return replace(Track("shot", times, truth[:, :3] + noise), **changes)
+    return replace(Track(times, truth[:, :3] + noise, name="shot"), **changes)
 
 
 def hit_track() -> Track:
@@ -34,7 +34,7 @@ def hit_track() -> Track:
     there = flown(40)
     back = flown(30, (*there.positions[-1], -6.0, 0.3, 2.0, 0.0, -40.0, 0.0), seed=1)
     times = 2.0 + 0.01 * np.arange(69)
-    return Track("hit", times, np.concatenate((there.positions, back.positions[1:])))
+    return Track(times, np.concatenate((there.positions, back.positions[1:])), name="hit")
 
 
 def shot_of(track: Track, settings: Settings = SETTINGS, **observe) -> Shot | str:

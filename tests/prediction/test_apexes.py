@@ -99,7 +99,7 @@ def test_flights_end_with_the_track() -> None:
 
 def shot(times: np.ndarray, states: np.ndarray, bounces: np.ndarray, observed: int = 60) -> Shot:
     apexes, when = true_apexes(times, states, bounces)
-    track = Track("hops", times, states[:, :3])
+    track = Track(times, states[:, :3], name="hops")
     return Shot(track, states[:, :3], observed, len(times), bounces, apexes, when, states)
 
 

@@ -52,7 +52,7 @@ def make_tracks() -> Callable[..., list[Track]]:
             p = np.stack([4 * t, 0.1 * t, 1 - 4.9 * t**2], axis=1) + rng.normal(0, 2e-3, (samples, 3))
             s = rng.uniform(1e-3, 2e-3, (samples, 3)) if sigmas else None
             labels = {"spin_x": rng.normal(), "spin_y": rng.normal(), "spin_z": 2.0, "group": f"{i % 2}"}
-            tracks.append(Track(f"{i:03d}", t, p, s, labels))
+            tracks.append(Track(t, p, s, labels, name=f"{i:03d}"))
         return tracks
 
     return make

@@ -32,7 +32,7 @@ def _tracks(count: int):
     sigmas = np.full((SAMPLES, 3), 0.002)
     for i in range(count):
         positions = rng.normal(0, 0.1, (SAMPLES, 3))
-        yield Track(f"{i:05d}", t, positions, sigmas, {"speed": rng.normal(), "group": "a"})
+        yield Track(t, positions, sigmas, {"speed": rng.normal(), "group": "a"}, name=f"{i:05d}")
 
 
 def _peak(folder, rows: int) -> int:

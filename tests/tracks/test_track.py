@@ -12,7 +12,7 @@ SPIN = {"spin_x": 1.0, "spin_y": 2.0, "spin_z": 3.0}
 
 def test_fields_are_copied_to_float64():
     positions = P.astype(np.float32)
-    track = Track("a", [0, 1, 2], positions, labels={"speed": 3})
+    track = Track([0, 1, 2], positions, labels={"speed": 3}, name="a")
     positions[0, 0] = 99
     assert track.times.dtype == track.positions.dtype == np.float64
     assert track.positions[0, 0] == 0
@@ -21,13 +21,13 @@ def test_fields_are_copied_to_float64():
 
 
 def test_spin_label_needs_all_three():
-    assert np.array_equal(Track("a", T, P, labels=SPIN).spin_label, [1, 2, 3])
-    assert Track("a", T, P, labels={"spin_x": 1.0}).spin_label is None
-    assert Track("a", T, P).spin_label is None
+    assert np.array_equal(Track(T, P, labels=SPIN, name="a").spin_label, [1, 2, 3])
+    assert Track(T, P, labels={"spin_x": 1.0}, name="a").spin_label is None
+    assert Track(T, P, name="a").spin_label is None
 
 
 def test_until_keeps_the_first_sample_and_its_spin():
-    part = Track("a", T, P, P + 1, {**SPIN, "group": "g"}).until(0.1)
+    part = Track(T, P, P + 1, {**SPIN, "group": "g"}, name="a").until(0.1)
     assert np.array_equal(part.times, [0.0, 0.1])
     assert np.array_equal(part.positions, P[:2])
     assert np.array_equal(part.sigmas, P[:2] + 1)
@@ -35,13 +35,13 @@ def test_until_keeps_the_first_sample_and_its_spin():
 
 
 def test_between_without_the_first_sample_leaves_the_spin_out():
-    part = Track("a", T, P, labels={**SPIN, "group": "g"}).between(0.1, 0.3)
+    part = Track(T, P, labels={**SPIN, "group": "g"}, name="a").between(0.1, 0.3)
     assert np.array_equal(part.times, [0.1, 0.3])
     assert part.labels == {"group": "g"}
 
 
 def test_track_survives_pickling():
-    copy = pickle.loads(pickle.dumps(Track("a", T, P, P + 1, SPIN)))
+    copy = pickle.loads(pickle.dumps(Track(T, P, P + 1, SPIN, name="a")))
     assert np.array_equal(copy.positions, P)
     assert copy.labels == SPIN
 
@@ -80,11 +80,11 @@ def test_bad_fields_are_named(arguments, message):
 
 def test_name_must_be_text():
     with pytest.raises(TypeError, match=r"track name must be a str; got int 3\. Pass str\(3\)"):
-        Track(3, T, P)
+        Track(T, P, name=3)
 
 
 def test_an_empty_interval_is_refused():
     with pytest.raises(ValueError, match=r"must hold a sample; got \[1, 2\] s while the track covers \[0, 0\.3\] s"):
-        Track("a", T, P).between(1, 2)
+        Track(T, P, name="a").between(1, 2)
     with pytest.raises(ValueError, match="Widen the interval"):
-        Track("a", T, P).until(-0.1)
+        Track(T, P, name="a").until(-0.1)

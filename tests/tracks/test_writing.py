@@ -84,7 +84,7 @@ def test_an_exception_leaves_the_older_dataset(tmp_path, info, make_tracks):
 
 
 TIMES = np.arange(3) / 100
-FAST = Track("fast", TIMES, np.array([[0, 0, 0], [100, 0, 0], [200, 0, 0]]))
+FAST = Track(TIMES, np.array([[0, 0, 0], [100, 0, 0], [200, 0, 0]]), name="fast")
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ FAST = Track("fast", TIMES, np.array([[0, 0, 0], [100, 0, 0], [200, 0, 0]]))
         ),
         (lambda tracks: [*tracks, FAST], "track 'fast': x, y, z must be in m and t in s; got a median speed of 1e+04"),
         (
-            lambda tracks: [*tracks, Track("s", TIMES, np.zeros((3, 3)), np.ones((3, 3)))],
+            lambda tracks: [*tracks, Track(TIMES, np.zeros((3, 3)), np.ones((3, 3)), name="s")],
             "tracks must have sigmas all or none; 's' differs from the first.",
         ),
     ],

@@ -190,7 +190,7 @@ def sighted_track(
     state = np.cumsum(first) - 1
     path = filled(moments, rough_path(Rays.of(sightings, times, rig), moments), name)
     seen = CameraSightings(sightings, rig, state, times - moments[state], np.zeros(len(rig)))
-    return Track(name, moments, path.positions, path.sigmas, dict(labels or {}), observations=(seen,), rough=True)
+    return Track(moments, path.positions, path.sigmas, dict(labels or {}), observations=(seen,), rough=True, name=name)
 
 
 def cameras_of(sightings: Sightings, cameras: Sequence[Camera]) -> tuple[Camera, ...]:

@@ -137,7 +137,7 @@ class Online(Estimator):
             raise ValueError("push must not follow push_sighting in one stream; call reset in between.")
         sample = Sample(float(time), point, spread)
         if observations:
-            moment = Track("stream", np.array([sample.time]), point[None], spread[None])
+            moment = Track(np.array([sample.time]), point[None], spread[None], name="stream")
             beside = self._measurements(moment.observed(*observations))
             sample.measurements += [measurement for found in beside.values() for _, measurement in found]
         return self._observe(sample)

@@ -64,7 +64,7 @@ class Tracking:
     def tracks(self) -> list[Track]:
         """The balls' points with their standard deviations."""
         return [
-            Track(name, ball.times, ball.points, np.sqrt(np.diagonal(ball.covariances, axis1=1, axis2=2)))
+            Track(ball.times, ball.points, np.sqrt(np.diagonal(ball.covariances, axis1=1, axis2=2)), name=name)
             for name, ball in zip(self.names, self.balls, strict=True)
         ]
 

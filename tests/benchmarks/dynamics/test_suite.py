@@ -133,7 +133,7 @@ def test_truth_needs_simulated_tracks() -> None:
 
 def test_a_measured_shot_ends_at_a_hit() -> None:
     times = np.arange(100) / 100
-    track = Track("hit", times, np.stack((times, times, 1 + times), axis=-1))
+    track = Track(times, np.stack((times, times, 1 + times), axis=-1), name="hit")
     blank = Estimate("hit", times, np.zeros((100, 9)), np.zeros((100, 9, 9)), Status.OK, np.zeros((100, 3)))
     whole = measured_shot(track, blank)
     cut = measured_shot(track, replace(blank, hits=np.array([40])))

@@ -37,7 +37,7 @@ class Wrong(Estimator):
 def case() -> Case:
     away = np.ones(SAMPLES, dtype=bool)
     away[7] = False
-    return Case(Track("0", 0.01 * np.arange(SAMPLES), np.zeros((SAMPLES, 3))), np.zeros((SAMPLES, 9)), away)
+    return Case(Track(0.01 * np.arange(SAMPLES), np.zeros((SAMPLES, 3)), name="0"), np.zeros((SAMPLES, 9)), away)
 
 
 def test_errors_and_nees_by_hand(case: Case) -> None:

@@ -29,7 +29,7 @@ def flown(model, start, count):
 
 def measured(name, states, labels, seed):
     noise = NOISE * np.random.default_rng(seed).standard_normal((len(states), 3))
-    return Track(name, 0.5 + np.arange(len(states)) / RATE, states[:, :3] + noise, labels=labels)
+    return Track(0.5 + np.arange(len(states)) / RATE, states[:, :3] + noise, labels=labels, name=name)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +53,7 @@ def tracks(make_ball, first_flight):
     positions = plain.positions.copy()
     positions[[12, 45]] += (0.15, -0.1, 0.2)
     return [
-        Track("plain", plain.times, positions, labels=SPIN),
+        Track(plain.times, positions, labels=SPIN, name="plain"),
         measured("hit", np.concatenate((first_flight, returned)), SPIN, 2),
         measured("short", first_flight[: LEAST_SAMPLES - 2], SPIN, 3),
         measured("group", first_flight[:30], {"group": "b"}, 4),

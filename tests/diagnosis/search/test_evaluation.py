@@ -69,7 +69,9 @@ def test_errors_of_predictions(make_ball, make_launches, make_shots, surfaces):
     data = make_shots(make_ball(), make_launches(4, 53), 53, duration=0.5).stretches
     tracks = [
         EvaluationTrack(
-            Track(name, data.times[i].numpy(), data.positions[i].numpy(), labels=labels_of(data.labels[i].tolist())),
+            Track(
+                data.times[i].numpy(), data.positions[i].numpy(), labels=labels_of(data.labels[i].tolist()), name=name
+            ),
             data.contacts[i][~data.contacts[i].isnan()].numpy(),
         )
         for i, name in enumerate(data.names)

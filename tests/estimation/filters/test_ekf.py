@@ -56,7 +56,7 @@ def simulate(model, settings: Settings, start, times, rng, surfaces=TABLE, label
     measured = truth[:, POSITION] + settings.position_noise * rng.standard_normal((len(times), 3))
     spin = truth[0, 6:] + settings.spin_label_noise * rng.standard_normal(3)
     labels = dict(zip(("spin_x", "spin_y", "spin_z"), spin, strict=True)) if label else {}
-    return truth, Track("simulated", times, measured, labels=labels)
+    return truth, Track(times, measured, labels=labels, name="simulated")
 
 
 def nees(estimate: Estimate, truth: np.ndarray, part: slice = slice(0, 9)) -> np.ndarray:
@@ -242,7 +242,7 @@ def flight(rng):
 
 
 def with_positions(track: Track, positions: np.ndarray) -> Track:
-    return Track(track.name, track.times, positions, labels=track.labels)
+    return Track(track.times, positions, labels=track.labels, name=track.name)
 
 
 def run(track: Track, **options) -> Estimate:
@@ -306,7 +306,7 @@ def test_planted_hit_is_found_in_its_interval(rng, smooth):
     second, after = simulate(nominal_model(), PLAIN, struck, np.arange(31) * 0.01, rng)
     truth = np.concatenate((first, second[1:]))
     positions = np.concatenate((before.positions, after.positions[1:]))
-    track = Track("struck", np.arange(55) * 0.01, positions, labels=before.labels)
+    track = Track(np.arange(55) * 0.01, positions, labels=before.labels, name="struck")
     result = run(track, smooth=smooth)
     assert result.hits.tolist() == [24]
     assert (result.quality == Quality.GOOD).all()
@@ -318,7 +318,7 @@ def test_planted_hit_is_found_in_its_interval(rng, smooth):
 def test_gap_of_a_fifth_of_a_second(flight):
     truth, track = flight
     keep = np.r_[0:10, 30:60]
-    result = run(Track("gap", track.times[keep], track.positions[keep], labels=track.labels))
+    result = run(Track(track.times[keep], track.positions[keep], labels=track.labels, name="gap"))
     assert (result.quality == Quality.GOOD).all()
     assert nees(result, truth[keep])[[9, 10, -1]].max() < chi2.ppf(0.999, 9)
 
@@ -326,7 +326,7 @@ def test_gap_of_a_fifth_of_a_second(flight):
 def test_gap_with_the_bounce_in_it(flight):
     truth, track = flight
     keep = np.r_[0:28, 48:60]
-    result = run(Track("gap", track.times[keep], track.positions[keep], labels=track.labels))
+    result = run(Track(track.times[keep], track.positions[keep], labels=track.labels, name="gap"))
     assert [contact.interval for contact in result.contacts] == [27]
     assert nees(result, truth[keep])[[28, -1]].max() < chi2.ppf(0.999, 9)
 

@@ -46,7 +46,7 @@ def estimate(track: Track, model=None, surfaces=FAR, settings=None):
 
 def test_straight_motion_is_exact():
     positions, velocities = parabola(np.zeros(3))
-    result = estimate(Track("line", TIMES, positions, labels=SPIN_LABEL))
+    result = estimate(Track(TIMES, positions, labels=SPIN_LABEL, name="line"))
     np.testing.assert_allclose(result.states[1:, VELOCITY], velocities[1:], rtol=1e-10)
     np.testing.assert_array_equal(result.states[:, POSITION], positions)
     np.testing.assert_array_equal(result.states[:, SPIN], np.tile([1.0, 60.0, -3.0], (40, 1)))
@@ -56,14 +56,14 @@ def test_straight_motion_is_exact():
 
 def test_constant_acceleration_lags_by_half_the_window():
     positions, velocities = parabola(GRAVITY)
-    result = estimate(Track("parabola", TIMES, positions))
+    result = estimate(Track(TIMES, positions, name="parabola"))
     lag = velocities - result.states[:, VELOCITY]
     np.testing.assert_allclose(lag[4:], np.tile(GRAVITY * 2 * DT, (36, 1)), atol=1e-10)
     np.testing.assert_allclose(lag[1:4], GRAVITY * DT * np.array([[0.5], [1.0], [1.5]]), atol=1e-10)
 
 
 def test_first_sample_has_the_prior_velocity():
-    result = estimate(Track("parabola", TIMES, parabola(GRAVITY)[0]))
+    result = estimate(Track(TIMES, parabola(GRAVITY)[0], name="parabola"))
     np.testing.assert_array_equal(result.states[0, VELOCITY], np.zeros(3))
     np.testing.assert_array_equal(result.covariances[0, VELOCITY, VELOCITY], 400.0 * np.eye(3))
     assert not result.covariances[0, POSITION, VELOCITY].any()
@@ -76,10 +76,10 @@ def test_covariance_is_the_mean_squared_error(rng):
     errors = []
     for _ in range(4000):
         noise = settings.position_noise * rng.standard_normal((11, 3))
-        result = estimate(Track("noisy", TIMES[:11], positions[:11] + noise), settings=settings)
+        result = estimate(Track(TIMES[:11], positions[:11] + noise, name="noisy"), settings=settings)
         errors.append(result.states[-1, :6] - truth)
     squared = np.einsum("ni,nj->ij", errors, errors) / len(errors)
-    stated = estimate(Track("parabola", TIMES, positions), settings=settings).covariances[10, :6, :6]
+    stated = estimate(Track(TIMES, positions, name="parabola"), settings=settings).covariances[10, :6, :6]
     scale = np.sqrt(np.diag(stated))
     np.testing.assert_allclose(squared / np.outer(scale, scale), stated / np.outer(scale, scale), atol=0.08)
 
@@ -94,7 +94,7 @@ def test_covariance_covers_unknown_spin_and_bounce(rng):
         truth = rollout(model, torch.from_numpy(start), torch.from_numpy(TIMES), TABLE).numpy()
     nees = []
     for states in truth:
-        track = Track("shot", TIMES, states[:, POSITION] + 0.002 * rng.standard_normal((40, 3)))
+        track = Track(TIMES, states[:, POSITION] + 0.002 * rng.standard_normal((40, 3)), name="shot")
         result = estimate(track, model, TABLE, settings)
         error = (result.states - states)[:, VELOCITY]
         nees.append(np.einsum("ni,nij,nj->n", error, np.linalg.inv(result.covariances[:, VELOCITY, VELOCITY]), error))
@@ -108,20 +108,20 @@ def test_spin_is_less_known_after_a_bounce():
     with torch.no_grad():
         start = torch.tensor([[0, 0, 0.2, 5, 0.5, 0, 0, 0, 0]], dtype=torch.float64)
         states = rollout(nominal_model(), start, torch.from_numpy(TIMES), TABLE)[0].numpy()
-    result = estimate(Track("shot", TIMES, states[:, POSITION], labels=SPIN_LABEL), nominal_model(), TABLE)
+    result = estimate(Track(TIMES, states[:, POSITION], labels=SPIN_LABEL, name="shot"), nominal_model(), TABLE)
     np.testing.assert_allclose(result.sigmas[:10, 6], 20.0, rtol=0.01)
     assert result.sigmas[-1, 6] > 60.0
 
 
 def test_own_sigmas_take_precedence():
     positions, _ = parabola(GRAVITY)
-    result = estimate(Track("own", TIMES, positions, sigmas=np.full((40, 3), 0.01)))
+    result = estimate(Track(TIMES, positions, sigmas=np.full((40, 3), 0.01), name="own"))
     np.testing.assert_allclose(result.sigmas[:, :3], 0.01)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
 def test_short_tracks(count):
-    result = estimate(Track("short", TIMES[:count], parabola(GRAVITY)[0][:count]))
+    result = estimate(Track(TIMES[:count], parabola(GRAVITY)[0][:count], name="short"))
     assert result.status is (Status.NO_VELOCITY if count == 1 else Status.OK)
     assert result.states.shape == (count, 9)
     assert (np.linalg.eigvalsh(result.covariances)[:, 0] > 0).all()

@@ -42,7 +42,7 @@ def test_one_short_track_is_enough_for_an_order_of_magnitude():
 def test_tracks_are_accepted():
     t, x = bouncing(np.random.default_rng(3))
     pair = estimate_position_noise([(t, x)])
-    assert np.array_equal(estimate_position_noise([Track("a", t, x)]), pair)
+    assert np.array_equal(estimate_position_noise([Track(t, x, name="a")]), pair)
 
 
 def test_reading_stops_when_there_is_enough():

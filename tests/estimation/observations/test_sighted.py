@@ -119,7 +119,7 @@ def nearest_stamp_positions(made: Scene) -> Track:
                 rows.append(camera.rotation[k] - share * camera.rotation[2])
                 sides.append(share * camera.tvec[2] - camera.tvec[k])
         points.append(np.linalg.lstsq(np.array(rows), np.array(sides), rcond=None)[0])
-    return Track("nearest", own[0].times, np.array(points))
+    return Track(own[0].times, np.array(points), name="nearest")
 
 
 def test_velocity_is_better_than_from_nearest_stamps(ball: World) -> None:
@@ -220,7 +220,7 @@ def test_a_wrong_candidate_moves_no_state(ball: World, made: Scene) -> None:
 @pytest.mark.parametrize("method", ["ekf", "sliding-window"])
 def test_others_use_the_rough_positions(ball: World, made: Scene, method: str) -> None:
     track = track_of(made)
-    plain = Track(track.name, track.times, track.positions, track.sigmas)
+    plain = Track(track.times, track.positions, track.sigmas, name=track.name)
     estimator = make_estimator(method, ball.model, ball.surfaces, Settings())
     np.testing.assert_array_equal(estimator.estimate(track).states, estimator.estimate(plain).states)
 

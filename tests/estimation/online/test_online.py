@@ -60,7 +60,7 @@ def make_track(start, n=50, *, model=None, surfaces=TABLE, seed=0, dt=0.01, labe
     state = torch.tensor([start], dtype=torch.float64)
     truth = rollout(model or nominal_model(), state, torch.from_numpy(times), surfaces)[0].detach().numpy()
     noise = SIGMA * np.random.default_rng(seed).standard_normal((n, 3))
-    return Track("shot", times, truth[:, :3] + noise, labels=labels or {}), truth
+    return Track(times, truth[:, :3] + noise, labels=labels or {}, name="shot"), truth
 
 
 def settings(**changes):
@@ -199,7 +199,7 @@ def hit_track():
     middle = before.positions[-1]
     after, truth = make_track((*middle, -6.0, 1.0, 2.0, 0.0, -50.0, 0.0), n=31, surfaces=NOWHERE, seed=5)
     times = np.arange(60) * 0.01
-    return Track("hit", times, np.concatenate((before.positions, after.positions[1:]))), truth[-1]
+    return Track(times, np.concatenate((before.positions, after.positions[1:])), name="hit"), truth[-1]
 
 
 def test_hit_is_found_some_samples_late():
@@ -228,7 +228,7 @@ def test_outlier(bad):
     clean, truth = make_track(FLYING, n=40, surfaces=NOWHERE)
     positions = clean.positions.copy()
     positions[bad] += (0.2, -0.15, 0.25)
-    track = Track("outlier", clean.times, positions)
+    track = Track(clean.times, positions, name="outlier")
     online = Online(nominal_model(), NOWHERE, settings())
     states = feed(online, track)
     assert bad == 1 or online._samples[bad].factor > 10.0  # one in the second sample is left to the robust loss
@@ -241,7 +241,7 @@ def test_label_and_dropped_frames():
     labels = {"spin_x": 0.0, "spin_y": 80.0, "spin_z": 20.0}
     full, truth = make_track(FLYING, n=60, surfaces=NOWHERE, labels=labels)
     keep = np.r_[0:15, 35:60]
-    track = Track("gap", full.times[keep], full.positions[keep], labels=labels)
+    track = Track(full.times[keep], full.positions[keep], labels=labels, name="gap")
     online = Online(nominal_model(), NOWHERE, settings())
     result = online.estimate(track)
     expected = Smoother(online.model, NOWHERE, online.settings).estimate(track)
@@ -253,7 +253,7 @@ def test_long_gap_starts_anew():
     first, _ = make_track(FLYING, n=20, surfaces=NOWHERE)
     second, truth = make_track(FLYING, n=30, surfaces=NOWHERE, seed=2)
     times = np.concatenate((first.times, second.times + 1.5))
-    track = Track("two", times, np.concatenate((first.positions, second.positions)))
+    track = Track(times, np.concatenate((first.positions, second.positions)), name="two")
     for chosen in (settings(), Settings.for_measured(nominal_model(), position_noise=(SIGMA,) * 3)):
         online = Online(nominal_model(), NOWHERE, chosen)
         last = feed(online, track)[-1]
@@ -385,7 +385,7 @@ def test_few_samples():
     track, _ = make_track(FLYING, n=5, surfaces=NOWHERE)
     model = nominal_model()
     for n in (1, 2, 3, 5):
-        part = Track("few", track.times[:n], track.positions[:n])
+        part = Track(track.times[:n], track.positions[:n], name="few")
         result = Online(model, NOWHERE, settings()).estimate(part)
         expected = Smoother(model, NOWHERE, settings()).estimate(part)
         assert result.status is expected.status

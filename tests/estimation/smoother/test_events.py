@@ -75,7 +75,7 @@ def honest(estimate: Estimate, states: np.ndarray, *, sigmas: float = 4.0) -> No
 
 
 def estimate_of(states: np.ndarray, positions: np.ndarray, settings: Settings, times=TIMES, surfaces=TABLE) -> Estimate:
-    return Smoother(MODEL, surfaces, settings).estimate(Track("t", times, positions))
+    return Smoother(MODEL, surfaces, settings).estimate(Track(times, positions, name="t"))
 
 
 @pytest.mark.parametrize("phase", [0.02, 0.1, 0.3, 0.5, 0.7, 0.9, 0.98])
@@ -99,7 +99,7 @@ def test_contact_time(phase, settings) -> None:
 
 @pytest.mark.parametrize("shift", [-2, -1, 1, 2])
 def test_a_contact_in_the_wrong_interval_moves_to_the_right_one(shift, settings) -> None:
-    track = Track("t", LATER, measured(truth_at(LATER)))
+    track = Track(LATER, measured(truth_at(LATER)), name="t")
     smoother = Smoother(MODEL, TABLE, settings)
     found = smoother.segment(track)
     right = [c.interval for c in smoother.solve(smoother.problem(track, found)).events.contacts]
@@ -115,7 +115,7 @@ def test_a_contact_in_the_wrong_interval_moves_to_the_right_one(shift, settings)
 def test_values_to_go_on_from_change_sides_with_their_contact() -> None:
     """The state between the old and the new place is moved to the other side: finite, and close to the truth."""
     states = truth(SERVE)
-    track = Track("t", TIMES, measured(states))
+    track = Track(TIMES, measured(states), name="t")
     bounce = bounces(states)[0]
     found = Smoother(MODEL, TABLE, EXACT).segment(track)
     start = (
@@ -179,7 +179,7 @@ def test_a_hit_that_the_segmentation_missed_is_marked(settings) -> None:
     A touch of 1 m/s would not break it: process noise of several intervals makes room for that.
     """
     states = hit_serve(KICKS["racket"])
-    track = Track("t", TIMES, measured(states))
+    track = Track(TIMES, measured(states), name="t")
     smoother = Smoother(MODEL, TABLE, settings)
     blind = replace(smoother.segment(track), hits=np.zeros(0, dtype=np.int64))
     solution = smoother.solve(smoother.problem(track, blind))
@@ -265,7 +265,7 @@ def test_five_observations_around_a_bounce(seed, labelled) -> None:
     part = slice(bounces(states)[0] - 2, bounces(states)[0] + 3)
     labels = dict(zip(("spin_x", "spin_y", "spin_z"), states[part][0, 6:].tolist(), strict=True)) if labelled else {}
     settings = replace(EXACT, spin_label_noise=5.0) if labelled else UNCERTAIN
-    track = Track("t", TIMES[part], measured(states, seed)[part], labels=labels)
+    track = Track(TIMES[part], measured(states, seed)[part], labels=labels, name="t")
     honest(Smoother(MODEL, TABLE, settings).estimate(track), states[part])
 
 
@@ -328,7 +328,7 @@ def test_nothing_but_noise_is_survived(settings) -> None:
 def test_an_impossible_contact_is_a_status_not_an_exception(settings) -> None:
     """The ball is 5 m below the surface that it is said to bounce on: FAILED, measured positions, prior covariances."""
     states = truth(SERVE)[:20]
-    track = Track("t", TIMES[:20], measured(states))
+    track = Track(TIMES[:20], measured(states), name="t")
     smoother = Smoother(MODEL, TABLE, settings)
     found = replace(smoother.segment(track), contacts=(Contact(8, 0.085, -60.0),))
     problem = smoother.problem(track, found)
@@ -345,11 +345,11 @@ def test_sigmas_of_a_track_stay_as_they_are() -> None:
     states = truth(SERVE)
     positions = measured(states)
     positions[30] += 0.2
-    track = Track("t", TIMES, positions, sigmas=np.full((80, 3), SIGMA))
+    track = Track(TIMES, positions, sigmas=np.full((80, 3), SIGMA), name="t")
     smoother = Smoother(MODEL, TABLE, EXACT)
     first = smoother.estimate(track)
     assert track.sigmas is not None
     np.testing.assert_array_equal(track.sigmas, SIGMA)
     np.testing.assert_array_equal(smoother.estimate(track).states, first.states)
-    without = smoother.estimate(Track("t", TIMES, positions))
+    without = smoother.estimate(Track(TIMES, positions, name="t"))
     np.testing.assert_allclose(without.states, first.states, atol=1e-12)

@@ -40,7 +40,7 @@ def estimate(track: Track, table_height: float = 0.76) -> Estimate:
 def turned(track: Track, R: np.ndarray) -> Track:
     spin = R @ track.spin_label
     labels = dict(zip(("spin_x", "spin_y", "spin_z"), spin.tolist(), strict=True))
-    return Track(track.name, track.times, track.positions @ R.T, labels=labels)
+    return Track(track.times, track.positions @ R.T, labels=labels, name=track.name)
 
 
 def off(given: Estimate, states: np.ndarray, reference: Estimate) -> float:

@@ -42,7 +42,7 @@ def falling_track(n: int = 25, seed: int = 4) -> Track:
     positions = np.stack((5.0 * t, 0.5 * t, 2.0 + 2.0 * t - G / 2 * t**2), axis=1)
     positions += rng.standard_normal((n, 3)) * PLAIN.position_noise
     labels = dict(zip(("spin_x", "spin_y", "spin_z"), LABEL.tolist(), strict=True))
-    return Track("falling", times, positions, labels=labels)
+    return Track(times, positions, labels=labels, name="falling")
 
 
 def kalman_rts(track: Track) -> tuple[np.ndarray, np.ndarray]:

@@ -135,7 +135,7 @@ def test_a_label_that_no_track_has(few_tracks) -> None:
 def test_categories_are_the_texts() -> None:
     times, positions = np.arange(2.0), np.zeros((2, 3))
     labels = ({"gun": "b", "level": 2.0}, {"gun": "a", "level": 3.0}, {"gun": "b"})
-    tracks = [Track(str(k), times, positions, labels=one) for k, one in enumerate(labels)]
+    tracks = [Track(times, positions, labels=one, name=str(k)) for k, one in enumerate(labels)]
     assert categories_of(["level", "gun"], tracks) == {"gun": ("a", "b")}
 
 

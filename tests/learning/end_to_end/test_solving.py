@@ -123,7 +123,7 @@ def test_pose_there_and_back() -> None:
 def test_a_pose_turns_the_spin_label() -> None:
     """And leaves other labels, stamps and what is not told as they are."""
     track = Track(
-        "t", np.arange(3.0), np.ones((3, 3)), labels={"topspin": 2.0, "spin_x": 1.0, "spin_y": 2.0, "spin_z": 3.0}
+        np.arange(3.0), np.ones((3, 3)), labels={"topspin": 2.0, "spin_x": 1.0, "spin_y": 2.0, "spin_z": 3.0}, name="t"
     )
     quarter = Pose(torch.tensor(np.pi / 2, dtype=torch.float64), torch.zeros(2, dtype=torch.float64))
     seen = quarter.track(track)

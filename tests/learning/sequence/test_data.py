@@ -14,7 +14,7 @@ NO_SETTINGS = torch.zeros(0, dtype=torch.float64)
 def line(count: int, *, start: float = 5.0) -> Track:
     """A sample every 10 ms, moving at 1, 2, 3 m/s."""
     times = start + 0.01 * np.arange(count)
-    return Track(f"line {count}", times, (times - start)[:, None] * np.array([1.0, 2.0, 3.0]))
+    return Track(times, (times - start)[:, None] * np.array([1.0, 2.0, 3.0]), name=f"line {count}")
 
 
 def test_times_count_from_the_last_observed_sample() -> None:
@@ -41,7 +41,7 @@ def test_padding_repeats_the_last_time_and_is_marked() -> None:
 
 def test_augmentation_moves_observed_part_and_rest_alike() -> None:
     track, (angle, shift) = line(6), augmentation(0, 0, 0)
-    moved = Track("moved", track.times, apply(torch.from_numpy(track.positions), angle, shift).numpy())
+    moved = Track(track.times, apply(torch.from_numpy(track.positions), angle, shift).numpy(), name="moved")
     a, b = example(track, 4, NO_SETTINGS).seen_from(angle, shift), example(moved, 4, NO_SETTINGS)
     assert torch.equal(a.observed, b.observed)
     assert torch.equal(a.rest, b.rest)

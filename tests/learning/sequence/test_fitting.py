@@ -20,7 +20,7 @@ def bouncing(number: int) -> Track:
     fall = (vz + np.sqrt(vz**2 + 2 * G * START)) / G
     up, after = RESTITUTION * (G * fall - vz), times - fall
     z = np.where(after < 0, START + vz * times - G / 2 * times**2, up * after - G / 2 * after**2)
-    return Track(str(number), times, np.stack([vx * times, vy * times, z], axis=1))
+    return Track(times, np.stack([vx * times, vy * times, z], axis=1), name=str(number))
 
 
 @pytest.mark.parametrize(("kind", "width", "steps", "rate"), [("lstm", 64, 500, 1e-2), ("diffusion", 16, 300, 4e-3)])

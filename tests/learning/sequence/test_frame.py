@@ -14,7 +14,7 @@ from ballfg.tracks import Track
 def example_of(times: np.ndarray, observed: int, settings: float = 0.0, offset: float = 0.0) -> Example:
     """A ball on the path (2 t, -t, 1 + 0.5 t), shifted along x."""
     positions = np.stack([2 * times + offset, -times, 1 + 0.5 * times], axis=1)
-    return example(Track("t", times, positions), observed, torch.tensor([settings, 7.0], dtype=torch.float64))
+    return example(Track(times, positions, name="t"), observed, torch.tensor([settings, 7.0], dtype=torch.float64))
 
 
 @pytest.fixture
@@ -89,6 +89,6 @@ def test_the_grid_of_a_track_does_not_depend_on_padding(frame: Frame, batch: Bat
 
 def test_tracks_that_rest_have_no_scale() -> None:
     times = 0.01 * np.arange(20)
-    resting = example(Track("rest", times, np.ones((20, 3))), 10, torch.zeros(0, dtype=torch.float64))
+    resting = example(Track(times, np.ones((20, 3)), name="rest"), 10, torch.zeros(0, dtype=torch.float64))
     with pytest.raises(ValueError, match=r"tracks must move horizontally and in height; their scales are \[0.0"):
         Frame(0).fit([resting])

@@ -82,7 +82,7 @@ def test_dropped_frames_are_taken(kind: SequenceKind, tracks: list[Track]) -> No
     model = untrained(kind, tracks)
     whole = tracks[0]
     kept = np.delete(np.arange(len(whole)), [4, 5, 11, 30, 31, 32, 33])
-    dropped = Track(whole.name, whole.times[kept], whole.positions[kept], labels=whole.labels)
+    dropped = Track(whole.times[kept], whole.positions[kept], labels=whole.labels, name=whole.name)
     cut = example(dropped, 25 - 3, LauncherSettings(LABELS).of(dropped))
     losses, positions = model.losses(collate([cut]), [(0, 0, 0)])
     assert torch.isfinite(losses).all()

@@ -40,7 +40,7 @@ def test_saved_and_loaded_predicts_the_same_bits(kind: SequenceKind, tracks: lis
 
 def test_text_labels_are_kept(tracks: list[Track], tmp_path: Path) -> None:
     labelled = [
-        Track(t.name, t.times, t.positions, labels={"group": "ab"[i % 2], "speed": t.labels["speed"]})
+        Track(t.times, t.positions, labels={"group": "ab"[i % 2], "speed": t.labels["speed"]}, name=t.name)
         for i, t in enumerate(tracks)
     ]
     launcher = LauncherSettings(("group", "speed"), {"group": ("a", "b")})
@@ -61,20 +61,20 @@ def test_many_are_predicted_as_one_by_one(tracks: list[Track]) -> None:
 
 def test_nothing_after_the_observed_part_is_used(tracks: list[Track]) -> None:
     predictor, track = predictor_of("diffusion", tracks), tracks[0]
-    cut = Track(track.name, track.times[:25], track.positions[:25], labels=track.labels)
+    cut = Track(track.times[:25], track.positions[:25], labels=track.labels, name=track.name)
     asked = track.times[25:]
     assert np.array_equal(predictor.predict(cut, 25, asked), predictor.predict(track, 25, asked))
 
 
 def test_a_track_without_settings_is_refused(tracks: list[Track]) -> None:
-    track = Track("bare", tracks[0].times, tracks[0].positions)
+    track = Track(tracks[0].times, tracks[0].positions, name="bare")
     with pytest.raises(ValueError, match=r"labels of track 'bare' must be known launcher settings; got .*None"):
         predictor_of("lstm", tracks).predict(track, 25, track.times[25:])
 
 
 def test_without_labels_observations_are_enough(tracks: list[Track]) -> None:
     predictor = predictor_of("lstm", tracks, LauncherSettings())
-    bare = Track("bare", tracks[0].times, tracks[0].positions)
+    bare = Track(tracks[0].times, tracks[0].positions, name="bare")
     assert np.isfinite(predictor.predict(bare, 25, bare.times[25:])).all()
 
 

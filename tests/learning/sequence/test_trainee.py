@@ -80,7 +80,7 @@ def test_augmentation_draws_anew_each_epoch(kind: SequenceKind, tracks: list[Tra
 
 
 def test_tracks_that_cannot_be_used_are_named(tracks: list[Track]) -> None:
-    short = Track("short", tracks[0].times[:20], tracks[0].positions[:20], labels=tracks[0].labels)
+    short = Track(tracks[0].times[:20], tracks[0].positions[:20], labels=tracks[0].labels, name="short")
     unlabelled = replace(tracks[1], name="unlabelled", labels={"topspin": 1.0})
     trainee = trainee_of("lstm", [*tracks[:8], short, unlabelled])
     judged = trainee.judge([8, 2, 9])
@@ -95,13 +95,14 @@ def test_tracks_that_cannot_be_used_are_named(tracks: list[Track]) -> None:
 
 def test_a_training_part_that_cannot_be_used_is_refused(tracks: list[Track]) -> None:
     short = [
-        Track(str(i), track.times[:25], track.positions[:25], labels=track.labels) for i, track in enumerate(tracks)
+        Track(track.times[:25], track.positions[:25], labels=track.labels, name=str(i))
+        for i, track in enumerate(tracks)
     ]
     with pytest.raises(ValueError, match=r"train must hold a track with observations and a rest; got none \(times of"):
         trainee_of("lstm", short)
 
 
 def test_scales_come_from_the_training_part_only(tracks: list[Track]) -> None:
-    far = Track("far", tracks[8].times, 100 * tracks[8].positions, labels=tracks[8].labels)
+    far = Track(tracks[8].times, 100 * tracks[8].positions, labels=tracks[8].labels, name="far")
     a, b = trainee_of("lstm", tracks), trainee_of("lstm", [*tracks[:8], far])
     assert float(a.module.frame.horizontal) == float(b.module.frame.horizontal)
