@@ -128,7 +128,7 @@ def predict(
     """Where the ball will be, with standard deviations.
 
     Args:
-        known: an estimate or a state; a track or its arrays, estimated first; a dataset or its folder, of which the first
+        known: an estimate or a state; a track or its arrays, estimated first; a dataset or folder, of which the first
             `observe` seconds of each track are estimated and what follows is predicted.
         horizon: s.
         observe: s from the first stamp of each track of a dataset.
