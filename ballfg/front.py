@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from os import PathLike
 from pathlib import Path
-from typing import TypeAlias, overload
+from typing import TypeAlias, TypedDict, Unpack, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -35,26 +35,26 @@ OneTrack: TypeAlias = Track | NDArray[np.float64] | tuple[ArrayLike, ArrayLike]
 """A track; or an array (n, 4) of t (s), x, y, z (m); or times (n,) s and positions (n, 3) m."""
 
 
+class Options(TypedDict, total=False):
+    """The keyword arguments of `estimate`."""
+
+    method: str
+    model: Model
+    surfaces: Surfaces | float | None
+    settings: Settings | None
+    jobs: int
+
+
+class PredictOptions(Options, total=False):
+    """The keyword arguments of `predict`; observe in s."""
+
+    observe: float
+
+
 @overload
-def estimate(
-    measured: OneTrack,
-    *,
-    method: str = ...,
-    model: Model = ...,
-    surfaces: Surfaces | float | None = ...,
-    settings: Settings | None = ...,
-    jobs: int = ...,
-) -> Estimate: ...
+def estimate(measured: OneTrack, **options: Unpack[Options]) -> Estimate: ...
 @overload
-def estimate(
-    measured: Tracks | Folder,
-    *,
-    method: str = ...,
-    model: Model = ...,
-    surfaces: Surfaces | float | None = ...,
-    settings: Settings | None = ...,
-    jobs: int = ...,
-) -> dict[str, Estimate]: ...
+def estimate(measured: Tracks | Folder, **options: Unpack[Options]) -> dict[str, Estimate]: ...
 def estimate(
     measured: OneTrack | Tracks | Folder,
     *,
@@ -92,27 +92,11 @@ def estimate(
 
 @overload
 def predict(
-    known: Estimate | BallState | OneTrack,
-    horizon: float = ...,
-    *,
-    observe: float = ...,
-    method: str = ...,
-    model: Model = ...,
-    surfaces: Surfaces | float | None = ...,
-    settings: Settings | None = ...,
-    jobs: int = ...,
+    known: Estimate | BallState | OneTrack, horizon: float = ..., **options: Unpack[PredictOptions]
 ) -> Ahead: ...
 @overload
 def predict(
-    known: Tracks | Folder,
-    horizon: float = ...,
-    *,
-    observe: float = ...,
-    method: str = ...,
-    model: Model = ...,
-    surfaces: Surfaces | float | None = ...,
-    settings: Settings | None = ...,
-    jobs: int = ...,
+    known: Tracks | Folder, horizon: float = ..., **options: Unpack[PredictOptions]
 ) -> dict[str, TrackPrediction]: ...
 def predict(
     known: Estimate | BallState | OneTrack | Tracks | Folder,
