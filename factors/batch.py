@@ -145,7 +145,7 @@ class FactorBatch(ABC):
         """The factor from these whitened residuals to residuals whitened with learned noise, differentiable in that.
 
         Args: noise: the learned numbers.
-        Returns: (m, dim, dim) lower triangular, or () for all rows, dimensionless; None where this noise is not learned.
+        Returns: (m, dim, dim) lower triangular, or () for all rows; dimensionless. None if this noise is not learned.
         """
         return None
 

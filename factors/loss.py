@@ -52,7 +52,7 @@ class Loss:
         return np.asarray(0.5 * norm**2)
 
     def of_square(self, square: Tensor) -> Tensor:
-        """rho in torch of squared norms, twice differentiable at zero too.
+        """Values rho in torch of squared norms, twice differentiable at zero too.
 
         Args: square: (...) whitened, squared norms.
         Returns: (...) dimensionless.

@@ -74,8 +74,12 @@ class Reading(Observation):
     def at(cls, track: Track, times: ArrayLike, values: ArrayLike, sigma: ArrayLike) -> Self:
         """Readings at times of their own, each with the nearest sample of the track.
 
-        Args: track: with its stamps.  times: (m,) s.  values: (m, dim).  sigma: as for the class.
-        Raises: ValueError: a reading that is farther than `FARTHEST` from every sample.
+        Args:
+            track: with its stamps.
+            times: (m,) s, in any order.
+            values: (m, dim), or (m,) where dim is 1, in the units of the columns.
+            sigma: as for the class.
+        Raises: ValueError: a reading that is farther than `FARTHEST` from every sample, or as for the class.
         """
         when = np.asarray(times, dtype=np.float64)
         order = np.argsort(when, kind="stable")

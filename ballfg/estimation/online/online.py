@@ -69,13 +69,15 @@ class Online(Estimator):
     which ends by minimising over the window to a tight tolerance.
 
     Args:
-        model: the ball.  surfaces: what it may bounce on.
+        model: the ball.  surfaces: that it may bounce on.
         settings: noise and priors; time offsets of cameras are not estimated here, see `estimate_time_offsets`.
         lag: the window is cut to this many states whenever it holds twice as many.
         cameras: that sightings come from.
 
     Attributes:
         window: the samples, states and factors that are held; None before the first observation.
+
+    Raises: ValueError: a lag below 2, time offsets in the settings, or as `Estimator`.
     """
 
     name = "online"
@@ -118,7 +120,7 @@ class Online(Estimator):
         sigma: ArrayLike | None = None,
         observations: Sequence[Observation] = (),
     ) -> OnlineState:
-        """Take in a measured position, and what else was measured at that time.
+        """Take in a measured position, and other measurements of that time.
 
         Args:
             time: s, later than the last.
