@@ -4,7 +4,7 @@ A first estimate::
 
     import ballfg as bf
 
-    shots = bf.read("my_shots")  # a folder of tracks: docs/tracks.md; one track: bf.Track(name, times, positions)
+    shots = bf.read("my_shots")  # a folder of tracks: docs/tracks.md; one track: bf.Track(times, positions)
     estimate = bf.estimate(shots["001"])  # the smoother, with the dataset's ball, table and noise
     ahead = bf.predict(estimate, horizon=0.3)  # where the ball will be, with standard deviations
     found = bf.diagnose(shots)  # the effects that the model lacks
