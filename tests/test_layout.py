@@ -15,10 +15,11 @@ LEVELS = (
     ("vision",),
     ("dynamics",),
     ("simulation", "factors"),
-    ("estimation",),
     ("prediction",),
+    ("estimation",),
     ("learning",),
     ("diagnosis",),
+    ("front",),
     ("benchmarks", "cli"),
 )
 """Rooms from the first to the last; a module imports from its own room and from earlier levels only."""
