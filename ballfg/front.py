@@ -132,9 +132,8 @@ def predict(
         method, model, surfaces, settings, jobs: as for `estimate`.
     Returns: the path ahead; of a dataset, the predicted measurements of each track by name.
     Raises:
-        TypeError: for anything else in place of a track.
-        ValueError: a horizon that is not positive, or as `estimate`.
-        FileNotFoundError: a folder or model file that is not there.
+        TypeError: for anything else in place of what is known.
+        ValueError: a horizon that is not positive, or what `estimate` raises.
     """
     if isinstance(known, Estimate | BallState):
         return known.predict(horizon)
