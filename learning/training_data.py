@@ -62,7 +62,10 @@ def read_training_data(config: TrainConfig) -> TrainingData:
 
 
 def open_dataset(folder: str) -> Dataset:
-    """The dataset of a folder with its readings; notes go to stderr. Raises: ValueError, FileNotFoundError: as in reading."""
+    """The dataset of a folder with all readings beside its positions; notes on repairs go to stderr.
+
+    Raises: ValueError, FileNotFoundError: as in reading.
+    """
     dataset = with_readings(read_dataset(folder))
     for note in dataset.notes:
         print(f"note: {note}", file=sys.stderr)
