@@ -131,7 +131,9 @@ def predict(
         observe: s from the first stamp of each track of a dataset.
         method, model, surfaces, settings, jobs: as for `estimate`.
     Returns: the path ahead; of a dataset, the predicted measurements of each track by name.
-    Raises: ValueError: a horizon that is not positive, or what `estimate` raises.
+    Raises:
+        TypeError: for anything else in place of what is known.
+        ValueError: a horizon that is not positive, or what `estimate` raises.
     """
     if isinstance(known, Estimate | BallState):
         return known.predict(horizon)

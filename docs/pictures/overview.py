@@ -11,8 +11,7 @@ import torch
 
 from ballfg.dynamics import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation import Smoother
-from ballfg.estimation import predict_tracks
+from ballfg.estimation import Smoother, predict_tracks
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
 
 OBSERVED = 0.25  # s
