@@ -119,7 +119,7 @@ class Reading(Observation):
         """
         if (self.sigma != self.sigma[:, :1]).any():
             raise ValueError(
-                f"sigma of '{self.name}' must be one number a reading in a table. Give it so, or no table."
+                f"sigma of '{self.name}' must be one number a reading in a table; got several."
             )
         values = dict(zip(self.columns, self.values.T, strict=True))
         return {"t": track.times[self.state] + self.delay, **values, "sigma": self.sigma[:, 0]}
