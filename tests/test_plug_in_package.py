@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ballfg.estimation import read
 from ballfg.simulation import MeasurementNoise, SimulationConfig, write_simulation
-from ballfg.tracks import read_dataset
 from tests.places import DOCS
 
 ROOT = Path(__file__).parents[1]
@@ -114,7 +114,7 @@ def test_info_lists_what_the_package_adds(site: Path) -> None:
     assert "  ball-lab 0.3: height\n" in sections["observations"]
     assert "  ball-lab 0.3: back-and-forth\n" in sections["estimators"]
     assert ": position, sighting, speed, spin\n" in sections["observations"]
-    assert "end-to-end" in sections["trainees"]
+    assert ": a-tune, mlp, mlp+gs, skip+gs, mnn+gs, lstm, diffusion\n" in sections["trainees"]
     assert "ball-lab" not in ballfg(None, "info")
 
 
@@ -187,5 +187,5 @@ def test_the_benchmark_on_simulated_tracks_has_its_rows(site: Path, tmp_path: Pa
         assert float(own) == pytest.approx(float(smoother), rel=0.2)
 
 
-def test_nothing_of_it_is_left_without_the_package(shots: Path) -> None:
-    assert {one.name for track in read_dataset(shots) for one in track.observations} == set()
+def test_without_the_package_its_table_is_left_alone(shots: Path) -> None:
+    assert not any(track.observations for track in read(shots))

@@ -118,9 +118,7 @@ class Reading(Observation):
         Raises: ValueError: if the values of one reading have different sigmas, for which the table has no place.
         """
         if (self.sigma != self.sigma[:, :1]).any():
-            raise ValueError(
-                f"sigma of '{self.name}' must be one number a reading in a table; got several."
-            )
+            raise ValueError(f"sigma of '{self.name}' must be one number a reading in a table; got several.")
         values = dict(zip(self.columns, self.values.T, strict=True))
         return {"t": track.times[self.state] + self.delay, **values, "sigma": self.sigma[:, 0]}
 
