@@ -7,7 +7,7 @@ Estimators know this interface only. A sort of measurement of one's own is a sub
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Self
 
@@ -185,3 +185,17 @@ def unknowns_of(observations: tuple[Observation, ...], settings: Settings) -> Un
         np.concatenate([np.zeros(0), *(one.sigmas for one in found)]),
         np.concatenate([np.zeros(0), *(one.origins for one in found)]),
     )
+
+
+def refuse_unknowns(observations: Iterable[Observation], settings: Settings, estimator: str) -> None:
+    """Refuses observations whose unknowns an estimator does not estimate.
+
+    Raises: ValueError: if one of them has unknowns.
+    """
+    for observation in observations:
+        names = observation.unknowns(settings).names
+        if names:
+            raise ValueError(
+                f"observations of the estimator '{estimator}' must have no unknowns; '{observation.name}' has "
+                f"{', '.join(names)}. Use the smoother."
+            )

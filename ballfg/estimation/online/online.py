@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
-from ballfg.estimation.observations.observation import Context, Observation
+from ballfg.estimation.observations.observation import Context, Observation, refuse_unknowns
 from ballfg.estimation.online.events import SIGMA_FACTOR, EventTracker, contact_step, first_difference
 from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unknown
 from ballfg.estimation.online.isam import Sample, Update
@@ -338,6 +338,7 @@ class Online(Estimator):
 
     def _measurements(self, track: Track) -> dict[str, list[tuple[int, Measurement]]]:
         """What was measured beside positions, by name of the observation: each with the number of its sample."""
+        refuse_unknowns(track.observations, self.settings, self.name)
         context = Context(track, self.model, self.settings, sample_sigmas(self.settings, len(track), track.sigmas))
         found = {}
         for observation in track.observations:
