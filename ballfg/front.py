@@ -66,8 +66,8 @@ def estimate(
 ) -> Estimate | dict[str, Estimate]:
     """Position, velocity and spin of the ball at every stamp, with covariances.
 
-    What is not given comes from the dataset that a track was read from: ball, table and noise. A track of nobody's
-    dataset is a table-tennis ball above a table at z = 0; the notes of its estimate tell where it does not look so.
+    Ball, table and noise that are not given are those of the dataset that a track was read from. A track without a
+    dataset is taken for a table-tennis ball above a table at z = 0; the notes of its estimate list signs against that.
 
     Args:
         measured: a track or its arrays, (n, 4) of t, x, y, z in s and m or times (n,) s and positions (n, 3) m; or a
@@ -109,16 +109,18 @@ def predict(
     settings: Settings | None = None,
     jobs: int = 1,
 ) -> Ahead | dict[str, TrackPrediction]:
-    """Where the ball will be, with standard deviations.
+    """The path of the ball ahead, with standard deviations.
 
     Args:
-        known: an estimate or a state; a track or its arrays, estimated first; a dataset or folder, of which the first
-            `observe` seconds of each track are estimated and what follows is predicted.
-        horizon: s.
+        known: an estimate or a state; a track or its arrays, estimated first; a dataset or its folder: the first
+            `observe` seconds of each track are estimated, and the measurements after them are predicted.
+        horizon: s, how far ahead.
         observe: s from the first stamp of each track of a dataset.
         method, model, surfaces, settings, jobs: as for `estimate`.
     Returns: the path ahead; of a dataset, the predicted measurements of each track by name.
-    Raises: ValueError: a horizon that is not positive, or what `estimate` raises.
+    Raises:
+        TypeError: for anything else in place of what is known.
+        ValueError: a horizon that is not positive, or what `estimate` raises.
     """
     if isinstance(known, Estimate | BallState):
         return known.predict(horizon)
@@ -131,12 +133,13 @@ def predict(
 
 
 def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) -> Diagnosis:
-    """What the model of the ball lacks, by what its measured tracks show.
+    """The effects that the model of the ball lacks, found in measured tracks.
 
     Args:
-        measured: a dataset or its folder; every second track is searched, the others judge.
-        model: the analytic model that one believes in, or its file; the nominal model of the ball where None.
+        measured: a dataset or its folder; one half of the tracks finds effects, the other half judges them.
+        model: the analytic model to diagnose, or its file; the nominal model of the ball where None.
         jobs: processes.
+    Returns: the effects found, how sure that is, and the corrected model.
     Raises:
         TypeError: if the model is a learned one.
         ValueError: if there are too few tracks, or none with a flight that is long enough.

@@ -21,9 +21,10 @@ class Step:
     """A solution of the linear subproblem.
 
     Attributes:
-        states: (n, 9) and coefficients: (p,): the step d that minimises |r + J d|^2 (+ damping).
+        states: (n, 9) m, m/s, rad/s, part of the step d that minimises |r + J d|^2 (+ damping).
+        coefficients: (p,) in their own units, the other part of it.
         bayes_net: GTSAM's result of the elimination, states in order, coefficients last.
-        decrease: half of |r|^2 - |r + J d|^2, what the linear model promises.
+        decrease: half of |r|^2 - |r + J d|^2, by which the linear model promises to reduce the objective.
     """
 
     states: Array

@@ -20,7 +20,7 @@ def diagnose(
         Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.", callback=check_dataset)
     ],
     out: Annotated[Path, typer.Option(help="Folder of the report: new, empty or with an earlier report.")],
-    model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal table-tennis model.")] = None,
+    model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal model of the ball.")] = None,
     effects: OwnEffects = None,
     jobs: Jobs = CORES,
 ) -> None:

@@ -18,7 +18,9 @@ from ballfg.registry import PACKAGE, Registry, source_of
 
 REGISTRIES = (
     ("effects", "ballfg.dynamics", "EFFECTS"),
+    ("observations", "ballfg.estimation", "OBSERVATIONS"),
     ("estimators", "ballfg.estimation", "ESTIMATORS"),
+    ("trainees", "ballfg.learning", "TRAINEES"),
 )
 """Title, module and attribute of each registry, in the order in which they are shown."""
 WIDTH = 110
@@ -26,7 +28,7 @@ WIDTH = 110
 
 
 def info() -> None:
-    """Show the installed versions, the machine, and every effect and estimator with the package it comes from.
+    """Show the installed versions, the machine, and what is registered, with the package it comes from.
 
     Example: ballfg info
     """

@@ -8,6 +8,7 @@ from .launcher import Launcher as Launcher
 from .observations.files import write_readings as write_readings
 from .observations.observation import Context as Context
 from .observations.observation import Observation as Observation
+from .observations.observation import Unknowns as Unknowns
 from .observations.reading import RadarSpeed as RadarSpeed
 from .observations.reading import Reading as Reading
 from .observations.reading import SpinReading as SpinReading
