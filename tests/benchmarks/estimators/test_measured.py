@@ -3,8 +3,7 @@ import pytest
 
 from ballfg.benchmarks.estimators.measured import WHOLE, Measured, _add_smoothing, prediction_rmse
 from ballfg.benchmarks.results import Results
-from ballfg.estimation import Estimate, Status
-from ballfg.prediction import TrackPrediction
+from ballfg.estimation import Estimate, Status, TrackPrediction
 
 
 def test_prediction_rmse_by_hand() -> None:
