@@ -66,11 +66,11 @@ def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> S
         _damp(graph, np.sqrt(damping * _diagonal(pieces, n, p)), n, p)
     try:
         bayes_net = graph.eliminateSequential(_in_order(n + (p > 0)), gtsam.EliminateQR)
+        solution = bayes_net.optimize()
     except RuntimeError as error:  # GTSAM's text changed between versions; the word did not
         if "Indetermin" not in str(error):
             raise
         return None
-    solution = bayes_net.optimize()
     states = solution.vector(list(range(n))).reshape(n, STATE_DIM)
     coefficients = solution.at(n) if p else np.zeros(0)
     if not np.isfinite(states).all():

@@ -114,13 +114,15 @@ def _inputs(data: Opened, model: Path | None) -> Inputs[Opened]:
     import torch
 
     from ballfg.dynamics import load_model, nominal_model, nominal_note
-    from ballfg.estimation import dataset_settings, dataset_surfaces
+    from ballfg.estimation import dataset_settings, dataset_surfaces, unused_model
 
     torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
-    guessed = nominal_note(data.info.ball) if model is None else None
-    for note in data.notes if guessed is None else [*data.notes, guessed]:
+    notes = list(data.notes)
+    if model is None:
+        notes += [note for note in (nominal_note(data.ball), *unused_model(data.path, data.ball)) if note]
+    for note in notes:
         print(f"note: {note}", file=sys.stderr)
-    ball = nominal_model(data.info.ball) if model is None else load_model(model, radius=data.info.ball.radius)
+    ball = nominal_model(data.ball) if model is None else load_model(model, radius=data.ball.radius)
     return Inputs(data, ball, dataset_surfaces(data), dataset_settings(data, ball))
 
 

@@ -22,6 +22,7 @@ from .observations.sightings import sightings_of as sightings_of
 from .online.online import Online as Online
 from .reading import has_positions as has_positions
 from .reading import read as read
+from .reading import unused_model as unused_model
 from .reading import with_readings as with_readings
 from .registry import ESTIMATORS as ESTIMATORS
 from .registry import make_estimator as make_estimator

@@ -25,7 +25,7 @@ def test_innovations_next_to_a_hit_do_not_count_and_marked_ones_count_as_failure
         np.zeros((6, 9)),
         np.tile(np.eye(9), (6, 1, 1)),
         Status.OK,
-        whitened,
+        {"position": whitened},
         hits=np.array([2]),
         quality=quality,
     )

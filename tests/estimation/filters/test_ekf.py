@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from scipy.stats import chi2
 
+from ballfg.dynamics import nominal_model
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.effects.flight.gravity import Gravity
@@ -405,11 +408,19 @@ def test_coefficients_are_learnt_on_the_way(rng):
     assert abs(float(result.coefficients[0]) - 0.85) < 3 * sigma
 
 
-def test_numbers_out_of_this_world_fail_with_a_status(flight):
+def test_numbers_out_of_this_world_are_refused(flight):
     _, track = flight
-    result = run(with_positions(track, track.positions * 1e170))
+    with pytest.raises(ValueError, match="x, y, z must be in m"):
+        run(with_positions(track, track.positions * 1e170))
+
+
+def test_a_filter_that_overflows_fails_with_a_status(flight):
+    """Priors as wide as that leave no number in the first update."""
+    _, track = flight
+    wild = ExtendedKalmanFilter(nominal_model(), TABLE, replace(PLAIN, velocity_prior=1e170))
+    result = wild.estimate(track)
     assert result.status is Status.FAILED
-    np.testing.assert_array_equal(result.states[:, POSITION], track.positions * 1e170)
+    np.testing.assert_array_equal(result.states[:, POSITION], track.positions)
 
 
 def test_unknown_start_is_refused():

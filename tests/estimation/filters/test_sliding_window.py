@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from ballfg.dynamics import nominal_model
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.effects.flight.gravity import Gravity
 from ballfg.dynamics.motion.rollout import rollout
