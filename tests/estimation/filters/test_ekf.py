@@ -15,7 +15,6 @@ from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.effects.flight.gravity import Gravity
 from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
 from ballfg.dynamics.motion.rollout import advance
-from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
 from ballfg.estimation.filters.sliding_window import SlidingWindow

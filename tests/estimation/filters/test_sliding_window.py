@@ -10,7 +10,6 @@ from ballfg.dynamics import nominal_model
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.effects.flight.gravity import Gravity
 from ballfg.dynamics.motion.rollout import rollout
-from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.filters.sliding_window import SlidingWindow, may_touch
 from ballfg.estimation.filters.window_velocity import window_velocities
