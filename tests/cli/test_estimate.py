@@ -52,7 +52,7 @@ def test_one_row_of_finite_numbers_for_each_stamp(
     out = tmp_path / "states.csv"
     assert status("estimate", dataset, "--method", method, "--out", out) == 0
     said = capsys.readouterr()
-    notes = [line for line in said.err.splitlines() if not line.endswith("tracks estimated")]  # a slow machine shows progress
+    notes = [line for line in said.err.splitlines() if not line.endswith("tracks estimated")]  # progress may show
     assert notes == []
     assert said.out.startswith(f"{out}: ")
     assert f"states of 4 tracks by {method}" in said.out

@@ -416,7 +416,7 @@ def test_numbers_out_of_this_world_are_refused(flight):
 def test_a_filter_that_overflows_fails_with_a_status(flight):
     """Priors as wide as that leave no number in the first update."""
     _, track = flight
-    wild = ExtendedKalmanFilter(nominal_model(), TABLE, replace(PLAIN, velocity_prior=1e170))
+    wild = ExtendedKalmanFilter(nominal_model(), TABLE, replace(PLAIN, velocity_prior=1e150))
     result = wild.estimate(track)
     assert result.status is Status.FAILED
     np.testing.assert_array_equal(result.states[:, POSITION], track.positions)
