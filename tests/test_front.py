@@ -334,12 +334,21 @@ def test_tennis_balls_get_their_own_model(tmp_path: Path) -> None:
     assert estimate.world.model.radius == pytest.approx(0.033, abs=2e-3)
 
 
-def test_a_model_beside_the_data_is_offered(tmp_path: Path) -> None:
+def test_a_model_beside_the_data_is_offered_where_it_is_another(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = written(tmp_path / "shots", 1)
-    assert not any("model.yaml" in note for note in bf.read(folder).notes)
-    bf.nominal_model().save(folder / "model.yaml")
-    (note,) = bf.read(folder).notes
-    assert note == f"{folder / 'model.yaml'} lies beside the tracks and is not used. Name it as the model to use it."
+    path, model = folder / "model.yaml", bf.nominal_model()
+    model.save(path)
+    assert bf.read(folder).notes == []
+    dict(model.named_parameters())["flight.drag.k"].data.fill_(0.15)
+    model.save(path)
+    offer = f"{path} lies beside the tracks and is not used. Give it as the model to use it."
+    assert bf.read(folder).notes == [offer]
+    for words, said in (([], True), (["--model", str(path)], False)):
+        with pytest.raises(SystemExit):
+            run(["estimate", str(folder), "--out", str(tmp_path / "states.csv"), "--jobs", "1", *words])
+        assert (f"note: {offer}\n" in capsys.readouterr().err) is said
 
 
 def test_the_door_itself_is_light() -> None:
