@@ -4,8 +4,6 @@ Every message says the argument, the rule, what came instead and the remedy. Con
 check themselves.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Collection, Iterable

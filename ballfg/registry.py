@@ -6,8 +6,6 @@ A package of one's own takes part by an entry point in its pyproject.toml:
     static_charge = "my_package.charge:StaticCharge"
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass

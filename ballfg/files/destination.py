@@ -1,7 +1,5 @@
 """Places to write to: refused where nothing can be written, or where something would be lost."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Running a user's Python file: an effect or a detector of one's own."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Writing a file as a whole: it has its name only when it is complete."""
 
-from __future__ import annotations
-
 import os
 import uuid
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Writing a folder as a whole: its files have their names only when all of them are complete."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import uuid

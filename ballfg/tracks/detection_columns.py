@@ -1,7 +1,5 @@
 """What tables of detections have in common, whether a row names its ball or not: columns, rules, noise."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """`detections.csv` by trajectory: the sightings of each ball in a dataset."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

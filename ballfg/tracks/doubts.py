@@ -1,7 +1,5 @@
 """Doubts about a track whose numbers can be metres and seconds, but perhaps not in this frame."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 

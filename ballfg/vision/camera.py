@@ -1,7 +1,5 @@
 """A calibrated camera: OpenCV's pinhole model with distortion, where it stands, how its clock runs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final

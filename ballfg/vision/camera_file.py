@@ -1,7 +1,5 @@
 """Cameras in files: `cameras.yaml`, and the files that OpenCV's FileStorage writes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral
 from os import PathLike

@@ -1,7 +1,5 @@
 """Cameras in the files of OpenCV's FileStorage: XML, JSON, and YAML with types that other readers do not know."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from os import PathLike

@@ -1,7 +1,5 @@
 """Projection in torch: points through many cameras in one call, differentiable, distortion included."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

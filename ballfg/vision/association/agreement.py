@@ -5,8 +5,6 @@ while the other cameras are fixed. The camera that moved then explains the disag
 cameras are needed: of two that disagree either may be wrong.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final

@@ -4,8 +4,6 @@ The steps: pieces of smooth motion in each image; matching of pieces between cam
 of one flight; unassigned candidates that fit; removal of tracks that do not fall like a ball.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final

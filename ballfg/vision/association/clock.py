@@ -1,7 +1,5 @@
 """Stamps of several cameras: which is nearest, and whether the cameras share a shutter."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """By how much two views contradict each other: the distance, in pixels, of two rays from lying in one plane."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ballfg.vision.arrays import Array

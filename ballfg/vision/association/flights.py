@@ -4,8 +4,6 @@ Between bounces a ball's acceleration is gravity, drag and lift; a waved arm's i
 continuation of the first meets that of the second in the gap, with a kink where the ball bounced or was hit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 

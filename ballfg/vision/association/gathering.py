@@ -1,7 +1,5 @@
 """Balls in the making: which candidates of which camera are one ball, and the points in space that they make."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

@@ -5,8 +5,6 @@ nine pixels. It is measured first, for each pair of cameras, on the pairs of pie
 time; then everything is judged by that scale.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations

@@ -5,8 +5,6 @@ through the nearest four. Between two parts, where the path has a kink, both sid
 Nothing is said before the first sample, after the last, or in a long gap.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final

@@ -1,7 +1,5 @@
 """One ball as several cameras saw it: its points in space, and the sightings they come from."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from ballfg.tracks.sightings import Sightings

@@ -5,8 +5,6 @@ ends where two answers are equally good or nothing is found for a few frames. At
 starts.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from itertools import product

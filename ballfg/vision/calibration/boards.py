@@ -1,7 +1,5 @@
 """Calibration boards, chessboard and ChArUco: where their corners are in an image, to a fraction of a pixel."""
 
-from __future__ import annotations
-
 import glob
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace

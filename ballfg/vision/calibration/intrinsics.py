@@ -1,7 +1,5 @@
 """The lens of a camera from views of a board: OpenCV's calibration, and whether the views can tell what it says."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """How well views of a board tell the lens: the covariance of its parameters, and what it means in pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final, TypeAlias
 

@@ -1,7 +1,5 @@
 """Picture of a calibration: what the lens leaves of the corners, view by view, and the table where it should be."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final
 

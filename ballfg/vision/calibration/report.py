@@ -1,7 +1,5 @@
 """What a calibration found, in lines for people and as a mapping for programs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Final

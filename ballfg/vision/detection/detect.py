@@ -1,7 +1,5 @@
 """Videos through detectors: one after the other, or each camera in a process of its own."""
 
-from __future__ import annotations
-
 import multiprocessing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future

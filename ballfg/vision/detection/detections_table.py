@@ -1,7 +1,5 @@
 """Candidates from a table: `detections.csv`, of a detector of any kind, as a recording of each camera."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """A detector of one's own, from a Python file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Where in a frame to look closer: connected changes of a sane size, found in the small picture."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

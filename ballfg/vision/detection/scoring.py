@@ -1,7 +1,5 @@
 """How ball-like a fitted candidate is: a product of marks between 0 and 1 for shape, contrast, size and colour."""
 
-from __future__ import annotations
-
 from typing import Final, Literal
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Stamps of frames from a CSV file."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Frames with their stamps: from a video file or a folder of images, stamped by the container or by a CSV file."""
 
-from __future__ import annotations
-
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence

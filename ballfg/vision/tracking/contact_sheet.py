@@ -1,7 +1,5 @@
 """The contact sheet: each track in every view and in space, so that one look tells whether they are balls."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """What was tracked as a dataset, with the pictures to look at: either all files appear, or none."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The overlay: all views side by side as a video, with candidates, balls, trails, names and a line of time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path

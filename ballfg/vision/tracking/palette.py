@@ -1,7 +1,5 @@
 """Colours of tracks in the pictures of a recording, the same track the same in all of them."""
 
-from __future__ import annotations
-
 from typing import Final
 
 TRACKS: Final = ("#e69f00", "#56b4e9", "#f0e442", "#cc79a7", "#00c08b", "#ff7f50")

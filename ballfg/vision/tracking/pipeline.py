@@ -1,7 +1,5 @@
 """What cameras recorded, turned into balls: detections, tracks, and whether the cameras agree."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Several cameras played back together: one clock, and the frame of each camera that is nearest to it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """Which file is which camera's: videos matched to the cameras of a rig, and checked against them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """A flight in one picture: the ball cut from several frames of a camera and put into one of them, with its trail."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Final, Protocol
 

@@ -1,7 +1,5 @@
 """One camera's view with what was found in it: candidates, the balls that they were taken for, trails and stamps."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 
