@@ -67,7 +67,7 @@ def calibrate_cameras(
     OUT_calibration.json and .png show how accurate the calibration is. Without --table only the lenses are written, for
     a later --intrinsics.
     """
-    from ballfg.files.destination import check_file
+    from ballfg.files.whole_file import check_file
     from ballfg.vision.calibration.boards import read_grey
     from ballfg.vision.calibration.table_points import read_table
 

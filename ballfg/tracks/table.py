@@ -16,8 +16,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 from numpy.typing import ArrayLike
 
-from ballfg.files.destination import check_file
-from ballfg.files.whole_file import whole_file
+from ballfg.files.whole_file import check_file, whole_file
 
 ENDINGS = (".csv", ".parquet")
 _BLOCK_ROWS = 1 << 16  # rows held back before they are written; also the row group of a Parquet file

@@ -2,7 +2,7 @@ from .association.agreement import Agreement as Agreement
 from .association.agreement import check_agreement as check_agreement
 from .association.associate import AssociationSettings as AssociationSettings
 from .association.associate import associate as associate
-from .association.seen_ball import SeenBall as SeenBall
+from .association.gathering import SeenBall as SeenBall
 from .association.triangulate import Triangulated as Triangulated
 from .association.triangulate import triangulate as triangulate
 from .calibration.extrinsics import calibrate_extrinsics as calibrate_extrinsics

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from ballfg.vision.arrays import Array
+from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.association.paths import path
-from ballfg.vision.association.seen_ball import SeenBall
 from ballfg.vision.association.triangulate import triangulate
 from ballfg.vision.camera import Camera
 

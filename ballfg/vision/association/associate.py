@@ -12,12 +12,10 @@ import numpy as np
 
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.arrays import Rows
-from ballfg.vision.association.clock import shared_stamps
 from ballfg.vision.association.completing import complete
 from ballfg.vision.association.flights import is_ball, successions
-from ballfg.vision.association.gathering import SAME_SHUTTER, Footage, Gathered, gather
+from ballfg.vision.association.gathering import SAME_SHUTTER, Footage, Gathered, SeenBall, gather, shared_stamps
 from ballfg.vision.association.matching import Piece, match
-from ballfg.vision.association.seen_ball import SeenBall
 from ballfg.vision.association.tracklets import find_tracklets
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections

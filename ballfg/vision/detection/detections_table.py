@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from ballfg.tracks.checks import check_step
-from ballfg.tracks.detection_columns import (
+from ballfg.tracks.detections_file import (
     CAMERA,
     OPTIONAL,
     RULES,

@@ -8,12 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ballfg.files.destination import check_folder, check_replaceable
-from ballfg.files.whole_folder import whole_folder
+from ballfg.files.whole_folder import check_folder, check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import DatasetInfo, TableWriter, write_dataset
-from ballfg.tracks.detection_columns import SCORE, seen_columns
-from ballfg.tracks.detections_file import DETECTIONS_FILE
+from ballfg.tracks.detections_file import DETECTIONS_FILE, SCORE, seen_columns
 from ballfg.tracks.info import INFO_FILE, write_info
 from ballfg.tracks.rows import KEY, SIGMAS, VALUES
 from ballfg.vision.arrays import Image

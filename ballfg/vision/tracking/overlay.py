@@ -10,12 +10,9 @@ import numpy as np
 
 from ballfg.progress import Watch, unwatched
 from ballfg.vision.arrays import Image
-from ballfg.vision.tracking.palette import bgr
 from ballfg.vision.tracking.pipeline import Tracking
 from ballfg.vision.tracking.playback import Schedule, play, schedule
-from ballfg.vision.tracking.view_painter import ViewPainter, write
-
-"""Hands items through and shows how far it is: (items, how many, what they are)."""
+from ballfg.vision.tracking.view_painter import ViewPainter, bgr, write
 
 VIEW_WIDTH: Final = 640
 """px of one view: three side by side make 1920, the width of a screen."""

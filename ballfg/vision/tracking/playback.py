@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from ballfg.vision.arrays import Array, Image, Rows
-from ballfg.vision.association.clock import nearest
+from ballfg.vision.association.gathering import nearest
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 

@@ -7,9 +7,8 @@ import cv2
 import numpy as np
 
 from ballfg.vision.arrays import Array, Image
-from ballfg.vision.tracking.palette import bgr
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.view_painter import by_score, polyline, ring, uncover, write
+from ballfg.vision.tracking.view_painter import bgr, by_score, polyline, ring, uncover, write
 
 WIDTH: Final = 480
 """px of the picture."""
