@@ -70,6 +70,7 @@ def calibrate_cameras(
     from ballfg.files.whole_file import check_file
     from ballfg.vision.calibration.boards import read_grey
     from ballfg.vision.calibration.table_points import read_table
+    from ballfg.vision.camera_file import read_cameras
 
     if out.suffix.lower() not in (*OURS, *THEIRS):
         raise ValueError(f"out must end in {', '.join((*OURS, *THEIRS))}; got {out}. Choose the format by the ending.")
@@ -82,7 +83,7 @@ def calibrate_cameras(
     shown = {name: read_grey(Path(paths[-1])) for name, paths in _grouped("view", view or ()).items()}
     marked = None if table is None else read_table(table)
     if intrinsics is not None:
-        lenses = _known(intrinsics)
+        lenses = {camera.name: camera for camera in read_cameras(intrinsics, posed=False)}
         _check_same(lenses, str(intrinsics), marked, table, shown)
         found = [_placed(camera, None, marked) for camera in lenses.values()]
     else:
@@ -102,12 +103,6 @@ def _grouped(option: str, words: Iterable[str]) -> dict[str, list[str]]:
             raise ValueError(f"--{option} must be NAME=PLACE, as left=calib/left; got {word!r}. Name the camera.")
         grouped.setdefault(name, []).append(place)
     return grouped
-
-
-def _known(path: Path) -> dict[str, Camera]:
-    from ballfg.vision.camera_file import read_cameras
-
-    return {camera.name: camera for camera in read_cameras(path, posed=False)}
 
 
 def _check_same(
@@ -176,8 +171,6 @@ def _write(out: Path, found: list[Calibration], shown: Mapping[str, Image], mark
         figure.savefig(temporary)
     write = write_cameras if out.suffix.lower() in OURS else write_opencv
     write(out, [one.camera for one in found], posed=marked is not None)
-    for one in found:
-        for line in summary(one):
-            print(line)
+    print(*(line for one in found for line in summary(one)), sep="\n")
     print(f"{out}: {len(found)} camera{'s' if len(found) > 1 else ''}{'' if marked else ', lenses only'}")
     print(f"how well they are known: {report}, {picture}")

@@ -9,16 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import OwnEffects, check_dataset, default_jobs, open_inputs
+from ballfg.cli.inputs import DatasetFolder, OwnEffects, default_jobs, open_inputs
 
 if TYPE_CHECKING:
     from ballfg.diagnosis.result import Diagnosis
 
 
 def diagnose(
-    dataset: Annotated[
-        Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.", callback=check_dataset)
-    ],
+    dataset: DatasetFolder,
     out: Annotated[Path, typer.Option(help="Folder of the report: new, empty or with an earlier report.")],
     model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal table-tennis model.")] = None,
     effects: OwnEffects = None,
@@ -52,8 +50,7 @@ def diagnose(
         inputs.dataset, inputs.model, jobs=jobs, watch=lambda line: print(line, file=sys.stderr, flush=True)
     )
     write_report(diagnosis, out)
-    for line in _summary(diagnosis):
-        print(line)
+    print(*_summary(diagnosis), sep="\n")
     written = ", ".join(name for name in (PAGE, REPORT, MODEL) if (out / name).is_file())
     print(f"\nwrote {written} to {out}")
 
@@ -84,15 +81,13 @@ def _errors(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
     from ballfg.diagnosis.report.wording import fixed
 
     before, after = diagnosis.before, diagnosis.after
-    rows: list[tuple[str, ...]] = [(f"on {diagnosis.tracks_judged_on} judging tracks", "before", "after")]
-    for name, was, now, decimals in (
-        ("prediction RMSE, mm", before.prediction_rmse_mm, after.prediction_rmse_mm, 1),
-        ("apex RMSE, mm", before.apex_rmse_mm, after.apex_rmse_mm, 1),
-        ("NIS (1 is right)", before.nis, after.nis, 2),
-        ("log likelihood", before.log_likelihood, after.log_likelihood, 2),
-    ):
-        rows.append((name, fixed(was, decimals), fixed(now, decimals)))
-    return rows
+    return [
+        (f"on {diagnosis.tracks_judged_on} judging tracks", "before", "after"),
+        ("prediction RMSE, mm", fixed(before.prediction_rmse_mm, 1), fixed(after.prediction_rmse_mm, 1)),
+        ("apex RMSE, mm", fixed(before.apex_rmse_mm, 1), fixed(after.apex_rmse_mm, 1)),
+        ("NIS (1 is right)", fixed(before.nis, 2), fixed(after.nis, 2)),
+        ("log likelihood", fixed(before.log_likelihood, 2), fixed(after.log_likelihood, 2)),
+    ]
 
 
 def _aligned(rows: Sequence[Sequence[str]]) -> Iterator[str]:

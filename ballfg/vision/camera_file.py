@@ -1,6 +1,6 @@
 """Cameras in files: `cameras.yaml`, and the files that OpenCV's FileStorage writes."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable
 from numbers import Integral
 from os import PathLike
 from pathlib import Path
@@ -38,8 +38,13 @@ def read_cameras(path: str | PathLike[str], *, posed: bool = True) -> list[Camer
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a file with cameras; there is none. Correct the path.")
     try:
-        contents = read_storage(path) if is_storage(path) else _read_ours(path)
-        return [_camera(name, content, posed) for name, content in contents.items()]
+        if is_storage(path):
+            cameras = read_storage(path)
+        else:
+            content = read_mapping(path)
+            check_keys(str(path), content, ("cameras",), ("cameras",))
+            cameras = mapping("cameras", content["cameras"])
+        return [_camera(name, fields, posed) for name, fields in cameras.items()]
     except (ValueError, TypeError) as error:
         text = str(error)
         rule = TypeError if isinstance(error, TypeError) else ValueError
@@ -57,27 +62,11 @@ def write_cameras(path: str | PathLike[str], cameras: Iterable[Camera], *, posed
         raise ValueError(f"path must end in .yaml; got {path}. Rename it; write_opencv writes .xml and .json.")
     cameras = check_names(cameras)
     fields = FIELDS if posed else (*LENS, "time_offset")
-    content = {"cameras": {camera.name: _plain(camera, fields) for camera in cameras}}
-    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
-    write_text(path, text)
-
-
-def _plain(camera: Camera, fields: Sequence[str]) -> dict[str, Any]:
-    whole = {
-        "size": list(camera.size),
-        "matrix": camera.matrix.tolist(),
-        "distortion": camera.distortion.tolist(),
-        "rvec": camera.rvec.tolist(),
-        "tvec": camera.tvec.tolist(),
-        "time_offset": camera.time_offset,
+    plain = {
+        camera.name: {field: np.asarray(getattr(camera, field)).tolist() for field in fields} for camera in cameras
     }
-    return {field: whole[field] for field in fields}
-
-
-def _read_ours(path: Path) -> Mapping[str, Any]:
-    content = read_mapping(path)
-    check_keys(str(path), content, ("cameras",), ("cameras",))
-    return mapping("cameras", content["cameras"])
+    text = yaml.safe_dump({"cameras": plain}, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+    write_text(path, text)
 
 
 def _camera(name: str, content: Any, posed: bool) -> Camera:

@@ -84,14 +84,8 @@ def _frames(detections: Detections) -> list[list[_Seen]]:
     frames: list[list[_Seen]] = [[] for _ in detections.frames]
     variances = np.maximum(np.trace(detections.covariances, axis1=1, axis2=2) / 2.0, _LEAST_VARIANCE)
     costs = _SCORE_COST * (1.0 - detections.scores)
-    numbers = zip(
-        detections.frame.tolist(),
-        detections.times.tolist(),
-        detections.pixels.tolist(),
-        variances.tolist(),
-        costs.tolist(),
-        strict=True,
-    )
+    columns = (detections.frame, detections.times, detections.pixels, variances, costs)
+    numbers = zip(*(column.tolist() for column in columns), strict=True)
     for row, (frame, time, (u, v), variance, cost) in enumerate(numbers):
         frames[frame].append(_Seen(row, frame, time, u, v, variance, cost))
     return frames

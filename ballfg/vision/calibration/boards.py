@@ -2,7 +2,7 @@
 
 import glob
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Final, TypeAlias
@@ -85,7 +85,7 @@ class Charuco:
     dictionary: str = "4X4_100"
     """One of `DICTIONARIES`."""
 
-    legacy: bool = field(default=False)
+    legacy: bool = False
     """Printed by OpenCV before 4.6, which began boards with an even number of rows with a marker."""
 
     def __post_init__(self) -> None:

@@ -199,13 +199,8 @@ def _fit(name: str, views: Sequence[View], distortion: int) -> Intrinsics:
         for view, rvec, tvec in zip(views, rvecs, tvecs, strict=True)
     )
     share = coverage(size, np.concatenate([view.pixels for view in views]))
-    return Intrinsics(camera, _covariance(camera, fitted), fitted, (), (), share)
-
-
-def _covariance(camera: Camera, views: Sequence[FittedView]) -> Array:
-    return covariance_of_lens(
-        camera, [(fitted.view.points, fitted.rvec, fitted.tvec, fitted.residuals) for fitted in views]
-    )
+    covariance = covariance_of_lens(camera, [(v.view.points, v.rvec, v.tvec, v.residuals) for v in fitted])
+    return Intrinsics(camera, covariance, fitted, (), (), share)
 
 
 @contextmanager

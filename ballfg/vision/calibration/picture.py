@@ -1,7 +1,7 @@
 """Picture of a calibration: what the lens leaves of the corners, view by view, and the table where it should be."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,7 +10,7 @@ from matplotlib.patheffects import withStroke
 
 from ballfg.vision.arrays import Array, Image
 from ballfg.vision.calibration.extrinsics import Extrinsics
-from ballfg.vision.calibration.intrinsics import CELLS
+from ballfg.vision.calibration.intrinsics import CELLS, Intrinsics
 from ballfg.vision.calibration.report import Calibration
 from ballfg.vision.calibration.table_points import TABLE_HEIGHT, table_outline
 from ballfg.vision.camera import Camera
@@ -37,29 +37,28 @@ def calibration_picture(
         images: by the camera's name, grey, what the table's outline is drawn into; white without one.
         table_height: m, z of the table's surface.
     """
-    kinds: list[Callable[[Axes, Calibration], None]] = []
+    kinds: list[tuple[str, Callable[[Axes, Any], None]]] = []
     if any(one.lens is not None for one in found):
-        kinds += [_corners, _views]
+        kinds += [("lens", _corners), ("lens", _views)]
     if any(one.place is not None for one in found):
-        kinds.append(lambda axes, one: _table(axes, one, images.get(one.camera.name), table_height))
+        kinds.append(("place", lambda axes, one: _table(axes, one, images.get(one.camera.name), table_height)))
     width, height = PANEL
     figure = Figure(figsize=(width * len(kinds), height * len(found) + 0.3), dpi=DPI, layout="constrained")
     panels = figure.subplots(len(found), len(kinds), squeeze=False)
     for row, one in zip(panels, found, strict=True):
-        for axes, draw in zip(row, kinds, strict=True):
-            draw(axes, one)
+        for axes, (part, draw) in zip(row, kinds, strict=True):
+            if getattr(one, part) is None:
+                axes.set_axis_off()
+            else:
+                draw(axes, getattr(one, part))
     return figure
 
 
-def _corners(axes: Axes, found: Calibration) -> None:
-    lens = found.lens
-    if lens is None:
-        axes.set_axis_off()
-        return
+def _corners(axes: Axes, lens: Intrinsics) -> None:
     pixels = np.concatenate([fitted.view.pixels for fitted in lens.views])
     residuals = np.concatenate([fitted.residuals for fitted in lens.views])
-    _image_axes(axes, found.camera)
-    width, height = found.camera.size
+    _image_axes(axes, lens.camera)
+    width, height = lens.camera.size
     for side, count, line in ((width, CELLS[0], axes.axvline), (height, CELLS[1], axes.axhline)):
         for place in np.linspace(0, side, count + 1)[1:-1]:
             line(place - 0.5, color=GREY, linewidth=0.3)
@@ -67,17 +66,13 @@ def _corners(axes: Axes, found: Calibration) -> None:
     longer = ARROW * width / (3.0 * typical) if typical > 0.0 else 1.0
     axes.quiver(*pixels.T, *(longer * residuals).T, angles="xy", scale_units="xy", scale=1, width=0.002, color=BLUE)
     axes.set_title(
-        f"{found.camera.name}: corners as seen minus as projected, x{longer:.0f}\n"
+        f"{lens.camera.name}: corners as seen minus as projected, x{longer:.0f}\n"
         f"RMS {lens.rms:.2f} px; corners in {lens.coverage:.0%} of the cells",
         size=9,
     )
 
 
-def _views(axes: Axes, found: Calibration) -> None:
-    lens = found.lens
-    if lens is None:
-        axes.set_axis_off()
-        return
+def _views(axes: Axes, lens: Intrinsics) -> None:
     fitted = [*lens.views, *lens.left_out]
     colours = [BLUE] * len(lens.views) + [VERMILION] * len(lens.left_out)
     places = np.arange(len(fitted))
@@ -88,29 +83,22 @@ def _views(axes: Axes, found: Calibration) -> None:
     axes.set_xticks(places, [one.view.name for one in fitted], rotation=90, size=6)
     axes.set_ylabel("RMS, px")
     orange = "; orange: left out" if lens.left_out else ""
-    axes.set_title(f"{found.camera.name}: error of each view{orange}", size=9)
+    axes.set_title(f"{lens.camera.name}: error of each view{orange}", size=9)
 
 
-def _table(axes: Axes, found: Calibration, image: Image | None, table_height: float) -> None:
-    place = found.place
-    if place is None:
-        axes.set_axis_off()
-        return
+def _table(axes: Axes, place: Extrinsics, image: Image | None, table_height: float) -> None:
     if image is not None:
         axes.imshow(image, cmap="gray", vmin=0, vmax=255)
-    _image_axes(axes, found.camera)
+    _image_axes(axes, place.camera)
     for line in table_outline(table_height):
-        axes.plot(*_drawn(found.camera, line).T, color=VERMILION, linewidth=1.0)
+        axes.plot(*_drawn(place.camera, line).T, color=VERMILION, linewidth=1.0)
     axes.plot(*place.marked.pixels.T, "o", color=BLUE, markersize=6, fillstyle="none")
     for name, pixel in zip(place.marked.names, place.marked.pixels, strict=True):
         axes.annotate(name, pixel, (4, 4), textcoords="offset points", size=6, color=BLUE, path_effects=[OUTLINED])
-    axes.set_title(_place_title(place), size=9)
-
-
-def _place_title(place: Extrinsics) -> str:
-    return (
+    axes.set_title(
         f"{place.camera.name}: the table as projected; circles: as marked\n"
-        f"RMS {place.rms:.2f} px; camera ± {1e3 * place.centre_sigma:.1f} mm, ± {np.degrees(place.turn_sigma):.2f}°"
+        f"RMS {place.rms:.2f} px; camera ± {1e3 * place.centre_sigma:.1f} mm, ± {np.degrees(place.turn_sigma):.2f}°",
+        size=9,
     )
 
 

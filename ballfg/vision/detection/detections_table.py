@@ -62,21 +62,15 @@ def read_detections(
     values |= {name: np.full(len(names), value) for name, value in _UNSTATED.items() if name not in values}
     known = (*REQUIRED, *OPTIONAL, *UNUSED)
     notes = [f"{path.name}: column {name!r} ignored" for name in header if name not in known]
-    names, values, repeats = _once(names, values)
-    if repeats:
-        notes.append(f"{path.name}: {repeats} exact repeats of rows dropped")
+    number = np.unique(names, return_inverse=True)[1]
+    kept = np.sort(np.unique(np.column_stack((number, *values.values())), axis=0, return_index=True)[1])
+    if len(kept) < len(names):
+        notes.append(f"{path.name}: {len(names) - len(kept)} exact repeats of rows dropped")
+    names, values = names[kept], {name: column[kept] for name, column in values.items()}
     found = [_of_camera(camera.name, names == camera.name, values) for camera in cameras]
     for seen in found:
         check_step(f"{path}, camera {seen.camera!r}", seen.frames)
     return found, notes
-
-
-def _once(names: Texts, values: dict[str, Array]) -> tuple[Texts, dict[str, Array], int]:
-    """The table without rows that stand in it before, and how many those were."""
-    _, number = np.unique(names, return_inverse=True)
-    _, first = np.unique(np.column_stack((number, *values.values())), axis=0, return_index=True)
-    kept = np.sort(first)
-    return names[kept], {name: column[kept] for name, column in values.items()}, len(names) - len(kept)
 
 
 def _check_all_seen(path: Path, names: Texts, cameras: Sequence[Camera]) -> None:
