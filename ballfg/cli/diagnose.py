@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import DatasetFolder, OwnEffects, default_jobs, open_inputs
+from ballfg.cli.inputs import CORES, DatasetFolder, Jobs, OwnEffects, open_inputs
 
 if TYPE_CHECKING:
     from ballfg.diagnosis.result import Diagnosis
@@ -20,7 +20,7 @@ def diagnose(
     out: Annotated[Path, typer.Option(help="Folder of the report: new, empty or with an earlier report.")],
     model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal table-tennis model.")] = None,
     effects: OwnEffects = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes to use.", show_default="one per core")] = default_jobs(),
+    jobs: Jobs = CORES,
 ) -> None:
     """Find effects that the model lacks, with their evidence, their alternatives and the gain in prediction.
 

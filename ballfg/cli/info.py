@@ -11,7 +11,7 @@ from typing import Any
 
 import typer
 
-from ballfg.cli.inputs import default_jobs
+from ballfg.machine import usable_cores
 from ballfg.registry import PACKAGE, Registry, source_of
 
 REGISTRIES = (
@@ -83,7 +83,7 @@ def _machine() -> Iterator[str]:
     memory = ""
     if hasattr(os, "sysconf"):
         memory = f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.1f} GiB memory"
-    yield f"{default_jobs()} cores{memory}"
+    yield f"{usable_cores()} cores{memory}"
     gpus = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
     yield f"GPU: {', '.join(gpus) or 'none'}"
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import enum
-import os
 import sys
 from collections import Counter
 from collections.abc import Iterable
@@ -12,6 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
 
 import typer
+
+from ballfg.machine import usable_cores
 
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel
@@ -23,11 +24,6 @@ if TYPE_CHECKING:
 
 MOST_DOUBTS = 3
 """Tracks whose doubts are printed, before the others are counted."""
-
-
-def default_jobs() -> int:
-    """One process per core that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def check_dataset(folder: Path) -> Path:
@@ -57,7 +53,7 @@ MethodName = Annotated[
 ModelFile = Annotated[
     Path | None, typer.Option("--model", help="Model file; by default the nominal model of the ball.")
 ]
-CORES = default_jobs()
+CORES = usable_cores()
 Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Number of processes.", show_default="one per core")]
 OutTable = Annotated[Path, typer.Option("--out", help="Output table, .csv or .parquet.")]
 Seed = Annotated[int, typer.Option("--seed", help="Random seed.")]

@@ -50,6 +50,9 @@ class TrackPrediction:
     measured: Array
     estimate: Estimate
 
+    def __repr__(self) -> str:
+        return f"TrackPrediction({self.name!r}, {len(self.times)} positions, {self.status.name.lower()})"
+
     @property
     def status(self) -> Status:
         """How the estimation of the observed part ended."""
