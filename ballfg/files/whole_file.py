@@ -13,7 +13,6 @@ def whole_file(path: Path, argument: str = "out") -> Iterator[Path]:
 
     After an exception or Ctrl-C what was there before is untouched.
 
-    Args: path: of the file.  argument: its name in a message.
     Raises: FileNotFoundError: the folder of the path does not exist. ValueError: the path is a folder.
     """
     check_file(path, argument)
@@ -44,7 +43,6 @@ def flush(path: Path) -> None:
 def check_file(path: Path, argument: str = "out") -> None:
     """Refuses a path to which no file can be written.
 
-    Args: path: of the file.  argument: its name in a message.
     Raises: FileNotFoundError: its folder does not exist. ValueError: it is a folder.
     """
     check_parent(path, argument)

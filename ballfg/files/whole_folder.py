@@ -58,7 +58,6 @@ def staging(folder: Path, argument: str = "out") -> Iterator[Path]:
 def check_folder(folder: Path, argument: str = "out") -> None:
     """Refuses a path at which no folder can be made or written to.
 
-    Args: folder: existing or not.  argument: its name in a message.
     Raises: FileNotFoundError: its parent does not exist. ValueError: it is a file.
     """
     check_parent(folder, argument)

@@ -84,11 +84,7 @@ def check_step(label: str, stamps: FloatArray) -> None:
 def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> FloatArray:
     """The samples of one trajectory, one for each stamp, in time order.
 
-    Args:
-        group: its rows; finite.
-        where: tells the place of rows of the file, for an error.
-        findings: what is repaired is added to them.
-    Returns: (n, 4) or (n, 7), columns as in Block.
+    Returns: (n, 4) or (n, 7), columns as in Block; what is repaired is added to the findings.
     Raises: ValueError: fewer than two stamps, or two rows at one stamp more than MERGE_DISTANCE apart.
     """
     findings = Findings() if findings is None else findings
@@ -135,12 +131,7 @@ def check_scale(
 ) -> None:
     """Refuses a track whose numbers cannot be metres and seconds.
 
-    Args:
-        label: what the message calls the track.
-        times: (n,) s, n >= 2, strictly increasing.
-        positions: (n, 3) m.
-        sigmas: (n, 3) m, or None.
-        rate: the dataset's declared rate, Hz, if any.
+    Args: times: (n,) s, n >= 2, increasing.  positions: (n, 3) m.  sigmas: (n, 3) m.  rate: as declared, Hz.
     Raises: ValueError: naming the likely unit.
     """
     steps = np.diff(times)

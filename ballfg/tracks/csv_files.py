@@ -123,7 +123,7 @@ def explain(path: Path, numeric: Sequence[str], reason: str) -> ValueError:
     line = 1
     try:
         for line, cells in records(path):
-            problem = _row_problem(header, numeric, cells)
+            problem = row_problem(header, numeric, cells)
             if problem:
                 return ValueError(f"{path}, line {line}{problem}")
     except ValueError as error:
@@ -138,7 +138,8 @@ def no_rows(path: Path) -> ValueError:
     return ValueError(f"{path}: must hold tracks; got a header without rows. Add the measurements.")
 
 
-def _row_problem(header: list[str], numeric: Sequence[str], cells: list[str]) -> str | None:
+def row_problem(header: list[str], numeric: Sequence[str], cells: list[str]) -> str | None:
+    """The end of a message about a row with too few or too many cells, or without a number where one must be."""
     if len(cells) != len(header):
         return (
             f": must have {len(header)} cells, one for each column of the header; got {len(cells)}. "

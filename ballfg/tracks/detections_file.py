@@ -144,7 +144,6 @@ def _sightings(table: _Table, rows: NDArray[np.int64], cameras: tuple[str, ...])
 def read_columns(path: Path, required: Sequence[str]) -> tuple[list[str], dict[str, Texts], dict[str, Array]]:
     """The columns of a table, cells not yet checked.
 
-    Args: path: of the table.  required: columns that it must have.
     Returns: the header; (n,) texts and (n,) numbers by column, of the required and the optional ones that are there.
     Raises: FileNotFoundError: no such file. ValueError: a missing or repeated column, a line or a cell that cannot be
         read; the message names it.
@@ -170,11 +169,9 @@ def read_columns(path: Path, required: Sequence[str]) -> tuple[list[str], dict[s
 def check_values(
     path: Path, values: Mapping[str, Array], lines: NDArray[np.int64], rules: Mapping[str, Rule] = RULES
 ) -> None:
-    """Refuses cells out of their range.
+    """Refuses cells out of their range; in columns without a rule, numbers that are not finite.
 
-    Args:
-        path: of the table.  values: (n,) of each column.  lines: (n,) numbers of their rows in the file.
-        rules: by column; others must be finite.
+    Args: values: (n,) of each column.  lines: (n,) numbers of their rows in the file.
     Raises: ValueError: naming line and column.
     """
     for name, column in values.items():
@@ -192,7 +189,7 @@ def check_cameras(
 ) -> None:
     """Refuses a row of a camera that is neither one of `cameras` nor `ignored`.
 
-    Args: path: of the table.  names: (n,) of the cameras.  lines: (n,) numbers of their rows in the file.
+    Args: names: (n,) of the cameras.  lines: (n,) numbers of their rows in the file.
     Raises: ValueError: naming the line.
     """
     strange = ~np.isin(names, [*cameras, *ignored])

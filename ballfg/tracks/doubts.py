@@ -24,10 +24,7 @@ AXES: Final = ("x", "y", "z")
 def doubts_about(times: Array, positions: Array, surfaces: Sequence[float], radius: float) -> tuple[str, ...]:
     """What does not look like a ball that falls along -z and bounces on the declared surfaces.
 
-    Args:
-        times: (n,) s.  positions: (n, 3) m.
-        surfaces: heights, m.
-        radius: m, of the ball.
+    Args: times: (n,) s.  positions: (n, 3) m.  surfaces: heights, m.  radius: m, of the ball.
     Returns: one sentence for each doubt.
     """
     step = float(np.median(np.diff(times))) if len(times) > 1 else np.inf

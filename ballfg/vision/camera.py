@@ -63,9 +63,6 @@ class Camera:
         if not (width > 0 and height > 0 and (width, height) == tuple(self.size)):
             raise ValueError(f"camera {self.name!r}: size must be width and height in pixels; got {self.size}")
         object.__setattr__(self, "size", (width, height))
-        object.__setattr__(self, "matrix", self._checked("matrix", self.matrix, (3, 3)))
-        object.__setattr__(self, "rvec", self._checked("rvec", self.rvec, (3,)))
-        object.__setattr__(self, "tvec", self._checked("tvec", self.tvec, (3,)))
         count = np.asarray(self.distortion).size
         if count not in DISTORTIONS:
             lengths = ", ".join(map(str, DISTORTIONS))
@@ -73,7 +70,8 @@ class Camera:
                 f"camera {self.name!r}: distortion must have one of {lengths} coefficients; got {count}. "
                 "Give them in OpenCV's order k1, k2, p1, p2, k3, ..."
             )
-        object.__setattr__(self, "distortion", self._checked("distortion", self.distortion, (count,)))
+        for field, shape in {"matrix": (3, 3), "rvec": (3,), "tvec": (3,), "distortion": (count,)}.items():
+            object.__setattr__(self, field, self._checked(field, getattr(self, field), shape))
         self._check_matrix()
         if not np.isfinite(self.time_offset):
             raise ValueError(f"camera {self.name!r}: time_offset must be finite, in s; got {self.time_offset}")

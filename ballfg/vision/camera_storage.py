@@ -81,7 +81,14 @@ def write_opencv(path: str | PathLike[str], cameras: Iterable[Camera], *, posed:
     with whole_file(path) as temporary:
         storage = cv2.FileStorage(str(temporary), cv2.FILE_STORAGE_WRITE)
         for camera in cameras:
-            _write(storage, camera, NODES if posed else ("matrix", "distortion"))
+            storage.startWriteStruct(camera.name, cv2.FileNode_MAP)
+            storage.write("image_width", camera.size[0])
+            storage.write("image_height", camera.size[1])
+            for field in NODES if posed else ("matrix", "distortion"):
+                array = getattr(camera, field)
+                storage.write(NODES[field][0], array if array.ndim == 2 else array[:, None])
+            storage.write("time_offset", camera.time_offset)
+            storage.endWriteStruct()
         storage.release()
 
 
@@ -94,17 +101,6 @@ def check_names(cameras: Iterable[Camera]) -> Sequence[Camera]:
     if count > 1:
         raise ValueError(f"cameras must have names of their own; got {name!r} {count} times. Rename them.")
     return cameras
-
-
-def _write(storage: cv2.FileStorage, camera: Camera, fields: Iterable[str]) -> None:
-    storage.startWriteStruct(camera.name, cv2.FileNode_MAP)
-    storage.write("image_width", camera.size[0])
-    storage.write("image_height", camera.size[1])
-    for field in fields:
-        array = getattr(camera, field)
-        storage.write(NODES[field][0], array if array.ndim == 2 else array[:, None])
-    storage.write("time_offset", camera.time_offset)
-    storage.endWriteStruct()
 
 
 def _fields(node: cv2.FileNode, where: str) -> dict[str, Any]:

@@ -57,9 +57,7 @@ class _Piece:
 def find_tracklets(detections: Detections, focal: float) -> list[Rows]:
     """The pieces of one camera's candidates, by the row of their first candidate.
 
-    Args:
-        detections: all candidates.
-        focal: px, of the camera: turns speeds across the view into pixels.
+    Args: focal: px, of the camera: turns speeds across the view into pixels.
     Returns: for each piece the rows (k,) of its candidates, k >= 3, in order of time.
     """
     open_pieces: list[_Piece] = []

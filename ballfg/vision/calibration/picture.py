@@ -32,9 +32,7 @@ def calibration_picture(
 ) -> Figure:
     """One row a camera: residuals of the corners, error of each view, the table in the image.
 
-    Args:
-        found: at least one, each with a lens or a place.
-        images: by the camera's name, grey, what the table's outline is drawn into; white without one.
+    Args: images: by the camera's name, grey, what the table's outline is drawn into; white without one.
         table_height: m, z of the table's surface.
     """
     kinds: list[tuple[str, Callable[[Axes, Any], None]]] = []

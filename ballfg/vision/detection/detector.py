@@ -127,9 +127,7 @@ class BallDetector:
 def patch_of(change: np.ndarray, behind: np.ndarray, region: Region, noise: Array) -> Patch | None:
     """The region's pixels along the colour by which it differs from its background; None where it does not.
 
-    Args:
-        change, behind: (m, 3) grey levels, difference to the background and the background, of the free pixels.
-        region: where they are.
+    Args: change, behind: (m, 3) grey levels, difference to the background and the background, of the free pixels.
         noise: (3, 3) grey levels^2, covariance of the channels.
     """
     strength = np.abs(change).max(axis=1)
@@ -151,10 +149,7 @@ def patch_of(change: np.ndarray, behind: np.ndarray, region: Region, noise: Arra
 
 
 def learned(look: Look, fit: StreakFit, blotches: float) -> Look:
-    """What to expect after another ball was seen: means weighted by information, which ages towards the first.
-
-    Args: look: expected up to now.  fit: made with it.  blotches: px across which noise is shared.
-    """
+    """What to expect after another ball was seen: means weighted by information, which ages towards the first."""
     doubt = max(fit.scatter, 1.0) ** 2 * blotches
     first = Look.unknown()
     old = FORGETS * (look.information - first.information)

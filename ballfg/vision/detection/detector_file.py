@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from functools import partial
+from itertools import count
 from pathlib import Path
 
 from ballfg.checks import did_you_mean
@@ -41,21 +42,13 @@ def load_detector(text: str) -> Maker:
 
 
 def _made(found: Detector | type[Detector], path: Path, video: Video) -> Detector:
-    """The detector of a camera, which serves no other."""
+    """The detector of a camera, which serves no other; what it raises is told with file, line, video and frame."""
     with blamed(path, f"making the detector of {video.name}"):
-        return _Watched(found() if isinstance(found, type) else found, path, video.name)
+        detector = found() if isinstance(found, type) else found
+    frames = count()
 
+    def watched(image: Image) -> Candidates:
+        with blamed(path, f"frame {next(frames)} of {video.name}"):
+            return detector(image)
 
-class _Watched:
-    """A user's detector; what it raises is told with the file, the line, the video and the frame."""
-
-    def __init__(self, detector: Detector, path: Path, video: str) -> None:
-        self.detector, self.path, self.video = detector, path, video
-        self.frame = 0
-
-    def __call__(self, image: Image) -> Candidates:
-        """The candidates of the next frame."""
-        with blamed(self.path, f"frame {self.frame} of {self.video}"):
-            found = self.detector(image)
-        self.frame += 1
-        return found
+    return watched

@@ -38,10 +38,8 @@ def score(
     """Mark of a candidate, 0 to 1.
 
     Args:
-        fit, patch: of its pixels.
         change, behind: (m, 3) grey levels, difference to the background and background of these pixels.
         diameter: px, least and greatest.
-        colour: that the ball has, if known.
     """
     shape = np.exp(-((fit.unexplained / UNEXPLAINED) ** 2)) * (1.0 if fit.settled else UNSETTLED)
     strength = 1.0 - np.exp(-((fit.strength / STRENGTH) ** 2))

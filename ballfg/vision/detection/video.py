@@ -112,11 +112,8 @@ class VideoFile(Video):
     def _decoded(self) -> Iterator[tuple[float, Image]]:
         capture = _capture(self.path)
         try:
-            while True:
-                there, image = capture.read()
-                if not there:
-                    return
-                yield 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC), np.asarray(image, dtype=np.uint8)
+            while (read := capture.read())[0]:
+                yield 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC), np.asarray(read[1], dtype=np.uint8)
         finally:
             capture.release()
 

@@ -38,10 +38,7 @@ TABLE: Final = "#2a7f4f"
 class ContactSheet:
     """Collects pictures while the videos pass by (`strobe.tapped`), then writes the sheet.
 
-    Args:
-        tracking: what was found.
-        ball_radius: m.
-        table_height: m, z of the table's surface.
+    Args: ball_radius: m.  table_height: m, z of the table's surface.
         table: (x_low, x_high, y_low, y_high) m; None where it is not known.
     """
 

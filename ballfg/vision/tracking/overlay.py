@@ -39,7 +39,6 @@ def write_overlay(
 
     Args:
         path: a new file; its folder exists.
-        tracking: what was found.
         streams: the frames of each camera once more, from the first on.
         watch: sees the frames that are drawn.
     Returns: the number of its frames.
@@ -60,12 +59,7 @@ def write_overlay(
 
 
 class OverlayPainter:
-    """Lays the views out and draws them.
-
-    Args: tracking: what was found.
-
-    Attributes: size: width and height of the overlay, px.
-    """
+    """Lays the views out and draws them. Attributes: size: width and height of the overlay, px."""
 
     def __init__(self, tracking: Tracking) -> None:
         self._tracking = tracking

@@ -30,9 +30,7 @@ class Schedule:
 def schedule(detections: Sequence[Detections], cameras: Sequence[Camera]) -> Schedule:
     """The moments at which to show a recording: the frames of the camera with most, and where it is silent the others'.
 
-    Args:
-        detections: of each camera; only its frames' stamps are used.
-        cameras: in the same order, for their time offsets.
+    Only the stamps of the detections' frames and the cameras' time offsets are used.
     """
     clocks = [seen.frames - camera.time_offset for seen, camera in zip(detections, cameras, strict=True)]
     times = np.zeros(0)
@@ -55,9 +53,7 @@ def shown(clock: Array, times: Array) -> Rows:
 def play(moments: Schedule, streams: Sequence[Iterator[tuple[float, Image]]]) -> Iterator[list[Image | None]]:
     """The images of each moment, one of each camera; None where it has none.
 
-    Args:
-        moments: of the recording.
-        streams: of each camera, from its first frame on; each is run through once.
+    Args: streams: of each camera, from its first frame on; each is run through once.
     """
     at = [-1] * len(streams)
     images: list[Image | None] = [None] * len(streams)

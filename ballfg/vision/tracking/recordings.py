@@ -14,9 +14,7 @@ SAME_SHAPE: Final = 0.01
 def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Sequence[str] = ()) -> dict[str, Path]:
     """The video of each camera.
 
-    Args:
-        given: paths, each with a camera's name as its stem, or `name=path`.
-        cameras: of the rig.
+    Args: given: paths, each with a camera's name as its stem, or `name=path`.
         ignored: names of cameras whose videos are passed over.
     Returns: camera -> path, in the order of the cameras.
     Raises: ValueError: a video of no camera, two of one, or a camera without one.
@@ -57,7 +55,7 @@ def named_path(text: str, names: Sequence[str]) -> tuple[str, Path]:
 def stamp_files(given: Sequence[str], cameras: Sequence[Camera]) -> dict[str, Path]:
     """The files of stamps of some cameras.
 
-    Args: given: `name=path`.  cameras: of the rig.
+    Args: given: `name=path`.
     Raises: ValueError: a word without a name, a name of no camera, or one that comes twice.
     """
     names = [camera.name for camera in cameras]

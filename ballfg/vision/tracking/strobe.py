@@ -50,13 +50,9 @@ class Picture(Protocol):
 class Strobe:
     """The picture of one ball in one camera, put together while the camera's frames pass by.
 
-    Args:
-        tracking: what was found.
-        track, camera: their numbers.
-        ball_radius: m.
+    Args: track, camera: their numbers.  ball_radius: m.
 
-    Attributes:
-        count: of the ball's sightings in this camera.
+    Attributes: count: of the ball's sightings in this camera.
     """
 
     def __init__(self, tracking: Tracking, track: int, camera: int, ball_radius: float) -> None:
@@ -138,10 +134,7 @@ class Strobe:
 
 
 class AllCandidates:
-    """The middle frame of a camera with the candidates of all its frames, for a recording without a ball.
-
-    Args: tracking: what was found.  camera: its number.
-    """
+    """The middle frame of a camera with the candidates of all its frames, for a recording without a ball."""
 
     def __init__(self, tracking: Tracking, camera: int) -> None:
         self._detections = tracking.detections[camera]

@@ -35,13 +35,7 @@ _SHIFT: Final = 4
 
 
 class ViewPainter:
-    """Draws one camera's frames at a smaller size.
-
-    Args:
-        tracking: what was found.
-        camera: number of the camera.
-        width: px of the drawn view; the height follows.
-    """
+    """Draws the frames of one camera, by its number, at a width in px; the height follows."""
 
     def __init__(self, tracking: Tracking, camera: int, width: int) -> None:
         self._camera = tracking.cameras[camera]
