@@ -157,8 +157,7 @@ def _placed(camera: Camera, lens: Intrinsics | None, marked: TableFile | None) -
 
 def _write(out: Path, found: list[Calibration], shown: Mapping[str, Image], marked: TableFile | None) -> None:
     from ballfg.files.whole_file import whole_file, write_text
-    from ballfg.vision.calibration.picture import calibration_picture
-    from ballfg.vision.calibration.report import content, summary
+    from ballfg.vision.calibration.report import calibration_picture, content, summary
     from ballfg.vision.calibration.table_points import TABLE_HEIGHT
     from ballfg.vision.camera_file import write_cameras
     from ballfg.vision.camera_storage import write_opencv

@@ -84,8 +84,13 @@ def read_sightings(
         check_step(f"{path}, camera {camera!r}", np.unique(table.values["t"][rows][table.camera[rows] == number]))
     offsets = np.array(list(time_offsets.values()))
     rows = rows[np.argsort((table.values["t"] - offsets[table.camera])[rows], kind="stable")]
-    found = {str(name): rows[table.names[rows] == name] for name in dict.fromkeys(table.names.tolist())}
-    return {name: _sightings(table, mine, tuple(time_offsets)) for name, mine in found.items()}, notes
+    found = {}
+    for name in dict.fromkeys(table.names.tolist()):
+        mine = rows[table.names[rows] == name]
+        values = {column: numbers[mine] for column, numbers in table.values.items()}
+        pixels = np.column_stack((values["u"], values["v"]))
+        found[name] = Sightings(tuple(time_offsets), table.camera[mine], values["t"], pixels, covariances(values))
+    return found, notes
 
 
 def write_sightings(path: str | os.PathLike[str], balls: Iterable[tuple[str, Sightings]]) -> None:
@@ -133,12 +138,6 @@ def _chosen(table: _Table) -> tuple[NDArray[np.int64], int]:
             "which candidate it is; they do not. Delete one of them."
         )
     return np.sort(order[np.append(True, ~same)]) if len(order) else order, int(same.sum())
-
-
-def _sightings(table: _Table, rows: NDArray[np.int64], cameras: tuple[str, ...]) -> Sightings:
-    values = {name: column[rows] for name, column in table.values.items()}
-    pixels = np.column_stack((values["u"], values["v"]))
-    return Sightings(cameras, table.camera[rows], values["t"], pixels, covariances(values))
 
 
 def read_columns(path: Path, required: Sequence[str]) -> tuple[list[str], dict[str, Texts], dict[str, Array]]:

@@ -112,18 +112,14 @@ def check_cells(source: RowSource, block: Block) -> None:
     bad[:, 4:] |= (sigmas < MIN_SIGMA) | (sigmas > MAX_SIGMA)
     if bad.any():
         row, column = (int(i) for i in np.argwhere(bad)[0])
+        value = float(block.values[row, column])
+        rule = "finite" if not np.isfinite(value) else f"at most {LARGEST:g} in size"
+        remedy = "Delete the line: a missing sample needs no row."
+        if column >= 4:
+            rule = f"a standard deviation of {MIN_SIGMA:g} to {MAX_SIGMA:g} m"
+            remedy = "Correct it, or drop the sigma columns."
         place = f"{source.where(block.start + row)}, column {source.columns[column]!r}"
-        raise ValueError(f"{place}: {_cell_problem(column, float(block.values[row, column]))}")
-
-
-def _cell_problem(column: int, value: float) -> str:
-    if column >= 4:
-        return (
-            f"must be a standard deviation of {MIN_SIGMA:g} to {MAX_SIGMA:g} m; got {value:g}. "
-            "Correct it, or drop the sigma columns."
-        )
-    rule = "finite" if not np.isfinite(value) else f"at most {LARGEST:g} in size"
-    return f"must be {rule}; got {value:g}. Delete the line: a missing sample needs no row."
+        raise ValueError(f"{place}: must be {rule}; got {value:g}. {remedy}")
 
 
 def _global_codes(block: Block, codes_of: dict[str, int]) -> NDArray[np.int32]:

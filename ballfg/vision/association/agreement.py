@@ -85,14 +85,10 @@ class Agreement:
 class _Scene:
     """Points that at least three cameras saw."""
 
-    pixels: Array
-    """(n, c, 2), NaN where not seen."""
-    weights: Array
-    """(n, c, 2, 2) inverse covariances; zero where not seen."""
-    points: Array
-    """(n, 3) m, first guess."""
-    expected: Array
-    """(n,) median of the squared error that noise alone makes."""
+    pixels: Array  # (n, c, 2), NaN where not seen
+    weights: Array  # (n, c, 2, 2) inverse covariances; zero where not seen
+    points: Array  # (n, 3) m, first guess
+    expected: Array  # (n,) median of the squared error that noise alone makes
 
 
 def check_agreement(balls: Sequence[SeenBall], cameras: Sequence[Camera]) -> Agreement:

@@ -70,10 +70,8 @@ class _Pair:
 
     first: int
     second: int
-    misses: Array
-    """(k,) px, what is left between the rays; NaN where they do not meet in front."""
-    variances: Array
-    """(k,) px^2, of the misses by noise and interpolation."""
+    misses: Array  # (k,) px, what is left between the rays; NaN where they do not meet in front
+    variances: Array  # (k,) px^2, of the misses by noise and interpolation
 
     def support(self, offset: float) -> float:
         """In common times: how many speak for the pair, less what speaks against it. `offset`: px, of calibration."""

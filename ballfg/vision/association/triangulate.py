@@ -51,16 +51,11 @@ class Triangulated:
 class _Views:
     """What c cameras see, in the planes z = 1 of their own frames, where projection is a division."""
 
-    rotations: Array
-    """(c, 3, 3) from the world to the cameras."""
-    translations: Array
-    """(c, 3) m."""
-    planes: Array
-    """(n, c, 2); zero where nothing is seen."""
-    weights: Array
-    """(n, c, 2, 2) inverse covariances of `planes`."""
-    seen: Flags
-    """(n, c)"""
+    rotations: Array  # (c, 3, 3) from the world to the cameras
+    translations: Array  # (c, 3) m
+    planes: Array  # (n, c, 2); zero where nothing is seen
+    weights: Array  # (n, c, 2, 2) inverse covariances of `planes`
+    seen: Flags  # (n, c)
 
     def project(self, points: Array) -> tuple[Array, Array, Array]:
         """Points (n, 3) -> their planes' coordinates (n, c, 2), derivatives (n, c, 2, 3) and depths (n, c) m."""

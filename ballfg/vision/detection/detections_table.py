@@ -6,32 +6,20 @@ from typing import Final
 
 import numpy as np
 
+from ballfg.tracks import detections_file
 from ballfg.tracks.checks import check_step
-from ballfg.tracks.detections_file import (
-    CAMERA,
-    OPTIONAL,
-    RULES,
-    SCORE,
-    UNSTATED,
-    Array,
-    Texts,
-    check_cameras,
-    check_values,
-    covariances,
-    read_columns,
-)
 from ballfg.tracks.rows import KEY
-from ballfg.vision.arrays import Flags
+from ballfg.vision.arrays import Array, Flags
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 
-REQUIRED: Final = ("t", CAMERA, "u", "v")
+REQUIRED: Final = ("t", detections_file.CAMERA, "u", "v")
 UNUSED: Final = (KEY,)
 """Columns that may be there and are not needed: which ball a row belongs to is found anew."""
 SURE: Final = 1.0
 """Score of all rows of a table without one: somebody has chosen them."""
-_UNSTATED: Final = UNSTATED | {SCORE: SURE}
-_RULES: Final = {**RULES, SCORE: ("0 to 1", lambda x: (x >= 0.0) & (x <= 1.0))}
+_UNSTATED: Final = detections_file.UNSTATED | {detections_file.SCORE: SURE}
+_RULES: Final = {**detections_file.RULES, detections_file.SCORE: ("0 to 1", lambda x: (x >= 0.0) & (x <= 1.0))}
 
 
 def read_detections(
@@ -53,14 +41,19 @@ def read_detections(
         ValueError: a column that is missing, a cell out of its range, an unknown camera, a camera without rows; the
             message names file, line and column.
     """
-    header, texts, values = read_columns(path, REQUIRED)
-    names = texts[CAMERA]
+    header, texts, values = detections_file.read_columns(path, REQUIRED)
+    names = texts[detections_file.CAMERA]
     rows = np.arange(len(names))
-    check_values(path, values, rows, _RULES)
-    check_cameras(path, names, rows, [camera.name for camera in cameras], ignored)
-    _check_all_seen(path, names, cameras)
+    detections_file.check_values(path, values, rows, _RULES)
+    detections_file.check_cameras(path, names, rows, [camera.name for camera in cameras], ignored)
+    blind = [camera.name for camera in cameras if not (names == camera.name).any()]
+    if blind:
+        raise ValueError(
+            f"{path}: every camera must have rows; got none of {' and '.join(map(repr, blind))}. "
+            f"Add them, or leave the camera out with --without {blind[0]}."
+        )
     values |= {name: np.full(len(names), value) for name, value in _UNSTATED.items() if name not in values}
-    known = (*REQUIRED, *OPTIONAL, *UNUSED)
+    known = (*REQUIRED, *detections_file.OPTIONAL, *UNUSED)
     notes = [f"{path.name}: column {name!r} ignored" for name in header if name not in known]
     number = np.unique(names, return_inverse=True)[1]
     kept = np.sort(np.unique(np.column_stack((number, *values.values())), axis=0, return_index=True)[1])
@@ -73,20 +66,11 @@ def read_detections(
     return found, notes
 
 
-def _check_all_seen(path: Path, names: Texts, cameras: Sequence[Camera]) -> None:
-    blind = [camera.name for camera in cameras if not (names == camera.name).any()]
-    if blind:
-        raise ValueError(
-            f"{path}: every camera must have rows; got none of {' and '.join(map(repr, blind))}. "
-            f"Add them, or leave the camera out with --without {blind[0]}."
-        )
-
-
 def _of_camera(name: str, rows: Flags, values: dict[str, Array]) -> Detections:
     mine = {column: numbers[rows] for column, numbers in values.items()}
     frames, frame = np.unique(mine["t"], return_inverse=True)
     order = np.argsort(frame, kind="stable")
     pixels = np.column_stack((mine["u"], mine["v"]))
     streaks = np.full((len(order), 2, 2), np.nan)
-    spread, scores = covariances(mine)[order], mine[SCORE][order]
+    spread, scores = detections_file.covariances(mine)[order], mine[detections_file.SCORE][order]
     return Detections(name, frames, frame[order], pixels[order], spread, scores, streaks)

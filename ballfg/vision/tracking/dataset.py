@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ballfg.files.whole_folder import check_folder, check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
@@ -104,14 +103,9 @@ def _write_tables(stage: Path, tracking: Tracking, info: DatasetInfo) -> None:
     write_cameras(stage / CAMERAS_FILE, tracking.cameras)
     with TableWriter(stage / DETECTIONS_FILE) as detections:
         for camera in range(len(tracking.cameras)):
-            detections.write(_detection_columns(tracking, camera))
-
-
-def _detection_columns(tracking: Tracking, camera: int) -> dict[str, ArrayLike]:
-    """All candidates of a camera. Those of a ball carry its name, the others none."""
-    seen = tracking.detections[camera]
-    names = np.full(len(seen), "", dtype=object)
-    for name, ball in zip(tracking.names, tracking.balls, strict=True):
-        names[tracking.rows(ball, camera)] = name
-    columns = seen_columns(seen.times, seen.camera, seen.pixels, seen.covariances)
-    return {KEY: names} | columns | {SCORE: seen.scores}
+            seen = tracking.detections[camera]
+            names = np.full(len(seen), "", dtype=object)  # of the balls; candidates of no ball have none
+            for name, ball in zip(tracking.names, tracking.balls, strict=True):
+                names[tracking.rows(ball, camera)] = name
+            columns = seen_columns(seen.times, seen.camera, seen.pixels, seen.covariances)
+            detections.write({KEY: names} | columns | {SCORE: seen.scores})

@@ -16,9 +16,18 @@ from ballfg.vision import Camera
 from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.detection.detections import Candidates, Detections
 from ballfg.vision.tracking.contact_sheet import MOST_TRACKS, ContactSheet
-from ballfg.vision.tracking.overlay import STRIP, VIEW_WIDTH, OverlayPainter, write_overlay
+from ballfg.vision.tracking.overlay import (
+    HELD,
+    STRIP,
+    VIEW_WIDTH,
+    Image,
+    OverlayPainter,
+    play,
+    schedule,
+    shown,
+    write_overlay,
+)
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.playback import HELD, Image, play, schedule, shown
 from ballfg.vision.tracking.strobe import HEIGHT, WIDTH, ZOOM, Strobe, tapped
 from ballfg.vision.tracking.view_painter import RING, bgr
 

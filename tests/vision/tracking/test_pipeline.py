@@ -22,8 +22,8 @@ from ballfg.vision.detection.detections_table import read_detections
 from ballfg.vision.detection.detector_file import load_detector
 from ballfg.vision.detection.video import Video, open_video
 from ballfg.vision.tracking.dataset import FILES, check_result_folder, write_tracking
+from ballfg.vision.tracking.overlay import Image
 from ballfg.vision.tracking.pipeline import Tracking, track_detections
-from ballfg.vision.tracking.playback import Image
 from ballfg.vision.tracking.report import no_ball, summary
 from tests.places import DOCS
 
