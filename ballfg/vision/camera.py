@@ -43,7 +43,7 @@ class Camera:
     """(3, 3) focal lengths and principal point, pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."""
 
     distortion: Array
-    """(k,) coefficients in OpenCV's order; k one of `DISTORTIONS`."""
+    """(k,) dimensionless coefficients in OpenCV's order; k one of `DISTORTIONS`."""
 
     rvec: Array
     """(3,) rad, rotation vector from the world to the camera."""
@@ -100,7 +100,7 @@ class Camera:
 
     @cached_property
     def rotation(self) -> Array:
-        """(3, 3) from the world to the camera."""
+        """(3, 3) dimensionless, from the world to the camera."""
         return np.asarray(cv2.Rodrigues(self.rvec)[0], dtype=np.float64)
 
     @cached_property

@@ -13,6 +13,7 @@ class CameraBank:
     """The cameras of a rig as stacked tensors.
 
     Args: cameras: in the order of their numbers.
+    Raises: ValueError: no cameras.
 
     Attributes:
         names: of the cameras, in that order.

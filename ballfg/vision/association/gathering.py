@@ -71,7 +71,7 @@ class SeenBall:
     """What the points come from, each at its own camera's stamp."""
 
     views: Rows
-    """(n,) how many cameras made each point."""
+    """(n,) number of cameras that made each point."""
 
     def __len__(self) -> int:
         return len(self.times)

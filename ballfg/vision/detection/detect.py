@@ -77,7 +77,7 @@ def detect_all(
         stamps: camera -> CSV file, for those whose stamps are not the container's.
         jobs: processes; no more than cameras are of use.
         watch: sees the numbers of the frames that are done, those of all cameras together.
-    Raises: as `open_video` and `detect`.
+    Raises: TypeError, ValueError, FileNotFoundError: as `open_video` and `detect`.
     """
     opened = {name: open_video(path, (stamps or {}).get(name)) for name, path in videos.items()}
     if jobs == 1 or len(opened) < 2:

@@ -32,7 +32,7 @@ class Candidates:
     """(k, 2, 2) px^2."""
 
     scores: Array
-    """(k,) in [0, 1], how ball-like."""
+    """(k,) dimensionless, in [0, 1], how ball-like."""
 
     streaks: Array
     """(k, 2, 2) px, centre at the shutter's opening and closing, in unknown order; NaN where not blurred."""
@@ -52,7 +52,7 @@ class Candidates:
     def at(cls, pixels: ArrayLike, sigma: float, scores: ArrayLike | None = None) -> Candidates:
         """Of a detector that gives centres only.
 
-        Args: pixels: (k, 2).  sigma: px, of each coordinate.  scores: (k,) in [0, 1]; 1 by default.
+        Args: pixels: (k, 2).  sigma: px, of each coordinate.  scores: (k,) dimensionless, in [0, 1]; 1 by default.
         """
         centres = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
         count = len(centres)
@@ -89,7 +89,7 @@ class Detections:
     """(n, 2, 2) px^2."""
 
     scores: Array
-    """(n,) in [0, 1], how ball-like."""
+    """(n,) dimensionless, in [0, 1], how ball-like."""
 
     streaks: Array
     """(n, 2, 2) px, centre at the shutter's opening and closing, in unknown order; NaN where not blurred."""

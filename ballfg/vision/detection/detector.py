@@ -76,7 +76,7 @@ class BallDetector:
     def learn(cls, images: Sequence[Image], settings: DetectorSettings | None = None) -> BallDetector:
         """A detector with the background that frames of the recording show.
 
-        Args: images: at least three, (h, w, 3) uint8 each, spread over the recording; see `Background`.
+        Args: images: at least three, (h, w, 3) grey levels, spread over the recording; see `Background`.
             settings: what is known about the ball; the default ones if None.
         Returns: the detector of that camera.
         Raises: ValueError: too few images, or of several sizes.
@@ -84,8 +84,9 @@ class BallDetector:
         return cls(Background(images), settings)
 
     def __call__(self, image: Image) -> Candidates:
-        """The candidates of the next frame (h, w, 3) in BGR.
+        """The candidates of the next frame.
 
+        Args: image: (h, w, 3) grey levels, BGR.
         Raises: ValueError: an image of another size than the background's.
         """
         if image.shape != self.background.full.shape:

@@ -23,6 +23,8 @@ SHORT: Final = (3, 0.02)
 class Video(ABC):
     """Frames of one camera, which can be read more than once.
 
+    Args: stamps: (f,) s, of its frames; None: those of the container.
+
     Attributes:
         name: the file's or folder's, without ending.
         path: of it.
