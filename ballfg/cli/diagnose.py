@@ -57,7 +57,7 @@ def diagnose(
 
 def _summary(diagnosis: Diagnosis) -> Iterator[str]:
     """The diagnosis in lines: the sentence, effects, errors on the held-out half, the rest."""
-    from ballfg.diagnosis.report.wording import listed, probability
+    from ballfg.diagnosis.report.wording import fixed, listed, probability
 
     yield f"{diagnosis.verdict.value}: {diagnosis.sentence}"
     rows = [("effect", "kind", "by chance", "BIC", "cannot be told from", "coefficients")]
@@ -66,7 +66,15 @@ def _summary(diagnosis: Diagnosis) -> Iterator[str]:
         rows.append((f.name, f.kind, probability(f.p_value), f"{f.delta_bic:+.0f}", others, listed(f.parameters)))
     if diagnosis.findings:
         yield from ("", *_aligned(rows))
-    yield from ("", *_aligned(_errors(diagnosis)))
+    before, after = diagnosis.before, diagnosis.after
+    errors = [
+        (f"on {diagnosis.tracks_judged_on} judging tracks", "before", "after"),
+        ("prediction RMSE, mm", fixed(before.prediction_rmse_mm, 1), fixed(after.prediction_rmse_mm, 1)),
+        ("apex RMSE, mm", fixed(before.apex_rmse_mm, 1), fixed(after.apex_rmse_mm, 1)),
+        ("NIS (1 is right)", fixed(before.nis, 2), fixed(after.nis, 2)),
+        ("log likelihood", fixed(before.log_likelihood, 2), fixed(after.log_likelihood, 2)),
+    ]
+    yield from ("", *_aligned(errors))
     left = diagnosis.unexplained
     if left.where:
         yield from ("", f"left unexplained: {left.where}")
@@ -75,19 +83,6 @@ def _summary(diagnosis: Diagnosis) -> Iterator[str]:
         yield f"  {left.fallback.kind}: {left.fallback.description}; prediction RMSE {error:.1f} mm with it"
     if diagnosis.excluded:
         yield from ("", *(f"left out: {line}" for line in diagnosis.excluded))
-
-
-def _errors(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
-    from ballfg.diagnosis.report.wording import fixed
-
-    before, after = diagnosis.before, diagnosis.after
-    return [
-        (f"on {diagnosis.tracks_judged_on} judging tracks", "before", "after"),
-        ("prediction RMSE, mm", fixed(before.prediction_rmse_mm, 1), fixed(after.prediction_rmse_mm, 1)),
-        ("apex RMSE, mm", fixed(before.apex_rmse_mm, 1), fixed(after.apex_rmse_mm, 1)),
-        ("NIS (1 is right)", fixed(before.nis, 2), fixed(after.nis, 2)),
-        ("log likelihood", fixed(before.log_likelihood, 2), fixed(after.log_likelihood, 2)),
-    ]
 
 
 def _aligned(rows: Sequence[Sequence[str]]) -> Iterator[str]:

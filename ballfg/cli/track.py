@@ -126,9 +126,8 @@ def _from_videos(
     without: Sequence[str],
 ) -> tuple[Tracking, Streams]:
     """What was found, and what gives each video's frames once more."""
-    from ballfg.vision.detection.detect import learn_detector
+    from ballfg.vision.detection.detect import learn_detector, load_detector
     from ballfg.vision.detection.detector import DetectorSettings
-    from ballfg.vision.detection.detector_file import load_detector
     from ballfg.vision.detection.video import open_video
     from ballfg.vision.tracking.pipeline import track_videos
     from ballfg.vision.tracking.recordings import match_videos, stamp_files

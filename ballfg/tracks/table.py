@@ -76,8 +76,8 @@ class TableWriter:
         """Appends a block of rows.
 
         Args:
-            columns: name -> (n,) numbers or text, in any unit, the same n for all; a single number or text is repeated. The
-                first block fixes the names, their order and their types.
+            columns: name -> (n,) numbers, in any unit, or text, the same n for all; a single number or text is
+                repeated. The first block fixes the names, their order and their types.
         Raises: ValueError: columns of different lengths, other names than in the first block, or values of another
             type. RuntimeError: outside a `with` block.
         """

@@ -73,12 +73,23 @@ class Track:
                 f"track {self.name!r}: times must have shape (n,) with n >= 1; got {times.shape}. "
                 "Pass one stamp per sample."
             )
-        _check_increasing(self.name, times)
+        wrong = np.flatnonzero(np.diff(times) <= 0)
+        if wrong.size:
+            i = int(wrong[0]) + 1
+            raise ValueError(
+                f"track {self.name!r}: times must be strictly increasing; times[{i}]={times[i]} <= "
+                f"times[{i - 1}]={times[i - 1]}. Sort or drop duplicates."
+            )
         positions = _finite(self.name, "positions", self.positions, (len(times), 3))
         sigmas = self.sigmas
         if sigmas is not None:
             sigmas = _finite(self.name, "sigmas", sigmas, (len(times), 3))
-            _check_positive(self.name, sigmas)
+            if (sigmas <= 0).any():
+                i, axis = (int(k) for k in np.argwhere(sigmas <= 0)[0])
+                raise ValueError(
+                    f"track {self.name!r}: sigmas must be positive; sigmas[{i}, {axis}]={sigmas[i, axis]}. "
+                    "Give a standard deviation in m, or no sigmas at all."
+                )
         labels = _checked_labels(self.name, self.labels)
         for key, value in {"times": times, "positions": positions, "sigmas": sigmas, "labels": labels}.items():
             object.__setattr__(self, key, value)
@@ -181,25 +192,6 @@ def _finite(track: str, argument: str, value: ArrayLike, shape: tuple[int, ...] 
             f"track {track!r}: {argument} must be finite; {argument}[{place}]={array[index]}. Drop that sample."
         )
     return array
-
-
-def _check_increasing(track: str, times: FloatArray) -> None:
-    wrong = np.flatnonzero(np.diff(times) <= 0)
-    if wrong.size:
-        i = int(wrong[0]) + 1
-        raise ValueError(
-            f"track {track!r}: times must be strictly increasing; times[{i}]={times[i]} <= "
-            f"times[{i - 1}]={times[i - 1]}. Sort or drop duplicates."
-        )
-
-
-def _check_positive(track: str, sigmas: FloatArray) -> None:
-    if (sigmas <= 0).any():
-        i, axis = (int(k) for k in np.argwhere(sigmas <= 0)[0])
-        raise ValueError(
-            f"track {track!r}: sigmas must be positive; sigmas[{i}, {axis}]={sigmas[i, axis]}. "
-            "Give a standard deviation in m, or no sigmas at all."
-        )
 
 
 def _checked_labels(track: str, labels: Mapping[str, Label]) -> dict[str, Label]:

@@ -72,7 +72,12 @@ class Camera:
             )
         for field, shape in {"matrix": (3, 3), "rvec": (3,), "tvec": (3,), "distortion": (count,)}.items():
             object.__setattr__(self, field, self._checked(field, getattr(self, field), shape))
-        self._check_matrix()
+        k = self.matrix
+        if not (k[0, 0] > 0 and k[1, 1] > 0 and k[1, 0] == 0 and (k[2] == (0, 0, 1)).all() and k[0, 1] == 0):
+            raise ValueError(
+                f"camera {self.name!r}: matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; "
+                f"got {k.tolist()}"
+            )
         if not np.isfinite(self.time_offset):
             raise ValueError(f"camera {self.name!r}: time_offset must be finite, in s; got {self.time_offset}")
         object.__setattr__(self, "time_offset", float(self.time_offset))
@@ -89,14 +94,6 @@ class Camera:
         array = array.reshape(shape)
         array.setflags(write=False)
         return array
-
-    def _check_matrix(self) -> None:
-        k = self.matrix
-        if not (k[0, 0] > 0 and k[1, 1] > 0 and k[1, 0] == 0 and (k[2] == (0, 0, 1)).all() and k[0, 1] == 0):
-            raise ValueError(
-                f"camera {self.name!r}: matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; "
-                f"got {k.tolist()}"
-            )
 
     @cached_property
     def rotation(self) -> Array:

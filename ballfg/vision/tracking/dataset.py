@@ -7,7 +7,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.files.whole_folder import check_folder, check_replaceable, whole_folder
+from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import DatasetInfo, TableWriter, write_dataset
 from ballfg.tracks.detections_file import DETECTIONS_FILE, SCORE, seen_columns
@@ -37,7 +37,6 @@ def check_result_folder(folder: Path, inputs: Sequence[Path], *, force: bool) ->
     Raises: ValueError: a file; an input that lies in it; other files; an earlier result and no `force`.
         FileNotFoundError: its parent does not exist.
     """
-    check_folder(folder)
     for path in inputs:
         if path.resolve().parent == folder.resolve():
             raise ValueError(f"out must not hold what is read; {path} lies in {folder}. Choose another folder.")

@@ -93,14 +93,11 @@ def check_sizes(sizes: Mapping[str, tuple[int, int]], cameras: Sequence[Camera])
     for camera in cameras:
         size = sizes[camera.name]
         if size != camera.size:
+            calibrated, filmed = (f"{width}x{height}" for width, height in (camera.size, size))
             raise ValueError(
-                f"camera {camera.name!r} must be calibrated at the size of its video; got {_by(camera.size)} in the "
-                f"cameras' file and a video of {_by(size)}. {_remedy(camera.size, size)}"
+                f"camera {camera.name!r} must be calibrated at the size of its video; got {calibrated} in the "
+                f"cameras' file and a video of {filmed}. {_remedy(camera.size, size)}"
             )
-
-
-def _by(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"
 
 
 def _remedy(calibrated: tuple[int, int], filmed: tuple[int, int]) -> str:
