@@ -159,8 +159,7 @@ def _write(out: Path, found: list[Calibration], shown: Mapping[str, Image], mark
     from ballfg.files.whole_file import whole_file, write_text
     from ballfg.vision.calibration.report import calibration_picture, content, summary
     from ballfg.vision.calibration.table_points import TABLE_HEIGHT
-    from ballfg.vision.camera_file import write_cameras
-    from ballfg.vision.camera_storage import write_opencv
+    from ballfg.vision.camera_file import write_cameras, write_opencv
 
     figure = calibration_picture(found, shown, TABLE_HEIGHT if marked is None else marked.table_height)
     report, picture = (out.with_name(f"{out.stem}_calibration{ending}") for ending in (".json", ".png"))

@@ -93,8 +93,7 @@ class CsvRows(RowSource):
 
     def where(self, *rows: int) -> str:
         """The file and the line numbers of these rows, counted from 1 with the header; see RowSource."""
-        lines = csv_files.lines_of_rows(self.path, rows)
-        return f"{self.path}, {_counted('line', lines)}"
+        return f"{self.path}, {_counted('line', csv_files.lines_of_rows(self.path, rows))}"
 
 
 class ParquetRows(RowSource):

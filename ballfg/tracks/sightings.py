@@ -57,9 +57,8 @@ class Sightings:
                 "Number the cameras in the order of their names."
             )
         object.__setattr__(self, "camera", camera.astype(np.int64))
-        object.__setattr__(self, "times", times)
-        object.__setattr__(self, "pixels", _floats("pixels", self.pixels, (m, 2)))
-        object.__setattr__(self, "covariances", _floats("covariances", self.covariances, (m, 2, 2)))
+        for field, shape in {"times": (m,), "pixels": (m, 2), "covariances": (m, 2, 2)}.items():
+            object.__setattr__(self, field, _floats(field, getattr(self, field), shape))
         self._check_stamps()
         good = are_covariances(self.covariances)
         if not good.all():

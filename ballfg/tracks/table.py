@@ -96,24 +96,21 @@ class TableWriter:
         assert self._file is not None
         table = pa.Table.from_batches(self._pending, self._schema).combine_chunks()
         if self.path.suffix.lower() == ".csv":
-            self._write_csv(self._file, table)
+            # The library quotes the header and, where a text needs quotes, all texts; simple readers expect neither.
+            if not self._has_header:
+                header = io.StringIO()
+                csv.writer(header, lineterminator="\n").writerow(table.column_names)
+                self._file.write(header.getvalue().encode())
+                self._has_header = True
+            texts = [column for column in table.columns if pa.types.is_string(column.type)]
+            quoted = any(pc.any(pc.match_substring_regex(column, '[,"\r\n]')).as_py() for column in texts)
+            style = pa_csv.WriteOptions(include_header=False, quoting_style="needed" if quoted else "none")
+            pa_csv.write_csv(table, self._file, style)
         else:
             if self._parquet is None:
                 self._parquet = pq.ParquetWriter(self._file, self._schema)
             self._parquet.write_table(table)
         self._pending, self._pending_rows = [], 0
-
-    def _write_csv(self, file: BinaryIO, table: pa.Table) -> None:
-        # The library quotes the header and, where a text needs quotes, all texts; simple readers expect neither.
-        if not self._has_header:
-            header = io.StringIO()
-            csv.writer(header, lineterminator="\n").writerow(table.column_names)
-            file.write(header.getvalue().encode())
-            self._has_header = True
-        texts = [column for column in table.columns if pa.types.is_string(column.type)]
-        quoted = any(pc.any(pc.match_substring_regex(column, '[,"\r\n]')).as_py() for column in texts)
-        style = "needed" if quoted else "none"
-        pa_csv.write_csv(table, file, pa_csv.WriteOptions(include_header=False, quoting_style=style))
 
 
 def _batch(columns: Mapping[str, ArrayLike]) -> pa.RecordBatch:

@@ -10,7 +10,7 @@ from .calibration.intrinsics import calibrate_intrinsics as calibrate_intrinsics
 from .camera import Camera as Camera
 from .camera_file import read_cameras as read_cameras
 from .camera_file import write_cameras as write_cameras
-from .camera_storage import write_opencv as write_opencv
+from .camera_file import write_opencv as write_opencv
 from .detection.detect import detect as detect
 from .detection.detect import detect_all as detect_all
 from .detection.detect import learn_detector as learn_detector
