@@ -145,8 +145,8 @@ def _stream(source: RowSource) -> Iterator[RowGroup]:
 
 
 def _joined(name: str, pieces: list[RowGroup]) -> RowGroup:
-    rows, values = (np.concatenate(arrays) for arrays in ([p.rows for p in pieces], [p.values for p in pieces]))
-    return RowGroup(name, rows, values)
+    rows = np.concatenate([piece.rows for piece in pieces])
+    return RowGroup(name, rows, np.concatenate([piece.values for piece in pieces]))
 
 
 def _regroup(source: RowSource, index: Index) -> Iterator[RowGroup]:

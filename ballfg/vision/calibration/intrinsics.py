@@ -168,10 +168,10 @@ def _check_views(name: str, used: Sequence[View], missed: Sequence[str]) -> None
         )
     for view in used:
         if view.size != used[0].size:
-            first, other = (f"{one.name} has {one.size[0]}x{one.size[1]}" for one in (used[0], view))
+            first, other = (f"{one.size[0]}x{one.size[1]}" for one in (used[0], view))
             raise ValueError(
-                f"camera {name!r}: images must have one size; {first} and {other} pixels. "
-                "Take them all as the videos will be."
+                f"camera {name!r}: images must have one size; {used[0].name} has {first} and {view.name} "
+                f"{other} pixels. Take them all as the videos will be."
             )
 
 
