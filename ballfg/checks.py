@@ -4,8 +4,6 @@ Every message says the argument, the rule, what came instead and the remedy. Con
 check themselves.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Collection, Iterable
@@ -23,9 +21,6 @@ _SYNONYMS = {
     "z": ("pos_z", "pz", "z_m"),
     "licence": ("license",),
 }
-
-
-# --- text and names ------------------------------------------------------------------------------------------------
 
 
 def type_name(value: object) -> str:
@@ -83,9 +78,6 @@ def did_you_mean(name: str, candidates: Iterable[str]) -> str:
     """`" Did you mean 'x'?"`, or empty text if nothing is near."""
     found = nearest(name, candidates)
     return "" if found is None else f" Did you mean {found!r}?"
-
-
-# --- numbers -------------------------------------------------------------------------------------------------------
 
 
 def is_number(value: object) -> bool:
@@ -154,9 +146,6 @@ def _check_type(label: str, value: object, unit: str = "") -> None:
     if not is_number(value):
         rule, got = (f"a number in {unit}", f"{type_name(value)} {value!r}") if unit else ("a number", f"{value!r}")
         raise TypeError(f"{label} must be {rule}; got {got}. Write it like 0.02 or 2.0e-2.")
-
-
-# --- arrays --------------------------------------------------------------------------------------------------------
 
 
 def check_array(

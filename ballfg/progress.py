@@ -1,7 +1,5 @@
 """Progress of long work: a bar on a terminal, plain lines now and then elsewhere; nothing for less than two seconds."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Iterable, Iterator

@@ -6,11 +6,9 @@ A package of one's own takes part by an entry point in its pyproject.toml:
     static_charge = "my_package.charge:StaticCharge"
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass, field
 from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, packages_distributions, version
 from types import ModuleType
 from typing import Any, Generic, TypeVar, cast
@@ -34,6 +32,7 @@ class Source:
         return self.package if self.version is None else f"{self.package} {self.version}"
 
 
+@dataclass(eq=False, repr=False)
 class Registry(Mapping[str, type[T]], Generic[T]):
     """Classes of one sort by their `name`.
 
@@ -49,25 +48,17 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         reserved: classes by name that are not in the registry; their names are taken.
     """
 
-    def __init__(
-        self,
-        sort: str,
-        *,
-        group: str,
-        base: type[Any] | tuple[type[Any], ...],
-        remedy: str,
-        check: Callable[[type[T]], None] | None = None,
-        reserved: Mapping[str, type[T]] | None = None,
-    ) -> None:
-        self.sort = sort
-        self.group = group
-        self._bases = base if isinstance(base, tuple) else (base,)
-        self._remedy = remedy
-        self._check = check
-        self._reserved = dict(reserved or {})
-        self._classes: dict[str, type[T]] = {}
-        self._packages: dict[str, Source] = {}
-        self._loaded = False
+    sort: str
+    _: KW_ONLY
+    group: str
+    base: type[Any] | tuple[type[Any], ...]
+    remedy: str
+    check: Callable[[type[T]], None] | None = None
+    reserved: Mapping[str, type[T]] = field(default_factory=dict)
+
+    _classes: dict[str, type[T]] = field(init=False, default_factory=dict)
+    _packages: dict[str, Source] = field(init=False, default_factory=dict)
+    _loaded: bool = field(init=False, default=False)
 
     def __getitem__(self, name: str) -> type[T]:
         if name not in self._classes:
@@ -97,16 +88,16 @@ class Registry(Mapping[str, type[T]], Generic[T]):
             TypeError: if it is no such class.
             ValueError: if its name is missing or taken, or if the registry's own check refuses it.
         """
-        if not (isinstance(cls, type) and issubclass(cls, self._bases)):
-            names = [base.__name__ for base in self._bases]
+        if not (isinstance(cls, type) and issubclass(cls, self.base)):
+            names = [base.__name__ for base in (self.base if isinstance(self.base, tuple) else (self.base,))]
             bases = " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-            raise TypeError(f"{self.sort} must be a subclass of {bases}; got {cls!r}. {self._remedy}")
+            raise TypeError(f"{self.sort} must be a subclass of {bases}; got {cls!r}. {self.remedy}")
         name = getattr(cls, "name", None)
         if not (isinstance(name, str) and name.strip()):
-            raise ValueError(f"{cls.__qualname__}.name must be a text; it is missing. {self._remedy}")
-        if self._check is not None and not _is_own(cls):
-            self._check(cls)
-        taken = self._classes.get(name) or self._reserved.get(name)
+            raise ValueError(f"{cls.__qualname__}.name must be a text; it is missing. {self.remedy}")
+        if self.check is not None and not _is_own(cls):
+            self.check(cls)
+        taken = self._classes.get(name) or self.reserved.get(name)
         if taken is not None and _place(taken) != _place(cls):
             article = "an" if self.sort[0] in "aeiou" else "a"
             raise ValueError(

@@ -4,8 +4,6 @@ State tensors and arrays have shape (..., 9), float64: position m, velocity m/s,
 rad/s, in a right-handed world frame with z up.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 STATE_DIM: Final = 9

@@ -67,9 +67,10 @@ def calibrate_cameras(
     OUT_calibration.json and .png show how accurate the calibration is. Without --table only the lenses are written, for
     a later --intrinsics.
     """
-    from ballfg.files.destination import check_file
+    from ballfg.files.whole_file import check_file
     from ballfg.vision.calibration.boards import read_grey
     from ballfg.vision.calibration.table_points import read_table
+    from ballfg.vision.camera_file import read_cameras
 
     if out.suffix.lower() not in (*OURS, *THEIRS):
         raise ValueError(f"out must end in {', '.join((*OURS, *THEIRS))}; got {out}. Choose the format by the ending.")
@@ -82,7 +83,7 @@ def calibrate_cameras(
     shown = {name: read_grey(Path(paths[-1])) for name, paths in _grouped("view", view or ()).items()}
     marked = None if table is None else read_table(table)
     if intrinsics is not None:
-        lenses = _known(intrinsics)
+        lenses = {camera.name: camera for camera in read_cameras(intrinsics, posed=False)}
         _check_same(lenses, str(intrinsics), marked, table, shown)
         found = [_placed(camera, None, marked) for camera in lenses.values()]
     else:
@@ -102,12 +103,6 @@ def _grouped(option: str, words: Iterable[str]) -> dict[str, list[str]]:
             raise ValueError(f"--{option} must be NAME=PLACE, as left=calib/left; got {word!r}. Name the camera.")
         grouped.setdefault(name, []).append(place)
     return grouped
-
-
-def _known(path: Path) -> dict[str, Camera]:
-    from ballfg.vision.camera_file import read_cameras
-
-    return {camera.name: camera for camera in read_cameras(path, posed=False)}
 
 
 def _check_same(
@@ -162,11 +157,9 @@ def _placed(camera: Camera, lens: Intrinsics | None, marked: TableFile | None) -
 
 def _write(out: Path, found: list[Calibration], shown: Mapping[str, Image], marked: TableFile | None) -> None:
     from ballfg.files.whole_file import whole_file, write_text
-    from ballfg.vision.calibration.picture import calibration_picture
-    from ballfg.vision.calibration.report import content, summary
+    from ballfg.vision.calibration.report import calibration_picture, content, summary
     from ballfg.vision.calibration.table_points import TABLE_HEIGHT
-    from ballfg.vision.camera_file import write_cameras
-    from ballfg.vision.camera_storage import write_opencv
+    from ballfg.vision.camera_file import write_cameras, write_opencv
 
     figure = calibration_picture(found, shown, TABLE_HEIGHT if marked is None else marked.table_height)
     report, picture = (out.with_name(f"{out.stem}_calibration{ending}") for ending in (".json", ".png"))
@@ -176,8 +169,6 @@ def _write(out: Path, found: list[Calibration], shown: Mapping[str, Image], mark
         figure.savefig(temporary)
     write = write_cameras if out.suffix.lower() in OURS else write_opencv
     write(out, [one.camera for one in found], posed=marked is not None)
-    for one in found:
-        for line in summary(one):
-            print(line)
+    print(*(line for one in found for line in summary(one)), sep="\n")
     print(f"{out}: {len(found)} camera{'s' if len(found) > 1 else ''}{'' if marked else ', lenses only'}")
     print(f"how well they are known: {report}, {picture}")

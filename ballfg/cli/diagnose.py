@@ -9,16 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import CORES, Jobs, OwnEffects, check_dataset, open_inputs
+from ballfg.cli.inputs import CORES, DatasetFolder, Jobs, OwnEffects, open_inputs
 
 if TYPE_CHECKING:
     from ballfg.diagnosis.result import Diagnosis
 
 
 def diagnose(
-    dataset: Annotated[
-        Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.", callback=check_dataset)
-    ],
+    dataset: DatasetFolder,
     out: Annotated[Path, typer.Option(help="Folder of the report: new, empty or with an earlier report.")],
     model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal model of the ball.")] = None,
     effects: OwnEffects = None,
@@ -52,15 +50,14 @@ def diagnose(
         inputs.dataset, inputs.model, jobs=jobs, watch=lambda line: print(line, file=sys.stderr, flush=True)
     )
     write_report(diagnosis, out)
-    for line in _summary(diagnosis):
-        print(line)
+    print(*_summary(diagnosis), sep="\n")
     written = ", ".join(name for name in (PAGE, REPORT, MODEL) if (out / name).is_file())
     print(f"\nwrote {written} to {out}")
 
 
 def _summary(diagnosis: Diagnosis) -> Iterator[str]:
     """The diagnosis in lines: the sentence, effects, errors on the held-out half, the rest."""
-    from ballfg.diagnosis.report.wording import listed, probability
+    from ballfg.diagnosis.report.wording import fixed, listed, probability
 
     yield f"{diagnosis.verdict.value}: {diagnosis.sentence}"
     rows = [("effect", "kind", "by chance", "BIC", "cannot be told from", "coefficients")]
@@ -69,7 +66,15 @@ def _summary(diagnosis: Diagnosis) -> Iterator[str]:
         rows.append((f.name, f.kind, probability(f.p_value), f"{f.delta_bic:+.0f}", others, listed(f.parameters)))
     if diagnosis.findings:
         yield from ("", *_aligned(rows))
-    yield from ("", *_aligned(_errors(diagnosis)))
+    before, after = diagnosis.before, diagnosis.after
+    errors = [
+        (f"on {diagnosis.tracks_judged_on} judging tracks", "before", "after"),
+        ("prediction RMSE, mm", fixed(before.prediction_rmse_mm, 1), fixed(after.prediction_rmse_mm, 1)),
+        ("apex RMSE, mm", fixed(before.apex_rmse_mm, 1), fixed(after.apex_rmse_mm, 1)),
+        ("NIS (1 is right)", fixed(before.nis, 2), fixed(after.nis, 2)),
+        ("log likelihood", fixed(before.log_likelihood, 2), fixed(after.log_likelihood, 2)),
+    ]
+    yield from ("", *_aligned(errors))
     left = diagnosis.unexplained
     if left.where:
         yield from ("", f"left unexplained: {left.where}")
@@ -78,21 +83,6 @@ def _summary(diagnosis: Diagnosis) -> Iterator[str]:
         yield f"  {left.fallback.kind}: {left.fallback.description}; prediction RMSE {error:.1f} mm with it"
     if diagnosis.excluded:
         yield from ("", *(f"left out: {line}" for line in diagnosis.excluded))
-
-
-def _errors(diagnosis: Diagnosis) -> list[tuple[str, ...]]:
-    from ballfg.diagnosis.report.wording import fixed
-
-    before, after = diagnosis.before, diagnosis.after
-    rows: list[tuple[str, ...]] = [(f"on {diagnosis.tracks_judged_on} judging tracks", "before", "after")]
-    for name, was, now, decimals in (
-        ("prediction RMSE, mm", before.prediction_rmse_mm, after.prediction_rmse_mm, 1),
-        ("apex RMSE, mm", before.apex_rmse_mm, after.apex_rmse_mm, 1),
-        ("NIS (1 is right)", before.nis, after.nis, 2),
-        ("log likelihood", before.log_likelihood, after.log_likelihood, 2),
-    ):
-        rows.append((name, fixed(was, decimals), fixed(now, decimals)))
-    return rows
 
 
 def _aligned(rows: Sequence[Sequence[str]]) -> Iterator[str]:

@@ -1,7 +1,5 @@
 """What a user sees when something is wrong: one line on stderr and an exit status."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 

@@ -8,21 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import (
-    CORES,
-    Jobs,
-    MethodName,
-    ModelFile,
-    OutTable,
-    OwnEffects,
-    Source,
-    check_dataset,
-    check_out,
-    open_inputs,
-    open_sighted,
-    print_doubts,
-    status_lines,
-)
+from ballfg.cli import inputs
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
@@ -34,21 +20,23 @@ if TYPE_CHECKING:
 def estimate(
     dataset: Annotated[
         Path,
-        typer.Argument(help="Folder with dataset.yaml and tracks, or detections and cameras.", callback=check_dataset),
+        typer.Argument(
+            help="Folder with dataset.yaml and tracks, or detections and cameras.", callback=inputs.check_dataset
+        ),
     ],
-    out: OutTable,
-    method: MethodName = "smoother",
-    model: ModelFile = None,
+    out: inputs.OutTable,
+    method: inputs.MethodName = "smoother",
+    model: inputs.ModelFile = None,
     source: Annotated[
-        Source | None,
+        inputs.Source | None,
         typer.Option(
             "--from",
             help="Input: positions of tracks, or camera detections (detections.csv with cameras.yaml).",
             show_default="positions where there is a table of tracks",
         ),
     ] = None,
-    effects: OwnEffects = None,
-    jobs: Jobs = CORES,
+    effects: inputs.OwnEffects = None,
+    jobs: inputs.Jobs = inputs.CORES,
 ) -> None:
     """Position, velocity and spin with standard deviations, one row per stamp.
 
@@ -67,21 +55,19 @@ def estimate(
     doubts: list[str] = []
     rows = hits = 0
     with TableWriter(out) as table:
-        check_out(out, dataset)
-        positions = has_positions(dataset) if source is None else source is Source.POSITIONS
-        opened = open_inputs if positions else open_sighted
-        inputs = opened(dataset, model, effects)
-        count = len(inputs.dataset)
-        estimates = estimate_tracks(inputs.estimator(method), inputs.dataset, count, jobs)
+        inputs.check_out(out, dataset)
+        positions = has_positions(dataset) if source is None else source is inputs.Source.POSITIONS
+        open_dataset = inputs.open_inputs if positions else inputs.open_sighted
+        opened = open_dataset(dataset, model, effects)
+        count = len(opened.dataset)
+        estimates = estimate_tracks(opened.estimator(method), opened.dataset, count, jobs)
         for result in progress(estimates, count, "tracks estimated"):
             table.write(_columns(result))
             statuses[result.status.value] += 1
             doubts += [f"track {result.name!r}: {note}" for note in result.notes]
             rows, hits = rows + len(result.times), hits + len(result.hits)
     print(f"{out}: {rows} states of {count} tracks by {method}; {hits} hits found")
-    for line in status_lines(statuses):
-        print(line)
-    print_doubts(doubts)
+    inputs.print_outcome(statuses, doubts)
 
 
 def _columns(result: Estimate) -> dict[str, str | np.ndarray]:

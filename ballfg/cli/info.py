@@ -1,7 +1,5 @@
 """`ballfg info`: what is installed, on which machine, and what is registered."""
 
-from __future__ import annotations
-
 import importlib
 import os
 import platform

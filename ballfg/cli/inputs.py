@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
@@ -26,6 +26,18 @@ MOST_DOUBTS = 3
 """Tracks whose doubts are printed, before the others are counted."""
 
 
+def check_dataset(folder: Path) -> Path:
+    """Refuses a mistyped path at once: before torch and GTSAM are imported, which takes seconds."""
+    if not folder.is_dir():
+        from ballfg.tracks import read_dataset
+
+        read_dataset(folder)  # raises: there is no such folder
+    return folder
+
+
+DatasetFolder = Annotated[
+    Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.", callback=check_dataset)
+]
 OwnEffects = Annotated[
     list[Path] | None,
     typer.Option("--effects", help="Trusted Python file that defines custom effects; may be repeated."),
@@ -76,15 +88,6 @@ class Inputs(Generic[D]):
         return make_estimator(method, self.model, self.surfaces, self.settings)
 
 
-def check_dataset(folder: Path) -> Path:
-    """Refuses a mistyped path at once: before torch and GTSAM are imported, which takes seconds."""
-    if not folder.is_dir():
-        from ballfg.tracks import read_dataset
-
-        read_dataset(folder)  # raises: there is no such folder
-    return folder
-
-
 def know_effects(files: Iterable[Path] | None) -> None:
     """Registers the effects that files define, so that model files and options can name them."""
     from ballfg.dynamics import load_effects
@@ -120,8 +123,7 @@ def _inputs(data: Opened, model: Path | None) -> Inputs[Opened]:
     notes = list(data.notes)
     if model is None:
         notes += [note for note in (nominal_note(data.ball), *unused_model(data.path, data.ball)) if note]
-    for note in notes:
-        print(f"note: {note}", file=sys.stderr)
+    print_notes(notes)
     ball = nominal_model(data.ball) if model is None else load_model(model, radius=data.ball.radius)
     return Inputs(data, ball, dataset_surfaces(data), dataset_settings(data, ball))
 
@@ -135,15 +137,16 @@ def check_out(out: Path, dataset: Path) -> None:
         raise ValueError(f"out must not be a table of the dataset itself; got {out}. Choose another name.")
 
 
-def status_lines(statuses: Counter[str]) -> Iterator[str]:
-    """How many tracks ended how, most first."""
+def print_notes(notes: Iterable[str]) -> None:
+    """Prints what the user should know, on stderr."""
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)
+
+
+def print_outcome(statuses: Counter[str], doubts: list[str]) -> None:
+    """Prints how many tracks ended how, most first, and on stderr the first doubts about their frame."""
     for text, number in statuses.most_common():
-        yield f"  {number} track{'s' if number > 1 else ''}: {text}"
-
-
-def print_doubts(doubts: list[str]) -> None:
-    """Prints what does not look like a ball in the declared frame, on stderr; of many tracks the first few."""
-    for doubt in doubts[:MOST_DOUBTS]:
-        print(f"note: {doubt}", file=sys.stderr)
+        print(f"  {number} track{'s' if number > 1 else ''}: {text}")
+    print_notes(doubts[:MOST_DOUBTS])
     if len(doubts) > MOST_DOUBTS:
-        print(f"note: the same doubts about {len(doubts) - MOST_DOUBTS} more tracks", file=sys.stderr)
+        print_notes([f"the same doubts about {len(doubts) - MOST_DOUBTS} more tracks"])

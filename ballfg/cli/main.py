@@ -3,8 +3,6 @@
 Command files import what they need inside the command: `ballfg --help` must not wait for torch or GTSAM.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version

@@ -3,24 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import (
-    CORES,
-    Jobs,
-    MethodName,
-    ModelFile,
-    OutTable,
-    OwnEffects,
-    check_dataset,
-    check_out,
-    open_inputs,
-    print_doubts,
-    status_lines,
-)
+from ballfg.cli import inputs
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
@@ -30,15 +17,13 @@ if TYPE_CHECKING:
 
 
 def predict(
-    dataset: Annotated[
-        Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.", callback=check_dataset)
-    ],
+    dataset: inputs.DatasetFolder,
     observe: Annotated[float, typer.Option(help="Observed time from the start of each track, s.")],
-    out: OutTable,
-    method: MethodName = "smoother",
-    model: ModelFile = None,
-    effects: OwnEffects = None,
-    jobs: Jobs = CORES,
+    out: inputs.OutTable,
+    method: inputs.MethodName = "smoother",
+    model: inputs.ModelFile = None,
+    effects: inputs.OwnEffects = None,
+    jobs: inputs.Jobs = inputs.CORES,
 ) -> None:
     """Positions at every stamp after the observed part, with the standard deviation of a measurement there.
 
@@ -53,11 +38,11 @@ def predict(
     doubts: list[str] = []
     rows, squares, ended = 0, 0.0, 0
     with TableWriter(out) as table:
-        check_out(out, dataset)
+        inputs.check_out(out, dataset)
         check_observe(observe)
-        inputs = open_inputs(dataset, model, effects)
-        count = len(inputs.dataset)
-        predictions = predict_tracks(inputs.estimator(method), inputs.dataset, count, observe, jobs=jobs)
+        opened = inputs.open_inputs(dataset, model, effects)
+        count = len(opened.dataset)
+        predictions = predict_tracks(opened.estimator(method), opened.dataset, count, observe, jobs=jobs)
         for result in progress(predictions, count, "tracks predicted"):
             table.write(_columns(result))
             statuses[result.status.value] += 1
@@ -66,9 +51,7 @@ def predict(
             ended += len(result.times) == 0
             squares += float(((result.positions - result.measured) ** 2).sum())
     print(f"{out}: {rows} positions of {count} tracks, from the first {observe:g} s of each by {method}")
-    for line in status_lines(statuses):
-        print(line)
-    print_doubts(doubts)
+    inputs.print_outcome(statuses, doubts)
     if rows:
         print(f"  RMSE against what was measured there: {1e3 * (squares / rows) ** 0.5:.1f} mm over all stamps")
     if ended:

@@ -53,30 +53,23 @@ def simulate(
     The dataset holds the measurements, model.yaml the declared model, for the option --model of other commands.
     truth.yaml holds the undeclared effects and all settings, truth.csv the true state at every stamp.
     """
-    from ballfg.simulation import (
-        MeasurementNoise,
-        MotionNoise,
-        SimulationConfig,
-        parse_effects,
-        parse_settings,
-        write_simulation,
-    )
+    from ballfg import simulation
     from ballfg.simulation.writing import check_format
 
     file_format = check_format(format)
     know_effects(effects)
-    config = SimulationConfig(
+    config = simulation.SimulationConfig(
         tracks=tracks,
         rate=rate,
         seed=seed,
         ball=_ball(ball, model),
-        settings=parse_settings(settings) if settings else {},
-        noise=MeasurementNoise(noise, dropout, jitter, outliers, outlier_size, spin_noise),
-        process=MotionNoise(process_noise, spin_process_noise, contact_noise, contact_spin_noise),
-        undeclared=parse_effects(effect or ()),
+        settings=simulation.parse_settings(settings) if settings else {},
+        noise=simulation.MeasurementNoise(noise, dropout, jitter, outliers, outlier_size, spin_noise),
+        process=simulation.MotionNoise(process_noise, spin_process_noise, contact_noise, contact_spin_noise),
+        undeclared=simulation.parse_effects(effect or ()),
         spin_labels=spin_labels,
     )
-    write_simulation(out, config, file_format, force=force, watch=progress)
+    simulation.write_simulation(out, config, file_format, force=force, watch=progress)
     names = ", ".join(e.name for e in config.undeclared) or "none"
     typer.echo(f"wrote {tracks} tracks to {out}: tracks.{file_format}, labels.csv, dataset.yaml, model.yaml (declared)")
     typer.echo(f"wrote the truth to {out}: truth.{file_format}, truth.yaml (undeclared effects: {names})")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import enum
 import os
-import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 
+from ballfg.cli.inputs import print_notes
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
@@ -66,7 +66,9 @@ def track(
     The dataset holds tracks.csv, detections.csv (all candidates) and cameras.yaml.
     overlay.mp4 shows the views with what was found, contact_sheet.png each track.
     """
-    _quiet_codecs()
+    # FFmpeg and OpenCV print what they think of a file, unless they are told not to before OpenCV is loaded.
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     from ballfg.files.whole_folder import staging
     from ballfg.simulation.balls import ball_kind
     from ballfg.tracks import DatasetInfo
@@ -91,10 +93,9 @@ def track(
         tracking, streams = _from_videos(recordings, rig, stamps or (), colour, detector, jobs, without or ())
     if time_offsets and tracking.balls:
         tracking = _on_one_clock(tracking, kind.model, replace(kind.surfaces, table_height=height))
-    for line in blind_cameras(tracking):
-        print(f"note: {line}", file=sys.stderr)
+    print_notes(blind_cameras(tracking))
     if (doubt := disagreement(tracking)) is not None:
-        print(f"note: {doubt}", file=sys.stderr)
+        print_notes([doubt])
     info = replace(info, rate=tracking.rate)
     written = write_tracking(
         out, tracking, info, table=kind.surfaces.extent, streams=streams, overlay=overlay, watch=progress
@@ -103,8 +104,7 @@ def track(
         raise ValueError(f"{no_ball(tracking)} {out} holds an empty dataset; look at {', '.join(written[4:])} there.")
     points = sum(len(ball.times) for ball in tracking.balls)
     print(f"{out}: {len(tracking.balls)} tracks of {points} points; wrote {', '.join(written)}")
-    for line in summary(tracking):
-        print(line)
+    print(*summary(tracking), sep="\n")
 
 
 def _refuse(**options: object) -> None:
@@ -114,12 +114,6 @@ def _refuse(**options: object) -> None:
             raise ValueError(
                 f"--{name} must not be given with detections: it is about videos; got {value}. Leave it out."
             )
-
-
-def _quiet_codecs() -> None:
-    """FFmpeg and OpenCV print what they think of a file, unless they are told not to before OpenCV is loaded."""
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 
 def _from_videos(
@@ -132,9 +126,8 @@ def _from_videos(
     without: Sequence[str],
 ) -> tuple[Tracking, Streams]:
     """What was found, and what gives each video's frames once more."""
-    from ballfg.vision.detection.detect import learn_detector
+    from ballfg.vision.detection.detect import learn_detector, load_detector
     from ballfg.vision.detection.detector import DetectorSettings
-    from ballfg.vision.detection.detector_file import load_detector
     from ballfg.vision.detection.video import open_video
     from ballfg.vision.tracking.pipeline import track_videos
     from ballfg.vision.tracking.recordings import match_videos, stamp_files
@@ -144,14 +137,7 @@ def _from_videos(
         raise ValueError("--colour must not be given with --detector: it is about ballfg's own. Leave one of them out.")
     settings = DetectorSettings(colour=cast("BallColour | None", colour))
     make = partial(learn_detector, settings=settings) if detector is None else load_detector(detector)
-    tracking = track_videos(
-        videos,
-        rig,
-        make,
-        stamps=files,
-        jobs=jobs or len(rig),
-        watch=progress,
-    )
+    tracking = track_videos(videos, rig, make, stamps=files, jobs=jobs or len(rig), watch=progress)
     return tracking, [open_video(path, files.get(name)).frames for name, path in videos.items()]
 
 
@@ -165,11 +151,11 @@ def _on_one_clock(tracking: Tracking, model: AnalyticModel, surfaces: Surfaces) 
     tracks = [sighted_track(name, ball.sightings, tracking.cameras) for name, ball in pairs]
     found = estimate_time_offsets(tracks, model, surfaces, Settings.for_measured(model))
     if not found.settled:
-        print("note: the time offsets did not settle and are left as they were", file=sys.stderr)
+        print_notes(["the time offsets did not settle and are left as they were"])
         return tracking
     corrected = track_detections(tracking.detections, found.cameras)
     if disagreement(corrected) is not None:
-        print("note: with time offsets the cameras still disagree; they are left as they were", file=sys.stderr)
+        print_notes(["with time offsets the cameras still disagree; they are left as they were"])
         return tracking
     for camera, sigma in list(zip(found.cameras, found.sigmas.tolist(), strict=True))[1:]:
         late = f"{1e3 * camera.time_offset:.3f} ± {1e3 * sigma:.3f} ms"
@@ -182,6 +168,5 @@ def _from_table(path: Path, rig: Sequence[Camera], without: Sequence[str]) -> Tr
     from ballfg.vision.tracking.pipeline import track_detections
 
     detections, notes = read_detections(path, rig, without)
-    for note in notes:
-        print(f"note: {note}", file=sys.stderr)
+    print_notes(notes)
     return track_detections(detections, rig)

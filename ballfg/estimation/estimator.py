@@ -15,8 +15,7 @@ from ballfg.estimation.settings import Settings
 from ballfg.factors.batch import FactorBatch
 from ballfg.prediction.state import World
 from ballfg.tracks import Ball, Track
-from ballfg.tracks.checks import check_scale
-from ballfg.tracks.doubts import doubts_about
+from ballfg.tracks.checks import check_scale, doubts_about
 
 LEAST_CHECKED = 3
 """Samples from which a track's scale can be told."""

@@ -1,11 +1,10 @@
 """Running a user's Python file: an effect or a detector of one's own."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from traceback import extract_tb
 from types import ModuleType
 
 
@@ -43,11 +42,8 @@ def blamed(path: Path, doing: str) -> Iterator[None]:
 
 def _where(error: BaseException, path: Path) -> str:
     """What happened, and in which line of the file."""
-    line = error.lineno if isinstance(error, SyntaxError) and error.filename == str(path) else None
-    trace = error.__traceback__
-    while trace is not None:
-        if trace.tb_frame.f_code.co_filename == str(path):
-            line = trace.tb_lineno
-        trace = trace.tb_next
+    lines = [frame.lineno for frame in extract_tb(error.__traceback__) if frame.filename == str(path)]
+    if not lines and isinstance(error, SyntaxError) and error.filename == str(path):
+        lines = [error.lineno]
     message = error.msg if isinstance(error, SyntaxError) else str(error)
-    return f"{'' if line is None else f'line {line}: '}{type(error).__name__}: {message}"
+    return f"{f'line {lines[-1]}: ' if lines else ''}{type(error).__name__}: {message}"

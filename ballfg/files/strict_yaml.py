@@ -1,7 +1,5 @@
 """Reading YAML files: safe loader only, no key twice."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,14 +1,10 @@
 """Writing a file as a whole: it has its name only when it is complete."""
 
-from __future__ import annotations
-
 import os
 import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-
-from ballfg.files.destination import check_file
 
 
 @contextmanager
@@ -17,7 +13,6 @@ def whole_file(path: Path, argument: str = "out") -> Iterator[Path]:
 
     After an exception or Ctrl-C what was there before is untouched.
 
-    Args: path: of the file.  argument: its name in a message.
     Raises: FileNotFoundError: the folder of the path does not exist. ValueError: the path is a folder.
     """
     check_file(path, argument)
@@ -43,3 +38,19 @@ def flush(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def check_file(path: Path, argument: str = "out") -> None:
+    """Refuses a path to which no file can be written.
+
+    Raises: FileNotFoundError: its folder does not exist. ValueError: it is a folder.
+    """
+    check_parent(path, argument)
+    if path.is_dir():
+        raise ValueError(f"{argument} must be a file; {path} is a folder. Give the name of a file in it.")
+
+
+def check_parent(path: Path, argument: str) -> None:
+    """Refuses a path in a folder that does not exist. Raises: FileNotFoundError."""
+    if not path.absolute().parent.is_dir():
+        raise FileNotFoundError(f"{argument} must be in an existing folder; {path.parent} is none. Create it first.")

@@ -1,17 +1,14 @@
 """Writing a folder as a whole: its files have their names only when all of them are complete."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import uuid
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from ballfg.files.destination import check_folder
-from ballfg.files.whole_file import flush
+from ballfg.files.whole_file import check_parent, flush
 
 
 @contextmanager
@@ -56,6 +53,39 @@ def staging(folder: Path, argument: str = "out") -> Iterator[Path]:
         yield stage
     finally:
         shutil.rmtree(stage, ignore_errors=True)
+
+
+def check_folder(folder: Path, argument: str = "out") -> None:
+    """Refuses a path at which no folder can be made or written to.
+
+    Raises: FileNotFoundError: its parent does not exist. ValueError: it is a file.
+    """
+    check_parent(folder, argument)
+    if folder.exists() and not folder.is_dir():
+        raise ValueError(f"{argument} must be a folder; {folder} is a file. Choose another name.")
+
+
+def check_replaceable(
+    folder: Path, *, mark: str, what: str, only: Collection[str] | None = None, force: bool = True
+) -> None:
+    """Refuses a folder that holds something that must not be lost; a new or an empty one never does.
+
+    Args:
+        folder: to write to.
+        mark: name of the file that tells an earlier result.
+        what: such a result is called in a message.
+        only: all names that an earlier result can have; None: other files may lie beside it.
+        force: an earlier result may be replaced.
+    Raises: ValueError: other content, or an earlier result and no `force`; else as `check_folder`.
+    """
+    check_folder(folder)
+    present = {entry.name for entry in folder.iterdir()} if folder.exists() else set()
+    if not present:
+        return
+    if not (folder / mark).is_file() or (only is not None and not present <= set(only)):
+        raise ValueError(f"out must be new, empty or hold {what}; {folder} holds other files. Choose another name.")
+    if not force:
+        raise ValueError(f"out must be new or empty; {folder} holds {what}. Replace it with --force.")
 
 
 @contextmanager

@@ -11,8 +11,7 @@ from typing import Any, Final, Literal, cast
 import yaml
 
 from ballfg.dynamics import Effect, save_model
-from ballfg.files.destination import check_replaceable
-from ballfg.files.whole_folder import whole_folder
+from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
 from ballfg.simulation.balls import describe
 from ballfg.simulation.config import SimulationConfig

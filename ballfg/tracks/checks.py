@@ -1,14 +1,16 @@
-"""The rules that a whole trajectory must keep, and the two repairs that are made openly.
+"""The rules that a whole trajectory must keep, the two repairs that are made openly, and doubts about its frame.
 
 Repairs: rows out of time order are sorted, exact repeats are dropped. Two different rows at one stamp that lie
 close together are one measurement with a stamp that is off (rounded or late): their mean takes their place.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
 import numpy as np
 
+from ballfg.state import STANDARD_GRAVITY, Z
 from ballfg.tracks.grouping import RowGroup
 from ballfg.tracks.track import FloatArray
 
@@ -35,6 +37,16 @@ MIN_STEP = 1e-6
 
 MAX_RATE_RATIO = 100.0
 """A median time step that misses the declared rate by more than this factor is refused."""
+
+BASELINE: Final = 0.05
+"""s to each side over which an acceleration is read off: 3 mm of noise make 3 m/s^2 of one, 0.5 of a track's median."""
+FALLS: Final = (0.4, 1.9)
+"""Multiples of gravity between which a flying ball's vertical acceleration lies; strong topspin doubles it."""
+LEAST_REVERSAL: Final = 0.8
+"""m/s. A ball that falls and rises at least so fast, from one sample to a few later, has bounced."""
+NEAR_SURFACE: Final = 0.08
+"""m. Bounces farther from every declared surface are doubtful; a fast ball falls so far between two samples."""
+AXES: Final = ("x", "y", "z")
 
 _NAMED = 3  # trajectories that a note names before it only counts
 
@@ -84,11 +96,7 @@ def check_step(label: str, stamps: FloatArray) -> None:
 def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> FloatArray:
     """The samples of one trajectory, one for each stamp, in time order.
 
-    Args:
-        group: its rows; finite.
-        where: tells the place of rows of the file, for an error.
-        findings: what is repaired is added to them.
-    Returns: (n, 4) or (n, 7), columns as in Block.
+    Returns: (n, 4) or (n, 7), columns as in Block; what is repaired is added to the findings.
     Raises: ValueError: fewer than two stamps, or two rows at one stamp more than MERGE_DISTANCE apart.
     """
     findings = Findings() if findings is None else findings
@@ -135,12 +143,7 @@ def check_scale(
 ) -> None:
     """Refuses a track whose numbers cannot be metres and seconds.
 
-    Args:
-        label: what the message calls the track.
-        times: (n,) s, n >= 2, strictly increasing.
-        positions: (n, 3) m.
-        sigmas: (n, 3) m, or None.
-        rate: the dataset's declared rate, Hz, if any.
+    Args: times: (n,) s, n >= 2, increasing.  positions: (n, 3) m.  sigmas: (n, 3) m.  rate: as declared, Hz.
     Raises: ValueError: naming the likely unit.
     """
     steps = np.diff(times)
@@ -177,6 +180,19 @@ def check_scale(
             f"{label}: sigmas must be in m, their median at most {MAX_MEDIAN_SIGMA:g}; got {np.median(sigmas):.4g}. "
             "The unit is probably mm: divide by 1000."
         )
+
+
+def doubts_about(times: FloatArray, positions: FloatArray, surfaces: Sequence[float], radius: float) -> tuple[str, ...]:
+    """What does not look like a ball that falls along -z and bounces on the declared surfaces.
+
+    Args: times: (n,) s.  positions: (n, 3) m.  surfaces: heights, m.  radius: m, of the ball.
+    Returns: one sentence for each doubt.
+    """
+    step = float(np.median(np.diff(times))) if len(times) > 1 else np.inf
+    reach = max(round(BASELINE / step), 1) if np.isfinite(step) else 1
+    if len(times) < 4 * reach:
+        return ()
+    return (*_other_axis(times, positions, reach), *_other_surface(times, positions, reach, surfaces, radius))
 
 
 def _one_per_stamp(group: RowGroup, where: Where, findings: Findings) -> FloatArray:
@@ -220,3 +236,39 @@ def _count(number: int, one: str, many: str | None = None) -> str:
 def _some(names: list[str]) -> str:
     more = len(names) - _NAMED
     return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def _other_axis(times: FloatArray, positions: FloatArray, reach: int) -> tuple[str, ...]:
+    before, middle, after = positions[: -2 * reach], positions[reach:-reach], positions[2 * reach :]
+    span = (times[2 * reach :] - times[: -2 * reach]) / 2
+    acceleration = np.median((after - 2 * middle + before) / span[:, None] ** 2, axis=0)
+    low, high = FALLS[0] * STANDARD_GRAVITY, FALLS[1] * STANDARD_GRAVITY
+    if abs(acceleration[Z]) >= low / 2:
+        if -high <= acceleration[Z] < 0.0 or abs(acceleration[Z]) > high:
+            return ()
+        return ("the ball rises faster and faster along z: z seems to point down. Turn the sign of z.",)
+    other = int(np.abs(acceleration[:2]).argmax())
+    if not low <= abs(acceleration[other]) <= high:
+        return ()
+    return (f"the ball falls along {AXES[other]}, not along z: exchange the axes so that z points up.",)
+
+
+def _other_surface(
+    times: FloatArray, positions: FloatArray, reach: int, surfaces: Sequence[float], radius: float
+) -> tuple[str, ...]:
+    z = positions[:, Z]
+    inner = np.arange(reach, len(z) - reach)
+    fall = (z[inner] - z[inner - reach]) / (times[inner] - times[inner - reach])
+    rise = (z[inner + reach] - z[inner]) / (times[inner + reach] - times[inner])
+    lowest = np.array([z[i] == z[i - reach : i + reach + 1].min() for i in inner])
+    bounces = z[inner[lowest & (fall < -LEAST_REVERSAL) & (rise > LEAST_REVERSAL)]] - radius
+    if not len(bounces) or not len(surfaces):
+        return ()
+    gaps = np.abs(bounces[:, None] - np.array(surfaces)).min(axis=1)
+    if np.median(gaps) <= NEAR_SURFACE:
+        return ()
+    heights = " and ".join(f"{height:g}" for height in surfaces)
+    return (
+        f"the ball bounces at z = {np.median(bounces):.2f} m, where no surface is declared (they are at {heights} m). "
+        "Correct the table's height.",
+    )

@@ -39,11 +39,8 @@ def read_header(path: Path) -> list[str]:
         first = re.split(rb"[\r\n]", file.read(_HEADER_LIMIT), maxsplit=1)[0]
     if not first.strip():
         raise ValueError(f"{path}: must begin with a line of column names; got an empty file or line. Add the header.")
-    try:
-        text = first.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise _not_utf8(path, 1) from None
-    if "\0" in text:
+    text = first.decode("utf-8-sig", errors="surrogateescape")
+    if "\0" in text or _has_surrogate(text):
         raise _not_utf8(path, 1)
     return next(csv.reader([text]))
 
@@ -92,7 +89,7 @@ def records(path: Path) -> Iterator[tuple[int, list[str]]]:
             while True:
                 line = reader.line_num + 1
                 cells = next(reader)
-                if any(not cell.isascii() and _has_surrogate(cell) for cell in cells):
+                if any(map(_has_surrogate, cells)):
                     raise _not_utf8(path, line)
                 if cells:
                     yield line, cells
@@ -119,16 +116,14 @@ def lines_of_rows(path: Path, rows: Sequence[int]) -> list[int]:
 def explain(path: Path, numeric: Sequence[str], reason: str) -> ValueError:
     """The error that names the first bad row of a file that the fast reader refused.
 
-    Args:
-        path: the file.
-        numeric: the columns that must hold numbers.
+    Args: path: the file.  numeric: the columns that must hold numbers.
         reason: the fast reader's own words, used if the second look finds nothing.
     """
     header = read_header(path)
     line = 1
     try:
         for line, cells in records(path):
-            problem = _row_problem(header, numeric, cells)
+            problem = row_problem(header, numeric, cells)
             if problem:
                 return ValueError(f"{path}, line {line}{problem}")
     except ValueError as error:
@@ -143,7 +138,8 @@ def no_rows(path: Path) -> ValueError:
     return ValueError(f"{path}: must hold tracks; got a header without rows. Add the measurements.")
 
 
-def _row_problem(header: list[str], numeric: Sequence[str], cells: list[str]) -> str | None:
+def row_problem(header: list[str], numeric: Sequence[str], cells: list[str]) -> str | None:
+    """The end of a message about a row with too few or too many cells, or without a number where one must be."""
     if len(cells) != len(header):
         return (
             f": must have {len(header)} cells, one for each column of the header; got {len(cells)}. "
@@ -158,7 +154,7 @@ def _row_problem(header: list[str], numeric: Sequence[str], cells: list[str]) ->
 
 
 def _has_surrogate(cell: str) -> bool:
-    return any("\udc80" <= letter <= "\udcff" for letter in cell)
+    return not cell.isascii() and any("\udc80" <= letter <= "\udcff" for letter in cell)
 
 
 def _not_utf8(path: Path, line: int) -> ValueError:

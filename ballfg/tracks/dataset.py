@@ -14,7 +14,7 @@ from ballfg.tracks.grouping import Index, RowGroup, groups, scan
 from ballfg.tracks.info import INFO_FILE, Ball, DatasetInfo, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
 from ballfg.tracks.rows import CsvRows, ParquetRows, RowSource
-from ballfg.tracks.track import FloatArray, Label, Track
+from ballfg.tracks.track import Track
 
 TRACK_FILES = ("tracks.csv", "tracks.parquet")
 
@@ -64,7 +64,10 @@ class Dataset(TrackFolder):
 
     def __iter__(self) -> Iterator[Track]:
         for group in groups(self._source, self._index):
-            track = _track(group.name, tidy(group, self._source.where), self._labels.of(group.name))
+            values = tidy(group, self._source.where)
+            sigmas = values[:, 4:] if self.has_sigmas else None
+            labels = self._labels.of(group.name)
+            track = Track(values[:, 0], values[:, 1:4], sigmas, labels, name=group.name)
             yield replace(track if self._attached is None else self._attached(track), dataset=self)
 
     def __repr__(self) -> str:
@@ -179,8 +182,3 @@ def _check_group(source: RowSource, group: RowGroup, info: DatasetInfo, findings
         check_scale(f"trajectory {group.name!r}", values[:, 0], values[:, 1:4], sigmas, info.rate)
     except ValueError as error:
         raise ValueError(f"{source.where(int(group.rows[0]))}: {error}") from None
-
-
-def _track(name: str, values: FloatArray, labels: dict[str, Label]) -> Track:
-    sigmas = values[:, 4:] if values.shape[1] > 4 else None
-    return Track(values[:, 0], values[:, 1:4], sigmas, labels, name=name)

@@ -9,6 +9,7 @@ each trajectory. Either way, memory grows with the longest trajectory, not with 
 import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import groupby, pairwise
 from typing import IO
 
 import numpy as np
@@ -70,9 +71,8 @@ def scan(source: RowSource) -> Index:
         known = len(counts)
         codes = _global_codes(block, codes_of)
         counts.extend([0] * (len(codes_of) - known))
-        starts = run_starts(codes)
         # A run may only continue the last trajectory or begin the next new one.
-        for start, end in zip(starts, [*starts[1:], len(codes)], strict=True):
+        for start, end in _runs(codes):
             code = int(codes[start])
             contiguous &= code == last or counts[code] == 0
             counts[code] += end - start
@@ -112,25 +112,14 @@ def check_cells(source: RowSource, block: Block) -> None:
     bad[:, 4:] |= (sigmas < MIN_SIGMA) | (sigmas > MAX_SIGMA)
     if bad.any():
         row, column = (int(i) for i in np.argwhere(bad)[0])
+        value = float(block.values[row, column])
+        rule = "finite" if not np.isfinite(value) else f"at most {LARGEST:g} in size"
+        remedy = "Delete the line: a missing sample needs no row."
+        if column >= 4:
+            rule = f"a standard deviation of {MIN_SIGMA:g} to {MAX_SIGMA:g} m"
+            remedy = "Correct it, or drop the sigma columns."
         place = f"{source.where(block.start + row)}, column {source.columns[column]!r}"
-        raise ValueError(f"{place}: {_cell_problem(column, float(block.values[row, column]))}")
-
-
-def run_starts(codes: NDArray[np.int32]) -> list[int]:
-    """Where each run of equal codes begins; empty for no codes."""
-    if len(codes) == 0:
-        return []
-    return [0, *(np.flatnonzero(np.diff(codes)) + 1).tolist()]
-
-
-def _cell_problem(column: int, value: float) -> str:
-    if column >= 4:
-        return (
-            f"must be a standard deviation of {MIN_SIGMA:g} to {MAX_SIGMA:g} m; got {value:g}. "
-            "Correct it, or drop the sigma columns."
-        )
-    rule = "finite" if not np.isfinite(value) else f"at most {LARGEST:g} in size"
-    return f"must be {rule}; got {value:g}. Delete the line: a missing sample needs no row."
+        raise ValueError(f"{place}: must be {rule}; got {value:g}. {remedy}")
 
 
 def _global_codes(block: Block, codes_of: dict[str, int]) -> NDArray[np.int32]:
@@ -139,25 +128,25 @@ def _global_codes(block: Block, codes_of: dict[str, int]) -> NDArray[np.int32]:
     return np.array(numbers, dtype=np.int32)[block.codes]
 
 
+def _runs(codes: NDArray[np.int32]) -> list[tuple[int, int]]:
+    """Start and end of each run of equal codes."""
+    edges = [0, *(np.flatnonzero(np.diff(codes)) + 1).tolist(), len(codes)]
+    return list(pairwise(edges)) if len(codes) else []
+
+
 def _stream(source: RowSource) -> Iterator[RowGroup]:
-    name: str | None = None
-    pieces: list[tuple[int, FloatArray]] = []
-    for block in source.blocks():
-        starts = run_starts(block.codes)
-        for start, end in zip(starts, [*starts[1:], len(block.codes)], strict=True):
-            run_name = block.names[block.codes[start]]
-            if run_name != name:
-                if name is not None:
-                    yield _joined(name, pieces)
-                name, pieces = run_name, []
-            pieces.append((block.start + start, block.values[start:end]))
-    if name is not None:
-        yield _joined(name, pieces)
+    pieces = (
+        RowGroup(str(block.names[block.codes[start]]), np.arange(start, end) + block.start, block.values[start:end])
+        for block in source.blocks()
+        for start, end in _runs(block.codes)
+    )
+    for name, run in groupby(pieces, key=lambda piece: piece.name):
+        yield _joined(name, list(run))
 
 
-def _joined(name: str, pieces: list[tuple[int, FloatArray]]) -> RowGroup:
-    rows = [np.arange(start, start + len(values), dtype=np.int64) for start, values in pieces]
-    return RowGroup(name, np.concatenate(rows), np.concatenate([values for _, values in pieces]))
+def _joined(name: str, pieces: list[RowGroup]) -> RowGroup:
+    rows = np.concatenate([piece.rows for piece in pieces])
+    return RowGroup(name, rows, np.concatenate([piece.values for piece in pieces]))
 
 
 def _regroup(source: RowSource, index: Index) -> Iterator[RowGroup]:
@@ -180,10 +169,8 @@ def _write_ordered(file: IO[bytes], source: RowSource, index: Index, width: int)
         codes = _global_codes(block, codes_of)
         order = np.argsort(codes, kind="stable")
         codes = codes[order]
-        numbers = (block.start + order).astype(np.float64)
-        table = np.column_stack([numbers, block.values[order]])
-        starts = run_starts(codes)
-        for start, end in zip(starts, [*starts[1:], len(codes)], strict=True):
+        table = np.column_stack([(block.start + order).astype(np.float64), block.values[order]])
+        for start, end in _runs(codes):
             code = int(codes[start])
             file.seek(position[code] * width * 8)
             file.write(table[start:end].tobytes())

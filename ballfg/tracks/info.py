@@ -153,13 +153,9 @@ def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:
         info = DatasetInfo.from_mapping(content)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
-    unknown = [key for key in content if key not in _KNOWN]
     absent = [key for key in _OPTIONAL if key not in content]
-    hints = [did_you_mean(key, absent) for key in unknown]
-    return info, [
-        f"{INFO_FILE}: field {key!r} ignored{'.' + hint if hint else ''}"
-        for key, hint in zip(unknown, hints, strict=True)
-    ]
+    hints = {key: did_you_mean(key, absent) for key in content if key not in _KNOWN}
+    return info, [f"{INFO_FILE}: field {key!r} ignored{'.' + hint if hint else ''}" for key, hint in hints.items()]
 
 
 def write_info(path: Path, info: DatasetInfo) -> None:

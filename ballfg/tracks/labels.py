@@ -44,9 +44,6 @@ class LabelTable:
 def read_labels(path: Path, trajectories: Collection[str]) -> LabelTable:
     """Reads a `labels.csv`.
 
-    Args:
-        path: the file.
-        trajectories: the names of the tracks.
     Raises: ValueError: a missing or repeated column, a ragged line, a row without a track, a second row for a
         track, or a cell that must be a number and is not; the message names line and column.
     """
@@ -73,11 +70,9 @@ def _read_rows(
     lines: list[int] = []
     cells: list[list[str]] = []
     for line, row in csv_files.records(path):
-        if len(row) != len(header):
-            raise ValueError(
-                f"{path}, line {line}: must have {len(header)} cells, one for each column of the header; "
-                f"got {len(row)}. Complete the line or delete it."
-            )
+        problem = csv_files.row_problem(header, (), row)
+        if problem:
+            raise ValueError(f"{path}, line {line}{problem}")
         name = row[key]
         if name in rows:
             raise ValueError(

@@ -42,13 +42,23 @@ class Block:
 
 
 class RowSource(ABC):
-    """A track table that can be read again and again, in blocks."""
+    """A track table that can be read again and again, in blocks.
+
+    Raises: ValueError: a missing or repeated column.
+    """
 
     def __init__(self, path: Path, header: Sequence[str]) -> None:
+        csv_files.check_header(path, header, (KEY, *VALUES), (KEY, *VALUES, *SIGMAS))
+        present = [name for name in SIGMAS if name in header]
+        if present and len(present) < len(SIGMAS):
+            absent = ", ".join(name for name in SIGMAS if name not in present)
+            raise ValueError(
+                f"{path}: sigma columns must be all three or none; {absent} missing, got {', '.join(present)}. "
+                "Add the missing ones or drop the others."
+            )
         self.path = path
-        self.columns = check_columns(path, header)
-        used = {KEY, *self.columns}
-        self.ignored = [name for name in header if name not in used]
+        self.columns = [*VALUES, *present]
+        self.ignored = [name for name in header if name not in (KEY, *self.columns)]
 
     @abstractmethod
     def blocks(self) -> Iterator[Block]:
@@ -83,8 +93,7 @@ class CsvRows(RowSource):
 
     def where(self, *rows: int) -> str:
         """The file and the line numbers of these rows, counted from 1 with the header; see RowSource."""
-        lines = csv_files.lines_of_rows(self.path, rows)
-        return f"{self.path}, {_counted('line', lines)}"
+        return f"{self.path}, {_counted('line', csv_files.lines_of_rows(self.path, rows))}"
 
 
 class ParquetRows(RowSource):
@@ -121,23 +130,6 @@ class ParquetRows(RowSource):
     def where(self, *rows: int) -> str:
         """The file and the numbers of these rows, counted from 1; see RowSource."""
         return f"{self.path}, {_counted('row', [row + 1 for row in rows])}"
-
-
-def check_columns(path: Path, header: Sequence[str]) -> list[str]:
-    """The numeric columns to read, in a fixed order, once the header is found to be right.
-
-    Returns: t, x, y, z and, if the file has them, sigma_x, sigma_y, sigma_z.
-    Raises: ValueError: a missing or repeated column.
-    """
-    csv_files.check_header(path, header, (KEY, *VALUES), (KEY, *VALUES, *SIGMAS))
-    present = [name for name in SIGMAS if name in header]
-    if present and len(present) < len(SIGMAS):
-        absent = ", ".join(name for name in SIGMAS if name not in present)
-        raise ValueError(
-            f"{path}: sigma columns must be all three or none; {absent} missing, got {', '.join(present)}. "
-            "Add the missing ones or drop the others."
-        )
-    return [*VALUES, *present]
 
 
 def _block(batch: pa.RecordBatch, start: int) -> Block:

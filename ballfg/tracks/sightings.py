@@ -57,11 +57,16 @@ class Sightings:
                 "Number the cameras in the order of their names."
             )
         object.__setattr__(self, "camera", camera.astype(np.int64))
-        object.__setattr__(self, "times", times)
-        object.__setattr__(self, "pixels", _floats("pixels", self.pixels, (m, 2)))
-        object.__setattr__(self, "covariances", _floats("covariances", self.covariances, (m, 2, 2)))
+        for field, shape in {"times": (m,), "pixels": (m, 2), "covariances": (m, 2, 2)}.items():
+            object.__setattr__(self, field, _floats(field, getattr(self, field), shape))
         self._check_stamps()
-        _check_covariances(self.covariances)
+        good = are_covariances(self.covariances)
+        if not good.all():
+            row = int(np.argmin(good))
+            raise ValueError(
+                f"covariances must be symmetric and positive definite; covariances[{row}]="
+                f"{self.covariances[row].tolist()}. Give the variance of u and v in px^2."
+            )
 
     def _check_stamps(self) -> None:
         for number, name in enumerate(self.cameras):
@@ -100,13 +105,3 @@ def are_covariances(matrices: Array) -> NDArray[np.bool_]:
     a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
     symmetric = np.abs(matrices[:, 1, 0] - b) <= ROUNDING * (a + c)
     return np.asarray(symmetric & (a > 0.0) & (c > 0.0) & (a * c > b * b))
-
-
-def _check_covariances(covariances: Array) -> None:
-    good = are_covariances(covariances)
-    if not good.all():
-        row = int(np.argmin(good))
-        raise ValueError(
-            f"covariances must be symmetric and positive definite; covariances[{row}]={covariances[row].tolist()}. "
-            "Give the variance of u and v in px^2."
-        )

@@ -3,11 +3,10 @@
 import csv
 import io
 import os
-from collections.abc import Mapping
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import pyarrow as pa
@@ -16,8 +15,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 from numpy.typing import ArrayLike
 
-from ballfg.files.destination import check_file
-from ballfg.files.whole_file import whole_file
+from ballfg.files.whole_file import check_file, whole_file
 
 ENDINGS = (".csv", ".parquet")
 _BLOCK_ROWS = 1 << 16  # rows held back before they are written; also the row group of a Parquet file
@@ -44,7 +42,6 @@ class TableWriter:
                 f"path must end in {' or '.join(ENDINGS)}; got {str(path)!r}. Choose the format by the ending."
             )
         check_file(self.path, "path")
-        self._stack = ExitStack()
         self._file: BinaryIO | None = None
         self._parquet: pq.ParquetWriter | None = None
         self._has_header = False
@@ -53,25 +50,34 @@ class TableWriter:
         self._pending_rows = 0
 
     def __enter__(self) -> "TableWriter":
-        with ExitStack() as stack:
-            temporary = stack.enter_context(whole_file(self.path, "path"))
-            self._file = stack.enter_context(temporary.open("xb"))
-            stack.push(self._finish)
-            self._stack = stack.pop_all()
-        return self
+        self._context = self._opened()
+        return self._context.__enter__()
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Writes the rest and closes the file, which then takes its name; after an exception it is removed."""
-        self._stack.__exit__(kind, error, trace)
+    def __exit__(self, *exception: Any) -> None:
+        self._context.__exit__(*exception)
+
+    @contextmanager
+    def _opened(self) -> Iterator["TableWriter"]:
+        """The file takes its name when the rest is written; after an exception it is removed."""
+        with whole_file(self.path, "path") as temporary, temporary.open("xb") as self._file:
+            try:
+                yield self
+                if self._schema is None:
+                    raise ValueError(
+                        f"{self.path}: a table must have columns; nothing was written. Write at least one block."
+                    )
+                self._flush()
+            finally:
+                parquet, self._parquet, self._file, self._pending = self._parquet, None, None, []
+                if parquet is not None:
+                    parquet.close()
 
     def write(self, columns: Mapping[str, ArrayLike]) -> None:
         """Appends a block of rows.
 
         Args:
-            columns: name -> (n,) numbers or text, the same n for all; a single number or text is repeated. The
-                first block fixes the names, their order and their types.
+            columns: name -> (n,) numbers, in any unit, or text, the same n for all; a single number or text is
+                repeated. The first block fixes the names, their order and their types.
         Raises: ValueError: columns of different lengths, other names than in the first block, or values of another
             type. RuntimeError: outside a `with` block.
         """
@@ -90,37 +96,21 @@ class TableWriter:
         assert self._file is not None
         table = pa.Table.from_batches(self._pending, self._schema).combine_chunks()
         if self.path.suffix.lower() == ".csv":
-            self._write_csv(self._file, table)
+            # The library quotes the header and, where a text needs quotes, all texts; simple readers expect neither.
+            if not self._has_header:
+                header = io.StringIO()
+                csv.writer(header, lineterminator="\n").writerow(table.column_names)
+                self._file.write(header.getvalue().encode())
+                self._has_header = True
+            texts = [column for column in table.columns if pa.types.is_string(column.type)]
+            quoted = any(pc.any(pc.match_substring_regex(column, '[,"\r\n]')).as_py() for column in texts)
+            style = pa_csv.WriteOptions(include_header=False, quoting_style="needed" if quoted else "none")
+            pa_csv.write_csv(table, self._file, style)
         else:
             if self._parquet is None:
                 self._parquet = pq.ParquetWriter(self._file, self._schema)
             self._parquet.write_table(table)
         self._pending, self._pending_rows = [], 0
-
-    def _write_csv(self, file: BinaryIO, table: pa.Table) -> None:
-        # The library quotes the header and, where a text needs quotes, all texts; simple readers expect neither.
-        if not self._has_header:
-            header = io.StringIO()
-            csv.writer(header, lineterminator="\n").writerow(table.column_names)
-            file.write(header.getvalue().encode())
-            self._has_header = True
-        style = "needed" if _needs_quotes(table) else "none"
-        pa_csv.write_csv(table, file, pa_csv.WriteOptions(include_header=False, quoting_style=style))
-
-    def _finish(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        try:
-            if kind is None:
-                if self._schema is None:
-                    raise ValueError(
-                        f"{self.path}: a table must have columns; nothing was written. Write at least one block."
-                    )
-                self._flush()
-        finally:
-            parquet, self._parquet, self._file, self._pending = self._parquet, None, None, []
-            if parquet is not None:
-                parquet.close()
 
 
 def _batch(columns: Mapping[str, ArrayLike]) -> pa.RecordBatch:
@@ -156,11 +146,6 @@ def _arrow(name: str, array: np.ndarray, count: int) -> pa.Array:
     if array.ndim == 0:
         return pa.repeat(pa.scalar(array.item(), type=kind or pa.from_numpy_dtype(array.dtype)), count)
     return pa.array(array, type=kind)
-
-
-def _needs_quotes(table: pa.Table) -> bool:
-    texts = [column for column in table.columns if pa.types.is_string(column.type)]
-    return any(pc.any(pc.match_substring_regex(column, '[,"\r\n]')).as_py() for column in texts)
 
 
 def _conformed(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:

@@ -9,6 +9,8 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ballfg.checks import check_array
+
 SPIN_LABELS = ("spin_x", "spin_y", "spin_z")
 
 Label = float | str
@@ -65,22 +67,32 @@ class Track:
 
     def __post_init__(self) -> None:
         _check_name(self.name)
-        times = _float_array(self.name, "times", self.times)
+        times = _finite(self.name, "times", self.times)
         if times.ndim != 1 or len(times) == 0:
             raise ValueError(
                 f"track {self.name!r}: times must have shape (n,) with n >= 1; got {times.shape}. "
                 "Pass one stamp per sample."
             )
-        _check_increasing(self.name, times)
-        positions = _float_array(self.name, "positions", self.positions, (len(times), 3))
+        wrong = np.flatnonzero(np.diff(times) <= 0)
+        if wrong.size:
+            i = int(wrong[0]) + 1
+            raise ValueError(
+                f"track {self.name!r}: times must be strictly increasing; times[{i}]={times[i]} <= "
+                f"times[{i - 1}]={times[i - 1]}. Sort or drop duplicates."
+            )
+        positions = _finite(self.name, "positions", self.positions, (len(times), 3))
         sigmas = self.sigmas
         if sigmas is not None:
-            sigmas = _float_array(self.name, "sigmas", sigmas, (len(times), 3))
-            _check_positive(self.name, sigmas)
-        object.__setattr__(self, "times", times)
-        object.__setattr__(self, "positions", positions)
-        object.__setattr__(self, "sigmas", sigmas)
-        object.__setattr__(self, "labels", _checked_labels(self.name, self.labels))
+            sigmas = _finite(self.name, "sigmas", sigmas, (len(times), 3))
+            if (sigmas <= 0).any():
+                i, axis = (int(k) for k in np.argwhere(sigmas <= 0)[0])
+                raise ValueError(
+                    f"track {self.name!r}: sigmas must be positive; sigmas[{i}, {axis}]={sigmas[i, axis]}. "
+                    "Give a standard deviation in m, or no sigmas at all."
+                )
+        labels = _checked_labels(self.name, self.labels)
+        for key, value in {"times": times, "positions": positions, "sigmas": sigmas, "labels": labels}.items():
+            object.__setattr__(self, key, value)
         object.__setattr__(self, "observations", tuple(self.observations))
         _check_observations(self.name, self.observations, self.rough)
 
@@ -171,18 +183,8 @@ def _check_name(name: object) -> None:
         )
 
 
-def _float_array(track: str, argument: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> FloatArray:
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"track {track!r}: {argument} must be an array of numbers; {error}. Pass one row per sample."
-        ) from None
-    if shape is not None and array.shape != shape:
-        raise ValueError(
-            f"track {track!r}: {argument} must have shape {shape}; got {array.shape}. "
-            "Pass one row of x, y, z per stamp."
-        )
+def _finite(track: str, argument: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> FloatArray:
+    array = check_array(f"track {track!r}: {argument}", value, shape, "Pass one row per sample.")
     if not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         place = ", ".join(map(str, index))
@@ -190,25 +192,6 @@ def _float_array(track: str, argument: str, value: ArrayLike, shape: tuple[int, 
             f"track {track!r}: {argument} must be finite; {argument}[{place}]={array[index]}. Drop that sample."
         )
     return array
-
-
-def _check_increasing(track: str, times: FloatArray) -> None:
-    wrong = np.flatnonzero(np.diff(times) <= 0)
-    if wrong.size:
-        i = int(wrong[0]) + 1
-        raise ValueError(
-            f"track {track!r}: times must be strictly increasing; times[{i}]={times[i]} <= "
-            f"times[{i - 1}]={times[i - 1]}. Sort or drop duplicates."
-        )
-
-
-def _check_positive(track: str, sigmas: FloatArray) -> None:
-    if (sigmas <= 0).any():
-        i, axis = (int(k) for k in np.argwhere(sigmas <= 0)[0])
-        raise ValueError(
-            f"track {track!r}: sigmas must be positive; sigmas[{i}, {axis}]={sigmas[i, axis]}. "
-            "Give a standard deviation in m, or no sigmas at all."
-        )
 
 
 def _checked_labels(track: str, labels: Mapping[str, Label]) -> dict[str, Label]:

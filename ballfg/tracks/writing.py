@@ -63,8 +63,7 @@ def _write_tracks(path: Path, info: DatasetInfo, tracks: Iterable[Track], spool:
     has_sigmas: bool | None = None
     with TableWriter(path) as table:
         for track in tracks:
-            if has_sigmas is None:
-                has_sigmas = track.sigmas is not None
+            has_sigmas = track.sigmas is not None if has_sigmas is None else has_sigmas
             _check_track(track, names, info, has_sigmas)
             names.add(track.name)
             table.write(_columns(track))

@@ -2,7 +2,7 @@ from .association.agreement import Agreement as Agreement
 from .association.agreement import check_agreement as check_agreement
 from .association.associate import AssociationSettings as AssociationSettings
 from .association.associate import associate as associate
-from .association.seen_ball import SeenBall as SeenBall
+from .association.gathering import SeenBall as SeenBall
 from .association.triangulate import Triangulated as Triangulated
 from .association.triangulate import triangulate as triangulate
 from .calibration.extrinsics import calibrate_extrinsics as calibrate_extrinsics
@@ -10,7 +10,7 @@ from .calibration.intrinsics import calibrate_intrinsics as calibrate_intrinsics
 from .camera import Camera as Camera
 from .camera_file import read_cameras as read_cameras
 from .camera_file import write_cameras as write_cameras
-from .camera_storage import write_opencv as write_opencv
+from .camera_file import write_opencv as write_opencv
 from .detection.detect import detect as detect
 from .detection.detect import detect_all as detect_all
 from .detection.detect import learn_detector as learn_detector

@@ -1,7 +1,5 @@
 """Types of arrays that cameras' code shares; shapes and units stand where they are used."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

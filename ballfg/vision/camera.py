@@ -1,7 +1,5 @@
 """A calibrated camera: OpenCV's pinhole model with distortion, where it stands, how its clock runs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Final
@@ -45,7 +43,7 @@ class Camera:
     """(3, 3) focal lengths and principal point, pixels: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."""
 
     distortion: Array
-    """(k,) coefficients in OpenCV's order; k one of `DISTORTIONS`."""
+    """(k,) dimensionless coefficients in OpenCV's order; k one of `DISTORTIONS`."""
 
     rvec: Array
     """(3,) rad, rotation vector from the world to the camera."""
@@ -65,9 +63,6 @@ class Camera:
         if not (width > 0 and height > 0 and (width, height) == tuple(self.size)):
             raise ValueError(f"camera {self.name!r}: size must be width and height in pixels; got {self.size}")
         object.__setattr__(self, "size", (width, height))
-        object.__setattr__(self, "matrix", self._checked("matrix", self.matrix, (3, 3)))
-        object.__setattr__(self, "rvec", self._checked("rvec", self.rvec, (3,)))
-        object.__setattr__(self, "tvec", self._checked("tvec", self.tvec, (3,)))
         count = np.asarray(self.distortion).size
         if count not in DISTORTIONS:
             lengths = ", ".join(map(str, DISTORTIONS))
@@ -75,8 +70,14 @@ class Camera:
                 f"camera {self.name!r}: distortion must have one of {lengths} coefficients; got {count}. "
                 "Give them in OpenCV's order k1, k2, p1, p2, k3, ..."
             )
-        object.__setattr__(self, "distortion", self._checked("distortion", self.distortion, (count,)))
-        self._check_matrix()
+        for field, shape in {"matrix": (3, 3), "rvec": (3,), "tvec": (3,), "distortion": (count,)}.items():
+            object.__setattr__(self, field, self._checked(field, getattr(self, field), shape))
+        k = self.matrix
+        if not (k[0, 0] > 0 and k[1, 1] > 0 and k[1, 0] == 0 and (k[2] == (0, 0, 1)).all() and k[0, 1] == 0):
+            raise ValueError(
+                f"camera {self.name!r}: matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; "
+                f"got {k.tolist()}"
+            )
         if not np.isfinite(self.time_offset):
             raise ValueError(f"camera {self.name!r}: time_offset must be finite, in s; got {self.time_offset}")
         object.__setattr__(self, "time_offset", float(self.time_offset))
@@ -94,17 +95,9 @@ class Camera:
         array.setflags(write=False)
         return array
 
-    def _check_matrix(self) -> None:
-        k = self.matrix
-        if not (k[0, 0] > 0 and k[1, 1] > 0 and k[1, 0] == 0 and (k[2] == (0, 0, 1)).all() and k[0, 1] == 0):
-            raise ValueError(
-                f"camera {self.name!r}: matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; "
-                f"got {k.tolist()}"
-            )
-
     @cached_property
     def rotation(self) -> Array:
-        """(3, 3) from the world to the camera."""
+        """(3, 3) dimensionless, from the world to the camera."""
         return np.asarray(cv2.Rodrigues(self.rvec)[0], dtype=np.float64)
 
     @cached_property

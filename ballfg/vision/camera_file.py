@@ -1,21 +1,20 @@
 """Cameras in files: `cameras.yaml`, and the files that OpenCV's FileStorage writes."""
 
-from __future__ import annotations
-
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from numbers import Integral
 from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
+import cv2
 import numpy as np
 import yaml
 
-from ballfg.checks import check_keys, is_number
+from ballfg.checks import check_keys, did_you_mean, is_number
 from ballfg.files.strict_yaml import mapping, read_mapping
-from ballfg.files.whole_file import write_text
+from ballfg.files.whole_file import whole_file, write_text
 from ballfg.vision.camera import Camera
-from ballfg.vision.camera_storage import check_names, is_storage, read_storage
 
 CAMERAS_FILE: Final = "cameras.yaml"
 """Its name in the folder of a dataset or a scene."""
@@ -23,6 +22,16 @@ LENS: Final = ("size", "matrix", "distortion")
 POSE: Final = ("rvec", "tvec")
 FIELDS: Final = (*LENS, *POSE, "time_offset")
 """Fields of a camera in the file, in the order in which they are written; docs/calibrate.md says what they mean."""
+
+_MATRIX: Final = "camera_matrix"
+_NODES: Final = {
+    "matrix": (_MATRIX,),
+    "distortion": ("distortion_coefficients", "dist_coeffs"),
+    "rvec": ("rvec",),
+    "tvec": ("tvec",),
+}
+"""Our name of an array -> OpenCV's names of its node, the one that is written first; others are read."""
+_ENDINGS: Final = (".xml", ".json", ".yml", ".yaml")
 
 
 def read_cameras(path: str | PathLike[str], *, posed: bool = True) -> list[Camera]:
@@ -40,8 +49,13 @@ def read_cameras(path: str | PathLike[str], *, posed: bool = True) -> list[Camer
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a file with cameras; there is none. Correct the path.")
     try:
-        contents = read_storage(path) if is_storage(path) else _read_ours(path)
-        return [_camera(name, content, posed) for name, content in contents.items()]
+        if _is_storage(path):
+            cameras = _read_storage(path)
+        else:
+            content = read_mapping(path)
+            check_keys(str(path), content, ("cameras",), ("cameras",))
+            cameras = mapping("cameras", content["cameras"])
+        return [_camera(name, fields, posed) for name, fields in cameras.items()]
     except (ValueError, TypeError) as error:
         text = str(error)
         rule = TypeError if isinstance(error, TypeError) else ValueError
@@ -57,29 +71,92 @@ def write_cameras(path: str | PathLike[str], cameras: Iterable[Camera], *, posed
     path = Path(path)
     if path.suffix.lower() not in (".yaml", ".yml"):
         raise ValueError(f"path must end in .yaml; got {path}. Rename it; write_opencv writes .xml and .json.")
-    cameras = check_names(cameras)
+    cameras = _check_names(cameras)
     fields = FIELDS if posed else (*LENS, "time_offset")
-    content = {"cameras": {camera.name: _plain(camera, fields) for camera in cameras}}
-    text = yaml.safe_dump(content, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
+    plain = {
+        camera.name: {field: np.asarray(getattr(camera, field)).tolist() for field in fields} for camera in cameras
+    }
+    text = yaml.safe_dump({"cameras": plain}, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)
     write_text(path, text)
 
 
-def _plain(camera: Camera, fields: Sequence[str]) -> dict[str, Any]:
-    whole = {
-        "size": list(camera.size),
-        "matrix": camera.matrix.tolist(),
-        "distortion": camera.distortion.tolist(),
-        "rvec": camera.rvec.tolist(),
-        "tvec": camera.tvec.tolist(),
-        "time_offset": camera.time_offset,
-    }
-    return {field: whole[field] for field in fields}
+def write_opencv(path: str | PathLike[str], cameras: Iterable[Camera], *, posed: bool = True) -> None:
+    """Writes cameras with OpenCV's FileStorage, a map for each; floats read back bit for bit. Never leaves half a file.
+
+    Args: path: .xml, .json, .yml or .yaml.  posed: False: without `rvec` and `tvec`.
+    Raises: ValueError: another ending, no cameras, a name twice, or one that FileStorage cannot take.
+        FileNotFoundError: the folder does not exist.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in _ENDINGS:
+        raise ValueError(f"path must end in {', '.join(_ENDINGS)}; got {path}. Choose the format by the ending.")
+    cameras = _check_names(cameras)
+    for camera in cameras:
+        plain = camera.name.replace("_", "a").replace("-", "0")
+        if not (plain.isascii() and plain.isalnum() and plain[0].isalpha()):
+            raise ValueError(
+                f"names of cameras must be letters, digits, - and _, a letter first, in OpenCV's files; "
+                f"got {camera.name!r}. Rename it, or write cameras.yaml."
+            )
+    with whole_file(path) as temporary:
+        storage = cv2.FileStorage(str(temporary), cv2.FILE_STORAGE_WRITE)
+        for camera in cameras:
+            storage.startWriteStruct(camera.name, cv2.FileNode_MAP)
+            storage.write("image_width", camera.size[0])
+            storage.write("image_height", camera.size[1])
+            for field in _NODES if posed else ("matrix", "distortion"):
+                array = getattr(camera, field)
+                storage.write(_NODES[field][0], array if array.ndim == 2 else array[:, None])
+            storage.write("time_offset", camera.time_offset)
+            storage.endWriteStruct()
+        storage.release()
 
 
-def _read_ours(path: Path) -> Mapping[str, Any]:
-    content = read_mapping(path)
-    check_keys(str(path), content, ("cameras",), ("cameras",))
-    return mapping("cameras", content["cameras"])
+def _is_storage(path: Path) -> bool:
+    """Whether a file is one of FileStorage's: .xml, .json, or YAML that begins with a %YAML line."""
+    if path.suffix.lower() in (".xml", ".json"):
+        return True
+    with path.open("rb") as file:
+        return file.read(8).removeprefix(b"\xef\xbb\xbf").startswith(b"%YAML")
+
+
+def _read_storage(path: Path) -> dict[str, dict[str, Any]]:
+    """Name of each camera -> its fields as in `cameras.yaml`; nodes that say nothing about a camera are left aside.
+
+    A file with `camera_matrix` at its top holds one camera, named as the file; otherwise every map with that node is
+    a camera.
+
+    Raises: ValueError: not readable, or without cameras; the message names file, camera and node.
+    """
+    try:
+        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    except (cv2.error, SystemError):  # the binding raises the latter where the constructor throws
+        raise ValueError(f"{path}: must be a file of OpenCV's FileStorage; it cannot be parsed. Correct it.") from None
+    try:
+        root = storage.root()
+        keys = _keys(root)
+        if _MATRIX in keys:
+            return {path.stem: _fields(root, str(path))}
+        found = {key: root.getNode(key) for key in keys}
+        cameras = {key: node for key, node in found.items() if _MATRIX in _keys(node)}
+        if not cameras:
+            got = ", ".join(keys) or "nothing"
+            hint = did_you_mean(_MATRIX, keys).replace("Did you mean", "Rename")
+            raise ValueError(f"{path}: node {_MATRIX!r} is required; got {got}.{hint} Add it.")
+        return {key: _fields(node, f"{path}: camera {key!r}") for key, node in cameras.items()}
+    finally:
+        storage.release()
+
+
+def _check_names(cameras: Iterable[Camera]) -> Sequence[Camera]:
+    """The cameras. Raises: ValueError: if there are none, or two of one name."""
+    cameras = list(cameras)
+    if not cameras:
+        raise ValueError("cameras must hold at least one camera; got none. Pass the cameras to write.")
+    name, count = Counter(camera.name for camera in cameras).most_common(1)[0]
+    if count > 1:
+        raise ValueError(f"cameras must have names of their own; got {name!r} {count} times. Rename them.")
+    return cameras
 
 
 def _camera(name: str, content: Any, posed: bool) -> Camera:
@@ -111,3 +188,51 @@ def _camera(name: str, content: Any, posed: bool) -> Camera:
 
 def _is_whole(value: object) -> bool:
     return is_number(value) and isinstance(value, Integral)
+
+
+def _fields(node: cv2.FileNode, where: str) -> dict[str, Any]:
+    fields: dict[str, Any] = {"size": _size(node, where)}
+    for field, names in _NODES.items():
+        present = [name for name in names if name in _keys(node)]
+        if present:
+            fields[field] = _array(node.getNode(present[0]), f"{where}: node {present[0]!r}")
+    if "time_offset" in _keys(node):
+        offset = node.getNode("time_offset")
+        if not (offset.isReal() or offset.isInt()):
+            raise ValueError(f"{where}: node 'time_offset' must be a number in s. Correct it.")
+        fields["time_offset"] = offset.real()
+    return fields
+
+
+def _size(node: cv2.FileNode, where: str) -> list[int]:
+    keys = _keys(node)
+    if "image_size" in keys:
+        numbers = np.ravel(_array(node.getNode("image_size"), f"{where}: node 'image_size'"))
+    elif "image_width" in keys and "image_height" in keys:
+        numbers = np.array([node.getNode(name).real() for name in ("image_width", "image_height")])
+    else:
+        raise ValueError(
+            f"{where}: nodes 'image_width' and 'image_height' are required; got {', '.join(keys)}. Add them."
+        )
+    if len(numbers) != 2 or (numbers != np.trunc(numbers)).any():
+        raise ValueError(f"{where}: the image's size must be two whole numbers; got {numbers.tolist()}. Correct it.")
+    return [int(number) for number in numbers]
+
+
+def _array(node: cv2.FileNode, where: str) -> list[float] | list[list[float]]:
+    """The numbers of a matrix or a sequence, flat unless it is a matrix of several rows and columns."""
+    if node.isSeq():
+        items = [node.at(i) for i in range(node.size())]
+        if all(item.isReal() or item.isInt() for item in items):
+            return [item.real() for item in items]
+    elif node.isMap():
+        matrix = node.mat()
+        if matrix is None:  # how an empty matrix comes back
+            return []
+        flat = matrix.ndim < 2 or 1 in matrix.shape[:2]
+        return list(map(float, matrix.ravel())) if flat else matrix.astype(float).tolist()
+    raise ValueError(f"{where} must be a matrix or a list of numbers. Correct it.")
+
+
+def _keys(node: cv2.FileNode) -> tuple[str, ...]:
+    return tuple(node.keys()) if node.isMap() else ()

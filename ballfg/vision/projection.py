@@ -1,7 +1,5 @@
 """Projection in torch: points through many cameras in one call, differentiable, distortion included."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -15,6 +13,7 @@ class CameraBank:
     """The cameras of a rig as stacked tensors.
 
     Args: cameras: in the order of their numbers.
+    Raises: ValueError: no cameras.
 
     Attributes:
         names: of the cameras, in that order.
@@ -28,12 +27,12 @@ class CameraBank:
         self._tvec = _stacked([camera.tvec for camera in cameras])
         self._focal = _stacked([camera.matrix[[0, 1], [0, 1]] for camera in cameras])
         self._principal = _stacked([camera.matrix[:2, 2] for camera in cameras])
-        self._distortion = _stacked([np.pad(c.distortion, (0, 14 - len(c.distortion))) for c in cameras])
+        distortions = [np.pad(camera.distortion, (0, 14 - len(camera.distortion))) for camera in cameras]
+        self._distortion = _stacked(distortions)
         self._widest = _stacked([np.array(camera.widest) for camera in cameras])
-        tilts = [_tilt(*camera.distortion[12:]) for camera in cameras if len(camera.distortion) == 14]
         self._tilt = None
-        if tilts:
-            self._tilt = torch.stack([_tilt(*np.pad(c.distortion, (0, 14 - len(c.distortion)))[12:]) for c in cameras])
+        if any(len(camera.distortion) == 14 for camera in cameras):
+            self._tilt = torch.stack([_tilt(*bent[12:]) for bent in distortions])
 
     def project(self, points: Tensor, camera: Tensor) -> Tensor:
         """Pixels of points, each in the camera of its row; NaN for those that are behind it or beyond its lens.

@@ -27,7 +27,7 @@ from ballfg.simulation.scene import Flight
 from ballfg.state import POSITION, VELOCITY, VZ
 from ballfg.tracks import Track
 from ballfg.vision import Camera, SeenBall, triangulate
-from ballfg.vision.association.clock import nearest
+from ballfg.vision.association.gathering import nearest
 
 NAIVE, FACTORS = "smoother, as if synchronised", "smoother, camera factors"
 """Two of the ways to estimate, which are compared with each other."""

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from ballfg.benchmarks.metrics import Array, nees, root_mean_square
 from ballfg.simulation.cameras import table_rig
 from ballfg.simulation.scene import Flight, Recording, SceneConfig, free_running, record, write_scene
-from ballfg.vision.association.clock import nearest
-from ballfg.vision.association.seen_ball import SeenBall
+from ballfg.vision.association.gathering import SeenBall, nearest
 from ballfg.vision.detection.detect import detect_all
 from ballfg.vision.detection.detections import Detections
 from ballfg.vision.tracking.pipeline import Tracking, track_detections

@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from ballfg.files.destination import check_replaceable
-from ballfg.files.whole_folder import recover, replaced_folder, whole_folder
+from ballfg.files.whole_folder import check_replaceable, recover, replaced_folder, whole_folder
 
 
 def contents(folder: Path) -> dict[str, str]:

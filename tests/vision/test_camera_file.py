@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from ballfg.vision import Camera
-from ballfg.vision.camera_file import read_cameras, write_cameras
-from ballfg.vision.camera_storage import write_opencv
+from ballfg.vision.camera_file import read_cameras, write_cameras, write_opencv
 
 
 def camera(name: str, count: int = 5) -> Camera:

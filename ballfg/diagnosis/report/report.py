@@ -14,8 +14,7 @@ import numpy as np
 from ballfg.diagnosis.report.page import page
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Fallback, Value
 from ballfg.dynamics import save_model
-from ballfg.files.destination import check_replaceable
-from ballfg.files.whole_folder import whole_folder
+from ballfg.files.whole_folder import check_replaceable, whole_folder
 
 REPORT: Final = "report.json"
 """Written last, so that the other files are complete where it exists."""

@@ -14,9 +14,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ballfg.files.destination import check_replaceable
 from ballfg.files.strict_yaml import read_yaml
-from ballfg.files.whole_folder import whole_folder
+from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
 from ballfg.simulation.scene.recording import Recording
 from ballfg.simulation.scene.visible import visible_columns

@@ -5,8 +5,6 @@ while the other cameras are fixed. The camera that moved then explains the disag
 cameras are needed: of two that disagree either may be wrong.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -16,8 +14,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from ballfg.vision.arrays import Array
+from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.association.paths import path
-from ballfg.vision.association.seen_ball import SeenBall
 from ballfg.vision.association.triangulate import triangulate
 from ballfg.vision.camera import Camera
 
@@ -42,10 +40,8 @@ _FAR: Final = 9.0
 """Median squared errors at which a point counts half."""
 _STEPS: Final = 8
 """Gauss-Newton steps; a camera turned by five degrees is right after six."""
-_TURNED: Final = 0.1
-"""rad, standard deviation of a nudge's turn: keeps the fit in place where the points are too few to tell."""
-_MOVED: Final = 0.3
-"""m, that of its shift."""
+_PRIOR: Final = np.diag([0.1**-2] * 3 + [0.3**-2] * 3)
+"""Information about a nudge, 0.1 rad of turn and 0.3 m of shift: keeps the fit in place where points are too few."""
 
 
 @dataclass(frozen=True)
@@ -89,14 +85,10 @@ class Agreement:
 class _Scene:
     """Points that at least three cameras saw."""
 
-    pixels: Array
-    """(n, c, 2), NaN where not seen."""
-    weights: Array
-    """(n, c, 2, 2) inverse covariances; zero where not seen."""
-    points: Array
-    """(n, 3) m, first guess."""
-    expected: Array
-    """(n,) median of the squared error that noise alone makes."""
+    pixels: Array  # (n, c, 2), NaN where not seen
+    weights: Array  # (n, c, 2, 2) inverse covariances; zero where not seen
+    points: Array  # (n, 3) m, first guess
+    expected: Array  # (n,) median of the squared error that noise alone makes
 
 
 def check_agreement(balls: Sequence[SeenBall], cameras: Sequence[Camera]) -> Agreement:
@@ -187,52 +179,21 @@ def _refined(scene: _Scene, cameras: list[Camera], points: Array, nudged: int | 
         gradient = np.einsum("ncij,nci->nj", weighted, errors)
         points = points + np.linalg.solve(information, gradient[..., None])[..., 0]
         if nudged is not None and start is not None:
-            mixed = np.einsum("nij,nik->njk", weighted[:, nudged], slopes[nudged])
+            by_pose, mine = slopes[nudged], scene.weights[:, nudged] @ slopes[nudged]
+            mixed = np.einsum("nij,nik->njk", weighted[:, nudged], by_pose)
             removed = np.linalg.solve(information, mixed)
+            squares = _squares(scene, errors)  # Cauchy weights: points far worse than the median count less
+            trust = 1.0 / (1.0 + squares / (_FAR * (np.median(squares) + 1.0)))
+            # The points are eliminated from the normal equations (Schur complement).
+            schur = np.einsum("n,nij,nik->jk", trust, mine, by_pose) - np.einsum("n,nji,njk->ik", trust, mixed, removed)
+            target = np.einsum("n,nij,ni->j", trust, mine, errors[:, nudged])
+            target -= np.einsum("n,nji,nj->i", trust, removed, gradient)
             pose = np.concatenate((cameras[nudged].rvec, cameras[nudged].tvec))
-            weight = scene.weights[:, nudged]
-            change = _pose_step(
-                _trust(scene, errors), weight, slopes[nudged], errors[:, nudged], mixed, removed, gradient, pose - start
-            )
+            change = np.linalg.solve(schur + _PRIOR, target - _PRIOR @ (pose - start))
             points = points - removed @ change
             pose = pose + change
             cameras[nudged] = replace(cameras[nudged], rvec=pose[:3], tvec=pose[3:])
     return points, cameras
-
-
-def _trust(scene: _Scene, errors: Array) -> Array:
-    """(n,) Cauchy weights: points far worse than the median count less."""
-    squares = _squares(scene, errors)
-    return np.asarray(1.0 / (1.0 + squares / (_FAR * (np.median(squares) + 1.0))))
-
-
-def _pose_step(
-    trust: Array,
-    weight: Array,
-    slopes: Array,
-    errors: Array,
-    mixed: Array,
-    removed: Array,
-    gradient: Array,
-    nudge: Array,
-) -> Array:
-    """(6,) the step of a camera's pose once the points are eliminated from the normal equations (Schur complement).
-
-    Args:
-        trust: (n,) of the points.
-        weight: (n, 2, 2) of the camera's sightings.
-        slopes: (n, 2, 6) derivatives of the projection by the pose.
-        errors: (n, 2) px, seen minus projected.
-        mixed: (n, 3, 6) block of the normal equations between points and pose.
-        removed: (n, 3, 6) the points' own blocks' inverse times `mixed`.
-        gradient: (n, 3) of the points.
-        nudge: (6,) by how much the pose is already off the calibrated one.
-    """
-    weighted = weight @ slopes
-    prior = np.diag([_TURNED**-2] * 3 + [_MOVED**-2] * 3)
-    schur = np.einsum("n,nij,nik->jk", trust, weighted, slopes) - np.einsum("n,nji,njk->ik", trust, mixed, removed)
-    target = np.einsum("n,nij,ni->j", trust, weighted, errors) - np.einsum("n,nji,nj->i", trust, removed, gradient)
-    return np.asarray(np.linalg.solve(schur + prior, target - prior @ nudge))
 
 
 def _slopes(camera: Camera, points: Array) -> Array:

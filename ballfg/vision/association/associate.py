@@ -4,8 +4,6 @@ The steps: pieces of smooth motion in each image; matching of pieces between cam
 of one flight; unassigned candidates that fit; removal of tracks that do not fall like a ball.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -14,12 +12,10 @@ import numpy as np
 
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.arrays import Rows
-from ballfg.vision.association.clock import shared_stamps
 from ballfg.vision.association.completing import complete
 from ballfg.vision.association.flights import is_ball, successions
-from ballfg.vision.association.gathering import SAME_SHUTTER, Footage, Gathered, gather
+from ballfg.vision.association.gathering import SAME_SHUTTER, Footage, Gathered, SeenBall, gather, shared_stamps
 from ballfg.vision.association.matching import Piece, match
-from ballfg.vision.association.seen_ball import SeenBall
 from ballfg.vision.association.tracklets import find_tracklets
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections

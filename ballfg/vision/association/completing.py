@@ -1,7 +1,5 @@
 """Unassigned candidates near the predicted track of a ball, between its own candidates and at the ends."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 

@@ -4,8 +4,6 @@ Between bounces a ball's acceleration is gravity, drag and lift; a waved arm's i
 continuation of the first meets that of the second in the gap, with a kink where the ball bounced or was hit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 
@@ -112,19 +110,14 @@ def meeting(earlier: Path, later: Path) -> float | None:
     times = np.linspace(start, end, _STEPS)
     before, spread, velocity = _continued(earlier, times, last=True)
     after, other_spread, other_velocity = _continued(later, times, last=False)
-    if end - start > LONGEST_HIT_GAP and not _only_bounced(velocity, other_velocity):
+    change, speed = np.linalg.norm((other_velocity - velocity)[:2]), np.linalg.norm(velocity[:2])
+    if end - start > LONGEST_HIT_GAP and change > _FRICTION * speed + _LEAST_CHANGE:  # more than a bounce
         return None
     apart = after - before
     away = np.linalg.norm(apart, axis=1)
     square = np.einsum("ni,ni->n", apart, np.linalg.solve(spread + other_spread, apart[..., None])[..., 0])
     close = (away <= _FARTHEST) & (square <= _GATE)
     return float(square[close].min()) if close.any() else None
-
-
-def _only_bounced(before: Array, after: Array) -> bool:
-    """Whether velocities (3,) before and after a gap are those of one flight, through a bounce at most."""
-    change, speed = np.linalg.norm((after - before)[:2]), np.linalg.norm(before[:2])
-    return bool(change <= _FRICTION * speed + _LEAST_CHANGE)
 
 
 def _continued(track: Path, times: Array, last: bool) -> tuple[Array, Array, Array]:

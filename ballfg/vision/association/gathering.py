@@ -1,13 +1,13 @@
-"""Balls in the making: which candidates of which camera are one ball, and the points in space that they make."""
-
-from __future__ import annotations
+"""Which candidates of which camera are one ball, and the points in space that they make on one clock."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ballfg.tracks.sightings import Sightings
 from ballfg.vision.arrays import Array, Rows
 from ballfg.vision.association.paths import Path, path
 from ballfg.vision.association.triangulate import triangulate
@@ -54,6 +54,29 @@ class Gathered:
     """(n,) cameras that made each point."""
 
 
+@dataclass(frozen=True, eq=False)
+class SeenBall:
+    """One ball's track, in order of time."""
+
+    times: Array
+    """(n,) s, true time."""
+
+    points: Array
+    """(n, 3) m, world."""
+
+    covariances: Array
+    """(n, 3, 3) m^2, of each point by itself; interpolated points share samples and so a little of their error."""
+
+    sightings: Sightings
+    """What the points come from, each at its own camera's stamp."""
+
+    views: Rows
+    """(n,) number of cameras that made each point."""
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+
 def gather(footage: Footage, rows: Sequence[Rows]) -> Gathered:
     """The points that candidates of several cameras make; none where fewer than two agree.
 
@@ -83,3 +106,33 @@ def _stamps(footage: Footage, rows: Sequence[Rows]) -> Array:
         return np.zeros(0)
     first, last = np.min(seen), np.max(seen)
     return np.asarray(stamps[(stamps >= first - SAME_SHUTTER) & (stamps <= last + SAME_SHUTTER)])
+
+
+def nearest(stamps: Array, times: Array) -> NDArray[np.intp]:
+    """(k,) for each time the number of the nearest of n >= 1 ascending stamps; the earlier of two equally near."""
+    after = np.clip(np.searchsorted(stamps, times), 1, max(len(stamps) - 1, 1))
+    after = np.minimum(after, len(stamps) - 1)
+    before = np.maximum(after - 1, 0)
+    return np.where(times - stamps[before] <= stamps[after] - times, before, after)
+
+
+def shared_stamps(frames: Sequence[Array], within: float) -> Array | None:
+    """The stamps that cameras share, if they do: those of all of them, each once.
+
+    They share a shutter if most frames of the camera with fewer frames, of every two, lie within `within` s of one of
+    the other's. Frames may be missing anywhere, and one camera may take every second frame only.
+
+    Args: frames: (f,) s of each camera, ascending, on one clock.
+    Returns: (k,) s, or None.
+    """
+    for one in frames:
+        for other in frames:
+            if len(one) <= len(other) and len(one):
+                apart = np.abs(other[nearest(other, one)] - one)
+                if np.median(apart) > within:
+                    return None
+    stamps = np.sort(np.concatenate(frames))
+    if not len(stamps):
+        return None
+    group = np.concatenate(([0], np.cumsum(np.diff(stamps) > within)))
+    return np.asarray(np.bincount(group, stamps) / np.bincount(group))

@@ -5,8 +5,6 @@ nine pixels. It is measured first, for each pair of cameras, on the pairs of pie
 time; then everything is judged by that scale.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
@@ -15,7 +13,6 @@ from typing import Final
 import numpy as np
 
 from ballfg.vision.arrays import Array, Rows
-from ballfg.vision.association.epipolar import epipolar_miss
 from ballfg.vision.association.paths import Path
 from ballfg.vision.camera import Camera
 
@@ -39,6 +36,8 @@ _SPEEDING: Final = 2.0
 """By how much faster than both pieces something may move between them: at a bounce or a hit."""
 _NEARBY: Final = 15.0
 """px, how far apart two successive pieces of one camera may be at least, however slow they are."""
+_NEAREST: Final = 0.1
+"""m, least distance from either camera at which two rays may meet."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,10 +70,8 @@ class _Pair:
 
     first: int
     second: int
-    misses: Array
-    """(k,) px, what is left between the rays; NaN where they do not meet in front."""
-    variances: Array
-    """(k,) px^2, of the misses by noise and interpolation."""
+    misses: Array  # (k,) px, what is left between the rays; NaN where they do not meet in front
+    variances: Array  # (k,) px^2, of the misses by noise and interpolation
 
     def support(self, offset: float) -> float:
         """In common times: how many speak for the pair, less what speaks against it. `offset`: px, of calibration."""
@@ -215,3 +212,42 @@ def _speed(path: Path) -> float:
     """px/s, mean over the piece."""
     lengths = np.linalg.norm(np.diff(path.values, axis=0), axis=1)
     return float(lengths.sum() / (path.times[-1] - path.times[0]))
+
+
+def epipolar_miss(first: Camera, second: Camera, pixels: Array, others: Array) -> tuple[Array, Array]:
+    """Sampson distance of pairs of pixels from the epipolar constraint.
+
+    Two rays d1, d2 from centres that are b apart lie in a plane if e = d1 . (b x d2) is zero. To first order the least
+    correction of the four pixel coordinates that makes it so is e / |grad e|, the value returned. Where it is measured
+    with sigma px in every coordinate, its own standard deviation is sigma.
+
+    Args: pixels: (n, 2) in the first camera; NaN where unknown.  others: (n, 2) in the second.
+    Returns: the distance (n,), signed, px; NaN where unknown or where the rays do not meet in front of both cameras;
+        and the unit gradient (n, 4) by the coordinates of both pixels.
+    Source: R. Hartley, A. Zisserman, Multiple View Geometry in Computer Vision, 2004, section 11.4.3.
+    """
+    known = np.isfinite(pixels).all(axis=1) & np.isfinite(others).all(axis=1)
+    miss, gradient = np.full(len(pixels), np.nan), np.full((len(pixels), 4), np.nan)
+    ones = np.ones((int(known.sum()), 1))
+    rays = np.concatenate((first.normalized(pixels[known]), ones), axis=1) @ first.rotation
+    towards = np.concatenate((second.normalized(others[known]), ones), axis=1) @ second.rotation
+    between = second.centre - first.centre
+    normal, other_normal = np.cross(between, towards), np.cross(rays, between)
+    by_first = normal @ first.rotation[:2].T / first.matrix[[0, 1], [0, 1]]
+    by_second = other_normal @ second.rotation[:2].T / second.matrix[[0, 1], [0, 1]]
+    slopes = np.concatenate((by_first, by_second), axis=1)
+    size = np.linalg.norm(slopes, axis=1)
+    meets = (_distances(rays, towards, between) > _NEAREST).all(axis=1) & (size > 0.0)
+    size[~meets] = np.nan
+    miss[known] = (rays * normal).sum(axis=1) / size
+    gradient[known] = slopes / size[:, None]
+    return miss, gradient
+
+
+def _distances(rays: Array, towards: Array, between: Array) -> Array:
+    """(n, 2) m, how far along the two rays they are closest; NaN where parallel."""
+    a, b, c = (rays**2).sum(axis=1), (rays * towards).sum(axis=1), (towards**2).sum(axis=1)
+    d, e = rays @ between, towards @ between
+    determinant = a * c - b**2
+    determinant[determinant <= 0.0] = np.nan
+    return np.stack(((c * d - b * e) / determinant, (b * d - a * e) / determinant), axis=1)

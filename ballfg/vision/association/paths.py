@@ -5,8 +5,6 @@ through the nearest four. Between two parts, where the path has a kink, both sid
 Nothing is said before the first sample, after the last, or in a long gap.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Final
@@ -123,17 +121,15 @@ class Path:
         values = np.einsum("kw,kwd->kd", solved[:, order], self.values[window]) / scale[:, None] ** order
         covariances = np.einsum("kw,kwde->kde", solved[:, order] ** 2, self.covariances[window])
         near = np.sort(np.abs(apart), axis=1)[:, : degree + 1].prod(axis=1)
-        remainder = self._bend(window, solved, scale, degree) * near * RATE_OF_CHANGE ** max(degree - 1, 0)
+        # The size of the acceleration; two samples cannot tell it: speed times RATE_OF_CHANGE stands for it then.
+        known = min(degree, 2)
+        derivative = np.einsum("kw,kwd->kd", solved[:, known], self.values[window]) / scale[:, None] ** known
+        bend = np.linalg.norm(derivative, axis=1) * (2.0 if known == 2 else RATE_OF_CHANGE)
+        remainder = bend * near * RATE_OF_CHANGE ** max(degree - 1, 0)
         spread = (remainder / (2.0, 2.0, 6.0, 24.0)[degree]) ** 2
         return values, covariances / scale[:, None, None] ** (2 * order) + spread[:, None, None] * np.eye(
             values.shape[1]
         )
-
-    def _bend(self, window: Index, solved: Array, scale: Array, degree: int) -> Array:
-        """(k,) size of the acceleration; where two samples cannot tell, speed times `RATE_OF_CHANGE`."""
-        order = min(degree, 2)
-        derivative = np.einsum("kw,kwd->kd", solved[:, order], self.values[window]) / scale[:, None] ** order
-        return np.asarray(np.linalg.norm(derivative, axis=1) * (2.0 if order == 2 else RATE_OF_CHANGE))
 
 
 def path(times: Array, values: Array, covariances: Array) -> Path:

@@ -5,8 +5,6 @@ ends where two answers are equally good or nothing is found for a few frames. At
 starts.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from itertools import product
@@ -59,9 +57,7 @@ class _Piece:
 def find_tracklets(detections: Detections, focal: float) -> list[Rows]:
     """The pieces of one camera's candidates, by the row of their first candidate.
 
-    Args:
-        detections: all candidates.
-        focal: px, of the camera: turns speeds across the view into pixels.
+    Args: focal: px, of the camera: turns speeds across the view into pixels.
     Returns: for each piece the rows (k,) of its candidates, k >= 3, in order of time.
     """
     open_pieces: list[_Piece] = []
@@ -86,14 +82,8 @@ def _frames(detections: Detections) -> list[list[_Seen]]:
     frames: list[list[_Seen]] = [[] for _ in detections.frames]
     variances = np.maximum(np.trace(detections.covariances, axis1=1, axis2=2) / 2.0, _LEAST_VARIANCE)
     costs = _SCORE_COST * (1.0 - detections.scores)
-    numbers = zip(
-        detections.frame.tolist(),
-        detections.times.tolist(),
-        detections.pixels.tolist(),
-        variances.tolist(),
-        costs.tolist(),
-        strict=True,
-    )
+    columns = (detections.frame, detections.times, detections.pixels, variances, costs)
+    numbers = zip(*(column.tolist() for column in columns), strict=True)
     for row, (frame, time, (u, v), variance, cost) in enumerate(numbers):
         frames[frame].append(_Seen(row, frame, time, u, v, variance, cost))
     return frames

@@ -26,8 +26,8 @@ _HOPELESS: Final = 1e-6
 """Information, in units of 1 / `MAX_SIGMA`^2, below which a normal matrix is singular up to rounding."""
 _TINY_ANGLE: Final = 1e-12
 """Squared sine below which two rays are parallel to the precision of float64: halfway between them is then nowhere."""
-_HALF_PIXEL: Final = 0.5
-"""px, step of the differences that say how far a pixel reaches in the undistorted image."""
+_AROUND: Final = 0.5 * np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]])
+"""px, steps of the central differences, a pixel wide, that say how far a pixel reaches in the undistorted image."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,16 +51,11 @@ class Triangulated:
 class _Views:
     """What c cameras see, in the planes z = 1 of their own frames, where projection is a division."""
 
-    rotations: Array
-    """(c, 3, 3) from the world to the cameras."""
-    translations: Array
-    """(c, 3) m."""
-    planes: Array
-    """(n, c, 2); zero where nothing is seen."""
-    weights: Array
-    """(n, c, 2, 2) inverse covariances of `planes`."""
-    seen: Flags
-    """(n, c)"""
+    rotations: Array  # (c, 3, 3) from the world to the cameras
+    translations: Array  # (c, 3) m
+    planes: Array  # (n, c, 2); zero where nothing is seen
+    weights: Array  # (n, c, 2, 2) inverse covariances of `planes`
+    seen: Flags  # (n, c)
 
     def project(self, points: Array) -> tuple[Array, Array, Array]:
         """Points (n, 3) -> their planes' coordinates (n, c, 2), derivatives (n, c, 2, 3) and depths (n, c) m."""
@@ -128,17 +123,11 @@ def _views(cameras: list[Camera], pixels: Array, covariances: Array) -> _Views:
     for c, camera in enumerate(cameras):
         rows = seen[:, c]
         planes[rows, c] = camera.normalized(pixels[rows, c])
-        reach = plane_by_pixel(camera, pixels[rows, c])
+        around = camera.normalized(pixels[rows, c, None] + _AROUND)
+        reach = np.stack((around[:, 0] - around[:, 1], around[:, 2] - around[:, 3]), axis=-1)  # by the pixels
         weights[rows, c] = np.linalg.inv(reach @ covariances[rows, c] @ np.swapaxes(reach, 1, 2))
     rotations = np.stack([camera.rotation for camera in cameras])
     return _Views(rotations, np.stack([camera.tvec for camera in cameras]), planes, weights, seen)
-
-
-def plane_by_pixel(camera: Camera, pixels: Array) -> Array:
-    """(n, 2, 2) derivatives of `camera.normalized` by the pixels (n, 2), from central differences."""
-    steps = np.array([[1.0, 0.0], [-1.0, 0.0], [0.0, 1.0], [0.0, -1.0]]) * _HALF_PIXEL
-    around = camera.normalized(pixels[:, None] + steps)
-    return np.stack((around[:, 0] - around[:, 1], around[:, 2] - around[:, 3]), axis=-1) / (2.0 * _HALF_PIXEL)
 
 
 def _consensus(views: _Views) -> tuple[Array, Flags]:

@@ -1,13 +1,11 @@
 """Calibration boards, chessboard and ChArUco: where their corners are in an image, to a fraction of a pixel."""
 
-from __future__ import annotations
-
 import glob
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Final, TypeAlias
+from typing import ClassVar, Final, TypeAlias
 
 import cv2
 import numpy as np
@@ -35,8 +33,11 @@ _TRIED: Final = 3
 
 
 @dataclass(frozen=True)
-class Chessboard:
-    """A chessboard. Raises: ValueError: fewer than 4 squares in a row or column, or no positive size."""
+class _Squares:
+    """Squares of a board."""
+
+    least: ClassVar[int]
+    """Fewest squares in a row and in a column."""
 
     columns: int
     """Squares in a row, the outermost ones too: one more than there are inner corners."""
@@ -48,7 +49,20 @@ class Chessboard:
     """m, side of a square."""
 
     def __post_init__(self) -> None:
-        _check_board(self, least=4)
+        if min(self.columns, self.rows) < self.least:
+            raise ValueError(
+                f"squares must be at least {self.least} a row and column; got {self.columns}x{self.rows}. "
+                "Count all squares, the outermost ones too."
+            )
+        if not 0.0 < self.square < np.inf:
+            raise ValueError(f"square must be the side of a square in m, above 0; got {self.square:g}. Measure it.")
+
+
+@dataclass(frozen=True)
+class Chessboard(_Squares):
+    """A chessboard. Raises: ValueError: fewer than 4 squares in a row or column, or no positive size."""
+
+    least: ClassVar[int] = 4
 
     def find(self, image: Image) -> tuple[Array, Array] | None:
         """Pixels (n, 2) and points (n, 3) m on the board of the inner corners in a grey image; None if not all show."""
@@ -65,21 +79,14 @@ class Chessboard:
 
 
 @dataclass(frozen=True)
-class Charuco:
+class Charuco(_Squares):
     """A chessboard with an ArUco marker in each white square; it may be seen in part.
 
     Raises: ValueError: fewer than 3 squares in a row or column, a marker not smaller than a square, a dictionary that
         there is not or that has too few markers.
     """
 
-    columns: int
-    """Squares in a row."""
-
-    rows: int
-    """Rows of squares."""
-
-    square: float
-    """m, side of a square."""
+    least: ClassVar[int] = 3
 
     marker: float
     """m, side of a marker."""
@@ -87,11 +94,11 @@ class Charuco:
     dictionary: str = "4X4_100"
     """One of `DICTIONARIES`."""
 
-    legacy: bool = field(default=False)
+    legacy: bool = False
     """Printed by OpenCV before 4.6, which began boards with an even number of rows with a marker."""
 
     def __post_init__(self) -> None:
-        _check_board(self, least=3)
+        super().__post_init__()
         if not 0.0 < self.marker < self.square:
             raise ValueError(
                 f"marker must be above 0 and smaller than a square of {self.square:g} m; got {self.marker:g}. "
@@ -188,9 +195,8 @@ def find_views(files: Iterable[Path], board: Board) -> Iterator[View]:
 
 def suggested(files: Sequence[Path], board: Board) -> str:
     """What to say where no image shows the board: whether it has other numbers of squares; empty if that is not it."""
-    least = 4 if isinstance(board, Chessboard) else 3
     for more in (1, -1):
-        if min(board.columns, board.rows) + more < least:
+        if min(board.columns, board.rows) + more < board.least:
             continue
         other = replace(board, columns=board.columns + more, rows=board.rows + more)
         if any(len(view.pixels) for view in find_views(files[:_TRIED], other)):
@@ -203,16 +209,6 @@ def suggested(files: Sequence[Path], board: Board) -> str:
 
 def _dictionary(name: str) -> cv2.aruco.Dictionary:
     return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{name}"))
-
-
-def _check_board(board: Chessboard | Charuco, least: int) -> None:
-    if min(board.columns, board.rows) < least:
-        raise ValueError(
-            f"squares must be at least {least} a row and column; got {board.columns}x{board.rows}. "
-            "Count all squares, the outermost ones too."
-        )
-    if not 0.0 < board.square < np.inf:
-        raise ValueError(f"square must be the side of a square in m, above 0; got {board.square:g}. Measure it.")
 
 
 def _where_squares_meet(image: Image, grid: Array | NDArray[np.float32]) -> bool:

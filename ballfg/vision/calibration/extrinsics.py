@@ -1,7 +1,5 @@
 """Where a camera stands: its pose from points of the world that it sees, for instance the table's corners."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 

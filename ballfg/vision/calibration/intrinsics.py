@@ -1,7 +1,5 @@
 """The lens of a camera from views of a board: OpenCV's calibration, and whether the views can tell what it says."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -170,14 +168,11 @@ def _check_views(name: str, used: Sequence[View], missed: Sequence[str]) -> None
         )
     for view in used:
         if view.size != used[0].size:
+            first, other = (f"{one.size[0]}x{one.size[1]}" for one in (used[0], view))
             raise ValueError(
-                f"camera {name!r}: images must have one size; {used[0].name} has {_size(used[0].size)} and {view.name} "
-                f"{_size(view.size)} pixels. Take them all as the videos will be."
+                f"camera {name!r}: images must have one size; {used[0].name} has {first} and {view.name} "
+                f"{other} pixels. Take them all as the videos will be."
             )
-
-
-def _size(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"
 
 
 def _fit(name: str, views: Sequence[View], distortion: int) -> Intrinsics:
@@ -201,13 +196,8 @@ def _fit(name: str, views: Sequence[View], distortion: int) -> Intrinsics:
         for view, rvec, tvec in zip(views, rvecs, tvecs, strict=True)
     )
     share = coverage(size, np.concatenate([view.pixels for view in views]))
-    return Intrinsics(camera, _covariance(camera, fitted), fitted, (), (), share)
-
-
-def _covariance(camera: Camera, views: Sequence[FittedView]) -> Array:
-    return covariance_of_lens(
-        camera, [(fitted.view.points, fitted.rvec, fitted.tvec, fitted.residuals) for fitted in views]
-    )
+    covariance = covariance_of_lens(camera, [(v.view.points, v.rvec, v.tvec, v.residuals) for v in fitted])
+    return Intrinsics(camera, covariance, fitted, (), (), share)
 
 
 @contextmanager

@@ -1,7 +1,5 @@
 """How well views of a board tell the lens: the covariance of its parameters, and what it means in pixels."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final, TypeAlias
 
@@ -38,10 +36,8 @@ def covariance_of_lens(camera: Camera, boards: Sequence[PosedBoard]) -> Array:
         information += left.T @ left
         squares += float((residuals**2).sum())
         freedom += residuals.size - POSE
-    if freedom <= 0:
-        return np.diag(np.full(unknowns, np.inf))
     scale = np.sqrt(np.diag(information))
-    if not (scale > 0.0).all():
+    if freedom <= 0 or not (scale > 0.0).all():
         return np.diag(np.full(unknowns, np.inf))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
     if values[0] <= np.finfo(np.float64).eps * unknowns:

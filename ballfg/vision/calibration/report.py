@@ -1,19 +1,32 @@
-"""What a calibration found, in lines for people and as a mapping for programs."""
+"""What a calibration found: lines and a picture for people, a mapping for programs."""
 
-from __future__ import annotations
-
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 
+from ballfg.vision.arrays import Array, Image
 from ballfg.vision.calibration.extrinsics import Extrinsics
-from ballfg.vision.calibration.intrinsics import RAYS, FittedView, Intrinsics
+from ballfg.vision.calibration.intrinsics import CELLS, RAYS, FittedView, Intrinsics
+from ballfg.vision.calibration.table_points import TABLE_HEIGHT, table_outline
 from ballfg.vision.camera import Camera
 
 COEFFICIENTS: Final = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 """Names of OpenCV's distortion coefficients, in their order."""
+BLUE, VERMILION, GREY = "#0072b2", "#d55e00", "#8c8c8c"
+OUTLINED: Final = withStroke(linewidth=1.5, foreground="white")
+"""For letters that must be read over any image."""
+ARROW: Final = 0.05
+"""Of the image's width: the length at which a residual of three times the median is drawn."""
+PARTS: Final = 40
+"""Of a line: how finely it is drawn, since the lens bends it."""
+PANEL: Final = (5.0, 3.4)
+"""Inches, width and height of a panel."""
+DPI: Final = 120
 IN_A_LINE: Final = 6
 """Views that a line of the summary names."""
 
@@ -116,3 +129,92 @@ def _lens_numbers(lens: Intrinsics) -> tuple[dict[str, float], dict[str, float]]
     names = ("fx", "fy", "cx", "cy", *COEFFICIENTS[: len(bent)])
     values = [matrix[0, 0], matrix[1, 1], matrix[0, 2], matrix[1, 2], *bent]
     return dict(zip(names, map(float, values), strict=True)), dict(zip(names, map(float, lens.sigmas), strict=True))
+
+
+def calibration_picture(
+    found: Sequence[Calibration], images: Mapping[str, Image], table_height: float = TABLE_HEIGHT
+) -> Figure:
+    """One row a camera: residuals of the corners, error of each view, the table in the image.
+
+    Args: images: by the camera's name, grey, what the table's outline is drawn into; white without one.
+        table_height: m, z of the table's surface.
+    """
+    kinds: list[tuple[str, Callable[[Axes, Any], None]]] = []
+    if any(one.lens is not None for one in found):
+        kinds += [("lens", _corners), ("lens", _views)]
+    if any(one.place is not None for one in found):
+        kinds.append(("place", lambda axes, one: _table(axes, one, images.get(one.camera.name), table_height)))
+    width, height = PANEL
+    figure = Figure(figsize=(width * len(kinds), height * len(found) + 0.3), dpi=DPI, layout="constrained")
+    panels = figure.subplots(len(found), len(kinds), squeeze=False)
+    for row, one in zip(panels, found, strict=True):
+        for axes, (part, draw) in zip(row, kinds, strict=True):
+            if getattr(one, part) is None:
+                axes.set_axis_off()
+            else:
+                draw(axes, getattr(one, part))
+    return figure
+
+
+def _corners(axes: Axes, lens: Intrinsics) -> None:
+    pixels = np.concatenate([fitted.view.pixels for fitted in lens.views])
+    residuals = np.concatenate([fitted.residuals for fitted in lens.views])
+    _image_axes(axes, lens.camera)
+    width, height = lens.camera.size
+    for side, count, line in ((width, CELLS[0], axes.axvline), (height, CELLS[1], axes.axhline)):
+        for place in np.linspace(0, side, count + 1)[1:-1]:
+            line(place - 0.5, color=GREY, linewidth=0.3)
+    typical = float(np.median(np.linalg.norm(residuals, axis=1)))
+    longer = ARROW * width / (3.0 * typical) if typical > 0.0 else 1.0
+    axes.quiver(*pixels.T, *(longer * residuals).T, angles="xy", scale_units="xy", scale=1, width=0.002, color=BLUE)
+    axes.set_title(
+        f"{lens.camera.name}: corners as seen minus as projected, x{longer:.0f}\n"
+        f"RMS {lens.rms:.2f} px; corners in {lens.coverage:.0%} of the cells",
+        size=9,
+    )
+
+
+def _views(axes: Axes, lens: Intrinsics) -> None:
+    fitted = [*lens.views, *lens.left_out]
+    colours = [BLUE] * len(lens.views) + [VERMILION] * len(lens.left_out)
+    places = np.arange(len(fitted))
+    axes.bar(places, [one.rms for one in fitted], color=colours)
+    axes.axhline(lens.rms, color=GREY, linewidth=0.8)
+    if lens.left_out:  # a wrong view is worse by so much that the others could not be seen beside it
+        axes.set_yscale("log")
+    axes.set_xticks(places, [one.view.name for one in fitted], rotation=90, size=6)
+    axes.set_ylabel("RMS, px")
+    orange = "; orange: left out" if lens.left_out else ""
+    axes.set_title(f"{lens.camera.name}: error of each view{orange}", size=9)
+
+
+def _table(axes: Axes, place: Extrinsics, image: Image | None, table_height: float) -> None:
+    if image is not None:
+        axes.imshow(image, cmap="gray", vmin=0, vmax=255)
+    _image_axes(axes, place.camera)
+    for line in table_outline(table_height):
+        axes.plot(*_drawn(place.camera, line).T, color=VERMILION, linewidth=1.0)
+    axes.plot(*place.marked.pixels.T, "o", color=BLUE, markersize=6, fillstyle="none")
+    for name, pixel in zip(place.marked.names, place.marked.pixels, strict=True):
+        axes.annotate(name, pixel, (4, 4), textcoords="offset points", size=6, color=BLUE, path_effects=[OUTLINED])
+    axes.set_title(
+        f"{place.camera.name}: the table as projected; circles: as marked\n"
+        f"RMS {place.rms:.2f} px; camera ± {1e3 * place.centre_sigma:.1f} mm, ± {np.degrees(place.turn_sigma):.2f}°",
+        size=9,
+    )
+
+
+def _drawn(camera: Camera, line: Array) -> Array:
+    """(k, 2) px along a line (2, 3) m; NaN outside the image, where distortion means nothing."""
+    share = np.linspace(0.0, 1.0, PARTS + 1)[:, None]
+    points = (1.0 - share) * line[0] + share * line[1]
+    return np.where(camera.in_view(points)[:, None], camera.project(points), np.nan)
+
+
+def _image_axes(axes: Axes, camera: Camera) -> None:
+    width, height = camera.size
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    axes.set_aspect("equal")
+    axes.set_xlabel("u, px")
+    axes.set_ylabel("v, px")

@@ -1,7 +1,5 @@
 """Points of a table-tennis table whose place in the world is known, and the file that says where cameras see them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """What a camera sees without the ball: learned from frames of the recording, followed slowly, in flickering light."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 

@@ -1,11 +1,10 @@
-"""Videos through detectors: one after the other, or each camera in a process of its own."""
-
-from __future__ import annotations
+"""Videos through detectors, ballfg's or a user's: one after the other, or each camera in a process of its own."""
 
 import multiprocessing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from functools import partial
+from itertools import count
 from pathlib import Path
 from queue import Empty, Queue
 from typing import Final, TypeVar
@@ -13,13 +12,19 @@ from typing import Final, TypeVar
 import cv2
 from joblib.externals.loky import get_reusable_executor
 
+from ballfg.checks import did_you_mean
+from ballfg.files.python_file import blamed, run_file
 from ballfg.progress import Watch, unwatched
+from ballfg.vision.arrays import Image
 from ballfg.vision.detection.background import FEWEST
 from ballfg.vision.detection.detections import Candidates, Detections, Detector
 from ballfg.vision.detection.detector import BallDetector, DetectorSettings
 from ballfg.vision.detection.video import Video, open_video
 
 T = TypeVar("T")
+
+Maker = Callable[[Video], Detector]
+"""Makes the detector of a camera from its video."""
 
 SAMPLE: Final = 15
 """Frames from which a background is learned: what stands in the same place in eight of them is background."""
@@ -46,6 +51,32 @@ def learn_detector(video: Video, settings: DetectorSettings | None = None) -> Ba
     return BallDetector.learn(images, settings)
 
 
+def load_detector(text: str) -> Maker:
+    """Runs a Python file and takes a detector from it: a function of an image, or a class of such things.
+
+    Args: text: `FILE.py:NAME`; the file is one that you trust: all of its code runs.
+    Returns: what makes the detector of a camera, fit to be sent to other processes: the function as it is, or an
+        instance of the class, made without arguments.
+    Raises:
+        FileNotFoundError: there is no such file.
+        ValueError: a text of another form, a file that does not run, or a name that is no callable of it.
+    """
+    file, colon, name = text.rpartition(":")
+    if not (colon and file and name.isidentifier()):
+        raise ValueError(f"detector must be FILE.py:NAME; got {text!r}. Name the callable after a colon.")
+    path = Path(file).resolve()
+    if not path.is_file():
+        raise FileNotFoundError(f"detector: {path} does not exist. A detector of one's own is one Python file.")
+    found = vars(run_file(path, "detector"))
+    if not callable(found.get(name)):
+        own = [word for word, item in found.items() if callable(item) and not word.startswith("_")]
+        problem = "is not callable" if name in found else "is not defined there"
+        raise ValueError(
+            f"{path} must define the callable {name!r}; it {problem}. Correct the name.{did_you_mean(name, own)}"
+        )
+    return partial(_made, found[name], path)
+
+
 def detect(video: Video, camera: str, detector: Detector, watch: Watch = unwatched) -> Detections:
     """All candidates of a video.
 
@@ -65,7 +96,7 @@ def detect(video: Video, camera: str, detector: Detector, watch: Watch = unwatch
 
 def detect_all(
     videos: Mapping[str, Path],
-    make: Callable[[Video], Detector] = learn_detector,
+    make: Maker = learn_detector,
     *,
     stamps: Mapping[str, Path] | None = None,
     jobs: int = 1,
@@ -79,7 +110,7 @@ def detect_all(
         stamps: camera -> CSV file, for those whose stamps are not the container's.
         jobs: processes; no more than cameras are of use.
         watch: sees the numbers of the frames that are done, those of all cameras together.
-    Raises: as `open_video` and `detect`.
+    Raises: TypeError, ValueError, FileNotFoundError: as `open_video` and `detect`.
     """
     opened = {name: open_video(path, (stamps or {}).get(name)) for name, path in videos.items()}
     if jobs == 1 or len(opened) < 2:
@@ -92,9 +123,7 @@ def detect_all(
     return _in_processes(opened, make, jobs, watch)
 
 
-def _in_processes(
-    videos: Mapping[str, Video], make: Callable[[Video], Detector], jobs: int, watch: Watch
-) -> dict[str, Detections]:
+def _in_processes(videos: Mapping[str, Video], make: Maker, jobs: int, watch: Watch) -> dict[str, Detections]:
     with multiprocessing.Manager() as manager:
         told = manager.Queue()
         pool = get_reusable_executor(max_workers=min(jobs, len(videos)))
@@ -112,7 +141,7 @@ def _failed(job: Future[Detections]) -> bool:
     return job.done() and job.exception() is not None
 
 
-def _job(video: Video, camera: str, make: Callable[[Video], Detector], told: Queue[int | None]) -> Detections:
+def _job(video: Video, camera: str, make: Maker, told: Queue[int | None]) -> Detections:
     """One camera, in a process of its own; says how many frames are done, and None at the end, come what may."""
     cv2.setNumThreads(1)
     try:
@@ -156,3 +185,16 @@ def _run(video: Video, detector: Detector, seen: list[tuple[float, Candidates]])
             )
         seen.append((stamp, candidates))
         yield number
+
+
+def _made(found: Detector | type[Detector], path: Path, video: Video) -> Detector:
+    """The detector of a camera, which serves no other; what it raises is told with file, line, video and frame."""
+    with blamed(path, f"making the detector of {video.name}"):
+        detector = found() if isinstance(found, type) else found
+    frames = count()
+
+    def watched(image: Image) -> Candidates:
+        with blamed(path, f"frame {next(frames)} of {video.name}"):
+            return detector(image)
+
+    return watched

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,6 +12,9 @@ from numpy.typing import ArrayLike
 from ballfg.checks import check_array
 from ballfg.tracks.sightings import are_covariances
 from ballfg.vision.arrays import Array, Flags, Image, Rows
+
+_SHAPES: Final = {"pixels": (2,), "covariances": (2, 2), "scores": (), "streaks": (2, 2)}
+"""What is known of each candidate, of a frame and of a recording alike, and its shape."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +32,7 @@ class Candidates:
     """(k, 2, 2) px^2."""
 
     scores: Array
-    """(k,) in [0, 1], how ball-like."""
+    """(k,) dimensionless, in [0, 1], how ball-like."""
 
     streaks: Array
     """(k, 2, 2) px, centre at the shutter's opening and closing, in unknown order; NaN where not blurred."""
@@ -48,17 +52,12 @@ class Candidates:
     def at(cls, pixels: ArrayLike, sigma: float, scores: ArrayLike | None = None) -> Candidates:
         """Of a detector that gives centres only.
 
-        Args: pixels: (k, 2).  sigma: px, of each coordinate.  scores: (k,) in [0, 1]; 1 by default.
+        Args: pixels: (k, 2).  sigma: px, of each coordinate.  scores: (k,) dimensionless, in [0, 1]; 1 by default.
         """
         centres = np.asarray(pixels, dtype=np.float64).reshape(-1, 2)
         count = len(centres)
-        covariances = np.tile(sigma**2 * np.eye(2), (count, 1, 1))
-        return cls(
-            centres,
-            covariances,
-            np.ones(count) if scores is None else np.asarray(scores, dtype=np.float64),
-            np.full((count, 2, 2), np.nan),
-        )
+        marks = np.ones(count) if scores is None else np.asarray(scores, dtype=np.float64)
+        return cls(centres, np.tile(sigma**2 * np.eye(2), (count, 1, 1)), marks, np.full((count, 2, 2), np.nan))
 
 
 Detector = Callable[[Image], Candidates]
@@ -90,7 +89,7 @@ class Detections:
     """(n, 2, 2) px^2."""
 
     scores: Array
-    """(n,) in [0, 1], how ball-like."""
+    """(n,) dimensionless, in [0, 1], how ball-like."""
 
     streaks: Array
     """(n, 2, 2) px, centre at the shutter's opening and closing, in unknown order; NaN where not blurred."""
@@ -128,7 +127,7 @@ class Detections:
         Returns: its candidates, k >= 0.
         """
         rows = slice(*np.searchsorted(self.frame, (number, number + 1)))
-        return Candidates(self.pixels[rows], self.covariances[rows], self.scores[rows], self.streaks[rows])
+        return Candidates(*(getattr(self, field)[rows] for field in _SHAPES))
 
     def select(self, keep: Flags) -> Detections:
         """Some of the candidates.
@@ -136,15 +135,7 @@ class Detections:
         Args: keep: (n,) bool, whether a candidate stays.
         Returns: the detections with these candidates and all frames.
         """
-        return Detections(
-            self.camera,
-            self.frames,
-            self.frame[keep],
-            self.pixels[keep],
-            self.covariances[keep],
-            self.scores[keep],
-            self.streaks[keep],
-        )
+        return replace(self, **{field: getattr(self, field)[keep] for field in ("frame", *_SHAPES)})
 
     def best_scores(self, count: int = 3) -> Array:
         """The highest scores.
@@ -162,19 +153,13 @@ class Detections:
         Returns: the detections of the recording.
         Raises: ValueError: stamps that do not increase.
         """
-        stamps: list[float] = []
-        found = [Candidates.none()]
-        for stamp, candidates in seen:
-            stamps.append(stamp)
-            found.append(candidates)
+        pairs = list(seen)
+        stamps, found = [stamp for stamp, _ in pairs], [Candidates.none(), *(candidates for _, candidates in pairs)]
         return cls(
             camera,
             np.array(stamps, dtype=np.float64),
             np.repeat(np.arange(len(stamps)), [len(candidates) for candidates in found[1:]]),
-            np.concatenate([candidates.pixels for candidates in found]),
-            np.concatenate([candidates.covariances for candidates in found]),
-            np.concatenate([candidates.scores for candidates in found]),
-            np.concatenate([candidates.streaks for candidates in found]),
+            *(np.concatenate([getattr(candidates, field) for candidates in found]) for field in _SHAPES),
         )
 
 
@@ -200,9 +185,8 @@ def _check_increasing(what: str, stamps: Array) -> None:
 def _check_fields(owner: Candidates | Detections, what: str) -> None:
     """What the candidates of a frame and those of a recording have in common."""
     count = len(np.asarray(owner.pixels))
-    shapes = {"pixels": (count, 2), "covariances": (count, 2, 2), "scores": (count,), "streaks": (count, 2, 2)}
-    for field, shape in shapes.items():
-        object.__setattr__(owner, field, _numbers(what, field, getattr(owner, field), shape))
+    for field, shape in _SHAPES.items():
+        object.__setattr__(owner, field, _numbers(what, field, getattr(owner, field), (count, *shape)))
     for field in ("pixels", "covariances", "scores"):
         finite = np.isfinite(getattr(owner, field))
         _refuse(~finite.all(axis=tuple(range(1, finite.ndim))), what, field, "be finite")

@@ -1,39 +1,25 @@
 """Candidates from a table: `detections.csv`, of a detector of any kind, as a recording of each camera."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from ballfg.tracks import detections_file
 from ballfg.tracks.checks import check_step
-from ballfg.tracks.detection_columns import (
-    CAMERA,
-    OPTIONAL,
-    RULES,
-    SCORE,
-    UNSTATED,
-    Array,
-    Texts,
-    check_cameras,
-    check_values,
-    covariances,
-    read_columns,
-)
 from ballfg.tracks.rows import KEY
-from ballfg.vision.arrays import Flags
+from ballfg.vision.arrays import Array, Flags
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 
-REQUIRED: Final = ("t", CAMERA, "u", "v")
+REQUIRED: Final = ("t", detections_file.CAMERA, "u", "v")
 UNUSED: Final = (KEY,)
 """Columns that may be there and are not needed: which ball a row belongs to is found anew."""
 SURE: Final = 1.0
 """Score of all rows of a table without one: somebody has chosen them."""
-_UNSTATED: Final = UNSTATED | {SCORE: SURE}
-_RULES: Final = {**RULES, SCORE: ("0 to 1", lambda x: (x >= 0.0) & (x <= 1.0))}
+_UNSTATED: Final = detections_file.UNSTATED | {detections_file.SCORE: SURE}
+_RULES: Final = {**detections_file.RULES, detections_file.SCORE: ("0 to 1", lambda x: (x >= 0.0) & (x <= 1.0))}
 
 
 def read_detections(
@@ -55,39 +41,29 @@ def read_detections(
         ValueError: a column that is missing, a cell out of its range, an unknown camera, a camera without rows; the
             message names file, line and column.
     """
-    header, texts, values = read_columns(path, REQUIRED)
-    names = texts[CAMERA]
+    header, texts, values = detections_file.read_columns(path, REQUIRED)
+    names = texts[detections_file.CAMERA]
     rows = np.arange(len(names))
-    check_values(path, values, rows, _RULES)
-    check_cameras(path, names, rows, [camera.name for camera in cameras], ignored)
-    _check_all_seen(path, names, cameras)
-    values |= {name: np.full(len(names), value) for name, value in _UNSTATED.items() if name not in values}
-    known = (*REQUIRED, *OPTIONAL, *UNUSED)
-    notes = [f"{path.name}: column {name!r} ignored" for name in header if name not in known]
-    names, values, repeats = _once(names, values)
-    if repeats:
-        notes.append(f"{path.name}: {repeats} exact repeats of rows dropped")
-    found = [_of_camera(camera.name, names == camera.name, values) for camera in cameras]
-    for seen in found:
-        check_step(f"{path}, camera {seen.camera!r}", seen.frames)
-    return found, notes
-
-
-def _once(names: Texts, values: dict[str, Array]) -> tuple[Texts, dict[str, Array], int]:
-    """The table without rows that stand in it before, and how many those were."""
-    _, number = np.unique(names, return_inverse=True)
-    _, first = np.unique(np.column_stack((number, *values.values())), axis=0, return_index=True)
-    kept = np.sort(first)
-    return names[kept], {name: column[kept] for name, column in values.items()}, len(names) - len(kept)
-
-
-def _check_all_seen(path: Path, names: Texts, cameras: Sequence[Camera]) -> None:
+    detections_file.check_values(path, values, rows, _RULES)
+    detections_file.check_cameras(path, names, rows, [camera.name for camera in cameras], ignored)
     blind = [camera.name for camera in cameras if not (names == camera.name).any()]
     if blind:
         raise ValueError(
             f"{path}: every camera must have rows; got none of {' and '.join(map(repr, blind))}. "
             f"Add them, or leave the camera out with --without {blind[0]}."
         )
+    values |= {name: np.full(len(names), value) for name, value in _UNSTATED.items() if name not in values}
+    known = (*REQUIRED, *detections_file.OPTIONAL, *UNUSED)
+    notes = [f"{path.name}: column {name!r} ignored" for name in header if name not in known]
+    number = np.unique(names, return_inverse=True)[1]
+    kept = np.sort(np.unique(np.column_stack((number, *values.values())), axis=0, return_index=True)[1])
+    if len(kept) < len(names):
+        notes.append(f"{path.name}: {len(names) - len(kept)} exact repeats of rows dropped")
+    names, values = names[kept], {name: column[kept] for name, column in values.items()}
+    found = [_of_camera(camera.name, names == camera.name, values) for camera in cameras]
+    for seen in found:
+        check_step(f"{path}, camera {seen.camera!r}", seen.frames)
+    return found, notes
 
 
 def _of_camera(name: str, rows: Flags, values: dict[str, Array]) -> Detections:
@@ -96,5 +72,5 @@ def _of_camera(name: str, rows: Flags, values: dict[str, Array]) -> Detections:
     order = np.argsort(frame, kind="stable")
     pixels = np.column_stack((mine["u"], mine["v"]))
     streaks = np.full((len(order), 2, 2), np.nan)
-    spread, scores = covariances(mine)[order], mine[SCORE][order]
+    spread, scores = detections_file.covariances(mine)[order], mine[detections_file.SCORE][order]
     return Detections(name, frames, frame[order], pixels[order], spread, scores, streaks)

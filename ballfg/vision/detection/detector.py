@@ -76,7 +76,7 @@ class BallDetector:
     def learn(cls, images: Sequence[Image], settings: DetectorSettings | None = None) -> BallDetector:
         """A detector with the background that frames of the recording show.
 
-        Args: images: at least three, (h, w, 3) uint8 each, spread over the recording; see `Background`.
+        Args: images: at least three, (h, w, 3) grey levels, spread over the recording; see `Background`.
             settings: what is known about the ball; the default ones if None.
         Returns: the detector of that camera.
         Raises: ValueError: too few images, or of several sizes.
@@ -84,8 +84,9 @@ class BallDetector:
         return cls(Background(images), settings)
 
     def __call__(self, image: Image) -> Candidates:
-        """The candidates of the next frame (h, w, 3) in BGR.
+        """The candidates of the next frame.
 
+        Args: image: (h, w, 3) grey levels, BGR.
         Raises: ValueError: an image of another size than the background's.
         """
         if image.shape != self.background.full.shape:
@@ -127,9 +128,7 @@ class BallDetector:
 def patch_of(change: np.ndarray, behind: np.ndarray, region: Region, noise: Array) -> Patch | None:
     """The region's pixels along the colour by which it differs from its background; None where it does not.
 
-    Args:
-        change, behind: (m, 3) grey levels, difference to the background and the background, of the free pixels.
-        region: where they are.
+    Args: change, behind: (m, 3) grey levels, difference to the background and the background, of the free pixels.
         noise: (3, 3) grey levels^2, covariance of the channels.
     """
     strength = np.abs(change).max(axis=1)
@@ -151,10 +150,7 @@ def patch_of(change: np.ndarray, behind: np.ndarray, region: Region, noise: Arra
 
 
 def learned(look: Look, fit: StreakFit, blotches: float) -> Look:
-    """What to expect after another ball was seen: means weighted by information, which ages towards the first.
-
-    Args: look: expected up to now.  fit: made with it.  blotches: px across which noise is shared.
-    """
+    """What to expect after another ball was seen: means weighted by information, which ages towards the first."""
     doubt = max(fit.scatter, 1.0) ** 2 * blotches
     first = Look.unknown()
     old = FORGETS * (look.information - first.information)

@@ -1,7 +1,5 @@
 """Where in a frame to look closer: connected changes of a sane size, found in the small picture."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -51,8 +49,7 @@ class Region:
 def find_regions(background: Background, image: Image, widest: float, longest: float, most: int) -> list[Region]:
     """Regions of one frame, the heaviest first; the background follows the frame.
 
-    Args: background: of the camera.  image: (h, w, 3).  widest, longest: px, of a ball and of its streak.
-        most: how many at most.
+    Args: image: (h, w, 3).  widest, longest: px, of a ball and of its streak.  most: how many at most.
     """
     small = shrunk(image)
     change = background.follow(small)

@@ -1,12 +1,10 @@
 """How ball-like a fitted candidate is: a product of marks between 0 and 1 for shape, contrast, size and colour."""
 
-from __future__ import annotations
-
 from typing import Final, Literal
 
 import numpy as np
 
-from ballfg.vision.arrays import Array, Array32
+from ballfg.vision.arrays import Array32
 from ballfg.vision.detection.streak import Patch, StreakFit, swept
 
 UNEXPLAINED: Final = 0.06
@@ -40,10 +38,8 @@ def score(
     """Mark of a candidate, 0 to 1.
 
     Args:
-        fit, patch: of its pixels.
         change, behind: (m, 3) grey levels, difference to the background and background of these pixels.
         diameter: px, least and greatest.
-        colour: that the ball has, if known.
     """
     shape = np.exp(-((fit.unexplained / UNEXPLAINED) ** 2)) * (1.0 if fit.settled else UNSETTLED)
     strength = 1.0 - np.exp(-((fit.strength / STRENGTH) ** 2))
@@ -56,14 +52,10 @@ def score(
     return float(np.clip(mark, 0.0, 1.0))
 
 
-def ball_colour(coverage: Array32, change: Array32, behind: Array32) -> Array:
-    """(3,) BGR grey levels of the ball itself: the background that shines through its streak is taken out."""
-    coverage = coverage[:, None]
-    return np.asarray((coverage * (change + coverage * behind)).sum(axis=0) / (coverage**2).sum(), dtype=np.float64)
-
-
 def _colour_mark(coverage: Array32, change: Array32, behind: Array32, colour: Literal["white", "orange"]) -> float:
-    blue, green, red = np.maximum(ball_colour(coverage, change, behind), 0.0)
+    column = coverage[:, None]  # the background that shines through the streak is taken out
+    ball = (column * (change + column * behind)).sum(axis=0) / (column**2).sum()
+    blue, green, red = np.maximum(ball.astype(np.float64), 0.0)
     most, least = max(blue, green, red, 1.0), min(blue, green, red)
     saturation = (most - least) / most
     if colour == "white":

@@ -146,11 +146,6 @@ class StreakFit:
         """Radius, px."""
         return float(self.values[RADIUS])
 
-    @property
-    def contrast(self) -> float:
-        """Grey levels between the ball and the background's mean."""
-        return float(self.values[CONTRAST])
-
 
 @cache
 def _quadrature(count: int) -> tuple[Array32, Array32]:

@@ -1,7 +1,5 @@
 """Frames with their stamps: from a video file or a folder of images, stamped by the container or by a CSV file."""
 
-from __future__ import annotations
-
 import re
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
@@ -12,8 +10,9 @@ from typing import Final
 import cv2
 import numpy as np
 
+from ballfg.tracks import csv_files
+from ballfg.tracks.checks import check_step
 from ballfg.vision.arrays import Array, Image
-from ballfg.vision.detection.stamps import read_stamps
 
 IMAGE_ENDINGS: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """Endings of what counts as an image in a folder; other files are left alone."""
@@ -23,6 +22,8 @@ SHORT: Final = (3, 0.02)
 
 class Video(ABC):
     """Frames of one camera, which can be read more than once.
+
+    Args: stamps: (f,) s, of its frames; None: those of the container.
 
     Attributes:
         name: the file's or folder's, without ending.
@@ -113,11 +114,8 @@ class VideoFile(Video):
     def _decoded(self) -> Iterator[tuple[float, Image]]:
         capture = _capture(self.path)
         try:
-            while True:
-                there, image = capture.read()
-                if not there:
-                    return
-                yield 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC), np.asarray(image, dtype=np.uint8)
+            while (read := capture.read())[0]:
+                yield 1e-3 * capture.get(cv2.CAP_PROP_POS_MSEC), np.asarray(read[1], dtype=np.uint8)
         finally:
             capture.release()
 
@@ -172,6 +170,39 @@ def open_video(path: str | PathLike[str], stamps: str | PathLike[str] | None = N
     if times is None:
         raise ValueError(f"stamps must be given for a folder of images; got none for {place}. Pass a CSV file.")
     return ImageFolder(place, times)
+
+
+def read_stamps(path: Path) -> Array:
+    """(f,) s, strictly increasing, one a frame.
+
+    Args: path: a CSV file with a header; column `t` (s), optionally `frame`, which then counts from 0.
+    Raises: FileNotFoundError: no such file. ValueError: no column `t`, no rows, or a row that breaks a rule.
+    """
+    if not path.is_file():
+        raise FileNotFoundError(f"file of stamps {path} does not exist. Check the path.")
+    names = [name.strip() for name in csv_files.read_header(path)]
+    if "t" not in names:
+        raise ValueError(f"{path} must have a column t (s); got {', '.join(names)}. Name it in line 1.")
+    stamps: list[float] = []
+    for line, cells in csv_files.records(path):
+        where = f"{path}, line {line}"
+        row = dict(zip(names, (cell.strip() for cell in cells), strict=False))
+        if "frame" in names and row.get("frame") != str(len(stamps)):
+            raise ValueError(
+                f"{where}: frame must count from 0; got {row.get('frame')!r} for {len(stamps)}. Sort the rows."
+            )
+        if not csv_files.is_number(row.get("t", "")):
+            raise ValueError(f"{where}: t must be a finite number of seconds; got {row.get('t')!r}. Correct it.")
+        stamps.append(float(row["t"]))
+        if len(stamps) > 1 and not stamps[-1] > stamps[-2]:
+            raise ValueError(
+                f"{where}: t must increase; frame {len(stamps) - 1} has {stamps[-1]!r} s after {stamps[-2]!r} s. "
+                "Sort the rows or correct the stamps."
+            )
+    if not stamps:
+        raise ValueError(f"{path} must have one row a frame; got none.")
+    check_step(str(path), np.array(stamps))
+    return np.array(stamps)
 
 
 def _capture(path: Path) -> cv2.VideoCapture:

@@ -1,7 +1,5 @@
 """The contact sheet: each track in every view and in space, so that one look tells whether they are balls."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
@@ -11,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ballfg.vision.arrays import Array
-from ballfg.vision.tracking.palette import hexadecimal
 from ballfg.vision.tracking.pipeline import Tracking
 from ballfg.vision.tracking.strobe import EXPOSURES, HEIGHT, WIDTH, ZOOM, AllCandidates, Picture, Strobe
+from ballfg.vision.tracking.view_painter import hexadecimal
 
 Extent = tuple[float, float, float, float]
 
@@ -40,10 +38,7 @@ TABLE: Final = "#2a7f4f"
 class ContactSheet:
     """Collects pictures while the videos pass by (`strobe.tapped`), then writes the sheet.
 
-    Args:
-        tracking: what was found.
-        ball_radius: m.
-        table_height: m, z of the table's surface.
+    Args: ball_radius: m.  table_height: m, z of the table's surface.
         table: (x_low, x_high, y_low, y_high) m; None where it is not known.
     """
 

@@ -1,21 +1,16 @@
 """What was tracked as a dataset, with the pictures to look at: either all files appear, or none."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from ballfg.files.destination import check_folder, check_replaceable
-from ballfg.files.whole_folder import whole_folder
+from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import DatasetInfo, TableWriter, write_dataset
-from ballfg.tracks.detection_columns import SCORE, seen_columns
-from ballfg.tracks.detections_file import DETECTIONS_FILE
+from ballfg.tracks.detections_file import DETECTIONS_FILE, SCORE, seen_columns
 from ballfg.tracks.info import INFO_FILE, write_info
 from ballfg.tracks.rows import KEY, SIGMAS, VALUES
 from ballfg.vision.arrays import Image
@@ -42,7 +37,6 @@ def check_result_folder(folder: Path, inputs: Sequence[Path], *, force: bool) ->
     Raises: ValueError: a file; an input that lies in it; other files; an earlier result and no `force`.
         FileNotFoundError: its parent does not exist.
     """
-    check_folder(folder)
     for path in inputs:
         if path.resolve().parent == folder.resolve():
             raise ValueError(f"out must not hold what is read; {path} lies in {folder}. Choose another folder.")
@@ -108,14 +102,9 @@ def _write_tables(stage: Path, tracking: Tracking, info: DatasetInfo) -> None:
     write_cameras(stage / CAMERAS_FILE, tracking.cameras)
     with TableWriter(stage / DETECTIONS_FILE) as detections:
         for camera in range(len(tracking.cameras)):
-            detections.write(_detection_columns(tracking, camera))
-
-
-def _detection_columns(tracking: Tracking, camera: int) -> dict[str, ArrayLike]:
-    """All candidates of a camera. Those of a ball carry its name, the others none."""
-    seen = tracking.detections[camera]
-    names = np.full(len(seen), "", dtype=object)
-    for name, ball in zip(tracking.names, tracking.balls, strict=True):
-        names[tracking.rows(ball, camera)] = name
-    columns = seen_columns(seen.times, seen.camera, seen.pixels, seen.covariances)
-    return {KEY: names} | columns | {SCORE: seen.scores}
+            seen = tracking.detections[camera]
+            names = np.full(len(seen), "", dtype=object)  # of the balls; candidates of no ball have none
+            for name, ball in zip(tracking.names, tracking.balls, strict=True):
+                names[tracking.rows(ball, camera)] = name
+            columns = seen_columns(seen.times, seen.camera, seen.pixels, seen.covariances)
+            detections.write({KEY: names} | columns | {SCORE: seen.scores})

@@ -1,9 +1,11 @@
-"""The overlay: all views side by side as a video, with candidates, balls, trails, names and a line of time."""
+"""The overlay: all views side by side as a video, with candidates, balls, trails, names and a line of time.
 
-from __future__ import annotations
+The cameras are played back on one clock: each shows its frame that is nearest to the time.
+"""
 
 import math
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
@@ -11,13 +13,12 @@ import cv2
 import numpy as np
 
 from ballfg.progress import Watch, unwatched
-from ballfg.vision.arrays import Image
-from ballfg.vision.tracking.palette import bgr
+from ballfg.vision.arrays import Array, Image, Rows
+from ballfg.vision.association.gathering import nearest
+from ballfg.vision.camera import Camera
+from ballfg.vision.detection.detections import Detections
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.playback import Schedule, play, schedule
-from ballfg.vision.tracking.view_painter import ViewPainter, write
-
-"""Hands items through and shows how far it is: (items, how many, what they are)."""
+from ballfg.vision.tracking.view_painter import ViewPainter, bgr, write
 
 VIEW_WIDTH: Final = 640
 """px of one view: three side by side make 1920, the width of a screen."""
@@ -31,10 +32,24 @@ BAR: Final = 6
 """px, height of a track's bar."""
 BARS: Final = 2 * BAR + 3
 """px from the upper lane of bars to the bottom."""
+HELD: Final = 0.1
+"""s that a camera's frame stays on show where its next ones are missing: long enough to bridge dropped frames, short
+enough that a picture never shows a ball that has long gone."""
 MARGIN: Final = 12
 """px left and right of it."""
 PAPER, INK = (40, 40, 40), (235, 235, 235)
 """Colours of the line of time and of its cursor and text."""
+
+
+@dataclass(frozen=True, eq=False)
+class Schedule:
+    """What is on show when."""
+
+    times: Array
+    """(k,) s, true time of each moment, increasing."""
+
+    frames: Rows
+    """(k, c) number of the frame of each camera; -1 where it has none within `HELD`."""
 
 
 def write_overlay(
@@ -44,7 +59,6 @@ def write_overlay(
 
     Args:
         path: a new file; its folder exists.
-        tracking: what was found.
         streams: the frames of each camera once more, from the first on.
         watch: sees the frames that are drawn.
     Returns: the number of its frames.
@@ -65,12 +79,7 @@ def write_overlay(
 
 
 class OverlayPainter:
-    """Lays the views out and draws them.
-
-    Args: tracking: what was found.
-
-    Attributes: size: width and height of the overlay, px.
-    """
+    """Lays the views out and draws them. Attributes: size: width and height of the overlay, px."""
 
     def __init__(self, tracking: Tracking) -> None:
         self._tracking = tracking
@@ -112,3 +121,41 @@ class OverlayPainter:
         """Where a time stands, px from the left."""
         share = (time - first) / (last - first) if last > first else 0.0
         return round(MARGIN + share * (self.size[0] - 1 - 2 * MARGIN))
+
+
+def schedule(detections: Sequence[Detections], cameras: Sequence[Camera]) -> Schedule:
+    """The moments at which to show a recording: the frames of the camera with most, and where it is silent the others'.
+
+    Only the stamps of the detections' frames and the cameras' time offsets are used.
+    """
+    clocks = [seen.frames - camera.time_offset for seen, camera in zip(detections, cameras, strict=True)]
+    times = np.zeros(0)
+    for clock in sorted(clocks, key=len, reverse=True):
+        if len(times) == 0:
+            times = clock
+        elif len(clock):
+            times = np.concatenate((clock[clock < times[0]], times, clock[clock > times[-1]]))
+    return Schedule(times, np.column_stack([shown(clock, times) for clock in clocks]))
+
+
+def shown(clock: Array, times: Array) -> Rows:
+    """(k,) index into `clock` (f,), increasing, of the stamp nearest to each of `times` (k,); -1 beyond `HELD`."""
+    if len(clock) == 0:
+        return np.full(len(times), -1, dtype=np.int64)
+    index = nearest(clock, times)
+    return np.where(np.abs(clock[index] - times) <= HELD, index, -1).astype(np.int64)
+
+
+def play(moments: Schedule, streams: Sequence[Iterator[tuple[float, Image]]]) -> Iterator[list[Image | None]]:
+    """The images of each moment, one of each camera; None where it has none.
+
+    Args: streams: of each camera, from its first frame on; each is run through once.
+    """
+    at = [-1] * len(streams)
+    images: list[Image | None] = [None] * len(streams)
+    for frames in moments.frames:
+        for i, wanted in enumerate(frames):
+            while at[i] < wanted:
+                _, images[i] = next(streams[i])
+                at[i] += 1
+        yield [image if frame >= 0 else None for image, frame in zip(images, frames, strict=True)]

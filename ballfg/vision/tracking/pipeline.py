@@ -1,7 +1,5 @@
 """What cameras recorded, turned into balls: detections, tracks, and whether the cameras agree."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +12,7 @@ from ballfg.tracks import Track
 from ballfg.vision.arrays import Array, Rows
 from ballfg.vision.association.agreement import Agreement, check_agreement
 from ballfg.vision.association.associate import AssociationSettings, associate
-from ballfg.vision.association.seen_ball import SeenBall
+from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detect import detect_all, learn_detector
 from ballfg.vision.detection.detections import Detections, Detector

@@ -1,7 +1,5 @@
 """Which file is which camera's: videos matched to the cameras of a rig, and checked against them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
@@ -16,9 +14,7 @@ SAME_SHAPE: Final = 0.01
 def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Sequence[str] = ()) -> dict[str, Path]:
     """The video of each camera.
 
-    Args:
-        given: paths, each with a camera's name as its stem, or `name=path`.
-        cameras: of the rig.
+    Args: given: paths, each with a camera's name as its stem, or `name=path`.
         ignored: names of cameras whose videos are passed over.
     Returns: camera -> path, in the order of the cameras.
     Raises: ValueError: a video of no camera, two of one, or a camera without one.
@@ -59,7 +55,7 @@ def named_path(text: str, names: Sequence[str]) -> tuple[str, Path]:
 def stamp_files(given: Sequence[str], cameras: Sequence[Camera]) -> dict[str, Path]:
     """The files of stamps of some cameras.
 
-    Args: given: `name=path`.  cameras: of the rig.
+    Args: given: `name=path`.
     Raises: ValueError: a word without a name, a name of no camera, or one that comes twice.
     """
     names = [camera.name for camera in cameras]
@@ -97,14 +93,11 @@ def check_sizes(sizes: Mapping[str, tuple[int, int]], cameras: Sequence[Camera])
     for camera in cameras:
         size = sizes[camera.name]
         if size != camera.size:
+            calibrated, filmed = (f"{width}x{height}" for width, height in (camera.size, size))
             raise ValueError(
-                f"camera {camera.name!r} must be calibrated at the size of its video; got {_by(camera.size)} in the "
-                f"cameras' file and a video of {_by(size)}. {_remedy(camera.size, size)}"
+                f"camera {camera.name!r} must be calibrated at the size of its video; got {calibrated} in the "
+                f"cameras' file and a video of {filmed}. {_remedy(camera.size, size)}"
             )
-
-
-def _by(size: tuple[int, int]) -> str:
-    return f"{size[0]}x{size[1]}"
 
 
 def _remedy(calibrated: tuple[int, int], filmed: tuple[int, int]) -> str:

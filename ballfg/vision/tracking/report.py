@@ -1,7 +1,5 @@
 """What was tracked, in words."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from ballfg.vision.association.agreement import LEAST_MISFIT

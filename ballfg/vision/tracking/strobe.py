@@ -1,7 +1,5 @@
 """A flight in one picture: the ball cut from several frames of a camera and put into one of them, with its trail."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Final, Protocol
 
@@ -9,9 +7,8 @@ import cv2
 import numpy as np
 
 from ballfg.vision.arrays import Array, Image
-from ballfg.vision.tracking.palette import bgr
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.view_painter import by_score, polyline, ring, uncover, write
+from ballfg.vision.tracking.view_painter import bgr, by_score, polyline, ring, uncover, write
 
 WIDTH: Final = 480
 """px of the picture."""
@@ -53,13 +50,9 @@ class Picture(Protocol):
 class Strobe:
     """The picture of one ball in one camera, put together while the camera's frames pass by.
 
-    Args:
-        tracking: what was found.
-        track, camera: their numbers.
-        ball_radius: m.
+    Args: track, camera: their numbers.  ball_radius: m.
 
-    Attributes:
-        count: of the ball's sightings in this camera.
+    Attributes: count: of the ball's sightings in this camera.
     """
 
     def __init__(self, tracking: Tracking, track: int, camera: int, ball_radius: float) -> None:
@@ -76,6 +69,7 @@ class Strobe:
         times = tracking.detections[camera].frames[self._frames] - model.time_offset
         points = np.column_stack([np.interp(times, ball.times, ball.points[:, axis]) for axis in range(3)])
         self._radii = np.maximum(model.matrix[0, 0] * ball_radius / model.depth(points), LEAST_RADIUS)
+        self._reach = np.ceil(CLOSE * self._radii).astype(int)  # px, from the middle of a patch to its edge
         self._box = _box(seen.pixels, model.size)
         self._base: Image | None = None
         self._patches: dict[int, Image] = {}
@@ -93,7 +87,7 @@ class Strobe:
     def see(self, frame: int, image: Image) -> None:
         """Takes what it needs of a frame (h, w, 3)."""
         for i in np.flatnonzero(self._frames == frame):
-            self._patches[int(i)] = _around(image, self._pixels[i], _reach(self._radii[i]))
+            self._patches[int(i)] = _around(image, self._pixels[i], self._reach[i])
             if i == len(self._frames) // 2:
                 left, top, width, height = self._box
                 self._base = image[top : top + height, left : left + width].copy()
@@ -132,7 +126,7 @@ class Strobe:
 
     def _close_up(self, i: int) -> Image:
         """A ball from near, with a circle as large as it should be where it was found."""
-        patch, reach = self._patches[i], _reach(self._radii[i])
+        patch, reach = self._patches[i], self._reach[i]
         close = np.asarray(cv2.resize(patch, (ZOOM, ZOOM), interpolation=cv2.INTER_CUBIC), dtype=np.uint8)
         scale = ZOOM / (2 * reach + 1)
         centre = (self._pixels[i] - self._pixels[i].round() + reach + 0.5) * scale - 0.5
@@ -141,10 +135,7 @@ class Strobe:
 
 
 class AllCandidates:
-    """The middle frame of a camera with the candidates of all its frames, for a recording without a ball.
-
-    Args: tracking: what was found.  camera: its number.
-    """
+    """The middle frame of a camera with the candidates of all its frames, for a recording without a ball."""
 
     def __init__(self, tracking: Tracking, camera: int) -> None:
         self._detections = tracking.detections[camera]
@@ -194,11 +185,6 @@ def _box(pixels: Array, size: tuple[int, int]) -> tuple[int, int, int, int]:
     corner = np.clip((low + high) / 2 - sides / 2, 0.0, np.array(size) - sides)
     left, top = (int(x) for x in corner)
     return left, top, int(sides[0]), int(sides[1])
-
-
-def _reach(radius: float) -> int:
-    """From the middle of a patch to its edge, px."""
-    return int(np.ceil(CLOSE * radius))
 
 
 def _around(image: Image, pixel: Array, reach: int) -> Image:

@@ -1,7 +1,5 @@
 """One camera's view with what was found in it: candidates, the balls that they were taken for, trails and stamps."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 
@@ -9,11 +7,13 @@ import cv2
 import numpy as np
 
 from ballfg.vision.arrays import Array, Image
-from ballfg.vision.tracking.palette import bgr
 from ballfg.vision.tracking.pipeline import Tracking
 
 Colour = tuple[int, int, int]
 
+TRACKS: Final = ("#e69f00", "#56b4e9", "#f0e442", "#cc79a7", "#00c08b", "#ff7f50")
+"""Light colours that differ for every kind of colour vision (after Okabe and Ito) and stand out on green, blue and grey
+images."""
 TRAIL: Final = 0.4
 """s of a ball's past that its trail shows: over a metre of flight, without filling the view."""
 LINGER: Final = 0.3
@@ -35,13 +35,7 @@ _SHIFT: Final = 4
 
 
 class ViewPainter:
-    """Draws one camera's frames at a smaller size.
-
-    Args:
-        tracking: what was found.
-        camera: number of the camera.
-        width: px of the drawn view; the height follows.
-    """
+    """Draws the frames of one camera, by its number, at a width in px; the height follows."""
 
     def __init__(self, tracking: Tracking, camera: int, width: int) -> None:
         self._camera = tracking.cameras[camera]
@@ -95,6 +89,18 @@ class ViewPainter:
     def _scaled(self, pixels: Array) -> Array:
         """Places on the drawn view of places in the image: both count from the centre of the top left pixel."""
         return np.asarray((pixels + 0.5) * self._scale - 0.5)
+
+
+def hexadecimal(track: int) -> str:
+    """The colour of a track by its number, as #rrggbb."""
+    return TRACKS[track % len(TRACKS)]
+
+
+def bgr(track: int) -> tuple[int, int, int]:
+    """The same as blue, green, red, each 0 .. 255."""
+    text = hexadecimal(track)
+    red, green, blue = (int(text[i : i + 2], 16) for i in (1, 3, 5))
+    return blue, green, red
 
 
 def by_score(score: float) -> Colour:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ballfg.vision.association.clock import nearest, shared_stamps
+from ballfg.vision.association.gathering import nearest, shared_stamps
 
 
 def test_nearest() -> None:

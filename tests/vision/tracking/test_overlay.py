@@ -13,15 +13,23 @@ from numpy.typing import NDArray
 
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision import Camera
-from ballfg.vision.association.seen_ball import SeenBall
+from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.detection.detections import Candidates, Detections
 from ballfg.vision.tracking.contact_sheet import MOST_TRACKS, ContactSheet
-from ballfg.vision.tracking.overlay import STRIP, VIEW_WIDTH, OverlayPainter, write_overlay
-from ballfg.vision.tracking.palette import bgr
+from ballfg.vision.tracking.overlay import (
+    HELD,
+    STRIP,
+    VIEW_WIDTH,
+    Image,
+    OverlayPainter,
+    play,
+    schedule,
+    shown,
+    write_overlay,
+)
 from ballfg.vision.tracking.pipeline import Tracking
-from ballfg.vision.tracking.playback import HELD, Image, play, schedule, shown
 from ballfg.vision.tracking.strobe import HEIGHT, WIDTH, ZOOM, Strobe, tapped
-from ballfg.vision.tracking.view_painter import RING
+from ballfg.vision.tracking.view_painter import RING, bgr
 
 SIZE = (640, 360)
 RATE = 100.0
