@@ -11,12 +11,12 @@ import torch
 
 from ballfg.dynamics import AnalyticModel, load_model, nominal_model
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
-from ballfg.estimation import Settings, dataset_settings, dataset_surfaces
+from ballfg.estimation import Settings, dataset_settings, dataset_surfaces, with_readings
 from ballfg.estimation.launcher import Launcher
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.shots import Shot, shots_of
 from ballfg.learning.split import training_split
-from ballfg.tracks import Dataset, Track, read_dataset
+from ballfg.tracks import Ball, Dataset, Track, read_dataset
 
 FIRST_SPIN = {"topspin": (0.0, 50.0, 0.0), "sidespin": (0.0, 0.0, 50.0)}
 """rad/s about (forward, across, up) per level of the settings with a known axis; other settings start at no spin."""
@@ -62,19 +62,22 @@ def read_training_data(config: TrainConfig) -> TrainingData:
 
 
 def open_dataset(folder: str) -> Dataset:
-    """The dataset of a folder; notes on repairs go to stderr. Raises: ValueError, FileNotFoundError: as in reading."""
-    dataset = read_dataset(folder)
+    """The dataset of a folder with all readings beside its positions; notes on repairs go to stderr.
+
+    Raises: ValueError, FileNotFoundError: as in reading.
+    """
+    dataset = with_readings(read_dataset(folder))
     for note in dataset.notes:
         print(f"note: {note}", file=sys.stderr)
     return dataset
 
 
-def analytic_model(path: str | None, radius: float) -> AnalyticModel:
-    """The analytic model of a file, or the nominal one for None; radius in m.
+def analytic_model(path: str | None, ball: Ball) -> AnalyticModel:
+    """The analytic model of a file, or the nominal one of the ball for None.
 
     Raises: ValueError: if the file's model has a learned part.
     """
-    model = nominal_model(radius) if path is None else load_model(path, radius=radius)
+    model = nominal_model(ball) if path is None else load_model(path, radius=ball.radius)
     if not isinstance(model, AnalyticModel):
         raise ValueError(f"model must be analytic; {path} has a learned part. Give its base, or leave it out.")
     return model
@@ -99,10 +102,11 @@ def _grouped(track: Track, dataset: Dataset) -> Track:
 
 
 def _analytic(config: TrainConfig, datasets: Sequence[Dataset]) -> AnalyticModel:
-    radii = {dataset.info.ball.radius for dataset in datasets}
+    balls = [dataset.info.ball for dataset in datasets]
+    radii = {ball.radius for ball in balls}
     if len(radii) > 1:
         raise ValueError(f"data must be of one kind of ball; got radii {sorted(radii)} m. Train a model for each.")
-    model = analytic_model(config.model, radii.pop())
+    model = analytic_model(config.model, balls[0])
     if not model.measures_plainly:
         raise ValueError("model must have no measurement effects; got some, which training does not know. Remove them.")
     return model

@@ -18,7 +18,7 @@ Mask = NDArray[np.bool_]
 
 
 class Verdict(enum.Enum):
-    """The answer to: does the model lack anything?"""
+    """The answer of a diagnosis: whether the model lacks anything."""
 
     FOUND = "effect found"
     NOTHING = "nothing lacking"

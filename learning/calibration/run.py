@@ -68,7 +68,7 @@ def _pose(config: CalibrationConfig, jobs: int) -> Problem:
         raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
     torch.set_num_threads(1)  # the batches are small: threads cost more than they gain
     dataset = open_dataset(config.data)
-    return pose(dataset, analytic_model(config.model, dataset.info.ball.radius), config, config.jobs or jobs)
+    return pose(dataset, analytic_model(config.model, dataset.info.ball), config, config.jobs or jobs)
 
 
 def _steps(problem: Problem, steps: list[Step], folder: Path, watch: Watch) -> None:

@@ -22,7 +22,7 @@ class CalibrationConfig(Section):
     """Distinguishes this config from that of a training."""
 
     model: str | None = None
-    """Model file to start from; null: the nominal table-tennis model."""
+    """Model file to start from; null: the nominal model of the dataset's ball."""
 
     data: str | None = None
     """Folder of the dataset. `--data` replaces it."""

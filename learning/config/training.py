@@ -226,8 +226,8 @@ class TrainConfig(Section):
     """Folder that is written. `--out` replaces it."""
 
     model: str | None = None
-    """Analytic model that a-tune and networks start from and a residual network corrects; null: the nominal
-    table-tennis model."""
+    """Analytic model that a-tune and networks start from and a residual network corrects; null: the nominal model of
+    the dataset's ball."""
 
     architecture: ArchitectureConfig = ArchitectureConfig()
     """Network of mlp, mlp+gs, skip+gs, mnn+gs."""
