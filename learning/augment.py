@@ -21,9 +21,7 @@ def augmentation(seed: int, epoch: int, track: int) -> tuple[Tensor, Tensor]:
         seed: of the run, >= 0.
         epoch: >= 0.
         track: number of the track, >= 0.
-
     Returns: (angle, shift): () rad, uniform in [-pi, pi); (2,) m along x and y, uniform in [-SHIFT, SHIFT). float64.
-
     Raises: ValueError: a negative number.
     """
     for name, number in (("seed", seed), ("epoch", epoch), ("track", track)):

@@ -67,7 +67,6 @@ def judge_tracks(
         horizon: s that are predicted, `inf` for the whole rest.
         jobs: number of processes.
         count: number of tracks.
-
     Returns: None for a track that cannot be judged: nothing left to predict, an estimate that failed.
     """
     score = partial(judge_track, estimator, observe=observe, horizon=horizon)

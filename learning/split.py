@@ -43,7 +43,6 @@ def split_tracks(dataset: Dataset, how: Literal["random", "label"], seed: int, *
         how: random: half to fit, half to judge, an odd one to fit. label: by the label `split`.
         seed: of the random split.
         needs_spin: leave out tracks without a spin label.
-
     Raises: ValueError: if fewer than two tracks are left to fit or none to judge, or a label is missing.
     """
     if how == "label" and LABEL not in dataset.label_names:
@@ -87,7 +86,6 @@ def training_split(tracks: Sequence[tuple[int, Track]], config: SplitConfig, see
         tracks: each with the number of its dataset; `alternate` counts in each dataset by itself.
         config: of the split.
         seed: of the random split.
-
     Raises: ValueError: if no track trains.
     """
     if config.by == "none":

@@ -44,10 +44,7 @@ def diagnose(
         jobs: processes that work on tracks at the same time.
         watch: is told of each stage, in lines.
         catalogue: effects to look for; by default all that are registered.
-
-    Returns:
-        The verdict, the findings with their evidence, errors before and after, and the corrected model.
-
+    Returns: the verdict, the findings with their evidence, errors before and after, and the corrected model.
     Raises:
         TypeError: if the model is a learned one.
         ValueError: if there are too few tracks, or none with a flight that is long enough.

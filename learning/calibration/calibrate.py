@@ -103,7 +103,6 @@ def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs
         model: to start from, with the ball's radius.
         config: of the calibration.
         jobs: number of processes.
-
     Raises: ValueError: coefficients that the model does not have or the data cannot determine, too few tracks.
     """
     chosen = choose(model, config.coefficients)
@@ -120,7 +119,6 @@ def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unw
         problem: from `pose`.
         done: steps of an earlier run of the same problem, which continues to the same numbers.
         watch: sees the tracks pass, for instance to show progress.
-
     Raises: TooManyFailures: more estimates of fitted tracks failed than the config allows.
     """
     steps = list(done)

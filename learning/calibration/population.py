@@ -80,7 +80,6 @@ def evidence(mean: Array, covariance: Array, prior_mean: Array, prior_sigma: Arr
     Args:
         mean: (p,) posterior mean.  covariance: (p, p) posterior covariance.
         prior_mean: (p,).  prior_sigma: (p,) standard deviations of the independent prior.
-
     Raises: ValueError: if the covariance is not positive definite or anything is not finite.
     """
     if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
@@ -106,7 +105,6 @@ def fit_population(tracks: Sequence[Evidence], start: Array, sigma: Array, low: 
         tracks: at least one.
         start: (p,) mean of the prior of the population's mean.  sigma: (p,) its standard deviation.
         low: (p,) least mean.  high: (p,) largest mean.
-
     Raises: ValueError: if there is no track.
     """
     if not tracks:

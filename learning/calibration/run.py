@@ -46,7 +46,6 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
         resume: continue after the last finished step.
         jobs: number of processes where the config has none.
         watch: sees the tracks pass, for instance to show progress.
-
     Raises: ValueError, FileNotFoundError: bad input. KeyboardInterrupt: after Ctrl-C; finished steps are kept.
     """
     files.check(folder, config, resume=resume)

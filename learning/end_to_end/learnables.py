@@ -28,7 +28,6 @@ class NoiseScales(nn.Module):
         process: starting values. Numbers that are zero stay zero.
         position: starting value, as a multiple of the noise that datasets and tracks state.
         learned: False keeps all of them fixed.
-
     Attributes:
         process: (q,) logarithms of the numbers `names`.
         position, spin: () logarithms of the scales of measured positions and of spin labels.

@@ -29,7 +29,6 @@ def launch(processes: int, work: Callable[..., int], *arguments: Any) -> int:
         processes: their number.
         work: a function of a module, which returns an exit status.
         arguments: of `work`, which can be pickled.
-
     Returns: the status of the first process.
     Raises:
         ChildProcessError: if a process was killed.

@@ -39,7 +39,6 @@ def run_training(config: TrainConfig, folder: Path, *, resume: bool = False, wat
         folder: to write; that of the earlier run if it is to `resume`.
         resume: continue from the last checkpoint.
         watch: sees the batches pass in the first process, for instance to show progress.
-
     Raises:
         ValueError, FileNotFoundError: bad input, or a training that cannot go on (`TrainingStoppedError`).
         KeyboardInterrupt: after Ctrl-C; the epochs up to the last checkpoint are kept.

@@ -27,7 +27,6 @@ class SequenceArchitecture:
     Attributes:
         kind: lstm or diffusion.
         width: of the hidden states; diffusion: channels of the denoiser. A multiple of 8, for the attention heads.
-
     Raises: ValueError: an unknown kind, or a width that is not a positive multiple of 8.
     """
 

@@ -123,7 +123,6 @@ def example(track: Track, observed: int, settings: Tensor, times: ArrayLike | No
         settings: (k,) of this track's launcher.
         times: (m,) s in the track's own time, increasing, later than the last observed sample; None: the stamps of
             the rest, with their measurements.
-
     Raises: ValueError: too few samples, nothing to predict, or times that do not increase from the last observed one.
     """
     if not LEAST_OBSERVED <= observed <= len(track):

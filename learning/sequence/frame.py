@@ -50,7 +50,6 @@ class Frame(nn.Module):
         """Set the scales from some examples.
 
         Returns: the number of grid points that reach to the end of the longest.
-
         Raises: ValueError: if nothing moves, so that there is no scale.
         """
         batch = collate(examples)
@@ -95,7 +94,6 @@ class Frame(nn.Module):
         Args:
             path: (b, points + 1, 3) at 0, step, 2 step ...
             times: (b, m) s, >= 0.
-
         Returns: (b, m, 3).
         """
         place = times / self.step
@@ -111,7 +109,6 @@ class Frame(nn.Module):
             local: (b, m, 3) the rest, as from `inward`.
             batch: whose times these are.
             points: of the grid.
-
         Returns: (values (b, points, 3), known (b, points) bool); a point is unknown beyond the last sample and inside
             a gap of more than LARGEST_GAP steps.
         """

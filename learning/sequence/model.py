@@ -36,7 +36,6 @@ class SequenceModel(nn.Module, ABC):
         Args:
             batch: with a measured rest.
             draws: one for each track.
-
         Returns: (losses, positions): (b,) differentiable, in squared units of the frame; (b, m, 3) m, the rest as
             predicted in training, without gradient.
         """

@@ -73,9 +73,7 @@ class SequencePredictor:
             track: its first `observed` samples and its labels are used, nothing else.
             observed: >= 2.
             times: (k,) s in the track's own time, increasing, later than the last observed sample.
-
         Returns: (k, 3) m.
-
         Raises: ValueError: too few samples, launcher settings that are missing or unknown, or bad times.
         """
         return self.predict_many([track], [observed], [times])[0]
@@ -89,9 +87,7 @@ class SequencePredictor:
             tracks: as for `predict`.
             observed: one number per track.
             times: (k,) s, one array per track.
-
         Returns: (k, 3) m, one array per track.
-
         Raises: ValueError: as `predict`.
         """
         examples = [

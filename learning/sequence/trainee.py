@@ -38,7 +38,6 @@ class SequenceTrainee(Trainee):
         launcher: its labels.
         seed: of initial weights, augmentation and diffusion noise, >= 0.
         augment: whether training tracks are rotated and shifted.
-
     Raises: ValueError: if no track of the training part can be used.
     """
 

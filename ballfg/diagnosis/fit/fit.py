@@ -44,9 +44,7 @@ def fit_model(model: AnalyticModel, stretches: Stretches, settings: Settings, *,
         stretches: the data. Those whose contacts the model does not reach from the first guess are left out.
         settings: of the dataset; the noise of spin labels and the prior of spins.
         settle_noise: whether the scale of the noise is estimated too.
-
-    Returns:
-        The minimum.
+    Returns: the minimum.
     """
     model = copy.deepcopy(model).requires_grad_(False)
     problem = Problem(model, reachable(model, stretches), declared_free(model))

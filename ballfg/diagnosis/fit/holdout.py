@@ -79,12 +79,8 @@ def hold_out(
         jobs: processes.
         watch: is told of progress, in lines.
         most_tracks: of a larger dataset so many tracks are used, evenly spread.
-
-    Returns:
-        Both halves, as stretches to fit and as tracks to predict.
-
-    Raises:
-        ValueError: if there are too few tracks, or a half without a stretch that is long enough.
+    Returns: both halves, as stretches to fit and as tracks to predict.
+    Raises: ValueError: if there are too few tracks, or a half without a stretch that is long enough.
     """
     tracks, excluded = _chosen(dataset, most_tracks)
     settings, surfaces = dataset_settings(dataset, model), dataset_surfaces(dataset)

@@ -87,7 +87,6 @@ def shoot(model: BallModel, start: Tensor, heights: Tensor, guesses: Tensor, end
         heights: (r, c) m, declared heights of the surfaces met, in order; NaN where there is no further one.
         guesses: (r, c) s, about when.
         ends: (r,) s, how long to fly.
-
     Returns:
         The motion, differentiable backward and forward in start and coefficients. A row that misses a contact is NaN
         from there on.

@@ -93,9 +93,7 @@ def stretches_of(smoother: Smoother, tracks: Iterable[Track], launcher: Launcher
         tracks: as measured.
         launcher: reads the settings of a shot; its weights do not matter.
         jobs: processes.
-
-    Raises:
-        ValueError: if no track has a stretch that is long enough.
+    Raises: ValueError: if no track has a stretch that is long enough.
     """
     tracks = list(tracks)
     cut = list(map_tracks(partial(_cut, smoother, launcher), tracks, len(tracks), jobs))

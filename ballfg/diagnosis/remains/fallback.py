@@ -98,9 +98,7 @@ def learned_residual(
         dataset: the origin of the tracks.
         tracks: to learn from.
         epochs: of the training.
-
-    Returns:
-        The corrected model; None if there are too few tracks or the training fails.
+    Returns: the corrected model; None if there are too few tracks or the training fails.
     """
     tracks, settings = _as_happened(base, dataset, tracks)
     if len(tracks) < LEAST_LEARNED:

@@ -56,9 +56,7 @@ def generic_tests(fit: Fit, reference: Fit | None = None) -> tuple[GenericTest, 
     Args:
         fit: of the model so far.
         reference: the fit of the declared model, to which shares refer; None: `fit` itself.
-
-    Returns:
-        The tests, the least probable first.
+    Returns: the tests, the least probable first.
     """
     tests = _tests_of(fit)
     first = tests if reference is None or reference is fit else _tests_of(reference)

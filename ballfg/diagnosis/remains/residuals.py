@@ -51,11 +51,8 @@ class _Piece:
 def residuals_of(fit: Fit) -> Residuals:
     """The residuals of a fit.
 
-    Args:
-        fit: at its minimum.
-
-    Returns:
-        Accelerations in flight, kicks at contacts and errors of positions, with their covariances.
+    Args: fit: at its minimum.
+    Returns: accelerations in flight, kicks at contacts and errors of positions, with their covariances.
     """
     path, system = fitted_path(fit), fit.linearised()
     pieces: dict[int, list[_Piece]] = defaultdict(list)

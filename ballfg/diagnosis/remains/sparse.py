@@ -44,11 +44,8 @@ class SparseTerms:
 def sparse_terms(before: Fit) -> SparseTerms | None:
     """The generic terms that a fit lacks.
 
-    Args:
-        before: the fit so far.
-
-    Returns:
-        The terms; None where none is worth its penalty.
+    Args: before: the fit so far.
+    Returns: the terms; None where none is worth its penalty.
     """
     library = _library(before)
     found, _ = hypothesis_signatures(before, library)

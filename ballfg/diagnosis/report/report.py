@@ -32,7 +32,6 @@ def write_report(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> None:
     Args:
         diagnosis: to report.
         out: folder, new, empty or with an earlier report; its parent must exist.
-
     Raises:
         ValueError: if `out` is a file or holds other things than a report.
         FileNotFoundError: if its parent does not exist.

@@ -69,9 +69,7 @@ def score_all(before: Fit, candidates: Sequence[Hypothesis]) -> list[Scored]:
     Args:
         before: the fit without any of them.
         candidates: the hypotheses; those without strengths are left out.
-
-    Returns:
-        The tests, the hypothesis that explains most first and those that the data cannot show last.
+    Returns: the tests, the hypothesis that explains most first and those that the data cannot show last.
     """
     testable = [h for h in candidates if h.strengths]
     if not testable:
@@ -102,9 +100,7 @@ def refit(before: Fit, scored: Scored) -> Refit:
     Args:
         before: the fit without the hypothesis.
         scored: the hypothesis and its score test.
-
-    Returns:
-        The better of the fits.
+    Returns: the better of the fits.
     """
     hypothesis, problem = scored.hypothesis, with_hypothesis(before.problem, scored.hypothesis)
     parameters = dict(problem.model.named_parameters())

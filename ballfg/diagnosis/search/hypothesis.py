@@ -120,9 +120,7 @@ def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effe
         model: as declared so far.
         scene: extent of the data.
         catalogue: effects by class.
-
-    Returns:
-        The hypotheses, in the order of the catalogue.
+    Returns: the hypotheses, in the order of the catalogue.
     """
     listed: list[Hypothesis] = []
     for effect in catalogue:
@@ -141,11 +139,8 @@ def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effe
 def scene_of(fit: Fit) -> Scene:
     """The extent of the stretches of a fit: places, speeds, impacts and spin labels.
 
-    Args:
-        fit: of a model to the stretches.
-
-    Returns:
-        The scene, in m and m/s.
+    Args: fit: of a model to the stretches.
+    Returns: the scene, in m and m/s.
     """
     stretches = fit.problem.stretches
     used = stretches.used.numpy()
