@@ -1,7 +1,5 @@
 """Augmentation: the same shot in another place, by a rotation about the vertical and a horizontal shift."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The error of a model's predictions on tracks that were not fitted: observe the first part, predict the rest."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 

@@ -1,7 +1,5 @@
 """Shots to learn from: what of a track is observed, what is to be predicted, and the events in it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """From a config to the data of a training: datasets, split, shots, and the settings of the estimator."""
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from collections.abc import Sequence

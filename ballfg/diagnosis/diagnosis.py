@@ -1,7 +1,5 @@
 """The diagnosis of a dataset: search for effects, evaluate them, test the rest, and say it in one sentence."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 

@@ -1,7 +1,5 @@
 """The result of a diagnosis: the verdict, effects added with their evidence, errors before and after, the rest."""
 
-from __future__ import annotations
-
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, field

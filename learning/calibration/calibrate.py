@@ -5,8 +5,6 @@ finds the population's mean and spread, and puts the mean into the model. It end
 docs/train.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 

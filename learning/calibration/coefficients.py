@@ -1,7 +1,5 @@
 """The coefficients that are calibrated: looked up in the model, checked against the data, put back into a model."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass

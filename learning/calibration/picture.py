@@ -1,7 +1,5 @@
 """The picture of a calibration: each track's coefficients, the population, and the errors before and after."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import matplotlib

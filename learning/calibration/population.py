@@ -9,8 +9,6 @@ L. Hu, J. Zhou, K. Lange, "MM algorithms for variance components models", J. Com
 lowers the likelihood and needs no step size.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

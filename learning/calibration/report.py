@@ -1,7 +1,5 @@
 """The result of a calibration as `report.json` and as text: coefficients and errors before and after."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """A calibration from config to results: `ballfg-train` with the kind `calibrate`, and its checkpoint."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The config of a calibration; each field with its meaning."""
 
-from __future__ import annotations
-
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field

@@ -1,7 +1,5 @@
 """The config file of `ballfg-train`: YAML with `key=value` overrides, checked before anything starts."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path

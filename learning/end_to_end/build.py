@@ -1,7 +1,5 @@
 """From a config to a model of the dynamics that is trained through the estimator."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from ballfg.dynamics import AnalyticModel, BallModel

@@ -5,8 +5,6 @@ group of shots may end with the wrong sign. The spin with which an analytic mode
 within some 10 rad/s.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Final

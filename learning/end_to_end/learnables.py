@@ -1,7 +1,5 @@
 """The learnable parameters of an estimator: the ball's model, the meaning of launcher settings, the noise."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any

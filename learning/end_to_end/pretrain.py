@@ -6,8 +6,6 @@ nothing about speeds and spins other than those of their launchers; as a term of
 close to the analytic one there.
 """
 
-from __future__ import annotations
-
 import copy
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Estimates of many shots together, each starting from where it ended the last time."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

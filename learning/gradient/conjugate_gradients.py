@@ -6,8 +6,6 @@ which GTSAM has factorised on the way to the minimum, differs from a block only 
 that a few steps are enough.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ The estimator minimises it in numpy, track by track. A gradient through the esti
 batch of tracks at once. Factors of the same sort are merged, so that a batch costs few torch calls.
 """
 
-from __future__ import annotations
-
 import copy
 from collections import defaultdict
 from collections.abc import Hashable, Sequence

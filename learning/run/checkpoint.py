@@ -1,7 +1,5 @@
 """The checkpoint of a training, from which it continues to the same numbers: a folder of tensors and YAML."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any

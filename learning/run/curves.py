@@ -1,7 +1,5 @@
 """The picture of a training: loss and RMSE of the predicted positions over the epochs."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from operator import itemgetter
 from pathlib import Path

@@ -4,8 +4,6 @@
 checkpoint takes the same steps, bit for bit.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterator, Sequence

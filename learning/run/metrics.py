@@ -1,7 +1,5 @@
 """The numbers of an epoch: one row of `metrics.csv`."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Sequence

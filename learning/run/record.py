@@ -1,7 +1,5 @@
 """The record of a training, written after each epoch: metrics, curves, TensorBoard, checkpoints, a line of text."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from statistics import fmean
 

@@ -1,7 +1,5 @@
 """The folder of a run: names of its files, checks before a run starts, config and versions."""
 
-from __future__ import annotations
-
 import json
 import platform
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """A training from config to model: the work of `ballfg-train` in each of its processes."""
 
-from __future__ import annotations
-
 import io
 import sys
 from contextlib import ExitStack, redirect_stderr, redirect_stdout

@@ -5,8 +5,6 @@ the answer there. Source: J. Ho, A. Jain, P. Abbeel 2020 (training); J. Song, C.
 noise); S. Lin et al. 2024 (zero terminal signal-to-noise ratio).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -4,8 +4,6 @@ Only shifts and scales: no direction is singled out and nothing is extrapolated.
 table lies at one height for all tracks.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """LSTM baseline: one recurrent network reads the observations, another predicts step by step."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

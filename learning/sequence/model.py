@@ -1,7 +1,5 @@
 """The contract of a sequence model: from the observed part of tracks to the rest, no estimator, no dynamics."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ convolution network over the future grid. It is causal, as motion is: the tail b
 measured, has no influence on the measured part.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """A sequence model with its tracks, for the training loop."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path

@@ -5,8 +5,6 @@ residuals, and so is the scatter of unlabelled spins about the launcher's mean. 
 effects declare, so that those which the data cannot determine keep their declared values.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterable, Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A dataset split for diagnosis: every second track to search for effects, the others held out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -7,8 +7,6 @@ thus serves every pattern of forces. The columns of P for velocity and spin are 
 contact.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

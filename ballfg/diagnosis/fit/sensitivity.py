@@ -3,8 +3,6 @@
 Derivatives are torch's forward mode: the batch is repeated once per direction, with a dual number in that direction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

@@ -5,8 +5,6 @@ guess of its time, and only their times are solved for. Each row flies in equal 
 contact; a Hermite polynomial gives the states in between.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

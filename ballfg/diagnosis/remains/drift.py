@@ -5,8 +5,6 @@ of them shows a pattern of its own. The columns of the block are those of the de
 the track.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ballfg.diagnosis.fit.problem import Fit

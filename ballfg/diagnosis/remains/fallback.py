@@ -3,8 +3,6 @@
 A few generic terms come first, because people can read them. Only if they do not help, a network corrects the model.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import cast
 

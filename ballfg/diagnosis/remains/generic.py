@@ -5,8 +5,6 @@ and declared coefficients projected out and tracks as independent units. Of a la
 data show best are tested; the residuals have no part in choosing them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,8 +4,6 @@ The first two are those that a smoother would find: free accelerations in short 
 estimated at once with the first state of their stretch, under the priors of a white process noise.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any

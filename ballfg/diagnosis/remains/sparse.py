@@ -5,8 +5,6 @@ none is worth its penalty. Terms that later ones made superfluous are then dropp
 "Extended Bayesian information criteria for model selection with large model spaces", with gamma = 1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 

@@ -6,8 +6,6 @@ tr(M), has mean zero whatever the scale of the noise on that stretch, and cumula
 M (W + c). The sum of U over stretches is compared with the gamma distribution of the same first three cumulants.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

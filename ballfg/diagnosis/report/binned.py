@@ -1,7 +1,5 @@
 """Residuals in the axes of the motion, and their means over bins, for the pictures."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

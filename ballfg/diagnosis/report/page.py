@@ -1,7 +1,5 @@
 """`report.html`: a diagnosis as one self-contained page. The answer comes first, then its grounds."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files

@@ -4,8 +4,6 @@ Each function draws one figure without pyplot. Where a model was changed, `befor
 one panel, always with the same axes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np

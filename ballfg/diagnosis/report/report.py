@@ -1,7 +1,5 @@
 """A diagnosis as files: `report.json` for programs, `report.html` for people, `model.yaml` for other commands."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -1,7 +1,5 @@
 """One round of the search: score every hypothesis, refit the leading ones, compare them by their refits."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Evaluation of a model on tracks that it was not fitted to: predictions of unseen parts, and held-out likelihood."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

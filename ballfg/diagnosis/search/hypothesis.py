@@ -1,7 +1,5 @@
 """A hypothesis: one effect, in one shape, that the model may lack; and the models that hold it."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace

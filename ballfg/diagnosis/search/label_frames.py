@@ -5,8 +5,6 @@ fitted to wrong labels would be wrong too. The frames in which the labels agree 
 full.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

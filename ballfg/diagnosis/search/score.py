@@ -12,8 +12,6 @@ of the correction: R. Bell and D. McCaffrey 2002, "Bias reduction in standard er
 multi-stage samples", Survey Methodology 28, the estimator known as CR2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
