@@ -55,12 +55,7 @@ class Arc:
 
 @dataclass(frozen=True)
 class Trajectories:
-    """The motion of r rows.
-
-    Attributes:
-        arcs: in order of time.
-        contacts: (r, c) s, time of each contact; NaN where there is none, or the ball never got there.
-    """
+    """The motion of r rows: arcs in order of time; (r, c) s of contacts, NaN where there is none or it was not reached."""
 
     arcs: tuple[Arc, ...]
     contacts: Tensor

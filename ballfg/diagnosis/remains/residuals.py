@@ -69,7 +69,8 @@ def residuals_of(fit: Fit) -> Residuals:
             if piece.contact is not None:
                 part = slice(end, end := end + 6)
                 contacts.append((row, *piece.contact, value[part], covariance[part, part]))
-    return Residuals(fit.problem.stretches.names, _flight(flights), _contact(contacts), _measurement(fit, path))
+    flight = FlightResiduals(*(np.array(column) for column in zip(*flights, strict=True)))
+    return Residuals(fit.problem.stretches.names, flight, _contact(contacts), _measurement(fit, path))
 
 
 def _pieces(fit: Fit, arc: ArcResponse) -> list[_Piece]:
@@ -106,11 +107,6 @@ def _posterior(residual: Array, by_start: Array, pieces: list[_Piece]) -> tuple[
     precision = columns.T @ columns + np.diag(np.concatenate((np.zeros(STATE_DIM), sigma**-2)))
     covariance = np.linalg.inv(precision)
     return (covariance @ (columns.T @ residual))[STATE_DIM:], covariance[STATE_DIM:, STATE_DIM:]
-
-
-def _flight(found: list[_Row]) -> FlightResiduals:
-    stretch, times, states, acceleration, covariance = (np.array(c) for c in zip(*found, strict=True))
-    return FlightResiduals(stretch, times, states, acceleration, covariance)
 
 
 def _contact(found: list[_Row]) -> ContactResiduals:

@@ -13,14 +13,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from ballfg.diagnosis.report.binned import at_contact, binned, in_flight, slip_speed
-from ballfg.diagnosis.result import (
-    Array,
-    Candidate,
-    Errors,
-    Index,
-    Outcome,
-    Residuals,
-)
+from ballfg.diagnosis.result import Array, Candidate, Errors, Index, Outcome, Residuals
 from ballfg.state import SPIN, VELOCITY, VZ
 
 Series = Mapping[str, Residuals]
@@ -238,15 +231,8 @@ def _means(column: Iterable[Axes], against: Array, values: Array, sigmas: Array,
     for axes, component, sigma in zip(column, values.T, sigmas.T, strict=True):
         bins = binned(against, component, sigma, stretch)
         axes.axhline(0.0, color="black", linewidth=0.8, zorder=0)
-        axes.errorbar(
-            *(bins.centres, bins.means, bins.errors),
-            fmt="o-",
-            color=colour,
-            markersize=4,
-            linewidth=1.2,
-            capsize=2,
-            label=label,
-        )
+        style = {"fmt": "o-", "color": colour, "markersize": 4, "linewidth": 1.2, "capsize": 2}
+        axes.errorbar(bins.centres, bins.means, bins.errors, label=label, **style)
 
 
 def _name_rows(panels: NDArray[np.object_], names: Sequence[str], unit: str) -> None:

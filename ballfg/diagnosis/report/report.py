@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from ballfg.diagnosis.report.page import page
-from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Fallback, Value
+from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Value
 from ballfg.dynamics import save_model
 from ballfg.files.destination import check_replaceable
 from ballfg.files.whole_folder import whole_folder
@@ -58,7 +58,10 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
 
     It has no times and no paths, so that the same diagnosis gives the same bytes.
     """
-    left = diagnosis.unexplained
+    left, fallback = diagnosis.unexplained, None
+    if left.fallback is not None:
+        error = {"before": _errors(left.fallback.before), "after": _errors(left.fallback.after)}
+        fallback = {"kind": left.fallback.kind, "description": left.fallback.description, "error": error}
     plain: dict[str, Any] = _plain(
         {
             "verdict": diagnosis.verdict.value,
@@ -75,7 +78,7 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
                 "where": left.where,
                 "share_of_residual": left.share_of_residual,
                 "tests": [vars(test) for test in left.tests],
-                "fallback": None if left.fallback is None else _fallback(left.fallback),
+                "fallback": fallback,
             },
             "calibrated": _values(diagnosis.calibrated),
             "noise": _values(diagnosis.noise),
@@ -101,11 +104,6 @@ def _candidate(candidate: Candidate) -> dict[str, Any]:
 def _errors(errors: Errors) -> dict[str, Any]:
     named = {"by_track": "by_track_mm"}
     return {named.get(name, name): value for name, value in vars(errors).items()}
-
-
-def _fallback(fallback: Fallback) -> dict[str, Any]:
-    error = {"before": _errors(fallback.before), "after": _errors(fallback.after)}
-    return {"kind": fallback.kind, "description": fallback.description, "error": error}
 
 
 def _values(values: Mapping[str, Value]) -> dict[str, Any]:

@@ -45,8 +45,8 @@ def _spins_without_labels(before: Fit) -> tuple[Array, Array, Array]:
     problem = before.problem
     labelled = problem.stretches.take(problem.stretches.labelled)
     bare = replace(labelled, labels=torch.full_like(labelled.labels, torch.nan), settings=0.0 * labelled.settings)
-    declared = dict(zip(problem.free, problem.centres.tolist(), strict=True))
-    unknowns = replace(before.unknowns, starts=before.unknowns.starts[problem.stretches.labelled], values=declared)
+    starts = before.unknowns.starts[problem.stretches.labelled]
+    unknowns = replace(before.unknowns, starts=starts, values=problem.declared)
     alone = replace(problem, stretches=bare, shared=False)
     result = fit_problem(alone, unknowns, replace(before.noise, spin=UNLABELLED_SPIN), settle_noise=False)
     covariances = np.linalg.inv(result.linearised().start_information)[:, SPIN, SPIN]

@@ -1,7 +1,5 @@
 """The search loop: fit, test, add the effect that is lacking, and repeat until nothing more helps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -58,6 +56,16 @@ class Search:
     predictive: PredictiveModel
     findings: tuple[Finding, ...] = ()
     rounds: tuple[tuple[Candidate, ...], ...] = ()
+
+
+@dataclass(frozen=True)
+class _Confirmed:
+    """A refit that helps on the held-out half; the same with its noise settled, and as it predicts."""
+
+    refit: Refit
+    evidence: HeldOutGain
+    settled: Fit
+    predictive: PredictiveModel
 
 
 @dataclass(frozen=True)
@@ -128,16 +136,6 @@ class SearchLoop:
                 return _Confirmed(candidate, evidence, settled, predictive), outcomes
             outcomes[candidate.name] = Outcome.MISLEADING
         return None, outcomes
-
-
-@dataclass(frozen=True)
-class _Confirmed:
-    """A refit that helps on the held-out half; the same with its noise settled, and as it predicts."""
-
-    refit: Refit
-    evidence: HeldOutGain
-    settled: Fit
-    predictive: PredictiveModel
 
 
 def _tried(
