@@ -13,12 +13,8 @@ SHIFT = 1.0
 def augmentation(seed: int, epoch: int, track: int) -> tuple[Tensor, Tensor]:
     """The rotation and shift of one track in one epoch, independent of batch and process.
 
-    Height is never shifted, since the table has one.
+    Height is never shifted, since the table has one. Seed, epoch and number of the track are at least 0.
 
-    Args:
-        seed: of the run, >= 0.
-        epoch: >= 0.
-        track: number of the track, >= 0.
     Returns: (angle, shift): () rad, uniform in [-pi, pi); (2,) m along x and y, uniform in [-SHIFT, SHIFT). float64.
     Raises: ValueError: a negative number.
     """

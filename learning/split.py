@@ -1,7 +1,5 @@
 """The split of tracks into those that are fitted and those that judge, made before anything is estimated."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -51,7 +49,10 @@ def split_tracks(dataset: Dataset, how: Literal["random", "label"], seed: int, *
     taken: dict[str, str] = {}
     left_out: dict[str, str] = {}
     for track in dataset:
-        _add(digest, track)
+        digest.update(repr((track.name, len(track), sorted(track.labels.items()))).encode())
+        digest.update(track.times.tobytes() + track.positions.tobytes())
+        if track.sigmas is not None:
+            digest.update(track.sigmas.tobytes())
         label = str(track.labels.get(LABEL, "none"))
         if needs_spin and track.spin_label is None:
             left_out[track.name] = "no spin label"
@@ -114,10 +115,3 @@ def tracks_of(dataset: Dataset, names: tuple[str, ...]) -> Iterator[Track]:
     """The tracks of some names, streamed in the order of the dataset."""
     wanted = set(names)
     return (track for track in dataset if track.name in wanted)
-
-
-def _add(digest: hashlib._Hash, track: Track) -> None:
-    digest.update(repr((track.name, len(track), sorted(track.labels.items()))).encode())
-    digest.update(track.times.tobytes() + track.positions.tobytes())
-    if track.sigmas is not None:
-        digest.update(track.sigmas.tobytes())

@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import Any, Final
 
 from ballfg.benchmarks.estimators.measured import HORIZON
-from ballfg.learning.kinds import NETWORKS, SEQUENCES
+from ballfg.learning.registry import NETWORKS, SEQUENCES
 
 RESIDUAL: Final = "analytic+mnn"
 """The method in which a network corrects the nominal model."""

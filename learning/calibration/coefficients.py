@@ -6,12 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ballfg.checks import did_you_mean
 from ballfg.dynamics import AnalyticModel
-
-Array = NDArray[np.float64]
+from ballfg.learning.calibration.population import Array
 
 NEED_SPIN_LABELS = ("flight.magnus.k", "flight.spin_decay.rate")
 """Coefficients that act through the spin alone: without measured spin only their product with it is observable."""

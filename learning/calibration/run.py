@@ -47,7 +47,11 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
     Raises: ValueError, FileNotFoundError: bad input. KeyboardInterrupt: after Ctrl-C; finished steps are kept.
     """
     files.check(folder, config, resume=resume)
-    problem = _pose(config, jobs)
+    if config.data is None:
+        raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
+    torch.set_num_threads(1)  # the batches are small: threads cost more than they gain
+    dataset = open_dataset(config.data)
+    problem = pose(dataset, analytic_model(config.model, dataset.info.ball), config, config.jobs or jobs)
     steps = read_checkpoint(folder, problem) if resume else []
     files.start(folder, config)
     print(f"{folder / files.CONFIG}: the config; {len(problem.split.fit)} tracks fit, {len(problem.split.judge)} judge")
@@ -57,15 +61,6 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
     except KeyboardInterrupt:
         print(f"{len(steps)} steps are kept; continue with --resume {folder}", file=sys.stderr)
         raise
-
-
-def _pose(config: CalibrationConfig, jobs: int) -> Problem:
-    """Open dataset and model and check them; notes go to stderr."""
-    if config.data is None:
-        raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
-    torch.set_num_threads(1)  # the batches are small: threads cost more than they gain
-    dataset = open_dataset(config.data)
-    return pose(dataset, analytic_model(config.model, dataset.info.ball), config, config.jobs or jobs)
 
 
 def _steps(problem: Problem, steps: list[Step], folder: Path, watch: Watch) -> None:

@@ -4,7 +4,6 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-import ballfg.learning.kinds  # noqa: F401 - registers the kinds of the package
 from ballfg.learning.registry import TRAINEES
 
 Positive = Annotated[float, Field(gt=0.0)]
@@ -188,11 +187,6 @@ def _known(kind: Any) -> Any:
     raise ValueError(f"must be {listed}; got {kind!r}. To calibrate coefficients write 'kind: calibrate'.")
 
 
-def _as_names(data: Any) -> Any:
-    """A list of one where a single dataset is written without a list."""
-    return (data,) if isinstance(data, str) else data
-
-
 class TrainConfig(Section):
     """A training. The same config on the same data gives the same numbers.
 
@@ -217,7 +211,7 @@ class TrainConfig(Section):
     seed: Annotated[int, Field(ge=0)] = 0
     """Seed of initial weights, random split, order of the tracks and augmentation."""
 
-    data: Annotated[Names | None, BeforeValidator(_as_names)] = None
+    data: Annotated[Names | None, BeforeValidator(lambda data: (data,) if isinstance(data, str) else data)] = None
     """Folder of the dataset, or a list of several that train one model. `--data` replaces it."""
 
     out: str = "training"

@@ -51,12 +51,7 @@ EMBEDDING_STEP: Final = 3.0
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted positions of some tracks against what was measured.
-
-    Attributes:
-        error: (t, k, 3) m, predicted less measured; zero at points that do not count.
-        counts: (t, k) bool, the points that count.
-    """
+    """Predicted less measured positions of some tracks (t, k, 3) m, and the points that count (t, k); else zero."""
 
     error: Tensor
     counts: Tensor

@@ -11,15 +11,13 @@ from typing import Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ballfg.dynamics.analytic import AnalyticModel, coefficient_sigmas
 from ballfg.dynamics.networks.spin_embedding import SPIN_UNIT, SpinEmbedding
 from ballfg.estimation import Smoother, Status
+from ballfg.factors.batch import Array
 from ballfg.learning.shots import Shot
 from ballfg.state import SPIN, VELOCITY
-
-Array = NDArray[np.float64]
 
 SPIN_PRIOR: Final = 150.0
 """rad/s, standard deviation of the prior: launchers reach this spin."""

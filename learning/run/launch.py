@@ -1,7 +1,5 @@
 """Several training processes on this machine, started as torchrun would start them."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time
@@ -53,7 +51,7 @@ def _take_part(
     rank: int,
     processes: int,
     port: int,
-    status: Synchronized[int],
+    status: "Synchronized[int]",
     work: Callable[..., int],
     arguments: tuple[Any, ...],
 ) -> None:

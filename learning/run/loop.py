@@ -60,12 +60,6 @@ class _Tally:
     norms: list[float] = field(default_factory=list)
     reasons: list[tuple[str, str]] = field(default_factory=list)
 
-    def add(self, loss: float, tracks: float, squared_error: float, points: float) -> None:
-        self.loss += loss
-        self.tracks += tracks
-        self.squared_error += squared_error
-        self.points += points
-
     @property
     def rmse(self) -> float | None:
         """m; None without a finite sum."""
@@ -158,7 +152,10 @@ class Training:
             self._skip(tally)
             return
         self.skipped_in_row = 0
-        tally.add(loss, tracks, squared_error, points)
+        tally.loss += loss
+        tally.tracks += tracks
+        tally.squared_error += squared_error
+        tally.points += points
         gradient = gradient / tracks
         norm = float(gradient.norm())
         tally.norms.append(norm)

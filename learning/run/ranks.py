@@ -4,8 +4,6 @@ A process is a rank. Each rank owns tracks by their number, independent of the b
 stays with it. A single process is the case of one rank: nothing is sent, and the numbers are the same up to rounding.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import traceback
@@ -13,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -36,7 +34,7 @@ class Trouble:
     text: str
 
     @classmethod
-    def of(cls, rank: int, error: BaseException) -> Trouble:
+    def of(cls, rank: int, error: BaseException) -> Self:
         """The form of an exception that is sent to the other ranks."""
         if isinstance(error, KeyboardInterrupt):
             return cls(rank, "interrupt", "")

@@ -77,7 +77,10 @@ class SequenceTrainee(Trainee):
         numbers = [number for number in tracks if number in self._examples]
         if not numbers:
             return BatchLoss.none(self._failed(tracks))
-        examples = [self._seen(number, epoch) for number in numbers]
+        examples = [self._examples[number] for number in numbers]
+        if self._augment:
+            poses = [augmentation(self._seed, epoch, number) for number in numbers]
+            examples = [one.seen_from(*pose) for one, pose in zip(examples, poses, strict=True)]
         batch = collate(examples)
         losses, positions = self.module.losses(batch, [(self._seed, epoch, number) for number in numbers])
         return self._batch_loss(tracks, losses.double(), positions, batch)
@@ -102,11 +105,6 @@ class SequenceTrainee(Trainee):
         path = folder / FOLDER
         self.predictor().save(path)
         return path
-
-    def _seen(self, number: int, epoch: int) -> Example:
-        if not self._augment:
-            return self._examples[number]
-        return self._examples[number].seen_from(*augmentation(self._seed, epoch, number))
 
     def _batch_loss(self, tracks: Sequence[int], losses: Tensor, positions: Tensor, batch: Batch) -> BatchLoss:
         squares = (positions - batch.rest)[batch.asked].square().sum()

@@ -55,7 +55,7 @@ class Arc:
 
 @dataclass(frozen=True)
 class Trajectories:
-    """The motion of r rows: arcs in order of time; (r, c) s of contacts, NaN where there is none or it was not reached."""
+    """The motion of r rows: arcs in order of time; (r, c) s of contacts, NaN where there is none or none is reached."""
 
     arcs: tuple[Arc, ...]
     contacts: Tensor

@@ -11,9 +11,16 @@ import numpy as np
 
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
-from ballfg.diagnosis.remains.drift import DRIFT, describe_drift, drift_block
 from ballfg.diagnosis.remains.label_check import LABEL, check_labels
-from ballfg.diagnosis.remains.patterns import EVERYWHERE, PLAUSIBLE, Block, blocks_of
+from ballfg.diagnosis.remains.patterns import (
+    DRIFT,
+    EVERYWHERE,
+    PLAUSIBLE,
+    Block,
+    blocks_of,
+    describe_drift,
+    drift_block,
+)
 from ballfg.diagnosis.remains.whiteness import whiteness
 from ballfg.diagnosis.result import Array, GenericTest
 from ballfg.diagnosis.search.score import pattern_tests
