@@ -1,9 +1,10 @@
 """The split of tracks into those that are fitted and those that judge, made before anything is estimated."""
 
 import hashlib
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from typing import Literal
 
 import numpy as np
@@ -18,13 +19,9 @@ FIT, JUDGE, VALIDATE = "train", "test", "validation"
 
 @dataclass(frozen=True)
 class Split:
-    """The parts of a dataset.
+    """The parts of a dataset: names of the tracks that are fitted and that judge, reasons for the others by name.
 
-    Attributes:
-        fit: names of the tracks that are fitted.
-        judge: names of the tracks that judge.
-        left_out: reasons for the other tracks, by name.
-        digest: hash of all stamps, positions, sigmas and labels.
+    The digest is a hash of all stamps, positions, sigmas and labels.
     """
 
     fit: tuple[str, ...]
@@ -37,9 +34,7 @@ def split_tracks(dataset: Dataset, how: Literal["random", "label"], seed: int, *
     """Split the tracks of a dataset, in one pass.
 
     Args:
-        dataset: the tracks.
         how: random: half to fit, half to judge, an odd one to fit. label: by the label `split`.
-        seed: of the random split.
         needs_spin: leave out tracks without a spin label.
     Raises: ValueError: if fewer than two tracks are left to fit or none to judge, or a label is missing.
     """
@@ -94,11 +89,8 @@ def training_split(tracks: Sequence[tuple[int, Track]], config: SplitConfig, see
     elif config.by == "label":
         chosen = [str(track.labels.get(LABEL)) for _, track in tracks]
     elif config.by == "alternate":
-        counts: Counter[int] = Counter()
-        chosen = []
-        for number, _ in tracks:
-            chosen.append(VALIDATE if counts[number] % 2 else FIT)
-            counts[number] += 1
+        counts: defaultdict[int, Iterator[str]] = defaultdict(lambda: cycle((FIT, VALIDATE)))
+        chosen = [next(counts[number]) for number, _ in tracks]
     else:
         order = np.random.default_rng(seed).permutation(len(tracks))
         validating = set(order[: round(config.validation * len(tracks))].tolist())

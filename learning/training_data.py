@@ -47,7 +47,11 @@ def read_training_data(config: TrainConfig) -> TrainingData:
     Raises: ValueError, FileNotFoundError: bad input, for instance no track that can be used.
     """
     datasets = [open_dataset(folder) for folder in config.data or ()]
-    tracks = [(number, _grouped(track, dataset)) for number, dataset in enumerate(datasets) for track in dataset]
+    tracks = [
+        (number, replace(track, labels={"group": dataset.info.name, **track.labels}))  # without groups it is one group
+        for number, dataset in enumerate(datasets)
+        for track in dataset
+    ]
     analytic = _analytic(config, datasets)
     train, validation = training_split(tracks, config.split, config.seed)
     embedding = _embedding(config, [tracks[k][1] for k in train])
@@ -92,11 +96,6 @@ def categories_of(labels: Sequence[str], tracks: Sequence[Track]) -> dict[str, t
         if texts:
             categories[label] = tuple(texts)
     return categories
-
-
-def _grouped(track: Track, dataset: Dataset) -> Track:
-    """The track with a label `group`; a dataset without groups is one group of its own name."""
-    return track if "group" in track.labels else replace(track, labels={**track.labels, "group": dataset.info.name})
 
 
 def _analytic(config: TrainConfig, datasets: Sequence[Dataset]) -> AnalyticModel:

@@ -29,18 +29,7 @@ class TooManyFailures(ValueError):  # noqa: N818 - the name is the statement
 
 @dataclass(frozen=True)
 class Problem:
-    """A calibration, checked and ready to start; made by `pose`.
-
-    Attributes:
-        dataset: the tracks.
-        config: of the calibration.
-        model: to start from.
-        chosen: its coefficients that are calibrated.
-        surfaces: on which the ball may bounce.
-        settings: of the estimator, those of `ballfg predict`.
-        split: the tracks that are fitted and those that judge.
-        jobs: number of processes.
-    """
+    """A calibration, checked and ready to start; made by `pose`. The estimator's settings are those of `predict`."""
 
     dataset: Dataset
     config: CalibrationConfig
@@ -104,10 +93,7 @@ def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs
 def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unwatched) -> Iterator[Step]:
     """The remaining steps, each as soon as it is finished; none if the calibration has ended.
 
-    Args:
-        problem: from `pose`.
-        done: steps of an earlier run of the same problem, which continues to the same numbers.
-        watch: sees the tracks pass, for instance to show progress.
+    Args: done: steps of an earlier run of the same problem, which continues to the same numbers.
     Raises: TooManyFailures: more estimates of fitted tracks failed than the config allows.
     """
     steps = list(done)

@@ -17,15 +17,9 @@ NEED_SPIN_LABELS = ("flight.magnus.k", "flight.spin_decay.rate")
 
 @dataclass(frozen=True)
 class Chosen:
-    """The p coefficients that are calibrated.
+    """The p coefficients that are calibrated, by their names as in `model.named_parameters()`.
 
-    Attributes:
-        names: as in `model.named_parameters()`.
-        units: SI, `1` for none.
-        start: (p,) values in the first model.
-        sigma: (p,) standard deviations of their priors.
-        low: (p,) lower bounds.
-        high: (p,) upper bounds.
+    Units are SI, `1` for none. Values in the first model, standard deviations of the priors and bounds have shape (p,).
     """
 
     names: tuple[str, ...]

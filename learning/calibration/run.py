@@ -36,14 +36,9 @@ class Checkpoint(BaseModel):
 
 
 def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jobs: int, watch: Watch) -> None:
-    """Calibrate coefficients and write the folder of the run.
+    """Calibrate coefficients and write the folder of the run; to `resume` is to continue after the last finished step.
 
-    Args:
-        config: of the calibration.
-        folder: to write; that of the earlier run if it is to `resume`.
-        resume: continue after the last finished step.
-        jobs: number of processes where the config has none.
-        watch: sees the tracks pass, for instance to show progress.
+    Args: jobs: number of processes where the config has none.
     Raises: ValueError, FileNotFoundError: bad input. KeyboardInterrupt: after Ctrl-C; finished steps are kept.
     """
     files.check(folder, config, resume=resume)

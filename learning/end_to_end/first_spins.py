@@ -28,10 +28,8 @@ LEAST_SPEED: Final = 0.5
 def begin_with_tracks(embedding: SpinEmbedding, shots: Iterable[Shot], model: AnalyticModel) -> None:
     """Set an embedding to the spins that a model finds in whole tracks, by least squares over their settings.
 
-    Args:
-        embedding: changed in place; unchanged where no shot shows a spin.
-        shots: training shots. Those with a spin label, or without all settings, are skipped.
-        model: its coefficients that vary from track to track are estimated too.
+    Shots with a spin label, or without all settings, are skipped; where none is left the embedding stays as it is.
+    Coefficients of the model that vary from track to track are estimated too.
     """
     settings, spins = [], []
     for shot in shots:

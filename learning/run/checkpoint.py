@@ -43,10 +43,8 @@ class Checkpoint:
     """A run after an epoch. There is no random state: random numbers derive from seed, epoch and track.
 
     Attributes:
-        progress: its progress.
-        weights: state of the module.
-        best: state of the module at the best epoch.
-        optimizer: state of the optimizer, as `<parameter>/<moment>`.
+        weights, best: state of the module now and at the best epoch.
+        optimizer: its state, as `<parameter>/<moment>`.
         memory: further state of the trainee (`Trainee.memory`).
     """
 

@@ -23,10 +23,7 @@ LAST_WORDS = 10.0
 def launch(processes: int, work: Callable[..., int], *arguments: Any) -> int:
     """Run `work` in several processes, which `join_ranks` joins to one group.
 
-    Args:
-        processes: their number.
-        work: a function of a module, which returns an exit status.
-        arguments: of `work`, which can be pickled.
+    Args: work: a function of a module, which returns an exit status; its arguments can be pickled.
     Returns: the status of the first process.
     Raises:
         ChildProcessError: if a process was killed.

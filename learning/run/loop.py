@@ -28,15 +28,9 @@ class TrainingStoppedError(ValueError):
 
 @dataclass(frozen=True)
 class Task:
-    """A training.
+    """A training: a model with its data, numbers of the tracks that train and validate, processes that share the work.
 
-    Attributes:
-        trainee: the model with its data.
-        train: numbers of the tracks that train.
-        validation: numbers of the tracks that judge the weights; may be empty.
-        config: of the training.
-        ranks: the processes that share the work.
-        watch: sees the batches pass in the first process, for instance to show progress.
+    There may be no validation tracks. `watch` sees the batches pass in the first process, to show progress.
     """
 
     trainee: Trainee
@@ -174,7 +168,6 @@ class Training:
         return torch.cat([part.double() for part in flat] + [_sums(found)])
 
     def _apply(self, gradient: Tensor) -> None:
-        """A step with a flat gradient."""
         parts = gradient.split([parameter.numel() for parameter in self.parameters])
         for parameter, part in zip(self.parameters, parts, strict=True):
             parameter.grad = part.view_as(parameter).to(parameter.dtype)
@@ -182,7 +175,6 @@ class Training:
         self.task.trainee.after_step()
 
     def _skip(self, tally: _Tally) -> None:
-        """Count a step that is not finite."""
         tally.skipped += 1
         self.skipped_in_row += 1
         if self.skipped_in_row > self.task.config.diverged_limit:
@@ -203,7 +195,6 @@ class Training:
         )
 
     def _judge(self, number: int) -> _Tally:
-        """Judge the validation tracks with the present weights."""
         ranks, size = self.task.ranks, self.task.config.optimizer.batch
         own = ranks.own(self.task.validation)
         parts = [own[i : i + size] for i in range(0, len(own), size)]

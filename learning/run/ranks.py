@@ -53,12 +53,7 @@ class Trouble:
 
 @dataclass
 class Ranks:
-    """This process among those that train.
-
-    Attributes:
-        rank: number of this process, from 0.
-        size: number of processes.
-    """
+    """This process, number `rank` from 0, among the `size` that train."""
 
     rank: int = 0
     size: int = 1

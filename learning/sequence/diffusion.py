@@ -52,13 +52,7 @@ def noise_schedule() -> Any:
 
 
 class DiffusionModel(SequenceModel):
-    """Encoder, denoiser and noise schedule.
-
-    Args:
-        settings: length of the launcher's settings.
-        points: of the grid.
-        width: channels of the denoiser; the encoder and the condition are wider in proportion.
-    """
+    """Encoder, denoiser of `width` channels, and noise schedule; encoder and condition are wider in proportion."""
 
     def __init__(self, settings: int, points: int, width: int) -> None:
         super().__init__()
@@ -66,9 +60,8 @@ class DiffusionModel(SequenceModel):
         self.frame = Frame(settings)
         condition = 2 * width
         self.encoder = Encoder(settings, 3 * width // 2, layers=2)
-        self.bridge = nn.Sequential(
-            nn.Linear(3 * width // 2 + settings, condition), nn.SiLU(), nn.Linear(condition, condition)
-        )
+        inward = nn.Linear(3 * width // 2 + settings, condition)
+        self.bridge = nn.Sequential(inward, nn.SiLU(), nn.Linear(condition, condition))
         self.denoiser = Denoiser(width, condition)
         self.schedule = noise_schedule()
 

@@ -17,7 +17,8 @@ Draw = tuple[int, int, int]
 class SequenceModel(nn.Module, ABC):
     """A network with the frame it works in. Networks compute in float32, positions outside are float64.
 
-    No track's result depends on the others in its batch, beyond rounding.
+    It is made from the number of the launcher's settings, that of the grid's points, and a width. No track's result
+    depends on the others in its batch, beyond rounding.
 
     Attributes:
         frame: scales and grid.

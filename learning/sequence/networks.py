@@ -37,13 +37,7 @@ PLACE = 2 * WAVES + 1
 
 
 class Encoder(nn.Module):
-    """Transformer over observations, then attention pooling.
-
-    Args:
-        settings: length of the launcher's settings.
-        width: of tokens and of the result.
-        layers: of the transformer.
-    """
+    """Transformer over observations, then attention pooling; tokens and result have the same width."""
 
     def __init__(self, settings: int, width: int, layers: int) -> None:
         super().__init__()
@@ -70,10 +64,7 @@ class Encoder(nn.Module):
 class Block(nn.Module):
     """One gated causal convolution with a skip; the condition scales and shifts its normalised input.
 
-    Args:
-        width: channels.
-        dilation: grid steps between its three taps.
-        condition: length of the condition.
+    Its three taps lie `dilation` grid steps apart.
     """
 
     def __init__(self, width: int, dilation: int, condition: int) -> None:
@@ -93,12 +84,7 @@ class Block(nn.Module):
 
 
 class Denoiser(nn.Module):
-    """The clean path from a noisy one.
-
-    Args:
-        width: channels.
-        condition: length of the vector that describes the observations.
-    """
+    """The clean path from a noisy one, given a vector of length `condition` that describes the observations."""
 
     def __init__(self, width: int, condition: int) -> None:
         super().__init__()

@@ -26,12 +26,9 @@ LAUNCHER_SPIN_SIGMA = 150.0
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Everything that a fit estimates.
+    """Everything that a fit estimates: first states (n, 9), coefficients by parameter name, and the launcher.
 
-    Attributes:
-        starts: (n, 9) first states.
-        values: coefficients by parameter name.
-        launcher: (s, 3) rad/s per unit of each launcher setting: spin about forward, across and up.
+    That is (s, 3) rad/s per unit of each launcher setting: spin about forward, across and up.
     """
 
     starts: Array
@@ -104,14 +101,9 @@ class Robust:
 
 @dataclass(frozen=True)
 class Fit:
-    """Unknowns of a problem and the samples that they predict. The result of a fit is the one at the minimum.
+    """Unknowns of a problem and the samples that they predict, after some Gauss-Newton steps.
 
-    Attributes:
-        problem: the data, the model and the priors.
-        unknowns: the estimates.
-        noise: scale of the noise.
-        predicted: samples that the unknowns predict.
-        steps: Gauss-Newton steps taken so far.
+    The result of a fit is the one at the minimum.
     """
 
     problem: Problem

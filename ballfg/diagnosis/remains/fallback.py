@@ -50,13 +50,8 @@ def fallback(
 ) -> Fallback | None:
     """A description of the rest without a name; None if nothing predicts better.
 
-    Args:
-        before: the fit so far, on the search half.
-        embedding: names its launcher settings.
-        dataset: the origin of the tracks.
-        tracks: of the search half.
-        now: errors of the model so far, on the held-out half.
-        evaluate: errors of a model's predictions on the held-out half.
+    The fit before and the tracks are those of the search half. The errors `now`, of the model so far, and those that
+    `evaluate` gives are those on the held-out half.
     """
     most = HELPS * now.prediction_rmse_mm
     parts = [EvaluationTrack(track, np.zeros(0)) for track in tracks]

@@ -38,14 +38,9 @@ MOST_SEEN = 95.0
 
 @dataclass(frozen=True)
 class _Test:
-    """One test of one fit.
+    """One test of one fit; p-value not corrected for their number. `quantities` are those of a block, else none.
 
-    Attributes:
-        kind: as in `GenericTest`.
-        quantities: of the block, in words; none for other tests.
-        where: place of the pattern, in words.
-        p_value: not corrected for the number of tests.
-        size: of the pattern, whose ratio to that at the start is its share.
+    The ratio of the pattern's size to that at the start is its share.
     """
 
     kind: str

@@ -59,11 +59,8 @@ def sparse_terms(before: Fit) -> SparseTerms | None:
     names = [name for h in library for name in h.columns]
     taken = {names[i] for i in chosen}
     kept = [replace(h, strengths=tuple(s for s in h.strengths if h.parameter(s) in taken)) for h in library]
-    return SparseTerms(
-        tuple(h for h in kept if h.strengths),
-        {names[i]: float(e) for i, e in zip(chosen, estimate, strict=True)},
-        float(estimate @ score[chosen]),
-    )
+    estimates = {names[i]: float(e) for i, e in zip(chosen, estimate, strict=True)}
+    return SparseTerms(tuple(h for h in kept if h.strengths), estimates, float(estimate @ score[chosen]))
 
 
 def fit_with_terms(before: Fit, terms: SparseTerms) -> Fit:

@@ -74,13 +74,9 @@ def whiteness(fit: Fit, system: System) -> Whiteness:
 
 
 def _summed(residual: Array, taken: Array, kept: Mask, kernel: Array) -> tuple[float, float, float]:
-    """Sum of U over stretches, its variance and third cumulant without drift.
+    """Sum of U over stretches, its variance and third cumulant without drift, from residuals (n, k, 3).
 
-    Args:
-        residual: (n, k, 3).
-        taken: (n, k, 3, d) directions that the fit takes up.
-        kept: (n, k) samples that count.
-        kernel: (n, k, k).
+    Args: taken: (n, k, 3, d) directions that the fit takes up.  kept: (n, k) samples that count.  kernel: (n, k, k).
     """
     n, k, _ = residual.shape
     once = np.einsum("nst,ntad->nsad", kernel, taken)

@@ -154,12 +154,6 @@ def scene_of(fit: Fit) -> Scene:
         cast(Vector, tuple(place.tolist()))
         for place in (positions.min(axis=0), positions.max(axis=0), np.median(positions, axis=0))
     )
-    return Scene(
-        low,
-        high,
-        middle,
-        float(np.median(np.linalg.norm(velocities[used], axis=-1))),
-        float(np.median(impacts)) if impacts else float("nan"),
-        len(impacts),
-        int(stretches.labelled.sum()),
-    )
+    speed = float(np.median(np.linalg.norm(velocities[used], axis=-1)))
+    impact = float(np.median(impacts)) if impacts else float("nan")
+    return Scene(low, high, middle, speed, impact, len(impacts), int(stretches.labelled.sum()))

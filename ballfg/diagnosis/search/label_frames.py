@@ -33,11 +33,8 @@ def frame_hypotheses(before: Fit, general: Hypothesis) -> list[Hypothesis]:
     spins, covariances, labels = _spins_without_labels(before)
     frames = signed_permutations().numpy()[1:]
     costs = [_disagreement(labels, spins, covariances, frame, before.noise.label) for frame in frames]
-    best = np.argsort(costs)[:FRAMES_FITTED]
-    return [
-        Hypothesis(general.effect, dict(zip(general.coefficients, frames[i].ravel().tolist(), strict=True)))
-        for i in best
-    ]
+    best = frames[np.argsort(costs)[:FRAMES_FITTED]].reshape(-1, 9).tolist()
+    return [Hypothesis(general.effect, dict(zip(general.coefficients, frame, strict=True))) for frame in best]
 
 
 def _spins_without_labels(before: Fit) -> tuple[Array, Array, Array]:

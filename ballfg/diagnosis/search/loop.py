@@ -72,12 +72,8 @@ class _Confirmed:
 class SearchLoop:
     """The inputs of a search, the same in every round.
 
-    Attributes:
-        holdout: the data.
-        catalogue: effects to look for.
-        predictive: gives a fitted model the process noise that predicts the tracks which it was fitted to.
-        watch: is told of progress, in lines.
-        plausible: as `PLAUSIBLE`.
+    `predictive` gives a fitted model the process noise that predicts the tracks which it was fitted to; `watch` is told
+    of progress, in lines.
     """
 
     holdout: Holdout

@@ -129,15 +129,9 @@ def hypothesis_columns(fit: Fit, group: Sequence[Hypothesis]) -> Array:
     names = [name for h in group for name in h.columns]
     parameters = dict(model.named_parameters())
     values = {name: float(parameters[name]) for name in [*names, *(n for shape in own for n in shape)]}
-    derivative = sensitivity(
-        model,
-        fit.problem.stretches,
-        fit.unknowns.starts,
-        {**values, **fit.unknowns.values},
-        names,
-        by_start=False,
-        shapes=[shape for h, shape in zip(group, own, strict=True) for _ in h.strengths],
-    )
-    scale = np.sqrt(fit.robust.spins) * fit.problem.stretches.labelled / fit.noise.label
+    stretches, starts, values = fit.problem.stretches, fit.unknowns.starts, {**values, **fit.unknowns.values}
+    shapes = [shape for h, shape in zip(group, own, strict=True) for _ in h.strengths]
+    derivative = sensitivity(model, stretches, starts, values, names, by_start=False, shapes=shapes)
+    scale = np.sqrt(fit.robust.spins) * stretches.labelled / fit.noise.label
     labels = derivative.labels * scale[:, None, None]
     return np.concatenate((fit.position_rows(derivative.positions), labels), axis=1)
