@@ -78,10 +78,7 @@ def split_tracks(dataset: Dataset, how: Literal["random", "label"], seed: int, *
 def training_split(tracks: Sequence[tuple[int, Track]], config: SplitConfig, seed: int) -> tuple[list[int], list[int]]:
     """Numbers of the tracks that train and of those that validate, in order; other tracks are not used.
 
-    Args:
-        tracks: each with the number of its dataset; `alternate` counts in each dataset by itself.
-        config: of the split.
-        seed: of the random split.
+    Args: tracks: each with the number of its dataset; `alternate` counts in each dataset by itself.
     Raises: ValueError: if no track trains.
     """
     if config.by == "none":

@@ -115,7 +115,11 @@ def fit_population(tracks: Sequence[Evidence], start: Array, sigma: Array, low: 
     variance = np.where(seen, 1.0, 0.0)
     for _ in range(MAX_STEPS):
         mean = _mean(information, moved, variance, bounds)
-        updated = np.minimum(variance * _growth(information, moved, variance, mean), MOST_SPREAD)
+        # the pulls as large as they are, against as large as they should be
+        pulls = (_residual(information, moved, variance, mean) ** 2).sum(axis=0)
+        expected = np.einsum("ikk->k", _marginal(information, variance))
+        growth = np.sqrt(np.divide(pulls, expected, out=np.zeros_like(pulls), where=expected > 0.0))
+        updated = np.minimum(variance * growth, MOST_SPREAD)
         updated[updated < NO_SPREAD] = 0.0
         change = np.abs(updated - variance)
         done = bool((change <= STEP_TOLERANCE * variance).all())
@@ -159,13 +163,6 @@ def _residual(information: Array, moved: Array, variance: Array, mean: Array) ->
     """(n, p) each track's pull on the mean."""
     pull = (moved - information @ mean)[..., None]
     return np.asarray(np.linalg.solve(_mixing(information, variance), pull)[..., 0])
-
-
-def _growth(information: Array, moved: Array, variance: Array, mean: Array) -> Array:
-    """(p,) factor of the variances: the pulls as large as they are, against as large as they should be."""
-    seen = (_residual(information, moved, variance, mean) ** 2).sum(axis=0)
-    expected = np.einsum("ikk->k", _marginal(information, variance))
-    return np.sqrt(np.divide(seen, expected, out=np.zeros_like(seen), where=expected > 0.0))
 
 
 def _log_likelihood(information: Array, moved: Array, variance: Array, mean: Array) -> float:

@@ -18,8 +18,6 @@ class Comparison:
     """Scores of the judging tracks before and after, of those that could be judged each time.
 
     Attributes:
-        before: with the model that the calibration started from.
-        after: with the calibrated model.
         with_spread: with the calibrated model, each track's prior as wide as the population.
         better: number of tracks whose RMSE fell.
         pairs: (n, 2) m, RMSE before and after of each track.

@@ -66,8 +66,6 @@ class EndToEnd(Trainee):
 
     Args:
         shots: all of them; batches are numbers of shots.
-        learnables: the parameters.
-        loss: the loss.
         method: of the gradient through the estimate; by default `ImplicitGradient`.
         seed: of the augmentation.
         augment: whether shots are rotated and shifted in training.
@@ -177,11 +175,8 @@ class EndToEnd(Trainee):
             states = [s.solution.minimum.values.states[0] for s in solved]
             prediction = self.predict(solved, torch.stack([torch.from_numpy(s) for s in states]), None)
             good = prediction.finite()
-            failed += [
-                (self.shots[s.number].name, "the predicted track is not finite")
-                for s, ok in zip(solved, good.tolist(), strict=True)
-                if not ok
-            ]
+            names = [self.shots[s.number].name for s, ok in zip(solved, good.tolist(), strict=True) if not ok]
+            failed += [(name, "the predicted track is not finite") for name in names]
             prediction = Prediction(prediction.error[good], prediction.counts[good])
             return _batch_loss(self._outer(prediction).sum(), prediction, failed)
 

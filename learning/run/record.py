@@ -40,10 +40,7 @@ TRAIN, VALIDATION, BEST = "#3b4cc0", "#d95f02", "#7f7f7f"
 class Record:
     """The files of a training, which the first process writes.
 
-    Args:
-        task: the training.
-        folder: of the run.
-        checkpoint: from which the run continues. Rows of later epochs are dropped, and those epochs run again.
+    Rows of epochs after the checkpoint from which the run continues are dropped, and those epochs run again.
     """
 
     def __init__(self, task: Task, folder: Path, checkpoint: Checkpoint | None) -> None:

@@ -89,9 +89,7 @@ class Frame(nn.Module):
     def at_times(self, path: Tensor, times: Tensor) -> Tensor:
         """A path on the grid, at any times: linear between its points and beyond the last.
 
-        Args:
-            path: (b, points + 1, 3) at 0, step, 2 step ...
-            times: (b, m) s, >= 0.
+        Args: path: (b, points + 1, 3) at 0, step, 2 step ...  times: (b, m) s, >= 0.
         Returns: (b, m, 3).
         """
         place = times / self.step
@@ -101,12 +99,8 @@ class Frame(nn.Module):
         return (1 - weight) * path.gather(1, index) + weight * path.gather(1, index + 1)
 
     def on_grid(self, local: Tensor, batch: Batch, points: int) -> tuple[Tensor, Tensor]:
-        """The measured rest on the grid, linear between samples.
+        """The measured rest of a batch, local as from `inward` (b, m, 3), on the grid, linear between samples.
 
-        Args:
-            local: (b, m, 3) the rest, as from `inward`.
-            batch: whose times these are.
-            points: of the grid.
         Returns: (values (b, points, 3), known (b, points) bool); a point is unknown beyond the last sample and inside
             a gap of more than LARGEST_GAP steps.
         """

@@ -107,14 +107,8 @@ class SequenceTrainee(Trainee):
         return path
 
     def _batch_loss(self, tracks: Sequence[int], losses: Tensor, positions: Tensor, batch: Batch) -> BatchLoss:
-        squares = (positions - batch.rest)[batch.asked].square().sum()
-        return BatchLoss(
-            total=losses.sum(),
-            tracks=len(losses),
-            squared_error=float(squares),
-            points=int(batch.asked.sum()),
-            failed=self._failed(tracks),
-        )
+        squares = float((positions - batch.rest)[batch.asked].square().sum())
+        return BatchLoss(losses.sum(), len(losses), squares, int(batch.asked.sum()), self._failed(tracks))
 
     def _failed(self, tracks: Sequence[int]) -> tuple[tuple[str, str], ...]:
         return tuple((self._names[number], self._unusable[number]) for number in tracks if number in self._unusable)

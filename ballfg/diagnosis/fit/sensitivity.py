@@ -81,9 +81,7 @@ def sensitivity(
     Args:
         model, stretches, starts, values: as for `predict`.
         names: coefficients among `values`; one that is named again has one derivative for each of its shapes.
-        by_start: whether first states are among the directions.
         shapes: for each name, values of other coefficients with which that derivative is taken; empty: none.
-        most_rows: of one forward pass.
     """
     wanted = [_Direction(component=number) for number in range(STATE_DIM if by_start else 0)]
     wanted += [_Direction(None, name, shape) for name, shape in zip(names, shapes or [{}] * len(names), strict=True)]

@@ -88,11 +88,9 @@ class Stretches:
 def stretches_of(smoother: Smoother, tracks: Iterable[Track], launcher: Launcher, jobs: int = 1) -> Stretches:
     """The stretches of tracks.
 
-    Args:
-        smoother: finds contacts, hits and outliers, and the states from which the fit starts.
-        tracks: as measured.
-        launcher: reads the settings of a shot; its weights do not matter.
-        jobs: processes.
+    The smoother finds contacts, hits and outliers, and the states from which the fit starts. The launcher reads the
+    settings of a shot; its weights do not matter.
+
     Raises: ValueError: if no track has a stretch that is long enough.
     """
     tracks = list(tracks)

@@ -88,15 +88,14 @@ def _pieces(fit: Fit, arc: ArcResponse) -> list[_Piece]:
         first = np.searchsorted(number[i], np.arange(count + 1))
         middle = (first[:-1] + first[1:] - 1) // 2
         length = arc.step[i] * q / count
+        times = arc.begun[i] + (np.arange(count) + 0.5) * length
         own, sigma = columns[i, :, : 3 * count], np.full(3 * count, ACCELERATION / np.sqrt(length))
         contact = None
         if arc.number:
             own = np.concatenate((own, kicks[i]), axis=1)
             sigma = np.concatenate((sigma, np.repeat((CONTACT_VELOCITY, CONTACT_SPIN), 3)))
             contact = (arc.number - 1, float(arc.begun[i]), arc.incoming[i])
-        pieces.append(
-            _Piece(own, sigma, arc.begun[i] + (np.arange(count) + 0.5) * length, arc.nodes[i, middle], contact)
-        )
+        pieces.append(_Piece(own, sigma, times, arc.nodes[i, middle], contact))
     return pieces
 
 

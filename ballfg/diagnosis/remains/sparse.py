@@ -75,12 +75,9 @@ def fit_with_terms(before: Fit, terms: SparseTerms) -> Fit:
 
 
 def select(information: Array, score: Array, penalty: float) -> list[int]:
-    """Indices of the terms worth their penalty, in the order chosen.
+    """Indices of the terms worth their penalty, in the order chosen, from information (p, p) and score (p,).
 
-    Args:
-        information: (p, p).
-        score: (p,).
-        penalty: least that a term must explain, as twice a log likelihood.
+    Args: penalty: least that a term must explain, as twice a log likelihood.
     """
     chosen: list[int] = []
     while len(chosen) < MOST_TERMS:

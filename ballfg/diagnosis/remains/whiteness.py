@@ -50,7 +50,9 @@ def whiteness(fit: Fit, system: System) -> Whiteness:
     stretches = fit.problem.stretches
     n, k = stretches.times.shape
     kept = stretches.used.numpy() & (fit.robust.samples >= LEAST_WEIGHT)
-    system = _without(system, ~kept)
+    rows = np.ones(system.residual.shape)  # without outliers, which pull at the fit a little and would look like drift
+    rows[:, : 3 * k] = np.repeat(kept, 3, axis=1)
+    system = System(system.residual * rows, system.by_start * rows[..., None], system.by_common * rows[..., None])
     projected = system.projected()
     residual = projected[:, : 3 * k, -1].reshape(n, k, 3)
     taken = _absorbed(fit, system, projected[..., :-1]).reshape(n, k, 3, -1)
@@ -103,13 +105,6 @@ def _summed(residual: Array, taken: Array, kept: Mask, kernel: Array) -> tuple[f
 
 def _trace(matrices: Array) -> Array:
     return np.asarray(np.trace(matrices, axis1=-2, axis2=-1))
-
-
-def _without(system: System, samples: Mask) -> System:
-    """The system without some samples (n, k): outliers, which pull at the fit a little, would look like drift."""
-    rows = np.ones(system.residual.shape)
-    rows[:, : 3 * samples.shape[1]] -= np.repeat(samples, 3, axis=1)
-    return System(system.residual * rows, system.by_start * rows[..., None], system.by_common * rows[..., None])
 
 
 def _absorbed(fit: Fit, system: System, shared: Array) -> Array:

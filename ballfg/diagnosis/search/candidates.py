@@ -43,12 +43,9 @@ class Scored:
 
 @dataclass(frozen=True)
 class Refit:
-    """A hypothesis in the model, everything fitted again.
+    """A hypothesis in the model, everything fitted again at the noise of the fit before, and BIC minus that before.
 
-    Attributes:
-        scored: the hypothesis and its score test.
-        fit: the minimum, at the noise of the fit before.
-        delta_bic: BIC minus that of the fit before; negative is better.
+    A negative difference is better.
     """
 
     scored: Scored

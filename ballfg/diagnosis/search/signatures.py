@@ -22,12 +22,9 @@ LEAST_SHARE = 1e-8
 
 @dataclass(frozen=True)
 class Signatures:
-    """Inner products of projected columns, summed over each of t tracks.
+    """Inner products (t, q + p + 1, q + p + 1) of projected columns, summed over each of t tracks.
 
-    Attributes:
-        gram: (t, q + p + 1, q + p + 1): q common columns, p columns of candidates, the residual.
-        precision: (q,) priors of the common ones.
-        common: q.
+    There are q = `common` columns, whose priors have the precision (q,), p columns of candidates, and the residual.
     """
 
     gram: Array
@@ -76,9 +73,7 @@ class Efficient:
 def visible_directions(information: Array, raw: Array) -> Array:
     """(p, r) the directions of p coefficients that projection leaves; r is zero where it leaves none.
 
-    Args:
-        information: (p, p), everything else projected out.
-        raw: (p,) information of each coefficient if all else were known.
+    Args: information: (p, p), everything else projected out.  raw: (p,) of each if all else were known.
     """
     if not (raw > 0.0).any():
         return np.zeros((len(raw), 0))
