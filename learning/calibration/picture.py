@@ -40,8 +40,8 @@ def _coefficient(axes: Axes, problem: Problem, last: Step, k: int) -> None:
     """Each track's estimate with its standard deviation, the population, its mean, and the starting value."""
     tracks = sorted((fit.values[k], fit.sigmas[k]) for fit in last.fits)
     values, sigmas = np.array(tracks).reshape(-1, 2).T
-    style = {"fmt": ".", "color": TRACKS, "elinewidth": 0.7}
-    axes.errorbar(np.arange(len(values)), values, sigmas, label="tracks, 1 sigma", **style)
+    order = np.arange(len(values))
+    axes.errorbar(order, values, sigmas, fmt=".", color=TRACKS, elinewidth=0.7, label="tracks, 1 sigma")
     mean, width = last.mean[k], last.next_track[k]
     axes.axhspan(mean - width, mean + width, color=BAND, alpha=0.2, linewidth=0, label="a new track, 1 sigma")
     axes.axhline(mean, color=BAND, linewidth=1.5, label="mean")

@@ -231,8 +231,17 @@ def _means(column: Iterable[Axes], against: Array, values: Array, sigmas: Array,
     for axes, component, sigma in zip(column, values.T, sigmas.T, strict=True):
         bins = binned(against, component, sigma, stretch)
         axes.axhline(0.0, color="black", linewidth=0.8, zorder=0)
-        style = {"fmt": "o-", "color": colour, "markersize": 4, "linewidth": 1.2, "capsize": 2}
-        axes.errorbar(bins.centres, bins.means, bins.errors, label=label, **style)
+        axes.errorbar(
+            bins.centres,
+            bins.means,
+            bins.errors,
+            fmt="o-",
+            color=colour,
+            label=label,
+            linewidth=1.2,
+            markersize=4,
+            capsize=2,
+        )
 
 
 def _name_rows(panels: NDArray[np.object_], names: Sequence[str], unit: str) -> None:
