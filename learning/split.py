@@ -69,9 +69,8 @@ def split_tracks(dataset: Dataset, how: Literal["random", "label"], seed: int, *
     fit = tuple(name for name in names if name in fitted)
     judge = tuple(name for name in names if name not in fitted)
     if len(fit) < 2 or not judge:
-        raise ValueError(
-            f"a calibration needs 2 tracks to fit and 1 to judge; got {len(fit)} and {len(judge)}. Add some."
-        )
+        got = f"{len(fit)} and {len(judge)}"
+        raise ValueError(f"a calibration needs 2 tracks to fit and 1 to judge; got {got}. Add some.")
     return Split(fit, judge, left_out, digest.hexdigest())
 
 

@@ -148,9 +148,7 @@ class SharedMemory:
     def gather(self, ranks: Ranks, own: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The memory of all ranks, on every rank. Args: own: memory of this rank."""
         known = self.given
-        changed = {
-            name: tensor for name, tensor in own.items() if name not in known or not torch.equal(tensor, known[name])
-        }
+        changed = {name: new for name, new in own.items() if name not in known or not torch.equal(new, known[name])}
         forgotten = [name for name in known if name not in own]
         merged = dict(known)
         for theirs, gone in ranks.gather((changed, forgotten)):

@@ -232,9 +232,7 @@ def _means(column: Iterable[Axes], against: Array, values: Array, sigmas: Array,
         bins = binned(against, component, sigma, stretch)
         axes.axhline(0.0, color="black", linewidth=0.8, zorder=0)
         axes.errorbar(
-            bins.centres,
-            bins.means,
-            bins.errors,
+            *(bins.centres, bins.means, bins.errors),
             fmt="o-",
             color=colour,
             label=label,
