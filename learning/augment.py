@@ -1,7 +1,5 @@
 """Augmentation: the same shot in another place, by a rotation about the vertical and a horizontal shift."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -15,15 +13,9 @@ SHIFT = 1.0
 def augmentation(seed: int, epoch: int, track: int) -> tuple[Tensor, Tensor]:
     """The rotation and shift of one track in one epoch, independent of batch and process.
 
-    Height is never shifted, since the table has one.
-
-    Args:
-        seed: of the run, >= 0.
-        epoch: >= 0.
-        track: number of the track, >= 0.
+    Height is never shifted, since the table has one. Seed, epoch and number of the track are at least 0.
 
     Returns: (angle, shift): () rad, uniform in [-pi, pi); (2,) m along x and y, uniform in [-SHIFT, SHIFT). float64.
-
     Raises: ValueError: a negative number.
     """
     for name, number in (("seed", seed), ("epoch", epoch), ("track", track)):

@@ -1,7 +1,5 @@
 """The error of a model's predictions on tracks that were not fitted: observe the first part, predict the rest."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 
@@ -58,24 +56,15 @@ class Summary(BaseModel):
 def judge_tracks(
     estimator: Estimator, tracks: Iterable[Track], observe: float, horizon: float, jobs: int, count: int
 ) -> Iterator[TrackScore | None]:
-    """Scores in the order of the tracks.
-
-    Args:
-        estimator: with the model to judge.
-        tracks: a stream.
-        observe: share of each track's duration that is observed.
-        horizon: s that are predicted, `inf` for the whole rest.
-        jobs: number of processes.
-        count: number of tracks.
-
-    Returns: None for a track that cannot be judged: nothing left to predict, an estimate that failed.
-    """
-    score = partial(judge_track, estimator, observe=observe, horizon=horizon)
-    return map_tracks(score, tracks, count, jobs)
+    """Scores of a stream of `count` tracks, in their order, as `judge_track`."""
+    return map_tracks(partial(judge_track, estimator, observe=observe, horizon=horizon), tracks, count, jobs)
 
 
 def judge_track(estimator: Estimator, track: Track, observe: float, horizon: float) -> TrackScore | None:
-    """The score of one track; None where it cannot be judged."""
+    """The score of one track; None where nothing is left to predict, or the estimate failed.
+
+    Args: observe: share of the duration that is observed.  horizon: s that are predicted, `inf` for the whole rest.
+    """
     if len(track) < 2:
         return None
     prediction = next(predict_tracks(estimator, [track], 1, observe * track.duration, horizon=horizon))

@@ -1,8 +1,7 @@
-"""The registry of trainees: what a config's key `kind` can name, and the kinds that come with the package.
+"""The registry of trainees, which a config's key `kind` can name, and those that come with the package.
 
 A kind of one's own is a subclass of `TraineeKind` and one call of `register_trainee`, or an entry point of the group
-`ballfg.trainees`. This module imports nothing heavy, so that a config is checked at once; models are imported when they
-are built.
+`ballfg.trainees`. Models are imported when they are built, so that a config is checked at once.
 """
 
 from __future__ import annotations

@@ -1,7 +1,5 @@
 """Shots to learn from: what of a track is observed, what is to be predicted, and the events in it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
@@ -65,15 +63,9 @@ def shots_of(
     samples: int | None,
     seconds: float | None,
 ) -> Iterator[tuple[Track, Shot | str]]:
-    """Each track with its shot, or the reason why it gives none.
+    """Each track with its shot, or the reason why it gives none. Observed are so many samples, or seconds.
 
-    Args:
-        tracks: whole.
-        model: finds the events; an analytic one will do.
-        surfaces: what the ball may bounce on.
-        settings: of the estimator.
-        samples: how many are observed; or
-        seconds: for how long is observed.
+    The model finds the events; an analytic one will do.
     """
     smoother = Smoother(model, surfaces, settings)
     for track in tracks:

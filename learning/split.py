@@ -1,11 +1,10 @@
 """The split of tracks into those that are fitted and those that judge, made before anything is estimated."""
 
-from __future__ import annotations
-
 import hashlib
-from collections import Counter
+from collections import defaultdict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import cycle
 from typing import Literal
 
 import numpy as np
@@ -20,13 +19,9 @@ FIT, JUDGE, VALIDATE = "train", "test", "validation"
 
 @dataclass(frozen=True)
 class Split:
-    """The parts of a dataset.
+    """The parts of a dataset: names of the tracks that are fitted and that judge, reasons for the others by name.
 
-    Attributes:
-        fit: names of the tracks that are fitted.
-        judge: names of the tracks that judge.
-        left_out: reasons for the other tracks, by name.
-        digest: hash of all stamps, positions, sigmas and labels.
+    The digest is a hash of all stamps, positions, sigmas and labels.
     """
 
     fit: tuple[str, ...]
@@ -39,11 +34,8 @@ def split_tracks(dataset: Dataset, how: Literal["random", "label"], seed: int, *
     """Split the tracks of a dataset, in one pass.
 
     Args:
-        dataset: the tracks.
         how: random: half to fit, half to judge, an odd one to fit. label: by the label `split`.
-        seed: of the random split.
         needs_spin: leave out tracks without a spin label.
-
     Raises: ValueError: if fewer than two tracks are left to fit or none to judge, or a label is missing.
     """
     if how == "label" and LABEL not in dataset.label_names:
@@ -52,7 +44,10 @@ def split_tracks(dataset: Dataset, how: Literal["random", "label"], seed: int, *
     taken: dict[str, str] = {}
     left_out: dict[str, str] = {}
     for track in dataset:
-        _add(digest, track)
+        digest.update(repr((track.name, len(track), sorted(track.labels.items()))).encode())
+        digest.update(track.times.tobytes() + track.positions.tobytes())
+        if track.sigmas is not None:
+            digest.update(track.sigmas.tobytes())
         label = str(track.labels.get(LABEL, "none"))
         if needs_spin and track.spin_label is None:
             left_out[track.name] = "no spin label"
@@ -74,20 +69,15 @@ def split_tracks(dataset: Dataset, how: Literal["random", "label"], seed: int, *
     fit = tuple(name for name in names if name in fitted)
     judge = tuple(name for name in names if name not in fitted)
     if len(fit) < 2 or not judge:
-        raise ValueError(
-            f"a calibration needs 2 tracks to fit and 1 to judge; got {len(fit)} and {len(judge)}. Add some."
-        )
+        got = f"{len(fit)} and {len(judge)}"
+        raise ValueError(f"a calibration needs 2 tracks to fit and 1 to judge; got {got}. Add some.")
     return Split(fit, judge, left_out, digest.hexdigest())
 
 
 def training_split(tracks: Sequence[tuple[int, Track]], config: SplitConfig, seed: int) -> tuple[list[int], list[int]]:
     """Numbers of the tracks that train and of those that validate, in order; other tracks are not used.
 
-    Args:
-        tracks: each with the number of its dataset; `alternate` counts in each dataset by itself.
-        config: of the split.
-        seed: of the random split.
-
+    Args: tracks: each with the number of its dataset; `alternate` counts in each dataset by itself.
     Raises: ValueError: if no track trains.
     """
     if config.by == "none":
@@ -95,11 +85,8 @@ def training_split(tracks: Sequence[tuple[int, Track]], config: SplitConfig, see
     elif config.by == "label":
         chosen = [str(track.labels.get(LABEL)) for _, track in tracks]
     elif config.by == "alternate":
-        counts: Counter[int] = Counter()
-        chosen = []
-        for number, _ in tracks:
-            chosen.append(VALIDATE if counts[number] % 2 else FIT)
-            counts[number] += 1
+        counts: defaultdict[int, Iterator[str]] = defaultdict(lambda: cycle((FIT, VALIDATE)))
+        chosen = [next(counts[number]) for number, _ in tracks]
     else:
         order = np.random.default_rng(seed).permutation(len(tracks))
         validating = set(order[: round(config.validation * len(tracks))].tolist())
@@ -116,10 +103,3 @@ def tracks_of(dataset: Dataset, names: tuple[str, ...]) -> Iterator[Track]:
     """The tracks of some names, streamed in the order of the dataset."""
     wanted = set(names)
     return (track for track in dataset if track.name in wanted)
-
-
-def _add(digest: hashlib._Hash, track: Track) -> None:
-    digest.update(repr((track.name, len(track), sorted(track.labels.items()))).encode())
-    digest.update(track.times.tobytes() + track.positions.tobytes())
-    if track.sigmas is not None:
-        digest.update(track.sigmas.tobytes())

@@ -1,12 +1,10 @@
 """The contract between a trained model and the loop that trains it."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor, nn
@@ -31,7 +29,7 @@ class BatchLoss:
     failed: tuple[tuple[str, str], ...] = ()
 
     @classmethod
-    def none(cls, failed: Sequence[tuple[str, str]] = ()) -> BatchLoss:
+    def none(cls, failed: Sequence[tuple[str, str]] = ()) -> Self:
         """The loss of no tracks."""
         return cls(torch.zeros((), dtype=torch.float64), 0, 0.0, 0, tuple(failed))
 

@@ -1,7 +1,5 @@
 """From a config to the data of a training: datasets, split, shots, and the settings of the estimator."""
 
-from __future__ import annotations
-
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -16,7 +14,7 @@ from ballfg.estimation.launcher import Launcher
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.shots import Shot, shots_of
 from ballfg.learning.split import training_split
-from ballfg.tracks import Dataset, Track, read_dataset
+from ballfg.tracks import Ball, Dataset, Track, read_dataset
 
 FIRST_SPIN = {"topspin": (0.0, 50.0, 0.0), "sidespin": (0.0, 0.0, 50.0)}
 """rad/s about (forward, across, up) per level of the settings with a known axis; other settings start at no spin."""
@@ -49,7 +47,11 @@ def read_training_data(config: TrainConfig) -> TrainingData:
     Raises: ValueError, FileNotFoundError: bad input, for instance no track that can be used.
     """
     datasets = [open_dataset(folder) for folder in config.data or ()]
-    tracks = [(number, _grouped(track, dataset)) for number, dataset in enumerate(datasets) for track in dataset]
+    tracks = [
+        (number, replace(track, labels={"group": dataset.info.name, **track.labels}))  # without groups it is one group
+        for number, dataset in enumerate(datasets)
+        for track in dataset
+    ]
     analytic = _analytic(config, datasets)
     train, validation = training_split(tracks, config.split, config.seed)
     embedding = _embedding(config, [tracks[k][1] for k in train])
@@ -72,12 +74,12 @@ def open_dataset(folder: str) -> Dataset:
     return dataset
 
 
-def analytic_model(path: str | None, radius: float) -> AnalyticModel:
-    """The analytic model of a file, or the nominal one for None; radius in m.
+def analytic_model(path: str | None, ball: Ball) -> AnalyticModel:
+    """The analytic model of a file, or the nominal one of the ball for None.
 
     Raises: ValueError: if the file's model has a learned part.
     """
-    model = nominal_model(radius) if path is None else load_model(path, radius=radius)
+    model = nominal_model(ball) if path is None else load_model(path, radius=ball.radius)
     if not isinstance(model, AnalyticModel):
         raise ValueError(f"model must be analytic; {path} has a learned part. Give its base, or leave it out.")
     return model
@@ -96,16 +98,12 @@ def categories_of(labels: Sequence[str], tracks: Sequence[Track]) -> dict[str, t
     return categories
 
 
-def _grouped(track: Track, dataset: Dataset) -> Track:
-    """The track with a label `group`; a dataset without groups is one group of its own name."""
-    return track if "group" in track.labels else replace(track, labels={**track.labels, "group": dataset.info.name})
-
-
 def _analytic(config: TrainConfig, datasets: Sequence[Dataset]) -> AnalyticModel:
-    radii = {dataset.info.ball.radius for dataset in datasets}
+    balls = [dataset.info.ball for dataset in datasets]
+    radii = {ball.radius for ball in balls}
     if len(radii) > 1:
         raise ValueError(f"data must be of one kind of ball; got radii {sorted(radii)} m. Train a model for each.")
-    model = analytic_model(config.model, radii.pop())
+    model = analytic_model(config.model, balls[0])
     if not model.measures_plainly:
         raise ValueError("model must have no measurement effects; got some, which training does not know. Remove them.")
     return model

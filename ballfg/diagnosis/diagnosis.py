@@ -1,7 +1,5 @@
 """The diagnosis of a dataset: search for effects, evaluate them, test the rest, and say it in one sentence."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -44,10 +42,7 @@ def diagnose(
         jobs: processes that work on tracks at the same time.
         watch: is told of each stage, in lines.
         catalogue: effects to look for; by default all that are registered.
-
-    Returns:
-        The verdict, the findings with their evidence, errors before and after, and the corrected model.
-
+    Returns: the verdict, the findings with their evidence, errors before and after, and the corrected model.
     Raises:
         TypeError: if the model is a learned one.
         ValueError: if there are too few tracks, or none with a flight that is long enough.

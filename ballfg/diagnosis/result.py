@@ -1,7 +1,5 @@
 """The result of a diagnosis: the verdict, effects added with their evidence, errors before and after, the rest."""
 
-from __future__ import annotations
-
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -18,7 +16,7 @@ Mask = NDArray[np.bool_]
 
 
 class Verdict(enum.Enum):
-    """The answer to: does the model lack anything?"""
+    """The answer of a diagnosis: whether the model lacks anything."""
 
     FOUND = "effect found"
     NOTHING = "nothing lacking"

@@ -5,27 +5,22 @@ finds the population's mean and spread, and puts the mean into the model. It end
 docs/train.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict
 
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_settings, dataset_surfaces, estimate_tracks
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
-from ballfg.learning.calibration.population import Evidence, evidence, fit_population
+from ballfg.learning.calibration.population import Array, Evidence, evidence, fit_population
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import TrackScore, judge_tracks
 from ballfg.learning.split import Split, split_tracks, tracks_of
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Dataset
-
-Array = NDArray[np.float64]
 
 
 class TooManyFailures(ValueError):  # noqa: N818 - the name is the statement
@@ -34,18 +29,7 @@ class TooManyFailures(ValueError):  # noqa: N818 - the name is the statement
 
 @dataclass(frozen=True)
 class Problem:
-    """A calibration, checked and ready to start; made by `pose`.
-
-    Attributes:
-        dataset: the tracks.
-        config: of the calibration.
-        model: to start from.
-        chosen: its coefficients that are calibrated.
-        surfaces: on which the ball may bounce.
-        settings: of the estimator, those of `ballfg predict`.
-        split: the tracks that are fitted and those that judge.
-        jobs: number of processes.
-    """
+    """A calibration, checked and ready to start; made by `pose`. The estimator's settings are those of `predict`."""
 
     dataset: Dataset
     config: CalibrationConfig
@@ -96,38 +80,26 @@ class Step(BaseModel):
 
 
 def pose(dataset: Dataset, model: AnalyticModel, config: CalibrationConfig, jobs: int = 1) -> Problem:
-    """Check a calibration against its data before anything starts.
-
-    Args:
-        dataset: the tracks.
-        model: to start from, with the ball's radius.
-        config: of the calibration.
-        jobs: number of processes.
+    """Check a calibration against its data before anything starts; the model has the ball's radius.
 
     Raises: ValueError: coefficients that the model does not have or the data cannot determine, too few tracks.
     """
     chosen = choose(model, config.coefficients)
     split = split_tracks(dataset, config.split, config.seed, needs_spin=chosen.needs_spin)
-    return Problem(
-        dataset, config, model, chosen, dataset_surfaces(dataset), dataset_settings(dataset, model), split, jobs
-    )
+    surfaces, settings = dataset_surfaces(dataset), dataset_settings(dataset, model)
+    return Problem(dataset, config, model, chosen, surfaces, settings, split, jobs)
 
 
 def calibrate(problem: Problem, done: Iterable[Step] = (), *, watch: Watch = unwatched) -> Iterator[Step]:
     """The remaining steps, each as soon as it is finished; none if the calibration has ended.
 
-    Args:
-        problem: from `pose`.
-        done: steps of an earlier run of the same problem, which continues to the same numbers.
-        watch: sees the tracks pass, for instance to show progress.
-
+    Args: done: steps of an earlier run of the same problem, which continues to the same numbers.
     Raises: TooManyFailures: more estimates of fitted tracks failed than the config allows.
     """
     steps = list(done)
     if not steps:
-        steps.append(
-            Step(number=0, mean=_plain(problem.chosen.start), scores=score(problem, problem.chosen.start, watch))
-        )
+        start = problem.chosen.start
+        steps.append(Step(number=0, mean=_plain(start), scores=score(problem, start, watch)))
         yield steps[-1]
     while not has_ended(problem.config, steps[-1]):
         steps.append(_advance(problem, steps[-1], watch))
@@ -147,20 +119,12 @@ def has_ended(config: CalibrationConfig, step: Step) -> bool:
 def score(
     problem: Problem, values: Array, watch: Watch = unwatched, settings: Settings | None = None
 ) -> tuple[TrackScore | None, ...]:
-    """Scores of the judging tracks, in order.
-
-    Args:
-        problem: from `pose`.
-        values: (p,) of the coefficients.
-        watch: sees the tracks pass.
-        settings: of the estimator; by default those of the problem.
-    """
+    """Scores of the judging tracks, in order, with values (p,) of the coefficients; settings: else the problem's."""
     config, names = problem.config, problem.split.judge
     horizon = np.inf if config.horizon is None else config.horizon
     estimator = problem.estimator(values, settings or problem.settings)
-    scores = judge_tracks(
-        estimator, tracks_of(problem.dataset, names), config.observe, horizon, problem.jobs, len(names)
-    )
+    tracks = tracks_of(problem.dataset, names)
+    scores = judge_tracks(estimator, tracks, config.observe, horizon, problem.jobs, len(names))
     return tuple(watch(scores, len(names), "tracks judged"))
 
 
@@ -207,7 +171,12 @@ def _fit_tracks(
             fit, found = _read(estimate, chosen, about)
         except ValueError as error:
             skipped.append((estimate.name, str(error)))
-            _check_failures(skipped, len(names), problem.config.failure_limit)
+            limit = problem.config.failure_limit
+            if len(skipped) > limit * len(names):
+                raise TooManyFailures(
+                    f"more than {100 * limit:g} % of the {len(names)} fitted tracks failed, the last one "
+                    f"'{estimate.name}': {error}. Raise failure_limit to go on without them."
+                ) from None
         else:
             fits.append(fit)
             evidences.append(found)
@@ -222,17 +191,7 @@ def _read(estimate: Estimate, chosen: Chosen, about: Array) -> tuple[TrackFit, E
     mean = estimate.coefficients[columns]
     covariance = estimate.coefficient_covariance[np.ix_(columns, columns)]
     found = evidence(mean, covariance, about, chosen.sigma)
-    fit = TrackFit(name=estimate.name, values=_plain(mean), sigmas=_plain(np.sqrt(np.diag(covariance))))
-    return fit, found
-
-
-def _check_failures(skipped: list[tuple[str, str]], count: int, limit: float) -> None:
-    if len(skipped) > limit * count:
-        name, reason = skipped[-1]
-        raise TooManyFailures(
-            f"more than {100 * limit:g} % of the {count} fitted tracks failed, the last one '{name}': {reason}. "
-            "Raise failure_limit to go on without them."
-        )
+    return TrackFit(name=estimate.name, values=_plain(mean), sigmas=_plain(np.sqrt(np.diag(covariance)))), found
 
 
 def _plain(values: Array) -> tuple[float, ...]:

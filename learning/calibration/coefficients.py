@@ -1,19 +1,15 @@
 """The coefficients that are calibrated: looked up in the model, checked against the data, put back into a model."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ballfg.checks import did_you_mean
 from ballfg.dynamics import AnalyticModel
-
-Array = NDArray[np.float64]
+from ballfg.learning.calibration.population import Array
 
 NEED_SPIN_LABELS = ("flight.magnus.k", "flight.spin_decay.rate")
 """Coefficients that act through the spin alone: without measured spin only their product with it is observable."""
@@ -21,15 +17,9 @@ NEED_SPIN_LABELS = ("flight.magnus.k", "flight.spin_decay.rate")
 
 @dataclass(frozen=True)
 class Chosen:
-    """The p coefficients that are calibrated.
+    """The p coefficients that are calibrated, by their names as in `model.named_parameters()`.
 
-    Attributes:
-        names: as in `model.named_parameters()`.
-        units: SI, `1` for none.
-        start: (p,) values in the first model.
-        sigma: (p,) standard deviations of their priors.
-        low: (p,) lower bounds.
-        high: (p,) upper bounds.
+    Units are SI, `1` for none. Values in the first model, standard deviations of the priors and bounds have shape (p,).
     """
 
     names: tuple[str, ...]

@@ -1,7 +1,5 @@
 """The picture of a calibration: each track's coefficients, the population, and the errors before and after."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import matplotlib
@@ -31,9 +29,8 @@ def draw(problem: Problem, last: Step, comparison: Comparison, path: Path) -> No
     _errors(axes[panels - 1], comparison)
     for unused in axes[panels:]:
         unused.set_axis_off()
-    figure.suptitle(
-        f"{problem.dataset.info.name}: {len(last.fits)} tracks fitted, {len(comparison.pairs)} judge", size=11
-    )
+    title = f"{problem.dataset.info.name}: {len(last.fits)} tracks fitted, {len(comparison.pairs)} judge"
+    figure.suptitle(title, size=11)
     with whole_file(path) as temporary:
         figure.savefig(temporary, dpi=DPI, format="png")
     plt.close(figure)
@@ -41,18 +38,10 @@ def draw(problem: Problem, last: Step, comparison: Comparison, path: Path) -> No
 
 def _coefficient(axes: Axes, problem: Problem, last: Step, k: int) -> None:
     """Each track's estimate with its standard deviation, the population, its mean, and the starting value."""
-    values = np.array([fit.values[k] for fit in last.fits])
-    sigmas = np.array([fit.sigmas[k] for fit in last.fits])
-    order = np.argsort(values)
-    axes.errorbar(
-        np.arange(len(values)),
-        values[order],
-        sigmas[order],
-        fmt=".",
-        color=TRACKS,
-        elinewidth=0.7,
-        label="tracks, 1 sigma",
-    )
+    tracks = sorted((fit.values[k], fit.sigmas[k]) for fit in last.fits)
+    values, sigmas = np.array(tracks).reshape(-1, 2).T
+    order = np.arange(len(values))
+    axes.errorbar(order, values, sigmas, fmt=".", color=TRACKS, elinewidth=0.7, label="tracks, 1 sigma")
     mean, width = last.mean[k], last.next_track[k]
     axes.axhspan(mean - width, mean + width, color=BAND, alpha=0.2, linewidth=0, label="a new track, 1 sigma")
     axes.axhline(mean, color=BAND, linewidth=1.5, label="mean")

@@ -9,8 +9,6 @@ L. Hu, J. Zhou, K. Lange, "MM algorithms for variance components models", J. Com
 lowers the likelihood and needs no step size.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -80,7 +78,6 @@ def evidence(mean: Array, covariance: Array, prior_mean: Array, prior_sigma: Arr
     Args:
         mean: (p,) posterior mean.  covariance: (p, p) posterior covariance.
         prior_mean: (p,).  prior_sigma: (p,) standard deviations of the independent prior.
-
     Raises: ValueError: if the covariance is not positive definite or anything is not finite.
     """
     if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
@@ -106,7 +103,6 @@ def fit_population(tracks: Sequence[Evidence], start: Array, sigma: Array, low: 
         tracks: at least one.
         start: (p,) mean of the prior of the population's mean.  sigma: (p,) its standard deviation.
         low: (p,) least mean.  high: (p,) largest mean.
-
     Raises: ValueError: if there is no track.
     """
     if not tracks:
@@ -119,7 +115,11 @@ def fit_population(tracks: Sequence[Evidence], start: Array, sigma: Array, low: 
     variance = np.where(seen, 1.0, 0.0)
     for _ in range(MAX_STEPS):
         mean = _mean(information, moved, variance, bounds)
-        updated = np.minimum(variance * _growth(information, moved, variance, mean), MOST_SPREAD)
+        # the pulls as large as they are, against as large as they should be
+        pulls = (_residual(information, moved, variance, mean) ** 2).sum(axis=0)
+        expected = np.einsum("ikk->k", _marginal(information, variance))
+        growth = np.sqrt(np.divide(pulls, expected, out=np.zeros_like(pulls), where=expected > 0.0))
+        updated = np.minimum(variance * growth, MOST_SPREAD)
         updated[updated < NO_SPREAD] = 0.0
         change = np.abs(updated - variance)
         done = bool((change <= STEP_TOLERANCE * variance).all())
@@ -163,13 +163,6 @@ def _residual(information: Array, moved: Array, variance: Array, mean: Array) ->
     """(n, p) each track's pull on the mean."""
     pull = (moved - information @ mean)[..., None]
     return np.asarray(np.linalg.solve(_mixing(information, variance), pull)[..., 0])
-
-
-def _growth(information: Array, moved: Array, variance: Array, mean: Array) -> Array:
-    """(p,) factor of the variances: the pulls as large as they are, against as large as they should be."""
-    seen = (_residual(information, moved, variance, mean) ** 2).sum(axis=0)
-    expected = np.einsum("ikk->k", _marginal(information, variance))
-    return np.sqrt(np.divide(seen, expected, out=np.zeros_like(seen), where=expected > 0.0))
 
 
 def _log_likelihood(information: Array, moved: Array, variance: Array, mean: Array) -> float:

@@ -1,7 +1,5 @@
 """The result of a calibration as `report.json` and as text: coefficients and errors before and after."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,8 +18,6 @@ class Comparison:
     """Scores of the judging tracks before and after, of those that could be judged each time.
 
     Attributes:
-        before: with the model that the calibration started from.
-        after: with the calibrated model.
         with_spread: with the calibrated model, each track's prior as wide as the population.
         better: number of tracks whose RMSE fell.
         pairs: (n, 2) m, RMSE before and after of each track.

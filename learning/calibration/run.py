@@ -1,7 +1,5 @@
 """A calibration from config to results: `ballfg-train` with the kind `calibrate`, and its checkpoint."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Sequence
@@ -38,19 +36,17 @@ class Checkpoint(BaseModel):
 
 
 def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jobs: int, watch: Watch) -> None:
-    """Calibrate coefficients and write the folder of the run.
+    """Calibrate coefficients and write the folder of the run; to `resume` is to continue after the last finished step.
 
-    Args:
-        config: of the calibration.
-        folder: to write; that of the earlier run if it is to `resume`.
-        resume: continue after the last finished step.
-        jobs: number of processes where the config has none.
-        watch: sees the tracks pass, for instance to show progress.
-
+    Args: jobs: number of processes where the config has none.
     Raises: ValueError, FileNotFoundError: bad input. KeyboardInterrupt: after Ctrl-C; finished steps are kept.
     """
     files.check(folder, config, resume=resume)
-    problem = _pose(config, jobs)
+    if config.data is None:
+        raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
+    torch.set_num_threads(1)  # the batches are small: threads cost more than they gain
+    dataset = open_dataset(config.data)
+    problem = pose(dataset, analytic_model(config.model, dataset.info.ball), config, config.jobs or jobs)
     steps = read_checkpoint(folder, problem) if resume else []
     files.start(folder, config)
     print(f"{folder / files.CONFIG}: the config; {len(problem.split.fit)} tracks fit, {len(problem.split.judge)} judge")
@@ -60,15 +56,6 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
     except KeyboardInterrupt:
         print(f"{len(steps)} steps are kept; continue with --resume {folder}", file=sys.stderr)
         raise
-
-
-def _pose(config: CalibrationConfig, jobs: int) -> Problem:
-    """Open dataset and model and check them; notes go to stderr."""
-    if config.data is None:
-        raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
-    torch.set_num_threads(1)  # the batches are small: threads cost more than they gain
-    dataset = open_dataset(config.data)
-    return pose(dataset, analytic_model(config.model, dataset.info.ball.radius), config, config.jobs or jobs)
 
 
 def _steps(problem: Problem, steps: list[Step], folder: Path, watch: Watch) -> None:

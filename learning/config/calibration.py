@@ -1,7 +1,5 @@
 """The config of a calibration; each field with its meaning."""
 
-from __future__ import annotations
-
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
@@ -22,7 +20,7 @@ class CalibrationConfig(Section):
     """Distinguishes this config from that of a training."""
 
     model: str | None = None
-    """Model file to start from; null: the nominal table-tennis model."""
+    """Model file to start from; null: the nominal model of the dataset's ball."""
 
     data: str | None = None
     """Folder of the dataset. `--data` replaces it."""

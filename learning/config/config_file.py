@@ -1,7 +1,5 @@
 """The config file of `ballfg-train`: YAML with `key=value` overrides, checked before anything starts."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -27,7 +25,6 @@ def read_config(path: str | Path, overrides: Iterable[str] = (), options: Mappin
         path: YAML file; an empty one means all defaults.
         overrides: `key=value`, nested keys with dots; the value is YAML, or a number as in `1e-3`.
         options: values of command-line options; they take precedence.
-
     Raises:
         FileNotFoundError: if there is no such file.
         ValueError: if it is not YAML, or a key or value is wrong; the message names key, rule and remedy.

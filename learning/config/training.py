@@ -1,7 +1,5 @@
 """The config of a training; each field with its meaning."""
 
-from __future__ import annotations
-
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -189,11 +187,6 @@ def _known(kind: Any) -> Any:
     raise ValueError(f"must be {listed}; got {kind!r}. To calibrate coefficients write 'kind: calibrate'.")
 
 
-def _as_names(data: Any) -> Any:
-    """A list of one where a single dataset is written without a list."""
-    return (data,) if isinstance(data, str) else data
-
-
 class TrainConfig(Section):
     """A training. The same config on the same data gives the same numbers.
 
@@ -218,15 +211,15 @@ class TrainConfig(Section):
     seed: Annotated[int, Field(ge=0)] = 0
     """Seed of initial weights, random split, order of the tracks and augmentation."""
 
-    data: Annotated[Names | None, BeforeValidator(_as_names)] = None
+    data: Annotated[Names | None, BeforeValidator(lambda data: (data,) if isinstance(data, str) else data)] = None
     """Folder of the dataset, or a list of several that train one model. `--data` replaces it."""
 
     out: str = "training"
     """Folder that is written. `--out` replaces it."""
 
     model: str | None = None
-    """Analytic model that a-tune and networks start from and a residual network corrects; null: the nominal
-    table-tennis model."""
+    """Analytic model that a-tune and networks start from and a residual network corrects; null: the nominal model of
+    the dataset's ball."""
 
     architecture: ArchitectureConfig = ArchitectureConfig()
     """Network of mlp, mlp+gs, skip+gs, mnn+gs."""

@@ -1,7 +1,5 @@
 """From a config to a model of the dynamics that is trained through the estimator."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 from ballfg.dynamics import AnalyticModel, BallModel
@@ -32,11 +30,8 @@ def build_end_to_end(config: TrainConfig) -> Prepared:
     data = read_training_data(config)
     if data.embedding is not None and config.launcher.start == "tracks":
         begin_with_tracks(data.embedding, [data.shots[k] for k in data.train], data.analytic)
-    noise = NoiseScales(
-        data.shots[0].settings.process,
-        position=config.noise.position_scale or 1.0,
-        learned=config.loss.likelihood > 0.0,
-    )
+    process, scale = data.shots[0].settings.process, config.noise.position_scale or 1.0
+    noise = NoiseScales(process, position=scale, learned=config.loss.likelihood > 0.0)
     model = _model(config, data.analytic)
     trainee = EndToEnd(
         data.shots,

@@ -4,8 +4,6 @@ The estimate is a function of the model, the launcher's embedding and the noise.
 implicit function theorem (`ballfg.learning.gradient.implicit`). Source: Q. Xiao, Z. Wu, M. Gombolay 2024, section III.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -53,12 +51,7 @@ EMBEDDING_STEP: Final = 3.0
 
 @dataclass(frozen=True)
 class Prediction:
-    """Predicted positions of some tracks against what was measured.
-
-    Attributes:
-        error: (t, k, 3) m, predicted less measured; zero at points that do not count.
-        counts: (t, k) bool, the points that count.
-    """
+    """Predicted less measured positions of some tracks (t, k, 3) m, and the points that count (t, k); else zero."""
 
     error: Tensor
     counts: Tensor
@@ -73,8 +66,6 @@ class EndToEnd(Trainee):
 
     Args:
         shots: all of them; batches are numbers of shots.
-        learnables: the parameters.
-        loss: the loss.
         method: of the gradient through the estimate; by default `ImplicitGradient`.
         seed: of the augmentation.
         augment: whether shots are rotated and shifted in training.
@@ -184,11 +175,8 @@ class EndToEnd(Trainee):
             states = [s.solution.minimum.values.states[0] for s in solved]
             prediction = self.predict(solved, torch.stack([torch.from_numpy(s) for s in states]), None)
             good = prediction.finite()
-            failed += [
-                (self.shots[s.number].name, "the predicted track is not finite")
-                for s, ok in zip(solved, good.tolist(), strict=True)
-                if not ok
-            ]
+            names = [self.shots[s.number].name for s, ok in zip(solved, good.tolist(), strict=True) if not ok]
+            failed += [(name, "the predicted track is not finite") for name in names]
             prediction = Prediction(prediction.error[good], prediction.counts[good])
             return _batch_loss(self._outer(prediction).sum(), prediction, failed)
 

@@ -5,23 +5,19 @@ group of shots may end with the wrong sign. The spin with which an analytic mode
 within some 10 rad/s.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from ballfg.dynamics.analytic import AnalyticModel, coefficient_sigmas
 from ballfg.dynamics.networks.spin_embedding import SPIN_UNIT, SpinEmbedding
 from ballfg.estimation import Smoother, Status
+from ballfg.factors.batch import Array
 from ballfg.learning.shots import Shot
 from ballfg.state import SPIN, VELOCITY
-
-Array = NDArray[np.float64]
 
 SPIN_PRIOR: Final = 150.0
 """rad/s, standard deviation of the prior: launchers reach this spin."""
@@ -32,10 +28,8 @@ LEAST_SPEED: Final = 0.5
 def begin_with_tracks(embedding: SpinEmbedding, shots: Iterable[Shot], model: AnalyticModel) -> None:
     """Set an embedding to the spins that a model finds in whole tracks, by least squares over their settings.
 
-    Args:
-        embedding: changed in place; unchanged where no shot shows a spin.
-        shots: training shots. Those with a spin label, or without all settings, are skipped.
-        model: its coefficients that vary from track to track are estimated too.
+    Shots with a spin label, or without all settings, are skipped; where none is left the embedding stays as it is.
+    Coefficients of the model that vary from track to track are estimated too.
     """
     settings, spins = [], []
     for shot in shots:

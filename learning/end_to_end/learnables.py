@@ -1,7 +1,5 @@
 """The learnable parameters of an estimator: the ball's model, the meaning of launcher settings, the noise."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -28,7 +26,6 @@ class NoiseScales(nn.Module):
         process: starting values. Numbers that are zero stay zero.
         position: starting value, as a multiple of the noise that datasets and tracks state.
         learned: False keeps all of them fixed.
-
     Attributes:
         process: (q,) logarithms of the numbers `names`.
         position, spin: () logarithms of the scales of measured positions and of spin labels.

@@ -6,8 +6,6 @@ nothing about speeds and spins other than those of their launchers; as a term of
 close to the analytic one there.
 """
 
-from __future__ import annotations
-
 import copy
 from typing import Final
 
@@ -37,14 +35,9 @@ SPIN_UNIT: Final = 10.0
 
 
 def pretrain(model: LearnedModel, teacher: BallModel, seed: int, iterations: int, *, samples: int = SAMPLES) -> float:
-    """Fit a model to a teacher on random states; the same seed gives the same weights.
+    """Fit a model, in place, to a teacher on random states by L-BFGS; the same seed gives the same weights.
 
-    Args:
-        model: changed in place.
-        teacher: gives rates and bounces.
-        seed: of the states.
-        iterations: of L-BFGS.
-        samples: number of flights, and of bounces.
+    Args: samples: number of flights, and of bounces.
     Returns: the root mean square of the remaining errors, in their units.
     """
     flying, bouncing = random_states(seed, samples)
@@ -64,13 +57,7 @@ def pretrain(model: LearnedModel, teacher: BallModel, seed: int, iterations: int
 
 
 class Anchor:
-    """The mean square difference of a model in training from another one.
-
-    Args:
-        model: in training.
-        start: the other one, as it is now.
-        seed: of the states.
-    """
+    """The mean square difference of a model in training from another one, as that is now, on random states."""
 
     def __init__(self, model: BallModel, start: BallModel, seed: int) -> None:
         self.model = model

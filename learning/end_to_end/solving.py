@@ -1,23 +1,19 @@
 """Estimates of many shots together, each starting from where it ended the last time."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Smoother
 from ballfg.estimation.segmentation import Contact
 from ballfg.estimation.smoother.problem import effective_sigmas
 from ballfg.estimation.smoother.smoother import Earlier
 from ballfg.estimation.smoother.solution import Solution
-from ballfg.factors.batch import Values
+from ballfg.factors.batch import Array, Values
 from ballfg.factors.graph import Convergence, LevenbergMarquardt, Search
 from ballfg.factors.lockstep import run_together
 from ballfg.learning.augment import apply, rotate, undo
@@ -25,8 +21,6 @@ from ballfg.learning.end_to_end.learnables import Learnables
 from ballfg.learning.shots import Shot
 from ballfg.state import POSITION, SPIN, VELOCITY
 from ballfg.tracks import SPIN_LABELS, Track
-
-Array = NDArray[np.float64]
 
 TRAINING = LevenbergMarquardt(tolerance=1e-4)
 """Posterior standard deviations to the minimum: the gradient is off by as little, far less than batches scatter."""
@@ -64,13 +58,7 @@ class Pose:
 
 @dataclass(frozen=True)
 class Solved:
-    """An estimate of a shot.
-
-    Attributes:
-        number: of the shot.
-        solution: graph, minimum and events.
-        positions: (n, 3) m, the whole track as seen in this estimate.
-    """
+    """An estimate of a shot by its number, with the positions (n, 3) m of the whole track as seen in it."""
 
     number: int
     solution: Solution
@@ -121,30 +109,21 @@ class WarmStarts:
                 self._last[int(number)] = (tensors[name].numpy(), coefficients, contacts)
 
 
-_Smoothers = dict[tuple[int, Surfaces], Smoother]
-
-
+@dataclass
 class BatchSolver:
-    """Solves shots with the parameters as they are.
+    """Solves shots, given by number, with the parameters as they are."""
 
-    Args:
-        shots: all of them, by number.
-        learnables: model, embedding, noise.
-        optimizer: how tightly estimates are solved.
-    """
-
-    def __init__(self, shots: Sequence[Shot], learnables: Learnables, optimizer: LevenbergMarquardt = TRAINING) -> None:
-        self.shots = shots
-        self.optimizer = optimizer
-        self.learnables = learnables
-        self.warm = WarmStarts()
+    shots: Sequence[Shot]
+    learnables: Learnables
+    optimizer: LevenbergMarquardt = TRAINING
+    warm: WarmStarts = field(default_factory=WarmStarts)
 
     def __call__(self, numbers: Sequence[int], poses: Mapping[int, Pose]) -> tuple[list[Solved], list[tuple[str, str]]]:
         """Estimates of some shots; name and reason of those that did not converge.
 
         Args: numbers: of the shots.  poses: for those that are not seen as measured.
         """
-        smoothers: _Smoothers = {}
+        smoothers: dict[tuple[int, Surfaces], Smoother] = {}
         searches = [self._search(number, poses.get(number), smoothers) for number in numbers]
         solved, failed = [], []
         for number, solution in zip(numbers, run_together(searches), strict=True):
@@ -158,12 +137,16 @@ class BatchSolver:
                 failed.append((self.shots[number].name, minimum.convergence.value))
         return solved, failed
 
-    def _search(self, number: int, pose: Pose | None, smoothers: _Smoothers) -> Search[Solution]:
+    def _search(
+        self, number: int, pose: Pose | None, smoothers: dict[tuple[int, Surfaces], Smoother]
+    ) -> Search[Solution]:
         shot = self.shots[number]
         key = id(shot.settings), shot.surfaces
-        smoother = smoothers.get(key)
-        if smoother is None:
-            smoother = smoothers[key] = self._smoother(shot)
+        if key not in smoothers:
+            # hits were looked for once, in the shots: what a model in training cannot explain yet is no hit
+            settings = replace(self.learnables.noise.settings(shot.settings), find_events=False)
+            smoothers[key] = Smoother(self.learnables.model, shot.surfaces, settings, self.optimizer)
+        smoother = smoothers[key]
         track, segmentation = shot.seen, shot.segmentation
         sigma = effective_sigmas(track, segmentation, smoother.settings)
         if pose is not None:
@@ -175,13 +158,3 @@ class BatchSolver:
         values, contacts = warm
         problem = smoother.problem(track, replace(segmentation, contacts=contacts), sigma)
         return smoother.search(problem, Earlier(values))
-
-    def _smoother(self, shot: Shot) -> Smoother:
-        # hits were looked for once, in the shots: what a model in training cannot explain yet is no hit
-        settings = replace(self.learnables.noise.settings(shot.settings), find_events=False)
-        return Smoother(self.model, shot.surfaces, settings, self.optimizer)
-
-    @property
-    def model(self) -> BallModel:
-        """The ball's model as it is now."""
-        return self.learnables.model

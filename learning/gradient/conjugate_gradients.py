@@ -6,9 +6,8 @@ which GTSAM has factorised on the way to the minimum, differs from a block only 
 that a few steps are enough.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 import torch
@@ -70,6 +69,7 @@ class GaussNewtonFactors(SquareRootInformation):
             states[:, i] = later[..., 0]
 
 
+@dataclass
 class ConjugateGradients:
     """Preconditioned conjugate gradients on blocks, in lockstep.
 
@@ -80,15 +80,12 @@ class ConjugateGradients:
         max_iterations: largest number of products with the Hessian.
     """
 
-    def __init__(
-        self, factors: GaussNewtonFactors, owners: Tensor, tolerance: float = 1e-10, max_iterations: int = 50
-    ) -> None:
-        self.factors = factors
-        self.owners = owners
-        self.tolerance = tolerance
-        self.max_iterations = max_iterations
-        self.iterations = 0
-        """Products with the Hessian in the last solution."""
+    factors: GaussNewtonFactors
+    owners: Tensor
+    tolerance: float = 1e-10
+    max_iterations: int = 50
+    iterations: int = field(default=0, init=False)
+    """Products with the Hessian in the last solution."""
 
     def precondition(self, vector: Tensor) -> Tensor:
         """The Gauss-Newton solution (n,), in SI units, of a right side `vector` (n,) in those of the gradient."""

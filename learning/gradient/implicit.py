@@ -7,8 +7,6 @@ lambda = H^-1 dL/dx*. This takes one linear solution, independent of the solver'
 A method takes the solve, the stationarity condition, the linear solver and the parameters as separate arguments.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol

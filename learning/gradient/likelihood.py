@@ -8,8 +8,6 @@ Fisher's identity), where T rewhitens factor k and S = r r^T + J C J^T is the me
 the posterior covariance C of its variables.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

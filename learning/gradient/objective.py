@@ -4,8 +4,6 @@ The estimator minimises it in numpy, track by track. A gradient through the esti
 batch of tracks at once. Factors of the same sort are merged, so that a batch costs few torch calls.
 """
 
-from __future__ import annotations
-
 import copy
 from collections import defaultdict
 from collections.abc import Hashable, Sequence
@@ -55,12 +53,8 @@ class Layout:
     def owners(self) -> Tensor:
         """Track number of each entry of the vector."""
         track = torch.arange(len(self.lengths))
-        return torch.cat(
-            (
-                track.repeat_interleave(torch.tensor(self.lengths) * STATE_DIM),
-                track.repeat_interleave(self.coefficients),
-            )
-        )
+        of_states = track.repeat_interleave(torch.tensor(self.lengths) * STATE_DIM)
+        return torch.cat((of_states, track.repeat_interleave(self.coefficients)))
 
 
 @dataclass(frozen=True)
@@ -70,9 +64,6 @@ class _Block:
     kind: FactorBatch
     places: tuple[tuple[bool, Tensor], ...]
     tracks: Tensor
-
-    def inputs(self, states: Tensor, coefficients: Tensor) -> tuple[Tensor, ...]:
-        return tuple((coefficients if shared else states)[index] for shared, index in self.places)
 
 
 class BatchObjective:
@@ -101,8 +92,8 @@ class BatchObjective:
         states, coefficients = self.layout.unpack(point)
         total = point.new_zeros(len(self.layout.lengths))
         for block in self._blocks:
-            residual = block.kind.residual(block.inputs(states, coefficients))
-            residual = rewhitened(residual, block.kind.rewhitening(noise))
+            inputs = tuple((coefficients if shared else states)[index] for shared, index in block.places)
+            residual = rewhitened(block.kind.residual(inputs), block.kind.rewhitening(noise))
             total = total.index_add(0, block.tracks, block.kind.loss.of_square(residual.square().sum(-1)))
         return total
 
@@ -130,9 +121,7 @@ def _block(members: Sequence[tuple[int, FactorBatch]], starts: Sequence[int]) ->
         moved.append(shifted)
     whole = merge(moved)
     is_shared = (members[0][1].variables == COEFFICIENTS).all(axis=0)
-    places = tuple(
-        (bool(shared), torch.from_numpy(column.copy()))
-        for shared, column in zip(is_shared, whole.variables.T, strict=True)
-    )
+    columns = [torch.from_numpy(column.copy()) for column in whole.variables.T]
+    places = tuple(zip(is_shared.tolist(), columns, strict=True))
     tracks = torch.tensor([track for track, _ in members])
     return _Block(whole, places, tracks.repeat_interleave(torch.tensor([len(kind) for _, kind in members])))

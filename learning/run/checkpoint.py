@@ -1,7 +1,5 @@
 """The checkpoint of a training, from which it continues to the same numbers: a folder of tensors and YAML."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -45,10 +43,8 @@ class Checkpoint:
     """A run after an epoch. There is no random state: random numbers derive from seed, epoch and track.
 
     Attributes:
-        progress: its progress.
-        weights: state of the module.
-        best: state of the module at the best epoch.
-        optimizer: state of the optimizer, as `<parameter>/<moment>`.
+        weights, best: state of the module now and at the best epoch.
+        optimizer: its state, as `<parameter>/<moment>`.
         memory: further state of the trainee (`Trainee.memory`).
     """
 
@@ -60,15 +56,12 @@ class Checkpoint:
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
-    """Replace the checkpoint of a run. At every moment either the old or the new one exists as a whole.
-
-    Args: folder: of the run.
-    """
+    """Replace the checkpoint in the folder of a run. At every moment the old or the new one exists as a whole."""
     with replaced_folder(folder / NAME) as part:
         for name in TENSORS:
             tensors: dict[str, Tensor] = getattr(checkpoint, name)
             owned = {key: tensor.detach().contiguous().clone() for key, tensor in tensors.items()}
-            save_file(owned, _tensors(part, name))
+            save_file(owned, part / f"{name}.safetensors")
         text = yaml.safe_dump(checkpoint.progress.model_dump(), sort_keys=False)
         (part / STATE).write_text(text, encoding="utf-8")
 
@@ -84,14 +77,10 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
         return None
     try:
         content: Any = read_yaml(path / STATE)
-        tensors = {name: load_file(_tensors(path, name)) for name in TENSORS}
+        tensors = {name: load_file(path / f"{name}.safetensors") for name in TENSORS}
         return Checkpoint(RunProgress.model_validate(content), **tensors)
     except ValidationError as error:
         reason = f"{STATE}: {error.errors()[0]['msg']}"
     except (OSError, YamlError, SafetensorError) as error:
         reason = " ".join(str(error).split())
     raise ValueError(f"{path}: not a whole checkpoint ({reason}). Start a new run.")
-
-
-def _tensors(folder: Path, name: str) -> Path:
-    return folder / f"{name}.safetensors"

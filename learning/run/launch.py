@@ -1,7 +1,5 @@
 """Several training processes on this machine, started as torchrun would start them."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time
@@ -25,11 +23,7 @@ LAST_WORDS = 10.0
 def launch(processes: int, work: Callable[..., int], *arguments: Any) -> int:
     """Run `work` in several processes, which `join_ranks` joins to one group.
 
-    Args:
-        processes: their number.
-        work: a function of a module, which returns an exit status.
-        arguments: of `work`, which can be pickled.
-
+    Args: work: a function of a module, which returns an exit status; its arguments can be pickled.
     Returns: the status of the first process.
     Raises:
         ChildProcessError: if a process was killed.
@@ -54,7 +48,7 @@ def _take_part(
     rank: int,
     processes: int,
     port: int,
-    status: Synchronized[int],
+    status: "Synchronized[int]",
     work: Callable[..., int],
     arguments: tuple[Any, ...],
 ) -> None:

@@ -4,8 +4,6 @@
 checkpoint takes the same steps, bit for bit.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -30,15 +28,9 @@ class TrainingStoppedError(ValueError):
 
 @dataclass(frozen=True)
 class Task:
-    """A training.
+    """A training: a model with its data, numbers of the tracks that train and validate, processes that share the work.
 
-    Attributes:
-        trainee: the model with its data.
-        train: numbers of the tracks that train.
-        validation: numbers of the tracks that judge the weights; may be empty.
-        config: of the training.
-        ranks: the processes that share the work.
-        watch: sees the batches pass in the first process, for instance to show progress.
+    There may be no validation tracks. `watch` sees the batches pass in the first process, to show progress.
     """
 
     trainee: Trainee
@@ -61,12 +53,6 @@ class _Tally:
     skipped: int = 0
     norms: list[float] = field(default_factory=list)
     reasons: list[tuple[str, str]] = field(default_factory=list)
-
-    def add(self, loss: float, tracks: float, squared_error: float, points: float) -> None:
-        self.loss += loss
-        self.tracks += tracks
-        self.squared_error += squared_error
-        self.points += points
 
     @property
     def rmse(self) -> float | None:
@@ -160,7 +146,10 @@ class Training:
             self._skip(tally)
             return
         self.skipped_in_row = 0
-        tally.add(loss, tracks, squared_error, points)
+        tally.loss += loss
+        tally.tracks += tracks
+        tally.squared_error += squared_error
+        tally.points += points
         gradient = gradient / tracks
         norm = float(gradient.norm())
         tally.norms.append(norm)
@@ -179,7 +168,6 @@ class Training:
         return torch.cat([part.double() for part in flat] + [_sums(found)])
 
     def _apply(self, gradient: Tensor) -> None:
-        """A step with a flat gradient."""
         parts = gradient.split([parameter.numel() for parameter in self.parameters])
         for parameter, part in zip(self.parameters, parts, strict=True):
             parameter.grad = part.view_as(parameter).to(parameter.dtype)
@@ -187,7 +175,6 @@ class Training:
         self.task.trainee.after_step()
 
     def _skip(self, tally: _Tally) -> None:
-        """Count a step that is not finite."""
         tally.skipped += 1
         self.skipped_in_row += 1
         if self.skipped_in_row > self.task.config.diverged_limit:
@@ -208,7 +195,6 @@ class Training:
         )
 
     def _judge(self, number: int) -> _Tally:
-        """Judge the validation tracks with the present weights."""
         ranks, size = self.task.ranks, self.task.config.optimizer.batch
         own = ranks.own(self.task.validation)
         parts = [own[i : i + size] for i in range(0, len(own), size)]

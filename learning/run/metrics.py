@@ -1,7 +1,5 @@
 """The numbers of an epoch: one row of `metrics.csv`."""
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Sequence
@@ -59,7 +57,8 @@ def read_metrics(path: Path) -> list[Epoch]:
     """The rows of a table. Raises: ValueError: if it is not one that `write_metrics` wrote."""
     try:
         with path.open(encoding="utf-8", newline="") as file:
-            return [_epoch(row) for row in csv.DictReader(file)]
+            rows = [{name: _number(name, text) for name, text in row.items()} for row in csv.DictReader(file)]
+        return [Epoch(**row) for row in rows]
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: not a table of epochs ({error}). Start a new run.") from None
 
@@ -78,15 +77,10 @@ def epoch_line(epoch: Epoch, last: int, seconds_left: float) -> str:
     return " ".join(parts) + (f", about {_duration(seconds_left)} left" if seconds_left else "")
 
 
-def _epoch(row: dict[str, str]) -> Epoch:
-    """Raises: TypeError, ValueError: not a row of this table."""
-    values: dict[str, Any] = {}
-    for name, text in row.items():
-        if name in INTEGERS:
-            values[name] = int(text)
-        else:
-            values[name] = float(text) if text else None
-    return Epoch(**values)
+def _number(name: str, text: str) -> Any:
+    if name in INTEGERS:
+        return int(text)
+    return float(text) if text else None
 
 
 def _millimetres(rmse: float | None) -> str:

@@ -1,7 +1,5 @@
 """AdamW over a trainee's parameters: groups, learning rate by step, state by parameter name."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -4,8 +4,6 @@ A process is a rank. Each rank owns tracks by their number, independent of the b
 stays with it. A single process is the case of one rank: nothing is sent, and the numbers are the same up to rounding.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import traceback
@@ -13,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import FrameType
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import torch
 import torch.distributed as dist
@@ -36,7 +34,7 @@ class Trouble:
     text: str
 
     @classmethod
-    def of(cls, rank: int, error: BaseException) -> Trouble:
+    def of(cls, rank: int, error: BaseException) -> Self:
         """The form of an exception that is sent to the other ranks."""
         if isinstance(error, KeyboardInterrupt):
             return cls(rank, "interrupt", "")
@@ -55,12 +53,7 @@ class Trouble:
 
 @dataclass
 class Ranks:
-    """This process among those that train.
-
-    Attributes:
-        rank: number of this process, from 0.
-        size: number of processes.
-    """
+    """This process, number `rank` from 0, among the `size` that train."""
 
     rank: int = 0
     size: int = 1
@@ -155,9 +148,7 @@ class SharedMemory:
     def gather(self, ranks: Ranks, own: Mapping[str, Tensor]) -> dict[str, Tensor]:
         """The memory of all ranks, on every rank. Args: own: memory of this rank."""
         known = self.given
-        changed = {
-            name: tensor for name, tensor in own.items() if name not in known or not torch.equal(tensor, known[name])
-        }
+        changed = {name: new for name, new in own.items() if name not in known or not torch.equal(new, known[name])}
         forgotten = [name for name in known if name not in own]
         merged = dict(known)
         for theirs, gone in ranks.gather((changed, forgotten)):

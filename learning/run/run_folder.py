@@ -1,7 +1,5 @@
 """The folder of a run: names of its files, checks before a run starts, config and versions."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -32,11 +30,7 @@ def check(folder: Path, config: Config, *, resume: bool) -> None:
     """
     if resume:
         _check_resumable(folder, config)
-    else:
-        _check_new(folder)
-
-
-def _check_new(folder: Path) -> None:
+        return
     if folder.exists() and not folder.is_dir():
         raise ValueError(f"out must be a folder; {folder} is a file. Choose another name.")
     there = [name for name in (*CALIBRATION, *TRAINING) if (folder / name).exists()]

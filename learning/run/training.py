@@ -1,7 +1,5 @@
 """A training from config to model: the work of `ballfg-train` in each of its processes."""
 
-from __future__ import annotations
-
 import io
 import sys
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
@@ -39,7 +37,6 @@ def run_training(config: TrainConfig, folder: Path, *, resume: bool = False, wat
         folder: to write; that of the earlier run if it is to `resume`.
         resume: continue from the last checkpoint.
         watch: sees the batches pass in the first process, for instance to show progress.
-
     Raises:
         ValueError, FileNotFoundError: bad input, or a training that cannot go on (`TrainingStoppedError`).
         KeyboardInterrupt: after Ctrl-C; the epochs up to the last checkpoint are kept.
@@ -56,7 +53,8 @@ def run_training(config: TrainConfig, folder: Path, *, resume: bool = False, wat
         record = ranks.together(lambda: Record(task, folder, checkpoint) if ranks.first else None)
         try:
             for epoch in training.epochs():
-                kept = training.checkpoint() if _is_due(epoch, config) else None
+                due = epoch.epoch % config.checkpoint_every == 0 or epoch.epoch == config.optimizer.epochs
+                kept = training.checkpoint() if due else None
                 ranks.from_first(partial(_write, record, epoch, kept))
             training.take_best()
             ranks.from_first(lambda: _finish(training, folder))
@@ -80,11 +78,6 @@ def _built(ranks: Ranks, config: TrainConfig) -> Prepared:
             quiet.enter_context(redirect_stdout(io.StringIO()))
             quiet.enter_context(redirect_stderr(io.StringIO()))
         return build(config)
-
-
-def _is_due(epoch: Epoch, config: TrainConfig) -> bool:
-    """Whether a checkpoint follows an epoch; the last one has one."""
-    return epoch.epoch % config.checkpoint_every == 0 or epoch.epoch == config.optimizer.epochs
 
 
 def _write(record: Record | None, epoch: Epoch, checkpoint: Checkpoint | None) -> None:

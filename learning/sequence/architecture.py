@@ -1,10 +1,8 @@
 """Kind and size of a sequence model, and the model itself."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal, Self, get_args
 
 import torch
 
@@ -27,7 +25,6 @@ class SequenceArchitecture:
     Attributes:
         kind: lstm or diffusion.
         width: of the hidden states; diffusion: channels of the denoiser. A multiple of 8, for the attention heads.
-
     Raises: ValueError: an unknown kind, or a width that is not a positive multiple of 8.
     """
 
@@ -41,7 +38,7 @@ class SequenceArchitecture:
             raise ValueError(f"width must be a positive multiple of 8; got {self.width!r}. Round it.")
 
     @classmethod
-    def of(cls, kind: SequenceKind) -> SequenceArchitecture:
+    def of(cls, kind: SequenceKind) -> Self:
         """The default of a kind. Raises: ValueError: an unknown kind."""
         return cls(kind, DEFAULT_WIDTH.get(kind, 0))
 

@@ -1,9 +1,8 @@
 """Tracks as padded tensors: observations, launcher settings, and the times to predict."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 import torch
@@ -75,7 +74,7 @@ class Example:
     times: Tensor
     rest: Tensor
 
-    def seen_from(self, angle: Tensor, shift: Tensor) -> Example:
+    def seen_from(self, angle: Tensor, shift: Tensor) -> Self:
         """The same shot, rotated by () rad and shifted by (2,) m (`augment.apply`); launcher settings stay the same."""
         return replace(self, observed=apply(self.observed, angle, shift), rest=apply(self.rest, angle, shift))
 
@@ -123,7 +122,6 @@ def example(track: Track, observed: int, settings: Tensor, times: ArrayLike | No
         settings: (k,) of this track's launcher.
         times: (m,) s in the track's own time, increasing, later than the last observed sample; None: the stamps of
             the rest, with their measurements.
-
     Raises: ValueError: too few samples, nothing to predict, or times that do not increase from the last observed one.
     """
     if not LEAST_OBSERVED <= observed <= len(track):

@@ -4,8 +4,6 @@ Only shifts and scales: no direction is singled out and nothing is extrapolated.
 table lies at one height for all tracks.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -50,7 +48,6 @@ class Frame(nn.Module):
         """Set the scales from some examples.
 
         Returns: the number of grid points that reach to the end of the longest.
-
         Raises: ValueError: if nothing moves, so that there is no scale.
         """
         batch = collate(examples)
@@ -92,10 +89,7 @@ class Frame(nn.Module):
     def at_times(self, path: Tensor, times: Tensor) -> Tensor:
         """A path on the grid, at any times: linear between its points and beyond the last.
 
-        Args:
-            path: (b, points + 1, 3) at 0, step, 2 step ...
-            times: (b, m) s, >= 0.
-
+        Args: path: (b, points + 1, 3) at 0, step, 2 step ...  times: (b, m) s, >= 0.
         Returns: (b, m, 3).
         """
         place = times / self.step
@@ -105,12 +99,7 @@ class Frame(nn.Module):
         return (1 - weight) * path.gather(1, index) + weight * path.gather(1, index + 1)
 
     def on_grid(self, local: Tensor, batch: Batch, points: int) -> tuple[Tensor, Tensor]:
-        """The measured rest on the grid, linear between samples.
-
-        Args:
-            local: (b, m, 3) the rest, as from `inward`.
-            batch: whose times these are.
-            points: of the grid.
+        """The measured rest of a batch, local as from `inward` (b, m, 3), on the grid, linear between samples.
 
         Returns: (values (b, points, 3), known (b, points) bool); a point is unknown beyond the last sample and inside
             a gap of more than LARGEST_GAP steps.

@@ -1,7 +1,5 @@
 """LSTM baseline: one recurrent network reads the observations, another predicts step by step."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch
@@ -21,12 +19,7 @@ class LstmModel(SequenceModel):
     """Encoder and decoder. The decoder feeds on its own positions only, in training as in use, over the frame's grid.
 
     Observed step i enters as position, displacement per grid step since the one before, interval, and settings. The
-    decoder's output is the displacement over the next grid step.
-
-    Args:
-        settings: length of the launcher's settings.
-        points: steps of the grid.
-        width: of both hidden states.
+    decoder's output is the displacement over the next grid step. Both hidden states have the same width.
     """
 
     def __init__(self, settings: int, points: int, width: int) -> None:

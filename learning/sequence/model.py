@@ -1,7 +1,5 @@
 """The contract of a sequence model: from the observed part of tracks to the rest, no estimator, no dynamics."""
 
-from __future__ import annotations
-
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
@@ -19,7 +17,8 @@ Draw = tuple[int, int, int]
 class SequenceModel(nn.Module, ABC):
     """A network with the frame it works in. Networks compute in float32, positions outside are float64.
 
-    No track's result depends on the others in its batch, beyond rounding.
+    It is made from the number of the launcher's settings, that of the grid's points, and a width. No track's result
+    depends on the others in its batch, beyond rounding.
 
     Attributes:
         frame: scales and grid.
@@ -36,7 +35,6 @@ class SequenceModel(nn.Module, ABC):
         Args:
             batch: with a measured rest.
             draws: one for each track.
-
         Returns: (losses, positions): (b,) differentiable, in squared units of the frame; (b, m, 3) m, the rest as
             predicted in training, without gradient.
         """

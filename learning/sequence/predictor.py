@@ -1,10 +1,9 @@
 """A trained sequence model for use: predictions from tracks, and its folder with a config and weights."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
 import torch
@@ -44,6 +43,7 @@ class FolderConfig(BaseModel):
     """Values of those that are text."""
 
 
+@dataclass(eq=False)
 class SequencePredictor:
     """Predicts the rest of tracks from their first samples.
 
@@ -56,10 +56,9 @@ class SequencePredictor:
         model: trained.
     """
 
-    def __init__(self, architecture: SequenceArchitecture, launcher: LauncherSettings, model: SequenceModel) -> None:
-        self.architecture = architecture
-        self.launcher = launcher
-        self.model = model
+    architecture: SequenceArchitecture
+    launcher: LauncherSettings
+    model: SequenceModel
 
     @property
     def parameter_count(self) -> int:
@@ -73,9 +72,7 @@ class SequencePredictor:
             track: its first `observed` samples and its labels are used, nothing else.
             observed: >= 2.
             times: (k,) s in the track's own time, increasing, later than the last observed sample.
-
         Returns: (k, 3) m.
-
         Raises: ValueError: too few samples, launcher settings that are missing or unknown, or bad times.
         """
         return self.predict_many([track], [observed], [times])[0]
@@ -89,9 +86,7 @@ class SequencePredictor:
             tracks: as for `predict`.
             observed: one number per track.
             times: (k,) s, one array per track.
-
         Returns: (k, 3) m, one array per track.
-
         Raises: ValueError: as `predict`.
         """
         examples = [
@@ -128,7 +123,7 @@ class SequencePredictor:
             save_file({name: value.contiguous() for name, value in self.model.state_dict().items()}, part / WEIGHTS)
 
     @classmethod
-    def load(cls, folder: str | Path) -> SequencePredictor:
+    def load(cls, folder: str | Path) -> Self:
         """Read what `save` wrote; predictions are the same to the last bit.
 
         Raises:

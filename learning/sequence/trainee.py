@@ -1,7 +1,5 @@
 """A sequence model with its tracks, for the training loop."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -38,7 +36,6 @@ class SequenceTrainee(Trainee):
         launcher: its labels.
         seed: of initial weights, augmentation and diffusion noise, >= 0.
         augment: whether training tracks are rotated and shifted.
-
     Raises: ValueError: if no track of the training part can be used.
     """
 
@@ -80,7 +77,10 @@ class SequenceTrainee(Trainee):
         numbers = [number for number in tracks if number in self._examples]
         if not numbers:
             return BatchLoss.none(self._failed(tracks))
-        examples = [self._seen(number, epoch) for number in numbers]
+        examples = [self._examples[number] for number in numbers]
+        if self._augment:
+            poses = [augmentation(self._seed, epoch, number) for number in numbers]
+            examples = [one.seen_from(*pose) for one, pose in zip(examples, poses, strict=True)]
         batch = collate(examples)
         losses, positions = self.module.losses(batch, [(self._seed, epoch, number) for number in numbers])
         return self._batch_loss(tracks, losses.double(), positions, batch)
@@ -106,20 +106,9 @@ class SequenceTrainee(Trainee):
         self.predictor().save(path)
         return path
 
-    def _seen(self, number: int, epoch: int) -> Example:
-        if not self._augment:
-            return self._examples[number]
-        return self._examples[number].seen_from(*augmentation(self._seed, epoch, number))
-
     def _batch_loss(self, tracks: Sequence[int], losses: Tensor, positions: Tensor, batch: Batch) -> BatchLoss:
-        squares = (positions - batch.rest)[batch.asked].square().sum()
-        return BatchLoss(
-            total=losses.sum(),
-            tracks=len(losses),
-            squared_error=float(squares),
-            points=int(batch.asked.sum()),
-            failed=self._failed(tracks),
-        )
+        squares = float((positions - batch.rest)[batch.asked].square().sum())
+        return BatchLoss(losses.sum(), len(losses), squares, int(batch.asked.sum()), self._failed(tracks))
 
     def _failed(self, tracks: Sequence[int]) -> tuple[tuple[str, str], ...]:
         return tuple((self._names[number], self._unusable[number]) for number in tracks if number in self._unusable)

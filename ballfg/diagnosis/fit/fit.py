@@ -5,8 +5,6 @@ residuals, and so is the scatter of unlabelled spins about the launcher's mean. 
 effects declare, so that those which the data cannot determine keep their declared values.
 """
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
@@ -44,9 +42,7 @@ def fit_model(model: AnalyticModel, stretches: Stretches, settings: Settings, *,
         stretches: the data. Those whose contacts the model does not reach from the first guess are left out.
         settings: of the dataset; the noise of spin labels and the prior of spins.
         settle_noise: whether the scale of the noise is estimated too.
-
-    Returns:
-        The minimum.
+    Returns: the minimum.
     """
     model = copy.deepcopy(model).requires_grad_(False)
     problem = Problem(model, reachable(model, stretches), declared_free(model))
@@ -66,9 +62,8 @@ def reachable(model: AnalyticModel, stretches: Stretches, values: Mapping[str, f
 
 def first_guess(problem: Problem, label_noise: float, spin_prior: float) -> tuple[Unknowns, Noise]:
     """The smoother's first states and the declared coefficients; label_noise and spin_prior in rad/s."""
-    values = dict(zip(problem.free, problem.centres.tolist(), strict=True))
     launcher = np.zeros((problem.stretches.settings.shape[1], 3))
-    unknowns = Unknowns(problem.stretches.starts.numpy().copy(), values, launcher)
+    unknowns = Unknowns(problem.stretches.starts.numpy().copy(), problem.declared, launcher)
     return unknowns, Noise(label=label_noise, spin=spin_prior)
 
 
@@ -156,17 +151,13 @@ def _followed_up(moved: Fit, system: System, weights: Robust) -> Fit:
     closer = Fit.at(moved.problem, unknowns, moved.noise)
     gains = closer.robust.losses < moved.robust.losses
     starts = np.where(gains[:, None], unknowns.starts, moved.unknowns.starts)
-    predicted = _chosen(gains, closer.predicted, moved.predicted)
-    return replace(moved, unknowns=replace(unknowns, starts=starts), predicted=predicted)
-
-
-def _chosen(first: Mask, one: Predicted, other: Predicted) -> Predicted:
-    """The prediction `one` for some stretches (n,), `other` for the rest."""
-    return Predicted(
-        np.where(first[:, None, None], one.positions, other.positions),
-        np.where(first[:, None], one.labels, other.labels),
-        np.where(first[:, None], one.contacts, other.contacts),
+    one, other = closer.predicted, moved.predicted
+    predicted = Predicted(
+        np.where(gains[:, None, None], one.positions, other.positions),
+        np.where(gains[:, None], one.labels, other.labels),
+        np.where(gains[:, None], one.contacts, other.contacts),
     )
+    return replace(moved, unknowns=replace(unknowns, starts=starts), predicted=predicted)
 
 
 def _settled(result: Fit) -> Noise:

@@ -1,7 +1,5 @@
 """A dataset split for diagnosis: every second track to search for effects, the others held out."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,12 +25,7 @@ LAUNCHER_LABELS = ("topspin", "sidespin", "speed")
 
 @dataclass(frozen=True)
 class EvaluationTrack:
-    """The part of a track that a model is to explain: up to the first hit or rest, without outliers.
-
-    Attributes:
-        track: that part.
-        bounces: (b,) s, contacts in it.
-    """
+    """The part of a track that a model is to explain: up to the first hit or rest, without outliers; bounces (b,) s."""
 
     track: Track
     bounces: Array
@@ -79,12 +72,8 @@ def hold_out(
         jobs: processes.
         watch: is told of progress, in lines.
         most_tracks: of a larger dataset so many tracks are used, evenly spread.
-
-    Returns:
-        Both halves, as stretches to fit and as tracks to predict.
-
-    Raises:
-        ValueError: if there are too few tracks, or a half without a stretch that is long enough.
+    Returns: both halves, as stretches to fit and as tracks to predict.
+    Raises: ValueError: if there are too few tracks, or a half without a stretch that is long enough.
     """
     tracks, excluded = _chosen(dataset, most_tracks)
     settings, surfaces = dataset_settings(dataset, model), dataset_surfaces(dataset)
@@ -95,9 +84,9 @@ def hold_out(
     if watch is not None:
         watch(f"estimating {len(tracks)} tracks")
     halves = tracks[::2], tracks[1::2]
-    search, held_out = (stretches_of(smoother, half, launcher, jobs) for half in halves)
-    search, held_out = (replace(half, sigmas=half.sigmas / excess) for half in (search, held_out))
-    parts = [list(map_tracks(partial(_evaluation_track, smoother), half, len(half), jobs)) for half in halves]
+    found = [stretches_of(smoother, half, launcher, jobs) for half in halves]
+    search, held_out = (replace(half, sigmas=half.sigmas / excess) for half in found)
+    parts = [map_tracks(partial(_evaluation_track, smoother), half, len(half), jobs) for half in halves]
     search_tracks, held_out_tracks = (tuple(part for part in half if part is not None) for half in parts)
     lost = len(tracks) - len(np.unique(search.track)) - len(np.unique(held_out.track))
     if lost:

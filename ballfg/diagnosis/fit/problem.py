@@ -1,10 +1,9 @@
 """A fit problem with its unknowns, priors and losses, and the linearised rows at some unknowns."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Self
 
 import numpy as np
 
@@ -27,12 +26,9 @@ LAUNCHER_SPIN_SIGMA = 150.0
 
 @dataclass(frozen=True)
 class Unknowns:
-    """Everything that a fit estimates.
+    """Everything that a fit estimates: first states (n, 9), coefficients by parameter name, and the launcher.
 
-    Attributes:
-        starts: (n, 9) first states.
-        values: coefficients by parameter name.
-        launcher: (s, 3) rad/s per unit of each launcher setting: spin about forward, across and up.
+    That is (s, 3) rad/s per unit of each launcher setting: spin about forward, across and up.
     """
 
     starts: Array
@@ -67,10 +63,15 @@ class Problem:
     shared: bool = True
 
     @property
-    def centres(self) -> Array:
-        """(q,) prior means: the model's own values."""
+    def declared(self) -> dict[str, float]:
+        """Prior means of the coefficients to estimate: the model's own values."""
         parameters = dict(self.model.named_parameters())
-        return np.array([float(parameters[name].detach()) for name in self.free])
+        return {name: float(parameters[name].detach()) for name in self.free}
+
+    @property
+    def centres(self) -> Array:
+        """(q,) prior means, as `declared`."""
+        return np.array(list(self.declared.values()))
 
     @property
     def precisions(self) -> Array:
@@ -100,14 +101,9 @@ class Robust:
 
 @dataclass(frozen=True)
 class Fit:
-    """Unknowns of a problem and the samples that they predict. The result of a fit is the one at the minimum.
+    """Unknowns of a problem and the samples that they predict, after some Gauss-Newton steps.
 
-    Attributes:
-        problem: the data, the model and the priors.
-        unknowns: the estimates.
-        noise: scale of the noise.
-        predicted: samples that the unknowns predict.
-        steps: Gauss-Newton steps taken so far.
+    The result of a fit is the one at the minimum.
     """
 
     problem: Problem
@@ -117,7 +113,7 @@ class Fit:
     steps: int = 0
 
     @classmethod
-    def at(cls, problem: Problem, unknowns: Unknowns, noise: Noise, steps: int = 0) -> Fit:
+    def at(cls, problem: Problem, unknowns: Unknowns, noise: Noise, steps: int = 0) -> Self:
         """The prediction at some unknowns."""
         predicted = predict(problem.model, problem.stretches, unknowns.starts, unknowns.values)
         return cls(problem, unknowns, noise, predicted, steps)
@@ -176,18 +172,16 @@ class Fit:
     def linearised(self) -> System:
         """The whitened, robustly weighted rows; common columns are coefficients, then launcher settings."""
         stretches, unknowns, noise = self.problem.stretches, self.unknowns, self.noise
-        derivative = sensitivity(
-            self.problem.model, stretches, unknowns.starts, unknowns.values, tuple(self.problem.free)
-        )
+        names = tuple(self.problem.free)
+        derivative = sensitivity(self.problem.model, stretches, unknowns.starts, unknowns.values, names)
         positions, labelled = self.position_rows(derivative.positions), stretches.labelled[:, None, None]
         spins = np.zeros((len(stretches), 3, derivative.labels.shape[-1]))
         spins[:, range(3), range(SPIN.start, SPIN.stop)] = 1.0 / noise.spin
         spins = np.where(labelled, derivative.labels / noise.label, spins) * np.sqrt(self.robust.spins)[:, None, None]
         towards = -launch_axes(unknowns.starts)[:, :, None, :] * stretches.settings[:, None, :, None] / noise.spin
-        by_launcher = np.zeros((*positions.shape[:2], unknowns.launcher.size))
-        by_launcher = np.concatenate(
-            (by_launcher, np.where(labelled, 0.0, towards.reshape(len(stretches), 3, -1))), axis=1
-        )
+        by_launcher = np.where(labelled, 0.0, towards.reshape(len(stretches), 3, -1))
+        none = np.zeros((*positions.shape[:2], unknowns.launcher.size))
+        by_launcher = np.concatenate((none, by_launcher), axis=1)
         rows = np.concatenate((positions, spins), axis=1)
         by_common = np.concatenate((rows[..., STATE_DIM:], by_launcher), axis=-1)
         return System(self.weighted_residual(self.robust), rows[..., :STATE_DIM], by_common)

@@ -7,8 +7,6 @@ thus serves every pattern of forces. The columns of P for velocity and spin are 
 contact.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -19,9 +17,9 @@ from torch import Tensor
 
 from ballfg.diagnosis.fit.dual import dual_level, make_dual
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.sensitivity import with_values
 from ballfg.diagnosis.fit.shooting import LEAST_ARC, Arc, Trajectories, shoot
 from ballfg.diagnosis.result import Array, Index
-from ballfg.dynamics import BallModel, substitute
 from ballfg.state import STATE_DIM, VELOCITY
 
 NODE = 0.01
@@ -32,13 +30,7 @@ MOST_STRETCHES = 100
 
 @dataclass(frozen=True)
 class FittedPath:
-    """The fitted motion of n stretches.
-
-    Attributes:
-        motion: its arcs.
-        times: (k, n) s, true times of the samples since the first one.
-        states: (n, k, 9) at the samples.
-    """
+    """The fitted motion of n stretches; times (k, n) s and states (n, k, 9) at their samples, from the first one on."""
 
     motion: Trajectories
     times: Tensor
@@ -89,7 +81,7 @@ def fitted_path(fit: Fit) -> FittedPath:
     """The motion at a fit's minimum."""
     stretches = fit.problem.stretches
     with torch.no_grad():
-        model = _valued(fit, len(stretches))
+        model = with_values(fit.problem.model, fit.unknowns.values, len(stretches))
         times = model.true_stamps(stretches.times.T.unsqueeze(-1)).squeeze(-1)
         starts = torch.from_numpy(fit.unknowns.starts)
         motion = shoot(model, starts, stretches.heights, stretches.contacts, stretches.ends)
@@ -108,12 +100,6 @@ def weighted(fit: Fit, positions: Array, rows: Index) -> Array:
     """(m, 3 k + 3, p) rows as in the fit's system, of derivatives (m, k, 3, p) of positions; labels do not respond."""
     moved = fit.position_rows(positions, rows)
     return np.concatenate((moved, np.zeros((len(rows), 3, positions.shape[-1]))), axis=1)
-
-
-def _valued(fit: Fit, count: int) -> BallModel:
-    values = fit.unknowns.values
-    columns = {name: torch.full((count, 1), value, dtype=torch.float64) for name, value in values.items()}
-    return substitute(fit.problem.model, columns)
 
 
 def _arc_response(fit: Fit, path: FittedPath, number: int, part: Tensor) -> ArcResponse:
@@ -160,7 +146,7 @@ def _shot(fit: Fit, path: FittedPath, number: int, part: Tensor, nodes: Tensor) 
     m = len(part)
     start = arc.nodes[0][part].repeat(STATE_DIM, 1)
     times = path.times[:, rows] - begun
-    model = _valued(fit, len(rows))
+    model = with_values(fit.problem.model, fit.unknowns.values, len(rows))
     with dual_level():
         first = make_dual(start, torch.eye(STATE_DIM, dtype=torch.float64).repeat_interleave(m, dim=0))
         guesses = path.motion.contacts[rows, number:] - begun.unsqueeze(-1)

@@ -3,8 +3,6 @@
 Derivatives are torch's forward mode: the batch is repeated once per direction, with a dual number in that direction.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
@@ -26,12 +24,9 @@ MOST_ROWS = 3000
 
 @dataclass(frozen=True)
 class Predicted:
-    """Samples as a model predicts them, for n stretches of k samples.
+    """Samples as a model predicts them: positions (n, k, 3) m, labels (n, 3) rad/s, and the times of contacts (n, c) s.
 
-    Attributes:
-        positions: (n, k, 3) m.
-        labels: (n, 3) rad/s.
-        contacts: (n, c) s, when each contact happens; NaN where there is none.
+    A time is NaN where there is no contact.
     """
 
     positions: Array
@@ -48,18 +43,17 @@ class Sensitivity:
 
 
 def predict(model: BallModel, stretches: Stretches, starts: Array, values: Mapping[str, float]) -> Predicted:
-    """The samples that a model predicts.
-
-    Args:
-        model: the ball.
-        stretches: stamps and contacts.
-        starts: (n, 9) states at the first samples.
-        values: coefficients that replace the model's own, by name as in `model.named_parameters()`.
-    """
+    """The samples that a model predicts from states (n, 9) at the first samples; values: those of some coefficients."""
     with torch.no_grad():
-        columns = {name: torch.full((len(stretches), 1), value, dtype=torch.float64) for name, value in values.items()}
-        positions, labels, motion = _measured(substitute(model, columns), stretches, torch.from_numpy(starts))
+        valued = with_values(model, values, len(stretches))
+        positions, labels, motion = _measured(valued, stretches, torch.from_numpy(starts))
     return Predicted(positions.numpy(), labels.numpy(), motion.contacts.numpy())
+
+
+def with_values(model: BallModel, values: Mapping[str, float], count: int) -> BallModel:
+    """The model with other values of some coefficients, for a batch of `count` rows."""
+    columns = {name: torch.full((count, 1), value, dtype=torch.float64) for name, value in values.items()}
+    return substitute(model, columns)
 
 
 @dataclass(frozen=True)
@@ -87,9 +81,7 @@ def sensitivity(
     Args:
         model, stretches, starts, values: as for `predict`.
         names: coefficients among `values`; one that is named again has one derivative for each of its shapes.
-        by_start: whether first states are among the directions.
         shapes: for each name, values of other coefficients with which that derivative is taken; empty: none.
-        most_rows: of one forward pass.
     """
     wanted = [_Direction(component=number) for number in range(STATE_DIM if by_start else 0)]
     wanted += [_Direction(None, name, shape) for name, shape in zip(names, shapes or [{}] * len(names), strict=True)]

@@ -5,8 +5,6 @@ guess of its time, and only their times are solved for. Each row flies in equal 
 contact; a Hermite polynomial gives the states in between.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
@@ -57,12 +55,7 @@ class Arc:
 
 @dataclass(frozen=True)
 class Trajectories:
-    """The motion of r rows.
-
-    Attributes:
-        arcs: in order of time.
-        contacts: (r, c) s, time of each contact; NaN where there is none, or the ball never got there.
-    """
+    """The motion of r rows: arcs in order of time; (r, c) s of contacts, NaN where there is none or none is reached."""
 
     arcs: tuple[Arc, ...]
     contacts: Tensor
@@ -87,7 +80,6 @@ def shoot(model: BallModel, start: Tensor, heights: Tensor, guesses: Tensor, end
         heights: (r, c) m, declared heights of the surfaces met, in order; NaN where there is no further one.
         guesses: (r, c) s, about when.
         ends: (r,) s, how long to fly.
-
     Returns:
         The motion, differentiable backward and forward in start and coefficients. A row that misses a contact is NaN
         from there on.

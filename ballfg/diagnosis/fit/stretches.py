@@ -5,12 +5,11 @@ is known. The stretch ends before the next hit or when the ball comes to rest. T
 samples hold beyond it is noise or an effect that the model lacks.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Self
 
 import numpy as np
 import torch
@@ -77,25 +76,22 @@ class Stretches:
         """(n,) whether each has a spin label."""
         return np.asarray(~np.isnan(self.labels[:, 0].numpy()))
 
-    def take(self, rows: Sequence[int] | Index | Mask) -> Stretches:
+    def take(self, rows: Sequence[int] | Index | Mask) -> Self:
         """Some of the stretches."""
         index = np.arange(len(self))[np.asarray(rows)]
         where = torch.from_numpy(index)
         tensors = {name: getattr(self, name)[where] for name in TENSORS}
-        return Stretches(tuple(self.names[i] for i in index), self.track[index], self.settings[index], **tensors)
+        names = tuple(self.names[i] for i in index)
+        return replace(self, names=names, track=self.track[index], settings=self.settings[index], **tensors)
 
 
 def stretches_of(smoother: Smoother, tracks: Iterable[Track], launcher: Launcher, jobs: int = 1) -> Stretches:
     """The stretches of tracks.
 
-    Args:
-        smoother: finds contacts, hits and outliers, and the states from which the fit starts.
-        tracks: as measured.
-        launcher: reads the settings of a shot; its weights do not matter.
-        jobs: processes.
+    The smoother finds contacts, hits and outliers, and the states from which the fit starts. The launcher reads the
+    settings of a shot; its weights do not matter.
 
-    Raises:
-        ValueError: if no track has a stretch that is long enough.
+    Raises: ValueError: if no track has a stretch that is long enough.
     """
     tracks = list(tracks)
     cut = list(map_tracks(partial(_cut, smoother, launcher), tracks, len(tracks), jobs))

@@ -5,14 +5,39 @@ candidate effects. The best first state absorbs a part of each column; the rest 
 fits need only the inner products of projected signatures, summed over each track.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
 from ballfg.diagnosis.result import Array, Index
 from ballfg.state import STATE_DIM
+
+
+@dataclass(frozen=True)
+class Eliminated:
+    """A system without its first states.
+
+    Attributes:
+        solved: (n, 9, q + 1) first states that absorb each column, the residual last.
+        gram: (n, q + 1, q + 1) inner products of projected columns, the residual last.
+    """
+
+    solved: Array
+    gram: Array
+
+    def common_step(self, precision: Array, pull: Array, damping: float = 0.0) -> Array:
+        """(q,) step of the common unknowns.
+
+        Args: precision: (q,) of the priors.  pull: (q,) prior mean minus present value, times the precision.
+        """
+        total = self.gram.sum(axis=0)
+        hessian = total[:-1, :-1] + np.diag(precision)
+        hessian[np.diag_indices_from(hessian)] *= 1.0 + damping
+        return np.asarray(np.linalg.solve(hessian, total[:-1, -1] + pull))
+
+    def start_step(self, common: Array) -> Array:
+        """(n, 9) step of the first states that goes with a step (q,) of the common unknowns."""
+        return np.asarray(self.solved[..., -1] - self.solved[..., :-1] @ common)
 
 
 @dataclass(frozen=True)
@@ -57,33 +82,6 @@ class System:
         """(n, m, q + 1) columns and residual with the part that first states absorb taken away."""
         pulled = self.by_start.swapaxes(-1, -2) @ self.columns
         return np.asarray(self.columns - self.by_start @ np.linalg.solve(self.start_information, pulled))
-
-
-@dataclass(frozen=True)
-class Eliminated:
-    """A system without its first states.
-
-    Attributes:
-        solved: (n, 9, q + 1) first states that absorb each column, the residual last.
-        gram: (n, q + 1, q + 1) inner products of projected columns, the residual last.
-    """
-
-    solved: Array
-    gram: Array
-
-    def common_step(self, precision: Array, pull: Array, damping: float = 0.0) -> Array:
-        """(q,) step of the common unknowns.
-
-        Args: precision: (q,) of the priors.  pull: (q,) prior mean minus present value, times the precision.
-        """
-        total = self.gram.sum(axis=0)
-        hessian = total[:-1, :-1] + np.diag(precision)
-        hessian[np.diag_indices_from(hessian)] *= 1.0 + damping
-        return np.asarray(np.linalg.solve(hessian, total[:-1, -1] + pull))
-
-    def start_step(self, common: Array) -> Array:
-        """(n, 9) step of the first states that goes with a step (q,) of the common unknowns."""
-        return np.asarray(self.solved[..., -1] - self.solved[..., :-1] @ common)
 
 
 def by_track(gram: Array, track: Index) -> Array:

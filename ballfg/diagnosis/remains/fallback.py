@@ -3,8 +3,6 @@
 A few generic terms come first, because people can read them. Only if they do not help, a network corrects the model.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import cast
 
@@ -52,13 +50,8 @@ def fallback(
 ) -> Fallback | None:
     """A description of the rest without a name; None if nothing predicts better.
 
-    Args:
-        before: the fit so far, on the search half.
-        embedding: names its launcher settings.
-        dataset: the origin of the tracks.
-        tracks: of the search half.
-        now: errors of the model so far, on the held-out half.
-        evaluate: errors of a model's predictions on the held-out half.
+    The fit before and the tracks are those of the search half. The errors `now`, of the model so far, and those that
+    `evaluate` gives are those on the held-out half.
     """
     most = HELPS * now.prediction_rmse_mm
     parts = [EvaluationTrack(track, np.zeros(0)) for track in tracks]
@@ -98,9 +91,7 @@ def learned_residual(
         dataset: the origin of the tracks.
         tracks: to learn from.
         epochs: of the training.
-
-    Returns:
-        The corrected model; None if there are too few tracks or the training fails.
+    Returns: the corrected model; None if there are too few tracks or the training fails.
     """
     tracks, settings = _as_happened(base, dataset, tracks)
     if len(tracks) < LEAST_LEARNED:

@@ -5,17 +5,22 @@ and declared coefficients projected out and tracks as independent units. Of a la
 data show best are tested; the residuals have no part in choosing them.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
-from ballfg.diagnosis.remains.drift import DRIFT, describe_drift, drift_block
 from ballfg.diagnosis.remains.label_check import LABEL, check_labels
-from ballfg.diagnosis.remains.patterns import EVERYWHERE, PLAUSIBLE, Block, blocks_of
+from ballfg.diagnosis.remains.patterns import (
+    DRIFT,
+    EVERYWHERE,
+    PLAUSIBLE,
+    Block,
+    blocks_of,
+    describe_drift,
+    drift_block,
+)
 from ballfg.diagnosis.remains.whiteness import whiteness
 from ballfg.diagnosis.result import Array, GenericTest
 from ballfg.diagnosis.search.score import pattern_tests
@@ -33,14 +38,9 @@ MOST_SEEN = 95.0
 
 @dataclass(frozen=True)
 class _Test:
-    """One test of one fit.
+    """One test of one fit; p-value not corrected for their number. `quantities` are those of a block, else none.
 
-    Attributes:
-        kind: as in `GenericTest`.
-        quantities: of the block, in words; none for other tests.
-        where: place of the pattern, in words.
-        p_value: not corrected for the number of tests.
-        size: of the pattern, whose ratio to that at the start is its share.
+    The ratio of the pattern's size to that at the start is its share.
     """
 
     kind: str
@@ -56,9 +56,7 @@ def generic_tests(fit: Fit, reference: Fit | None = None) -> tuple[GenericTest, 
     Args:
         fit: of the model so far.
         reference: the fit of the declared model, to which shares refer; None: `fit` itself.
-
-    Returns:
-        The tests, the least probable first.
+    Returns: the tests, the least probable first.
     """
     tests = _tests_of(fit)
     first = tests if reference is None or reference is fit else _tests_of(reference)

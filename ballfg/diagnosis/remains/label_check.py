@@ -6,8 +6,6 @@ common scale corrects. A label that stands out among the others belongs to anoth
 most labels are off by several times their noise, no misjudged noise explains that: labels and model disagree.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,8 @@
 """Blocks of patterns without a name: a force, a kick or an error of position that depends on a group of quantities.
 
 A block has one column for every quantity (centred, in units of its scatter over the data) along every axis: the change
-of the samples that such a pattern makes. Quantities and axes are named in words.
+of the samples that such a pattern makes. Quantities and axes are named in words. One more block is that of declared
+coefficients which change over a recording.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import torch
 
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.response import ArcResponse, FittedPath, fitted_path, responses, weighted
+from ballfg.diagnosis.fit.system import System
 from ballfg.diagnosis.result import Array
 from ballfg.dynamics.effects.generic import flight_axes
 from ballfg.state import POSITION, SPIN, VELOCITY
@@ -41,6 +43,8 @@ CONTACT: tuple[tuple[Names, Names], ...] = (
 )
 MEASUREMENT = (PLACE, ("velocity along x", "velocity along y", "vertical velocity"))
 """Groups of quantities that are tested together; those of forces and kicks with the axes of the pattern."""
+DRIFT = "recording"
+"""Kind of the block of drift over a recording, as in reports."""
 LEAST_SCATTER = 1e-6
 """In the unit of a quantity. Less is rounding: all tracks have the same of it."""
 
@@ -175,3 +179,32 @@ def _axes(names: Names, states: Array) -> Array:
     if names == WORLD:
         return np.broadcast_to(np.eye(3), (*states.shape[:-1], 3, 3))
     return flight_axes(torch.from_numpy(states[..., VELOCITY])).numpy()
+
+
+def drift_block(fit: Fit, system: System) -> Block | None:
+    """One column for each free coefficient: one prior sigma below its value at the first track, one above at the last.
+
+    It tests for another table, another ball or another day: tracks of several sessions in one dataset contradict each
+    other, though none of them shows a pattern of its own.
+
+    Args: system: of the fit, linearised at its minimum.
+    Returns: None if there is nothing free, or one track only.
+    """
+    free = fit.problem.free
+    number = fit.problem.stretches.track.astype(np.float64)
+    if not free or np.ptp(number) == 0.0:
+        return None
+    order = 2.0 * (number - number.min()) / np.ptp(number) - 1.0
+    sigmas = np.array([c.sigma for c in free.values()])
+    columns = order[:, None, None] * system.by_common[..., : len(free)] * sigmas
+    return Block(DRIFT, quantities=tuple(free), axes=("",), values=np.eye(len(free)), columns=columns)
+
+
+def describe_drift(fit: Fit, block: Block, strengths: Array) -> str:
+    """The coefficient that changes most and its values, in words; strengths: (1, f) of the block's columns."""
+    most = int(np.argmax(np.abs(strengths[0])))
+    name, coefficient = block.quantities[most], fit.problem.free[block.quantities[most]]
+    change = np.array((-1.0, 1.0)) * strengths[0, most] * coefficient.sigma
+    first, last = np.clip(fit.unknowns.values[name] + change, coefficient.low, coefficient.high)
+    unit = "" if coefficient.unit == "1" else f" {coefficient.unit}"
+    return f"recording: {name} changes from {first:.3g} to {last:.3g}{unit} between the first tracks and the last"

@@ -4,8 +4,6 @@ The first two are those that a smoother would find: free accelerations in short 
 estimated at once with the first state of their stretch, under the priors of a white process noise.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import dataclass
 from typing import Any
@@ -51,11 +49,8 @@ class _Piece:
 def residuals_of(fit: Fit) -> Residuals:
     """The residuals of a fit.
 
-    Args:
-        fit: at its minimum.
-
-    Returns:
-        Accelerations in flight, kicks at contacts and errors of positions, with their covariances.
+    Args: fit: at its minimum.
+    Returns: accelerations in flight, kicks at contacts and errors of positions, with their covariances.
     """
     path, system = fitted_path(fit), fit.linearised()
     pieces: dict[int, list[_Piece]] = defaultdict(list)
@@ -74,7 +69,8 @@ def residuals_of(fit: Fit) -> Residuals:
             if piece.contact is not None:
                 part = slice(end, end := end + 6)
                 contacts.append((row, *piece.contact, value[part], covariance[part, part]))
-    return Residuals(fit.problem.stretches.names, _flight(flights), _contact(contacts), _measurement(fit, path))
+    flight = FlightResiduals(*(np.array(column) for column in zip(*flights, strict=True)))
+    return Residuals(fit.problem.stretches.names, flight, _contact(contacts), _measurement(fit, path))
 
 
 def _pieces(fit: Fit, arc: ArcResponse) -> list[_Piece]:
@@ -92,15 +88,14 @@ def _pieces(fit: Fit, arc: ArcResponse) -> list[_Piece]:
         first = np.searchsorted(number[i], np.arange(count + 1))
         middle = (first[:-1] + first[1:] - 1) // 2
         length = arc.step[i] * q / count
+        times = arc.begun[i] + (np.arange(count) + 0.5) * length
         own, sigma = columns[i, :, : 3 * count], np.full(3 * count, ACCELERATION / np.sqrt(length))
         contact = None
         if arc.number:
             own = np.concatenate((own, kicks[i]), axis=1)
             sigma = np.concatenate((sigma, np.repeat((CONTACT_VELOCITY, CONTACT_SPIN), 3)))
             contact = (arc.number - 1, float(arc.begun[i]), arc.incoming[i])
-        pieces.append(
-            _Piece(own, sigma, arc.begun[i] + (np.arange(count) + 0.5) * length, arc.nodes[i, middle], contact)
-        )
+        pieces.append(_Piece(own, sigma, times, arc.nodes[i, middle], contact))
     return pieces
 
 
@@ -111,11 +106,6 @@ def _posterior(residual: Array, by_start: Array, pieces: list[_Piece]) -> tuple[
     precision = columns.T @ columns + np.diag(np.concatenate((np.zeros(STATE_DIM), sigma**-2)))
     covariance = np.linalg.inv(precision)
     return (covariance @ (columns.T @ residual))[STATE_DIM:], covariance[STATE_DIM:, STATE_DIM:]
-
-
-def _flight(found: list[_Row]) -> FlightResiduals:
-    stretch, times, states, acceleration, covariance = (np.array(c) for c in zip(*found, strict=True))
-    return FlightResiduals(stretch, times, states, acceleration, covariance)
 
 
 def _contact(found: list[_Row]) -> ContactResiduals:

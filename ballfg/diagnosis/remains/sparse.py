@@ -5,8 +5,6 @@ none is worth its penalty. Terms that later ones made superfluous are then dropp
 "Extended Bayesian information criteria for model selection with large model spaces", with gamma = 1.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -44,11 +42,8 @@ class SparseTerms:
 def sparse_terms(before: Fit) -> SparseTerms | None:
     """The generic terms that a fit lacks.
 
-    Args:
-        before: the fit so far.
-
-    Returns:
-        The terms; None where none is worth its penalty.
+    Args: before: the fit so far.
+    Returns: the terms; None where none is worth its penalty.
     """
     library = _library(before)
     found, _ = hypothesis_signatures(before, library)
@@ -64,11 +59,8 @@ def sparse_terms(before: Fit) -> SparseTerms | None:
     names = [name for h in library for name in h.columns]
     taken = {names[i] for i in chosen}
     kept = [replace(h, strengths=tuple(s for s in h.strengths if h.parameter(s) in taken)) for h in library]
-    return SparseTerms(
-        tuple(h for h in kept if h.strengths),
-        {names[i]: float(e) for i, e in zip(chosen, estimate, strict=True)},
-        float(estimate @ score[chosen]),
-    )
+    estimates = {names[i]: float(e) for i, e in zip(chosen, estimate, strict=True)}
+    return SparseTerms(tuple(h for h in kept if h.strengths), estimates, float(estimate @ score[chosen]))
 
 
 def fit_with_terms(before: Fit, terms: SparseTerms) -> Fit:
@@ -83,12 +75,9 @@ def fit_with_terms(before: Fit, terms: SparseTerms) -> Fit:
 
 
 def select(information: Array, score: Array, penalty: float) -> list[int]:
-    """Indices of the terms worth their penalty, in the order chosen.
+    """Indices of the terms worth their penalty, in the order chosen, from information (p, p) and score (p,).
 
-    Args:
-        information: (p, p).
-        score: (p,).
-        penalty: least that a term must explain, as twice a log likelihood.
+    Args: penalty: least that a term must explain, as twice a log likelihood.
     """
     chosen: list[int] = []
     while len(chosen) < MOST_TERMS:

@@ -6,8 +6,6 @@ tr(M), has mean zero whatever the scale of the noise on that stretch, and cumula
 M (W + c). The sum of U over stretches is compared with the gamma distribution of the same first three cumulants.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,7 +50,9 @@ def whiteness(fit: Fit, system: System) -> Whiteness:
     stretches = fit.problem.stretches
     n, k = stretches.times.shape
     kept = stretches.used.numpy() & (fit.robust.samples >= LEAST_WEIGHT)
-    system = _without(system, ~kept)
+    rows = np.ones(system.residual.shape)  # without outliers, which pull at the fit a little and would look like drift
+    rows[:, : 3 * k] = np.repeat(kept, 3, axis=1)
+    system = System(system.residual * rows, system.by_start * rows[..., None], system.by_common * rows[..., None])
     projected = system.projected()
     residual = projected[:, : 3 * k, -1].reshape(n, k, 3)
     taken = _absorbed(fit, system, projected[..., :-1]).reshape(n, k, 3, -1)
@@ -76,13 +76,9 @@ def whiteness(fit: Fit, system: System) -> Whiteness:
 
 
 def _summed(residual: Array, taken: Array, kept: Mask, kernel: Array) -> tuple[float, float, float]:
-    """Sum of U over stretches, its variance and third cumulant without drift.
+    """Sum of U over stretches, its variance and third cumulant without drift, from residuals (n, k, 3).
 
-    Args:
-        residual: (n, k, 3).
-        taken: (n, k, 3, d) directions that the fit takes up.
-        kept: (n, k) samples that count.
-        kernel: (n, k, k).
+    Args: taken: (n, k, 3, d) directions that the fit takes up.  kept: (n, k) samples that count.  kernel: (n, k, k).
     """
     n, k, _ = residual.shape
     once = np.einsum("nst,ntad->nsad", kernel, taken)
@@ -109,13 +105,6 @@ def _summed(residual: Array, taken: Array, kept: Mask, kernel: Array) -> tuple[f
 
 def _trace(matrices: Array) -> Array:
     return np.asarray(np.trace(matrices, axis1=-2, axis2=-1))
-
-
-def _without(system: System, samples: Mask) -> System:
-    """The system without some samples (n, k): outliers, which pull at the fit a little, would look like drift."""
-    rows = np.ones(system.residual.shape)
-    rows[:, : 3 * samples.shape[1]] -= np.repeat(samples, 3, axis=1)
-    return System(system.residual * rows, system.by_start * rows[..., None], system.by_common * rows[..., None])
 
 
 def _absorbed(fit: Fit, system: System, shared: Array) -> Array:

@@ -1,7 +1,5 @@
 """Residuals in the axes of the motion, and their means over bins, for the pictures."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -72,9 +70,7 @@ def binned(against: Array, values: Array, sigmas: Array, stretch: Index) -> Bins
         against: (m,) quantity that is cut into bins.
         values, sigmas: (m,) and their standard deviations, which give the weights.
         stretch: (m,) number of the stretch: values of one stretch are correlated and count as one.
-
-    Returns:
-        The bins with enough stretches. The standard errors come from the scatter between stretches alone.
+    Returns: the bins with enough stretches. The standard errors come from the scatter between stretches alone.
     """
     rows: list[tuple[float, float, float]] = []
     if len(against):

@@ -1,7 +1,5 @@
 """`report.html`: a diagnosis as one self-contained page. The answer comes first, then its grounds."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from importlib.resources import files
@@ -24,9 +22,13 @@ RANKING = ("candidate", "squared residual it would explain", "by chance", "BIC",
 
 def page(diagnosis: Diagnosis) -> str:
     """The whole page."""
+    badge = tag("span", diagnosis.verdict.value, kind=f"badge {BADGES[diagnosis.verdict]}")
+    question = tag("p", f"{diagnosis.dataset} · what does the model lack? ", badge)
+    calibrated = table(("coefficient", "declared", "fitted with the added effects"), _values(diagnosis.calibrated))
+    noise = table(("position noise along", "stated", "estimated"), _values(diagnosis.noise))
     body = tag(
         "main",
-        _answer(diagnosis),
+        tag("header", question, tag("h1", diagnosis.sentence)),
         _errors(diagnosis),
         section("What was added to the model", *(_finding(f) for f in diagnosis.findings)),
         _alike(diagnosis),
@@ -34,7 +36,7 @@ def page(diagnosis: Diagnosis) -> str:
         _residuals(diagnosis),
         _rankings(diagnosis),
         _invisible(diagnosis),
-        _coefficients(diagnosis),
+        section("Coefficients and noise", calibrated, noise),
         _evaluation(diagnosis),
     )
     style = files(__package__).joinpath("style.css").read_text(encoding="utf-8")
@@ -43,12 +45,6 @@ def page(diagnosis: Diagnosis) -> str:
         f"<title>{text(diagnosis.dataset)}: diagnosis</title><style>\n{style}</style>"
     )
     return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>{body}</body></html>\n'
-
-
-def _answer(diagnosis: Diagnosis) -> Html:
-    badge = tag("span", diagnosis.verdict.value, kind=f"badge {BADGES[diagnosis.verdict]}")
-    where = tag("p", f"{diagnosis.dataset} · what does the model lack? ", badge)
-    return tag("header", where, tag("h1", diagnosis.sentence))
 
 
 def _errors(diagnosis: Diagnosis) -> Html:
@@ -214,13 +210,6 @@ def _invisible(diagnosis: Diagnosis) -> Html:
     rows = ((tag("b", n), *((EFFECTS[n].sentence, EFFECTS[n].decide) if n in EFFECTS else (NONE, NONE))) for n in names)
     parts = (tag("p", words), table(("candidate", "it is", "to see it"), rows)) if names else ()
     return section("What these data cannot show", *parts)
-
-
-def _coefficients(diagnosis: Diagnosis) -> Html:
-    """Declared coefficients and noise, as declared and as fitted."""
-    calibrated = table(("coefficient", "declared", "fitted with the added effects"), _values(diagnosis.calibrated))
-    noise = table(("position noise along", "stated", "estimated"), _values(diagnosis.noise))
-    return section("Coefficients and noise", calibrated, noise)
 
 
 def _values(values: Mapping[str, Value]) -> Iterator[tuple[str, ...]]:

@@ -1,7 +1,5 @@
 """The elements of the page: escaped text, tables, pictures inside the page, bars."""
 
-from __future__ import annotations
-
 import base64
 import html
 import io

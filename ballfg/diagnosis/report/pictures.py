@@ -4,8 +4,6 @@ Each function draws one figure without pyplot. Where a model was changed, `befor
 one panel, always with the same axes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
@@ -15,14 +13,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
 from ballfg.diagnosis.report.binned import at_contact, binned, in_flight, slip_speed
-from ballfg.diagnosis.result import (
-    Array,
-    Candidate,
-    Errors,
-    Index,
-    Outcome,
-    Residuals,
-)
+from ballfg.diagnosis.result import Array, Candidate, Errors, Index, Outcome, Residuals
 from ballfg.state import SPIN, VELOCITY, VZ
 
 Series = Mapping[str, Residuals]
@@ -244,10 +235,10 @@ def _means(column: Iterable[Axes], against: Array, values: Array, sigmas: Array,
             *(bins.centres, bins.means, bins.errors),
             fmt="o-",
             color=colour,
-            markersize=4,
-            linewidth=1.2,
-            capsize=2,
             label=label,
+            linewidth=1.2,
+            markersize=4,
+            capsize=2,
         )
 
 

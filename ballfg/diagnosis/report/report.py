@@ -1,7 +1,5 @@
 """A diagnosis as files: `report.json` for programs, `report.html` for people, `model.yaml` for other commands."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
@@ -12,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from ballfg.diagnosis.report.page import page
-from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Fallback, Value
+from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Value
 from ballfg.dynamics import save_model
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 
@@ -31,7 +29,6 @@ def write_report(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> None:
     Args:
         diagnosis: to report.
         out: folder, new, empty or with an earlier report; its parent must exist.
-
     Raises:
         ValueError: if `out` is a file or holds other things than a report.
         FileNotFoundError: if its parent does not exist.
@@ -60,7 +57,10 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
 
     It has no times and no paths, so that the same diagnosis gives the same bytes.
     """
-    left = diagnosis.unexplained
+    left, fallback = diagnosis.unexplained, None
+    if left.fallback is not None:
+        error = {"before": _errors(left.fallback.before), "after": _errors(left.fallback.after)}
+        fallback = {"kind": left.fallback.kind, "description": left.fallback.description, "error": error}
     plain: dict[str, Any] = _plain(
         {
             "verdict": diagnosis.verdict.value,
@@ -77,7 +77,7 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
                 "where": left.where,
                 "share_of_residual": left.share_of_residual,
                 "tests": [vars(test) for test in left.tests],
-                "fallback": None if left.fallback is None else _fallback(left.fallback),
+                "fallback": fallback,
             },
             "calibrated": _values(diagnosis.calibrated),
             "noise": _values(diagnosis.noise),
@@ -103,11 +103,6 @@ def _candidate(candidate: Candidate) -> dict[str, Any]:
 def _errors(errors: Errors) -> dict[str, Any]:
     named = {"by_track": "by_track_mm"}
     return {named.get(name, name): value for name, value in vars(errors).items()}
-
-
-def _fallback(fallback: Fallback) -> dict[str, Any]:
-    error = {"before": _errors(fallback.before), "after": _errors(fallback.after)}
-    return {"kind": fallback.kind, "description": fallback.description, "error": error}
 
 
 def _values(values: Mapping[str, Value]) -> dict[str, Any]:

@@ -1,7 +1,5 @@
 """Numbers for people, with as many digits as are known and their unit, and the answer in one sentence."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 

@@ -1,7 +1,5 @@
 """One round of the search: score every hypothesis, refit the leading ones, compare them by their refits."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -45,12 +43,9 @@ class Scored:
 
 @dataclass(frozen=True)
 class Refit:
-    """A hypothesis in the model, everything fitted again.
+    """A hypothesis in the model, everything fitted again at the noise of the fit before, and BIC minus that before.
 
-    Attributes:
-        scored: the hypothesis and its score test.
-        fit: the minimum, at the noise of the fit before.
-        delta_bic: BIC minus that of the fit before; negative is better.
+    A negative difference is better.
     """
 
     scored: Scored
@@ -69,9 +64,7 @@ def score_all(before: Fit, candidates: Sequence[Hypothesis]) -> list[Scored]:
     Args:
         before: the fit without any of them.
         candidates: the hypotheses; those without strengths are left out.
-
-    Returns:
-        The tests, the hypothesis that explains most first and those that the data cannot show last.
+    Returns: the tests, the hypothesis that explains most first and those that the data cannot show last.
     """
     testable = [h for h in candidates if h.strengths]
     if not testable:
@@ -102,9 +95,7 @@ def refit(before: Fit, scored: Scored) -> Refit:
     Args:
         before: the fit without the hypothesis.
         scored: the hypothesis and its score test.
-
-    Returns:
-        The better of the fits.
+    Returns: the better of the fits.
     """
     hypothesis, problem = scored.hypothesis, with_hypothesis(before.problem, scored.hypothesis)
     parameters = dict(problem.model.named_parameters())

@@ -1,7 +1,5 @@
 """Evaluation of a model on tracks that it was not fitted to: predictions of unseen parts, and held-out likelihood."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -36,12 +34,8 @@ def prediction_errors(
         surfaces: of the dataset with this model.
         settings: of the dataset with this model.
         jobs: processes.
-
-    Returns:
-        Errors over all tracks, in mm and without unit.
-
-    Raises:
-        ValueError: if no track leaves enough to predict.
+    Returns: errors over all tracks, in mm and without unit.
+    Raises: ValueError: if no track leaves enough to predict.
     """
     estimator = make_estimator("smoother", model, surfaces, settings)
     observed = [t.track for t in tracks]
@@ -99,9 +93,7 @@ def held_out_gain(before: Fit, after: Fit, held_out: Stretches) -> HeldOutGain:
         before: fit on other tracks.
         after: fit of the larger model on the same other tracks.
         held_out: stretches to compare on.
-
-    Returns:
-        The gain in natural units per track, and its probability by chance.
+    Returns: the gain in natural units per track, and its probability by chance.
     """
     for fitted in (before, after):
         held_out = reachable(fitted.problem.model, held_out, fitted.unknowns.values)

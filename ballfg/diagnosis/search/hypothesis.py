@@ -1,7 +1,5 @@
 """A hypothesis: one effect, in one shape, that the model may lack; and the models that hold it."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
@@ -120,9 +118,7 @@ def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effe
         model: as declared so far.
         scene: extent of the data.
         catalogue: effects by class.
-
-    Returns:
-        The hypotheses, in the order of the catalogue.
+    Returns: the hypotheses, in the order of the catalogue.
     """
     listed: list[Hypothesis] = []
     for effect in catalogue:
@@ -141,11 +137,8 @@ def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effe
 def scene_of(fit: Fit) -> Scene:
     """The extent of the stretches of a fit: places, speeds, impacts and spin labels.
 
-    Args:
-        fit: of a model to the stretches.
-
-    Returns:
-        The scene, in m and m/s.
+    Args: fit: of a model to the stretches.
+    Returns: the scene, in m and m/s.
     """
     stretches = fit.problem.stretches
     used = stretches.used.numpy()
@@ -161,12 +154,6 @@ def scene_of(fit: Fit) -> Scene:
         cast(Vector, tuple(place.tolist()))
         for place in (positions.min(axis=0), positions.max(axis=0), np.median(positions, axis=0))
     )
-    return Scene(
-        low,
-        high,
-        middle,
-        float(np.median(np.linalg.norm(velocities[used], axis=-1))),
-        float(np.median(impacts)) if impacts else float("nan"),
-        len(impacts),
-        int(stretches.labelled.sum()),
-    )
+    speed = float(np.median(np.linalg.norm(velocities[used], axis=-1)))
+    impact = float(np.median(impacts)) if impacts else float("nan")
+    return Scene(low, high, middle, speed, impact, len(impacts), int(stretches.labelled.sum()))

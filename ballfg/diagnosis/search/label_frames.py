@@ -5,8 +5,6 @@ fitted to wrong labels would be wrong too. The frames in which the labels agree 
 full.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -35,11 +33,8 @@ def frame_hypotheses(before: Fit, general: Hypothesis) -> list[Hypothesis]:
     spins, covariances, labels = _spins_without_labels(before)
     frames = signed_permutations().numpy()[1:]
     costs = [_disagreement(labels, spins, covariances, frame, before.noise.label) for frame in frames]
-    best = np.argsort(costs)[:FRAMES_FITTED]
-    return [
-        Hypothesis(general.effect, dict(zip(general.coefficients, frames[i].ravel().tolist(), strict=True)))
-        for i in best
-    ]
+    best = frames[np.argsort(costs)[:FRAMES_FITTED]].reshape(-1, 9).tolist()
+    return [Hypothesis(general.effect, dict(zip(general.coefficients, frame, strict=True))) for frame in best]
 
 
 def _spins_without_labels(before: Fit) -> tuple[Array, Array, Array]:
@@ -47,8 +42,8 @@ def _spins_without_labels(before: Fit) -> tuple[Array, Array, Array]:
     problem = before.problem
     labelled = problem.stretches.take(problem.stretches.labelled)
     bare = replace(labelled, labels=torch.full_like(labelled.labels, torch.nan), settings=0.0 * labelled.settings)
-    declared = dict(zip(problem.free, problem.centres.tolist(), strict=True))
-    unknowns = replace(before.unknowns, starts=before.unknowns.starts[problem.stretches.labelled], values=declared)
+    starts = before.unknowns.starts[problem.stretches.labelled]
+    unknowns = replace(before.unknowns, starts=starts, values=problem.declared)
     alone = replace(problem, stretches=bare, shared=False)
     result = fit_problem(alone, unknowns, replace(before.noise, spin=UNLABELLED_SPIN), settle_noise=False)
     covariances = np.linalg.inv(result.linearised().start_information)[:, SPIN, SPIN]

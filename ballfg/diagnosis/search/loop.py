@@ -1,7 +1,5 @@
 """The search loop: fit, test, add the effect that is lacking, and repeat until nothing more helps."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -61,15 +59,21 @@ class Search:
 
 
 @dataclass(frozen=True)
+class _Confirmed:
+    """A refit that helps on the held-out half; the same with its noise settled, and as it predicts."""
+
+    refit: Refit
+    evidence: HeldOutGain
+    settled: Fit
+    predictive: PredictiveModel
+
+
+@dataclass(frozen=True)
 class SearchLoop:
     """The inputs of a search, the same in every round.
 
-    Attributes:
-        holdout: the data.
-        catalogue: effects to look for.
-        predictive: gives a fitted model the process noise that predicts the tracks which it was fitted to.
-        watch: is told of progress, in lines.
-        plausible: as `PLAUSIBLE`.
+    `predictive` gives a fitted model the process noise that predicts the tracks which it was fitted to; `watch` is told
+    of progress, in lines.
     """
 
     holdout: Holdout
@@ -128,16 +132,6 @@ class SearchLoop:
                 return _Confirmed(candidate, evidence, settled, predictive), outcomes
             outcomes[candidate.name] = Outcome.MISLEADING
         return None, outcomes
-
-
-@dataclass(frozen=True)
-class _Confirmed:
-    """A refit that helps on the held-out half; the same with its noise settled, and as it predicts."""
-
-    refit: Refit
-    evidence: HeldOutGain
-    settled: Fit
-    predictive: PredictiveModel
 
 
 def _tried(

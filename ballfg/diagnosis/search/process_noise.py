@@ -6,8 +6,6 @@ makes them overconfident; too much makes them ignore the observed part. The usua
 scaled as a whole, to the scale at which predictions of the search half have the largest likelihood.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

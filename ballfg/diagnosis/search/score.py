@@ -12,8 +12,6 @@ of the correction: R. Bell and D. McCaffrey 2002, "Bias reduction in standard er
 multi-stage samples", Survey Methodology 28, the estimator known as CR2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -112,9 +110,7 @@ def _score(pattern: Pattern, turn: Array) -> Score:
 def pattern_tests(signatures: Signatures, directions: Sequence[Array]) -> list[Pattern]:
     """One test for each pattern, the scatter of all helping where tracks are few.
 
-    Args:
-        signatures: of common columns and p columns of all patterns.
-        directions: for each pattern (p, r), combinations of columns.
+    Args: directions: for each pattern (p, r), combinations of the p columns of all patterns.
     """
     found = [_corrected(signatures, turn) for turn in directions]
     ratios = [float(np.trace(np.linalg.solve(f.information, f.scatter))) / f.rank for f in found]

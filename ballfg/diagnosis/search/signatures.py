@@ -22,12 +22,9 @@ LEAST_SHARE = 1e-8
 
 @dataclass(frozen=True)
 class Signatures:
-    """Inner products of projected columns, summed over each of t tracks.
+    """Inner products (t, q + p + 1, q + p + 1) of projected columns, summed over each of t tracks.
 
-    Attributes:
-        gram: (t, q + p + 1, q + p + 1): q common columns, p columns of candidates, the residual.
-        precision: (q,) priors of the common ones.
-        common: q.
+    There are q = `common` columns, whose priors have the precision (q,), p columns of candidates, and the residual.
     """
 
     gram: Array
@@ -76,9 +73,7 @@ class Efficient:
 def visible_directions(information: Array, raw: Array) -> Array:
     """(p, r) the directions of p coefficients that projection leaves; r is zero where it leaves none.
 
-    Args:
-        information: (p, p), everything else projected out.
-        raw: (p,) information of each coefficient if all else were known.
+    Args: information: (p, p), everything else projected out.  raw: (p,) of each if all else were known.
     """
     if not (raw > 0.0).any():
         return np.zeros((len(raw), 0))
@@ -129,15 +124,9 @@ def hypothesis_columns(fit: Fit, group: Sequence[Hypothesis]) -> Array:
     names = [name for h in group for name in h.columns]
     parameters = dict(model.named_parameters())
     values = {name: float(parameters[name]) for name in [*names, *(n for shape in own for n in shape)]}
-    derivative = sensitivity(
-        model,
-        fit.problem.stretches,
-        fit.unknowns.starts,
-        {**values, **fit.unknowns.values},
-        names,
-        by_start=False,
-        shapes=[shape for h, shape in zip(group, own, strict=True) for _ in h.strengths],
-    )
-    scale = np.sqrt(fit.robust.spins) * fit.problem.stretches.labelled / fit.noise.label
+    stretches, starts, values = fit.problem.stretches, fit.unknowns.starts, {**values, **fit.unknowns.values}
+    shapes = [shape for h, shape in zip(group, own, strict=True) for _ in h.strengths]
+    derivative = sensitivity(model, stretches, starts, values, names, by_start=False, shapes=shapes)
+    scale = np.sqrt(fit.robust.spins) * stretches.labelled / fit.noise.label
     labels = derivative.labels * scale[:, None, None]
     return np.concatenate((fit.position_rows(derivative.positions), labels), axis=1)

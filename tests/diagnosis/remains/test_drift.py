@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ballfg.diagnosis.fit.stretches import joined
-from ballfg.diagnosis.remains.drift import DRIFT, drift_block
 from ballfg.diagnosis.remains.generic import ALARM, generic_tests
+from ballfg.diagnosis.remains.patterns import DRIFT, drift_block
 
 COUNT = 20
 
