@@ -1,7 +1,5 @@
 """The analytic model: a ball whose motion and measurement are a sum of named physical effects."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from typing import cast
 

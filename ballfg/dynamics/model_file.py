@@ -1,7 +1,5 @@
 """Model files: which effects a model declares, with the values of their coefficients, and what is learned, as YAML."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Mapping
 from pathlib import Path

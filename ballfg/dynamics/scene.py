@@ -1,7 +1,5 @@
 """What a set of tracks spans: where the balls flew, how high, how fast; effects say in which shapes they may act."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 Vector = tuple[float, float, float]

@@ -1,7 +1,5 @@
 """Balls that can be launched: what they are, how they move, and on what they bounce."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

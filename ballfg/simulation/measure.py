@@ -1,7 +1,5 @@
 """From the true motion to what is measured: stamps, positions and labels with noise, dropped frames, outliers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Synthetic tracks, one after the other: launch, fly, measure, in blocks of bounded size."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 

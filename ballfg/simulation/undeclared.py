@@ -3,8 +3,6 @@
 Those three test whether a diagnosis reports an unexplained part where the catalogue lacks the explanation.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Iterable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """A simulation as files: the dataset, the declared model, and the truth beside them."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict

@@ -1,7 +1,5 @@
 """Cameras whose shutters do not open together: velocities from camera factors and from points, and clock offsets."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final

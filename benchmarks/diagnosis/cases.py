@@ -1,7 +1,5 @@
 """The cases of the loop's benchmark: datasets to be made, and the effects that a diagnosis of each should find."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace

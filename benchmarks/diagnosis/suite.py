@@ -1,7 +1,5 @@
 """The suite of `ballfg-bench loop`: does the diagnosis find what was planted, and stay silent where nothing was?"""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path

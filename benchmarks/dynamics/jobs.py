@@ -1,7 +1,5 @@
 """Making and judging the methods of the dynamics comparison, each in a process of its own; finished ones are kept."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator, Sequence
 from functools import partial

@@ -1,7 +1,5 @@
 """Measured tracks as tasks: learn from every second shot, observe a quarter of a second, predict what follows."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice

@@ -1,7 +1,5 @@
 """The methods of the dynamics comparison."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal

@@ -1,7 +1,5 @@
 """Pictures of the comparison of estimators."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any

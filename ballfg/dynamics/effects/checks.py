@@ -1,7 +1,5 @@
 """Which effect classes are accepted: what each must say, and what must not contradict itself."""
 
-from __future__ import annotations
-
 from torch import nn
 
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, FlightEffect

@@ -1,7 +1,5 @@
 """Generic effects: sums of terms in place, velocity and spin, for what nobody can name; one for each kind."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Final
 

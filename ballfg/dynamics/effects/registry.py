@@ -1,7 +1,5 @@
 """The effects a model file may name: one line for each. docs/add_an_effect.md shows how to add one, here or outside."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final
 

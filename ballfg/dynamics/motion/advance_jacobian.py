@@ -1,7 +1,5 @@
 """Motion with events of one ball, with its Jacobian: what a filter's prediction and a belief's propagation need."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 

@@ -4,8 +4,6 @@ Derivation in docs/derivations/impact.md. Source: A. Nakashima et al., "Modeling
 ball with friction and elastic effects", American Control Conference 2010, sections II and III.
 """
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -5,8 +5,6 @@ model's rates at the four stages in one batch, and the chain rule through the st
 about half of what autograd through the whole step costs.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -7,8 +7,6 @@ A contact is solved once an arc, for all balls together. What does not simply fl
 below a surface) is handed to `rollout`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch

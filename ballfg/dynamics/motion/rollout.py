@@ -12,8 +12,6 @@ What is defined where nature is not asked:
   ball that rolls over the edge falls from the end of the integration step in which it does.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -1,7 +1,5 @@
 """Vectors seen in the axes of a tilted plane: the shortest turn that takes the vertical into the plane's normal."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

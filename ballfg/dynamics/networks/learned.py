@@ -1,7 +1,5 @@
 """The learned model: networks say how the ball flies and bounces, alone or as a correction of another model."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import torch

@@ -4,8 +4,6 @@ Safe loaders only. The folder's name ends with a digest of its content: a model 
 saving again never changes one that a file names.
 """
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The flight and the contact of a learned ball, with Gram-Schmidt features or with raw velocity and spin."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import torch

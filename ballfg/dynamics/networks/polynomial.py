@@ -5,8 +5,6 @@ states are gone through once, for the coefficients, instead of once for each sta
 docs/derivations/mnn.md.
 """
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
 from itertools import combinations_with_replacement

@@ -5,8 +5,6 @@ outline of a sphere through the full camera model, the small ellipse of perspect
 outline is averaged along the path.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -3,8 +3,6 @@
 All are capsules (a ball swept along a segment) that stand in the world, so that every camera sees the same thing.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -1,7 +1,5 @@
 """A recording before it is drawn: the balls, the cameras, and what each camera's frames hold."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 The room is drawn once. A frame redraws only where something moves; the lens and the level of noise are redone there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Final
 

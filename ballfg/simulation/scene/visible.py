@@ -1,7 +1,5 @@
 """Which frames show which balls, and where: what detections and tracks are judged against."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A recording as files: videos or images, stamps, cameras, and the truth about every ball and frame."""
 
-from __future__ import annotations
-
 import glob
 import os
 from collections.abc import Iterator

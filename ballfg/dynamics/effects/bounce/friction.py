@@ -1,7 +1,5 @@
 """Friction between ball and surface, and the tangential restitution of a ball that grips."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Impact

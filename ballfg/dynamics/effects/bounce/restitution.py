@@ -1,7 +1,5 @@
 """Restitution: the share of the normal speed that a bounce gives back, constant or falling with the speed."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from torch import Tensor

@@ -1,7 +1,5 @@
 """The table's true place: another height than the declared one, or a tilt."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

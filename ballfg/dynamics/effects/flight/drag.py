@@ -1,7 +1,5 @@
 """Drag: the air slows the ball, in proportion to the square of its speed; the factor may depend on speed and spin."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from torch import Tensor

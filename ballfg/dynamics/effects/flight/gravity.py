@@ -1,7 +1,5 @@
 """Gravity and buoyancy: constant vertical accelerations."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Magnus force: a spinning ball is pushed across its flight; the lift may saturate."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import torch

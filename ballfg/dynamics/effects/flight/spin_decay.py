@@ -1,7 +1,5 @@
 """Spin decay: the air slows the spin."""
 
-from __future__ import annotations
-
 from torch import Tensor
 
 from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect

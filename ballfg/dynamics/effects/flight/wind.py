@@ -1,7 +1,5 @@
 """Moving air: everywhere the same, growing with the height, or in one part of the room."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import Final

@@ -1,7 +1,5 @@
 """Errors of the clock: coordinates or positions that are late, and a wrong length of the second."""
 
-from __future__ import annotations
-
 import torch
 from torch import Tensor
 

@@ -1,7 +1,5 @@
 """Errors of the frame: tilted axes, wrong lengths, a wrong range from one place."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import torch

@@ -1,7 +1,5 @@
 """Errors of spin labels: other axes or signs, a factor, a constant."""
 
-from __future__ import annotations
-
 import itertools
 
 import torch
