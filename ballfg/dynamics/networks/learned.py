@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.dynamics.effect import Coefficient, per_row
-from ballfg.dynamics.effects.bounce.table import TableHeight
+from ballfg.dynamics.effects.bounce import TableHeight
 from ballfg.dynamics.measurement import Later
 from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
 from ballfg.dynamics.networks.architecture import Architecture

@@ -17,8 +17,7 @@ from ballfg.diagnosis.search.hypothesis import (
     without_effect,
 )
 from ballfg.dynamics import EFFECTS
-from ballfg.dynamics.effects.flight.drag import DragSpeed
-from ballfg.dynamics.effects.flight.wind import GustRegion, Wind
+from ballfg.dynamics.effects.flight import DragSpeed, GustRegion, Wind
 from ballfg.dynamics.scene import Scene
 
 SCENE = Scene((-0.2, -0.8, 0.8), (3.0, 0.9, 1.5), (1.2, 0.1, 1.0), 4.5, 2.5, 20, 12)

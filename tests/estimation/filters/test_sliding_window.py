@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.effects.flight.gravity import Gravity
+from ballfg.dynamics.effects.flight import Gravity
 from ballfg.dynamics.model_file import nominal_model
 from ballfg.dynamics.motion.rollout import rollout
 from ballfg.dynamics.surfaces import Surfaces
