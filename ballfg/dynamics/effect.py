@@ -16,7 +16,6 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from ballfg.dynamics.scene import Scene
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 
@@ -64,6 +63,27 @@ def per_row(value: Tensor) -> Tensor:
 
 
 Kind = Literal["flight", "bounce", "measurement"]
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Extent of the data that a set of tracks spans; effects say in which shapes they may act there.
+
+    Attributes:
+        low, high, middle: m, of the positions; the middle is the median.
+        speed: m/s, median over samples.
+        impact_speed: m/s, median normal speed of impacts; NaN without contacts.
+        contacts, labels: how many contacts and spin labels there are.
+    """
+
+    low: Vector
+    high: Vector
+    middle: Vector
+    speed: float
+    impact_speed: float
+    contacts: int
+    labels: int
 
 
 class Flight:

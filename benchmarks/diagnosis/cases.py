@@ -82,7 +82,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is computed.
+    """How much is computed; by default everything.
 
     Attributes:
         effects, sizes: planted one by one, each in every size.
@@ -96,36 +96,22 @@ class Plan:
         timed: diagnoses that are timed alone.
     """
 
-    effects: tuple[str, ...]
-    unlabelled: tuple[str, ...]
-    pairs: tuple[tuple[str, str], ...]
-    sizes: tuple[float, ...]
-    seeds: int
-    side_seeds: int
-    unlabelled_seeds: int
-    ratios: tuple[float, ...]
-    detection_seeds: int
-    nulls: int
-    unknown: tuple[str, ...]
-    unknown_seeds: int
-    timed: int
+    effects: tuple[str, ...] = tuple(PLANTS)
+    unlabelled: tuple[str, ...] = tuple(name for name in PLANTS if not name.startswith("spin_label"))
+    pairs: tuple[tuple[str, str], ...] = PAIRS
+    sizes: tuple[float, ...] = (0.5, 1.0, 2.0)
+    seeds: int = 4
+    side_seeds: int = 1
+    unlabelled_seeds: int = 2
+    ratios: tuple[float, ...] = (1.0, 1.5, 2.0)
+    detection_seeds: int = 2
+    nulls: int = 100
+    unknown: tuple[str, ...] = tuple(UNKNOWN)
+    unknown_seeds: int = 3
+    timed: int = 3
 
 
-FULL: Final = Plan(
-    effects=tuple(PLANTS),
-    unlabelled=tuple(name for name in PLANTS if not name.startswith("spin_label")),
-    pairs=PAIRS,
-    sizes=(0.5, 1.0, 2.0),
-    seeds=4,
-    side_seeds=1,
-    unlabelled_seeds=2,
-    ratios=(1.0, 1.5, 2.0),
-    detection_seeds=2,
-    nulls=100,
-    unknown=tuple(UNKNOWN),
-    unknown_seeds=3,
-    timed=3,
-)
+FULL: Final = Plan()
 QUICK: Final = Plan(
     effects=FULL.effects[:8],
     unlabelled=FULL.unlabelled[:3],

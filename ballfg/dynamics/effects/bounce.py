@@ -5,8 +5,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.effect import TINY_LENGTH, BounceEffect, Coefficient, Impact, length, vector
-from ballfg.dynamics.scene import Scene
+from ballfg.dynamics.effect import TINY_LENGTH, BounceEffect, Coefficient, Impact, Scene, length, vector
 
 
 class Restitution(BounceEffect):

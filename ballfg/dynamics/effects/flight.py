@@ -7,8 +7,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect, length, vector
-from ballfg.dynamics.scene import Scene
+from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect, Scene, length, vector
 from ballfg.state import STANDARD_GRAVITY, Z
 
 TINY_SPEED: Final = 1e-9

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ballfg.dynamics.model import BallModel, take_rows
 from ballfg.dynamics.motion.contact import contact_time
-from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, fly, rk4_from
+from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, fly, rk4_step
 from ballfg.dynamics.motion.rollout import LONGEST_MOTION, REST_SPEED, next_surface, rollout, stays
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, VELOCITY, VZ
@@ -132,7 +132,7 @@ def _fly_arc(model: BallModel, state: Tensor, left: Tensor, surfaces: Surfaces) 
     slopes: list[Tensor] = []
     while not slopes or not bool(done.all()):
         slope = derivative(model.rates, state)
-        after = rk4_from(model.rates, state, slope, h)
+        after = rk4_step(model.rates, state, h, slope)
         height = surfaces.level_below(state.detach())
         height, landing = next_surface(model, state.detach(), after.detach(), height, ~done, surfaces)
         step = torch.where(landing, len(slopes), step)

@@ -31,25 +31,23 @@ _MODEL, _LAUNCHER, _BASE = "model.", "launcher.", "base."
 stand in the model file itself."""
 
 
-class _LauncherConfig(BaseModel):
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+class _Section(BaseModel):
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
+
+class _LauncherConfig(_Section):
     labels: Annotated[tuple[str, ...], Field(strict=False)]
     categories: dict[str, Annotated[tuple[str, ...], Field(strict=False)]]
 
 
-class _TrainedConfig(BaseModel):
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
-
+class _TrainedConfig(_Section):
     process_noise: dict[str, float]
     position_scale: float
     spin_noise: float | None
     launcher: _LauncherConfig | None
 
 
-class _Config(BaseModel):
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
-
+class _Config(_Section):
     architecture: Architecture | None
     trained: _TrainedConfig | None
 

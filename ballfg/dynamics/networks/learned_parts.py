@@ -116,11 +116,7 @@ class GramSchmidtContact(nn.Module):
 class RawContact(nn.Module):
     """A bounce: a network of velocity and spin as they are changes a first guess of it.
 
-    Args:
-        kind, width, depth: of the network.
-        radius: m; not used: raw velocity and spin are all that the network sees.
-        first: restitution of the guess; 1 where the guess is another model's bounce.
-        generator: of the first weights.
+    Args: as for `GramSchmidtContact`. The radius is not used: raw velocity and spin are all that the network sees.
     """
 
     def __init__(
@@ -138,12 +134,9 @@ class RawContact(nn.Module):
 
 
 def _changed(guess: Tensor, velocity: Tensor, normal: Tensor, spin: Tensor, first: float) -> Tensor:
-    """A guess of the state after a contact, changed; the normal velocity by a factor that keeps its sign.
+    """A guess (..., 9) of the state after a contact, changed; the normal velocity by a factor that keeps its sign.
 
-    Args:
-        guess: (..., 9), with a restitution of `first`.
-        velocity: (..., 2) m/s and spin: (..., 3) rad/s to add.
-        normal: (..., 1); takes the restitution from 0 (very negative) over `first` (0) to `HIGHEST_RESTITUTION`.
+    `normal` takes the restitution from 0 (very negative) over `first`, that of the guess (0), to `HIGHEST_RESTITUTION`.
     """
     t = torch.tanh(normal)
     room = HIGHEST_RESTITUTION - first

@@ -9,12 +9,9 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ballfg.simulation.scene.view import Rect, clipped
+from ballfg.simulation.scene.view import Array, Rect, clipped
 from ballfg.vision.camera import Camera
-
-Array = NDArray[np.float64]
 
 STEP: Final = 0.25
 """px, longest step of the path along which the outline is averaged."""
