@@ -11,7 +11,7 @@ from __future__ import annotations
 from abc import ABC
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
@@ -218,6 +218,11 @@ class Effect(nn.Module, ABC):
                     f"{self.name}.{c.name} must lie in [{c.low:g}, {c.high:g}] {c.unit}; got {value:g}. Check its unit."
                 )
             self.register_parameter(c.name, nn.Parameter(torch.tensor(value, dtype=torch.float64)))
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Tensor:
+            """The value of a coefficient: () or (..., 1)."""
 
     def values(self) -> dict[str, float]:
         """The values of the coefficients by name, each in its own unit."""

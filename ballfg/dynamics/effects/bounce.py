@@ -15,7 +15,6 @@ class Restitution(BounceEffect):
     sentence = "Constant coefficient of restitution along the normal."
     decide = "Drop the ball without spin and compare the heights before and after several bounces."
     coefficients = (Coefficient("e", 0.93, 0.02, "1", 0.0, 1.0, varies=True, absent=1.0),)
-    e: Tensor
 
     def adjust(self, impact: Impact) -> Impact:
         """The impact with e as its restitution."""
@@ -36,8 +35,6 @@ class RestitutionSpeed(BounceEffect):
         Coefficient("reference", 3.0, 0.0, "m/s", 0.0, 20.0, absent=None),
     )
     needs = ("restitution",)
-    slope: Tensor
-    reference: Tensor
 
     @classmethod
     def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
@@ -59,7 +56,6 @@ class Friction(BounceEffect):
         "Shoot fast and flat, so that the ball slides through the bounce: only then does friction set what it loses."
     )
     coefficients = (Coefficient("mu", 0.25, 0.05, "1", 0.0, 2.0),)
-    mu: Tensor
 
     def adjust(self, impact: Impact) -> Impact:
         """The impact with mu as its friction coefficient."""
@@ -76,7 +72,6 @@ class TangentialRestitution(BounceEffect):
     sentence = "Tangential compliance of the contact: slip is partly reversed when the ball grips."
     decide = "Shoot slowly with much spin, so that the ball grips in the bounce, and measure the spin after it."
     coefficients = (Coefficient("e_t", 0.15, 0.1, "1", -1.0, 1.0),)
-    e_t: Tensor
 
     def adjust(self, impact: Impact) -> Impact:
         """The impact with e_t as its tangential restitution."""
@@ -94,7 +89,6 @@ class TableHeight(BounceEffect):
     sentence = "Surfaces lie higher or lower than declared."
     decide = "Lay the ball on the table and measure its position; vary the steepness of the impacts."
     coefficients = (Coefficient("offset", 0.0, 0.004, "m", -0.2, 0.2, varies=True),)
-    offset: Tensor
 
     def surface_offset(self, position: Tensor) -> Tensor:
         """() or (..., 1) m."""
@@ -115,8 +109,6 @@ class TableTilt(BounceEffect):
     )
     decide = "Put a level on the table, or bounce the ball in several places: a tilted frame bends flights too."
     coefficients = tuple(Coefficient(axis, 0.0, 0.005, "rad", -0.3, 0.3) for axis in "xy")
-    x: Tensor
-    y: Tensor
 
     def surface_offset(self, position: Tensor) -> Tensor:
         """(..., 1) m, the plane's height below the ball less that over the origin."""

@@ -32,7 +32,6 @@ class Gravity(FlightEffect):
     )
     decide = "Look up the local g, known to four digits: a ball that falls otherwise shows a wrong clock or length."
     coefficients = (Coefficient("g", STANDARD_GRAVITY, 0.0, "m/s^2", 0.0, 30.0),)
-    g: Tensor
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2, straight down."""
@@ -46,7 +45,6 @@ class Buoyancy(FlightEffect):
     sentence = "The displaced air carries a part of the weight: exactly the same as a smaller g."
     decide = "Weigh the ball and measure its diameter: rho V g / m is known; tracks show only the sum with gravity."
     coefficients = (Coefficient("a", 0.0, 0.15, "m/s^2", -5.0, 5.0),)
-    a: Tensor
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2, straight up."""
@@ -60,7 +58,6 @@ class Drag(FlightEffect):
     sentence = "Quadratic air drag with a constant coefficient."
     decide = "Vary the speed of still-air shots: drag grows with its square and points backwards, whatever the spin."
     coefficients = (Coefficient("k", 0.12, 0.035, "1/m", 0.0, 2.0, varies=True),)
-    k: Tensor
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2, opposite to the velocity; zero, with zero derivative, at rest."""
@@ -82,8 +79,6 @@ class DragSpeed(FlightEffect):
         Coefficient("reference", 5.0, 0.0, "m/s", 0.0, 20.0, absent=None),
     )
     needs = ("drag",)
-    slope: Tensor
-    reference: Tensor
 
     @classmethod
     def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
@@ -103,7 +98,6 @@ class DragSpin(FlightEffect):
     decide = "Shoot at one speed with and without spin; sidespin and topspin must slow the ball alike."
     coefficients = (Coefficient("gain", 0.0, 0.3, "1", -10.0, 10.0),)
     needs = ("drag",)
-    gain: Tensor
 
     def adjust(self, flight: Flight) -> Flight:
         """The flight with more drag where it spins; the force, with S |v| = R |w|, has no pole at rest."""
@@ -120,7 +114,6 @@ class Magnus(FlightEffect):
         "Shoot with spins of opposite sign at one speed: the lift changes its sign with the spin, nothing else does."
     )
     coefficients = (Coefficient("k", 0.0028, 0.0008, "1", -0.1, 0.1),)
-    k: Tensor
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2, perpendicular to velocity and spin."""
@@ -140,7 +133,6 @@ class MagnusSaturation(FlightEffect):
     decide = "Shoot at one speed with little, medium and much spin: the lift per spin must fall."
     coefficients = (Coefficient("strength", 0.0, 0.5, "1", 0.0, 20.0),)
     needs = ("magnus",)
-    strength: Tensor
 
     def adjust(self, flight: Flight) -> Flight:
         """The flight with the lift multiplied by 1 / (1 + strength S)."""
@@ -155,7 +147,6 @@ class SpinDecay(FlightEffect):
     sentence = "Viscous torque of the air: the spin falls exponentially."
     decide = "Film a mark on the ball at launch and at the end of a long flight, or label the spin at both ends."
     coefficients = (Coefficient("rate", 0.2, 0.2, "1/s", 0.0, 20.0),)
-    rate: Tensor
 
     def spin_rate(self, flight: Flight) -> Tensor:
         """(..., 3) rad/s^2, opposite to the spin."""
@@ -169,9 +160,6 @@ class Wind(FlightEffect):
     sentence = "The air moves at a constant velocity: drag and Magnus force act on the velocity against the air."
     decide = "Shoot in the opposite direction, or across: the wind keeps its direction, drag turns with the shot."
     coefficients = tuple(Coefficient(axis, 0.0, 0.3, "m/s", -20.0, 20.0) for axis in "xyz")
-    x: Tensor
-    y: Tensor
-    z: Tensor
 
     def air_velocity(self, flight: Flight) -> Tensor:
         """(3,) or (..., 3) m/s, the same everywhere."""
@@ -191,9 +179,6 @@ class WindShear(FlightEffect):
         *(Coefficient(axis, 0.0, 0.3, "1/s", -20.0, 20.0) for axis in "xy"),
         Coefficient("reference", 1.0, 0.5, "m", -100.0, 100.0, absent=None),
     )
-    x: Tensor
-    y: Tensor
-    reference: Tensor
 
     @classmethod
     def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
@@ -221,13 +206,6 @@ class GustRegion(FlightEffect):
         Coefficient("center_z", 1.1, 0.5, "m", -100.0, 100.0, absent=None),
         Coefficient("size", 0.4, 0.2, "m", 0.01, 100.0, absent=None),
     )
-    x: Tensor
-    y: Tensor
-    z: Tensor
-    center_x: Tensor
-    center_y: Tensor
-    center_z: Tensor
-    size: Tensor
 
     @classmethod
     def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:

@@ -90,10 +90,6 @@ class GenericFlight(FlightEffect):
         *_center(),
         Coefficient("speed", 5.0, 0.0, "m/s", 0.0, 100.0, absent=None),
     )
-    center_x: Tensor
-    center_y: Tensor
-    center_z: Tensor
-    speed: Tensor
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2."""
@@ -134,9 +130,6 @@ class GenericMeasurement(MeasurementEffect):
     decide = "Measure a ball that hangs still at known places, then one that moves slowly and fast on a known path."
     coefficients = (*_coefficients(WORLD_AXES, MEASUREMENT_TERMS, MEASUREMENT_BOUND), *_center())
     rank = 2
-    center_x: Tensor
-    center_y: Tensor
-    center_z: Tensor
 
     def positions(self, states: Tensor, later: Later) -> Tensor:
         """(..., 3) m, with the error."""

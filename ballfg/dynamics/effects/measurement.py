@@ -33,9 +33,6 @@ class TimeOffset(MeasurementEffect):
     )
     coefficients = tuple(Coefficient(axis, 0.0, 0.002, "s", -0.1, 0.1) for axis in "xyz")
     rank = 0
-    x: Tensor
-    y: Tensor
-    z: Tensor
 
     def positions(self, states: Tensor, later: Later) -> Tensor:
         """(..., 3) m, each coordinate from its own moment; a contact on the way is passed through exactly."""
@@ -56,7 +53,6 @@ class TimeScale(MeasurementEffect):
     decide = "Film a clock, or trust the local g: gravity then gives the scale of the time."
     coefficients = (Coefficient("s", 0.0, 0.01, "1", -0.5, 0.5),)
     rank = 100
-    s: Tensor
 
     def true_stamps(self, stamps: Tensor) -> Tensor:
         """(...) s of true time."""
@@ -83,7 +79,6 @@ class VelocityLag(MeasurementEffect):
     )
     coefficients = (Coefficient("lag", 0.0, 0.003, "s", -0.2, 0.2),)
     rank = 1
-    lag: Tensor
 
     def positions(self, states: Tensor, later: Later) -> Tensor:
         """(..., 3) m, behind the ball."""
@@ -101,8 +96,6 @@ class FrameTilt(MeasurementEffect):
     decide = "Film a plumb line, or a ball rolling on a levelled table."
     coefficients = tuple(Coefficient(axis, 0.0, 0.01, "rad", -0.5, 0.5) for axis in "xy")
     rank = 10
-    x: Tensor
-    y: Tensor
 
     def positions(self, states: Tensor, later: Later) -> Tensor:
         """(..., 3) m, in the tilted frame: Rodrigues' formula, p + sin(a)/a r x p + (1 - cos(a))/a^2 r x (r x p)."""
@@ -126,9 +119,6 @@ class Scale(MeasurementEffect):
     decide = "Measure a rod of known length along each axis."
     coefficients = tuple(Coefficient(axis, 0.0, 0.01, "1", -0.5, 0.5) for axis in "xyz")
     rank = 11
-    x: Tensor
-    y: Tensor
-    z: Tensor
 
     def positions(self, states: Tensor, later: Later) -> Tensor:
         """(..., 3) m, stretched."""
@@ -148,10 +138,6 @@ class RadialBias(MeasurementEffect):
         Coefficient("z", 0.0, 1.0, "m", -100.0, 100.0, absent=None),
     )
     rank = 12
-    offset: Tensor
-    x: Tensor
-    y: Tensor
-    z: Tensor
 
     def positions(self, states: Tensor, later: Later) -> Tensor:
         """(..., 3) m, pushed outwards."""
@@ -205,7 +191,6 @@ class SpinLabelScale(MeasurementEffect):
     decide = "Film a mark on the ball, or use bounces that grip: they show the spin itself."
     coefficients = (Coefficient("s", 0.0, 0.1, "1", -10.0, 10.0),)
     rank = 102
-    s: Tensor
 
     def label(self, spin: Tensor) -> Tensor:
         """(..., 3) rad/s as labelled."""
@@ -223,9 +208,6 @@ class SpinLabelOffset(MeasurementEffect):
     decide = "Shoot without spin: what curves then is not in the labels' scale; film a mark on the ball."
     coefficients = tuple(Coefficient(axis, 0.0, 10.0, "rad/s", -2000.0, 2000.0) for axis in "xyz")
     rank = 103
-    x: Tensor
-    y: Tensor
-    z: Tensor
 
     def label(self, spin: Tensor) -> Tensor:
         """(..., 3) rad/s as labelled."""

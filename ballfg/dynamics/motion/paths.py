@@ -88,12 +88,7 @@ class _Arc:
         theta = (place - step).unsqueeze(-1)
         index = step.unsqueeze(-1).expand(-1, -1, self.nodes.shape[-1])
         nodes, slopes = self.nodes.transpose(0, 1), self.slopes.transpose(0, 1)
-        ends = (
-            nodes.gather(1, index),
-            slopes.gather(1, index),
-            nodes.gather(1, index + 1),
-            slopes.gather(1, index + 1),
-        )
+        ends = [values.gather(1, end) for end in (index, index + 1) for values in (nodes, slopes)]
         return hermite(theta, MAX_STEP, *ends)
 
 
