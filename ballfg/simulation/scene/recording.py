@@ -75,8 +75,8 @@ def visible_columns(recording: Recording, number: int) -> dict[str, Any]:
 
     Columns: `camera`; `frame`, counted from 0 over the frames that were written; `t` (s), its stamp; `t_true` (s), the
     true time of the middle of its exposure; `trajectory`, the ball's; `u,v` (px), where its centre is in the middle of
-    the exposure; `u_open,v_open,u_close,v_close` (px), where it is as the shutter opens and closes; `radius` (px), of
-    its outline; `whole`, 1 if all of its outline lies in the image throughout the exposure, else 0.
+    the exposure; `u_open,v_open,u_close,v_close` (px), where it is as the shutter opens and closes; `radius` (px),
+    the mean one of its outline; `whole`, 1 if all of its outline lies in the image throughout the exposure, else 0.
     """
     camera, frames = recording.cameras[number], recording.frames[number]
     rows: list[dict[str, Any]] = []
@@ -84,7 +84,8 @@ def visible_columns(recording: Recording, number: int) -> dict[str, Any]:
         pixels = camera.project(passage.paths)
         seen = inside(camera, pixels[:, PATH_POINTS // 2])
         pixels, frame = pixels[seen], passage.frames[seen]
-        radius = outline_radius(camera, passage.centres[seen], recording.config.ball.ball.radius)
+        focal = np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
+        radius = focal * recording.config.ball.ball.radius / camera.depth(passage.centres[seen])
         rows.append(
             {
                 "frame": frame,
@@ -102,8 +103,3 @@ def visible_columns(recording: Recording, number: int) -> dict[str, Any]:
             }
         )
     return {"camera": camera.name} | {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
-
-
-def outline_radius(camera: Camera, centres: NDArray[np.float64], radius: float) -> NDArray[np.float64]:
-    """(n,) px, mean radius of the outlines of balls of a radius in m at centres (n, 3) m."""
-    return np.asarray(np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1]) * radius / camera.depth(centres))

@@ -126,6 +126,5 @@ class Renderer:
 
 
 def _blurred(image: Image) -> Image:
-    """An image as a lens shows it."""
     side = 2 * _REACH + 1
     return np.asarray(cv2.GaussianBlur(image, (side, side), LENS_BLUR, borderType=cv2.BORDER_REPLICATE))
