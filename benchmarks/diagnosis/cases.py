@@ -202,3 +202,19 @@ def timed_cases(plan: Plan, seed: int) -> Iterator[Case]:
     """Diagnoses that have the machine for themselves, with two processes: a wind, 50 tracks."""
     for number in range(seed, seed + plan.timed):
         yield replace(planted_case("time", "wind", 1.0, number), jobs=2)
+
+
+def all_cases(plan: Plan, seed: int, ideal: Mapping[str, float], data: Sequence[Path]) -> list[Case]:
+    """Everything that may run side by side, parts evenly mixed: an early look sees something of all.
+
+    Args: ideal: by effect, the size that the ideal test needs.  data: folders of measured tracks.
+    """
+    parts = [
+        list(measured_cases(data)),
+        list(naming_cases(plan, seed)),
+        list(null_cases(plan, seed)),
+        list(unknown_cases(plan, seed)),
+        list(detection_cases(plan, seed, ideal)),
+    ]
+    placed = [(number / len(part), case) for part in parts for number, case in enumerate(part)]
+    return [case for _, case in sorted(placed, key=lambda pair: pair[0])]
