@@ -78,8 +78,8 @@ class Renderer:
             paths: of each ball that is there, (m, 3) m, its centre from the shutter's opening to its closing. Balls are
                 drawn in front of everything else.
         """
-        moving, exposure = movers(time) if self._config.distractors else [], self._config.exposure
-        drawn = [draw(self._sharp, self._distance, self._camera, thing, exposure) for thing in moving]
+        moving = movers(time) if self._config.distractors else []
+        drawn = [draw(self._sharp, self._distance, self._camera, thing, self._config.exposure) for thing in moving]
         drawn += [self._draw_ball(path) for path in paths]
         changed = [self._through_lens(rect) for rect in drawn if rect is not None]
         image = self._developed(time)
