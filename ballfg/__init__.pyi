@@ -9,7 +9,6 @@ from . import simulation as simulation
 from . import tracks as tracks
 from . import vision as vision
 from .diagnosis import Diagnosis as Diagnosis
-from .diagnosis import diagnose as diagnose
 from .dynamics import AnalyticModel as AnalyticModel
 from .dynamics import Surfaces as Surfaces
 from .dynamics import load_model as load_model
@@ -19,9 +18,18 @@ from .dynamics import save_model as save_model
 from .estimation import Estimate as Estimate
 from .estimation import ExtendedKalmanFilter as ExtendedKalmanFilter
 from .estimation import Online as Online
+from .estimation import RadarSpeed as RadarSpeed
 from .estimation import Settings as Settings
 from .estimation import Smoother as Smoother
+from .estimation import SpinReading as SpinReading
 from .estimation import Status as Status
+from .estimation import read as read
+from .estimation import register_estimator as register_estimator
+from .estimation import register_observation as register_observation
+from .front import diagnose as diagnose
+from .front import estimate as estimate
+from .front import predict as predict
+from .prediction import BallState as BallState
 from .simulation import simulate as simulate
 from .tracks import Ball as Ball
 from .tracks import Dataset as Dataset

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
-from typing import TypeAlias, overload
+from typing import TypeAlias, TypedDict, Unpack, overload
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from ballfg.diagnosis import Diagnosis
 from ballfg.diagnosis import diagnose as diagnose_dataset
@@ -31,30 +31,32 @@ from ballfg.tracks import TABLE_TENNIS, Dataset, Track
 Folder: TypeAlias = str | PathLike[str]
 Tracks: TypeAlias = Dataset | SightedDataset
 Model: TypeAlias = BallModel | Folder | None
+OneTrack: TypeAlias = Track | NDArray[np.float64] | tuple[ArrayLike, ArrayLike]
+"""A track; or an array (n, 4) of t (s), x, y, z (m); or times (n,) s and positions (n, 3) m."""
+
+
+class Options(TypedDict, total=False):
+    """The keyword arguments of `estimate`."""
+
+    method: str
+    model: Model
+    surfaces: Surfaces | float | None
+    settings: Settings | None
+    jobs: int
+
+
+class PredictOptions(Options, total=False):
+    """The keyword arguments of `predict`; observe in s."""
+
+    observe: float
 
 
 @overload
-def estimate(
-    measured: Track,
-    *,
-    method: str = ...,
-    model: Model = ...,
-    surfaces: Surfaces | float | None = ...,
-    settings: Settings | None = ...,
-    jobs: int = ...,
-) -> Estimate: ...
+def estimate(measured: OneTrack, **options: Unpack[Options]) -> Estimate: ...
 @overload
+def estimate(measured: Tracks | Folder, **options: Unpack[Options]) -> dict[str, Estimate]: ...
 def estimate(
-    measured: Tracks | Folder,
-    *,
-    method: str = ...,
-    model: Model = ...,
-    surfaces: Surfaces | float | None = ...,
-    settings: Settings | None = ...,
-    jobs: int = ...,
-) -> dict[str, Estimate]: ...
-def estimate(
-    measured: Track | Tracks | Folder,
+    measured: OneTrack | Tracks | Folder,
     *,
     method: str = "smoother",
     model: Model = None,
@@ -64,11 +66,12 @@ def estimate(
 ) -> Estimate | dict[str, Estimate]:
     """Position, velocity and spin of the ball at every stamp, with covariances.
 
-    What is not given comes from the dataset that a track was read from: ball, table and noise. A track of nobody's
-    dataset is a table-tennis ball above a table at z = 0; the notes of its estimate tell where it does not look so.
+    Ball, table and noise that are not given are those of the dataset that a track was read from. A track without a
+    dataset is taken for a table-tennis ball above a table at z = 0; the notes of its estimate list signs against that.
 
     Args:
-        measured: a track, or a dataset or its folder for all tracks.
+        measured: a track or its arrays, (n, 4) of t, x, y, z in s and m or times (n,) s and positions (n, 3) m; or a
+            dataset or its folder for all tracks.
         method: "smoother", "online", "ekf", "sliding-window", or the name of a registered estimator.
         model: of the ball, or its file; the nominal model of the ball where None.
         surfaces: that the ball may bounce on; a number is the height of the table, m.
@@ -89,30 +92,14 @@ def estimate(
 
 @overload
 def predict(
-    known: Estimate | BallState | Track,
-    horizon: float = ...,
-    *,
-    observe: float = ...,
-    method: str = ...,
-    model: Model = ...,
-    surfaces: Surfaces | float | None = ...,
-    settings: Settings | None = ...,
-    jobs: int = ...,
+    known: Estimate | BallState | OneTrack, horizon: float = ..., **options: Unpack[PredictOptions]
 ) -> Ahead: ...
 @overload
 def predict(
-    known: Tracks | Folder,
-    horizon: float = ...,
-    *,
-    observe: float = ...,
-    method: str = ...,
-    model: Model = ...,
-    surfaces: Surfaces | float | None = ...,
-    settings: Settings | None = ...,
-    jobs: int = ...,
+    known: Tracks | Folder, horizon: float = ..., **options: Unpack[PredictOptions]
 ) -> dict[str, TrackPrediction]: ...
 def predict(
-    known: Estimate | BallState | Track | Tracks | Folder,
+    known: Estimate | BallState | OneTrack | Tracks | Folder,
     horizon: float = 0.3,
     *,
     observe: float = 0.25,
@@ -122,16 +109,18 @@ def predict(
     settings: Settings | None = None,
     jobs: int = 1,
 ) -> Ahead | dict[str, TrackPrediction]:
-    """Where the ball will be, with standard deviations.
+    """The path of the ball ahead, with standard deviations.
 
     Args:
-        known: an estimate or a state; a track, which is estimated first; a dataset or its folder, of which the first
-            `observe` seconds of each track are estimated and what follows is predicted.
-        horizon: s.
+        known: an estimate or a state; a track or its arrays, estimated first; a dataset or its folder: the first
+            `observe` seconds of each track are estimated, and the measurements after them are predicted.
+        horizon: s, how far ahead.
         observe: s from the first stamp of each track of a dataset.
         method, model, surfaces, settings, jobs: as for `estimate`.
     Returns: the path ahead; of a dataset, the predicted measurements of each track by name.
-    Raises: ValueError: a horizon that is not positive, or what `estimate` raises.
+    Raises:
+        TypeError: for anything else in place of what is known.
+        ValueError: a horizon that is not positive, or what `estimate` raises.
     """
     if isinstance(known, Estimate | BallState):
         return known.predict(horizon)
@@ -144,12 +133,13 @@ def predict(
 
 
 def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) -> Diagnosis:
-    """What the model of the ball lacks, by what its measured tracks show.
+    """The effects that the model of the ball lacks, found in measured tracks.
 
     Args:
-        measured: a dataset or its folder; every second track is searched, the others judge.
-        model: the analytic model that one believes in, or its file; the nominal model of the ball where None.
+        measured: a dataset or its folder; one half of the tracks finds effects, the other half judges them.
+        model: the analytic model to diagnose, or its file; the nominal model of the ball where None.
         jobs: processes.
+    Returns: the effects found, how sure that is, and the corrected model.
     Raises:
         TypeError: if the model is a learned one.
         ValueError: if there are too few tracks, or none with a flight that is long enough.
@@ -192,7 +182,11 @@ def _opened(measured: object) -> Track | Tracks:
         return read(measured)
     if isinstance(measured, Track | Dataset | SightedDataset):
         return measured
-    hint = "Track(times, positions), (n,) s and (n, 3) m"
-    if isinstance(measured, np.ndarray | Iterable):
-        hint += ", makes a track of arrays"
-    raise TypeError(f"measured must be a Track, a dataset or its folder; got {type(measured).__name__}. {hint}.")
+    if isinstance(measured, np.ndarray) and measured.ndim == 2 and measured.shape[1] == 4:
+        return Track(measured[:, 0], measured[:, 1:])
+    if isinstance(measured, tuple) and len(measured) == 2:
+        return Track(*measured)
+    raise TypeError(
+        f"measured must be a Track, a dataset, its folder, or arrays; got {type(measured).__name__}. Arrays are times "
+        "(n,) s and positions (n, 3) m as a pair, or one array (n, 4) of both."
+    )

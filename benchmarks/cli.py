@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ballfg.cli.errors import guarded
-from ballfg.cli.inputs import default_jobs
+from ballfg.cli.inputs import CORES
 
 if TYPE_CHECKING:
     from ballfg.benchmarks.results import Results
@@ -45,7 +45,6 @@ Out = Annotated[Path, typer.Option("--out", help="Folder for results.json and pi
 Quick = Annotated[bool, typer.Option("--quick", help="A quick look at few tracks or runs, not a measurement.")]
 Seed = Annotated[int, typer.Option("--seed", min=0, help="Random seed.")]
 Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Number of processes.", show_default="one per core")]
-EVERY_CORE = default_jobs()
 
 
 @app.callback(invoke_without_command=True)
@@ -57,7 +56,7 @@ def _root(context: typer.Context) -> None:
 
 @app.command()
 def estimators(
-    data: Data = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = EVERY_CORE
+    data: Data = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = CORES
 ) -> None:
     """Comparison of sliding window, EKF, RTS, online estimator and smoother on the same tracks.
 
@@ -79,7 +78,7 @@ def estimators(
 
 
 @app.command()
-def cameras(out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = EVERY_CORE) -> None:
+def cameras(out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = CORES) -> None:
     """Tracking from rendered videos of three cameras: points, velocities and clocks against the truth.
 
     The recordings have one shutter or three, one ball or two, dropped frames, a clock that is late, and a camera that
@@ -102,7 +101,7 @@ def dynamics(
     out: Out = Path("results"),
     quick: Quick = False,
     seed: Seed = 0,
-    jobs: Jobs = EVERY_CORE,
+    jobs: Jobs = CORES,
 ) -> None:
     """Comparison of dynamics models that are trained on the same tracks and predict the same others.
 
@@ -131,7 +130,7 @@ def dynamics(
 
 @app.command()
 def loop(
-    data: Beside = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = EVERY_CORE
+    data: Beside = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = CORES
 ) -> None:
     """Test of the diagnosis: planted effects that it names, false alarms, and models that it repairs.
 

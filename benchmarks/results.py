@@ -6,13 +6,12 @@ import platform
 import sys
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
-from importlib import metadata
 from pathlib import Path
 from typing import Any, TextIO
 
 from ballfg.benchmarks.metrics import Figure
-from ballfg.cli.inputs import default_jobs
 from ballfg.files.whole_file import whole_file
+from ballfg.machine import usable_cores, versions
 
 PACKAGES = ("ballfg", "gtsam", "torch", "numpy", "scipy", "filterpy")
 """The numbers depend on their versions, and on Python's."""
@@ -73,9 +72,14 @@ class Results:
 
     def to_dict(self) -> dict[str, Any]:
         """The content of `results.json`."""
-        versions = {"python": platform.python_version()} | {name: metadata.version(name) for name in PACKAGES}
         rows = [asdict(row) for row in self.rows]
-        return {"command": self.command, "versions": versions, "machine": machine(), "seed": self.seed, "rows": rows}
+        return {
+            "command": self.command,
+            "versions": versions(PACKAGES),
+            "machine": machine(),
+            "seed": self.seed,
+            "rows": rows,
+        }
 
     def write(self, folder: Path) -> Path:
         """Write `results.json` whole or not at all."""
@@ -92,7 +96,7 @@ def _finite(value: float) -> float | None:
 
 def machine() -> dict[str, Any]:
     """Processor, usable cores and system; nothing that identifies a user's machine."""
-    return {"cpu": _cpu_model(), "cores": default_jobs(), "system": f"{platform.system()} {platform.machine()}"}
+    return {"cpu": _cpu_model(), "cores": usable_cores(), "system": f"{platform.system()} {platform.machine()}"}
 
 
 def _cpu_model() -> str:

@@ -34,21 +34,27 @@ class Values:
     """A point at which a graph is evaluated.
 
     Attributes:
-        states: (n, 9).
-        coefficients: (p,) of the model's coefficients that are estimated; (0,) for none.
+        states: (n, 9) position m, velocity m/s, spin rad/s.
+        coefficients: (p,) the coefficients that are estimated, in their own units; (0,) where there are none.
     """
 
     states: Array
     coefficients: Array
 
     def gather(self, variables: Index) -> Array:
-        """(m, d) values of m variables of one sort."""
+        """(m, d) values, in the variables' own units.
+
+        Args: variables: (m,) index of each; all are states, or all are `COEFFICIENTS`.
+        """
         if len(variables) and variables[0] == COEFFICIENTS:
             return np.broadcast_to(self.coefficients, (len(variables), len(self.coefficients)))
         return self.states[variables]
 
     def moved(self, states: Array, coefficients: Array) -> Values:
-        """These values plus a step."""
+        """These values plus a step.
+
+        Args: states: (n, 9) m, m/s, rad/s.  coefficients: (p,) in their own units.
+        """
         return Values(self.states + states, self.coefficients + coefficients)
 
 
@@ -57,9 +63,9 @@ class Rows:
     """Linearised factors of one batch: whitened residuals r + J d, before the loss.
 
     Attributes:
-        variables: (m, a) variable numbers.
-        residual: (m, r).
-        jacobians: a arrays (m, r, d).
+        variables: (m, a) index of each variable.
+        residual: (m, r) whitened.
+        jacobians: a arrays (m, r, d) whitened, each per unit of its variable.
         loss: the loss on each residual's norm.
     """
 
@@ -79,8 +85,9 @@ class Noise:
 
     Attributes:
         process: (7,) the numbers of `ballfg.factors.noise.PROCESS_NOISE`.
-        position: () standard deviation of every measured position in multiples of what the factors were built with.
-        spin: () the same for what labels or launcher settings say of the spin.
+        position: () dimensionless, the standard deviation of every measured position in multiples of the one that the
+            factors were built with.
+        spin: () dimensionless, the same for the spin that labels or launcher settings tell.
     """
 
     process: Tensor | None = None
@@ -92,7 +99,7 @@ class FactorBatch(ABC):
     """m factors of one sort, each between the same number of variables.
 
     Attributes:
-        variables: (m, a) numbers of the variables of each factor: a state's index or `COEFFICIENTS`.
+        variables: (m, a) index of each factor's variables: that of a state, or `COEFFICIENTS`.
         dim: dimension of a residual.
         loss: the loss on the norm of a whitened residual.
         row_arrays: names of the attributes that hold one entry a factor.
@@ -116,9 +123,9 @@ class FactorBatch(ABC):
         """Whitened residuals and Jacobians of some rows.
 
         Args:
-            rows: which of the m factors, k of them.
-            inputs: for each of the a variables the values (k, d).
-        Returns: residuals (k, dim) and a Jacobians (k, dim, d).
+            rows: (k,) index of the factors asked for, or a slice.
+            inputs: for each of the a variables its values (k, d), in the variable's own units.
+        Returns: residuals (k, dim) whitened, and a Jacobians (k, dim, d) whitened, each per unit of its variable.
         """
 
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
@@ -126,7 +133,7 @@ class FactorBatch(ABC):
 
         Only a gradient through the estimate asks for them; estimation needs `compute` alone.
 
-        Args: inputs: for each of the a variables the values (m, d).
+        Args: inputs: for each of the a variables its values (m, d), in the variable's own units.
         Raises: NotImplementedError: if the batch has none.
         """
         raise NotImplementedError(
@@ -135,9 +142,10 @@ class FactorBatch(ABC):
         )
 
     def rewhitening(self, noise: Noise) -> Tensor | None:
-        """What turns whitened residuals into residuals whitened with learned noise, differentiable in that.
+        """The factor from these whitened residuals to residuals whitened with learned noise, differentiable in that.
 
-        Returns: (m, dim, dim) lower triangular, or () a common factor; None where nothing is learned of this noise.
+        Args: noise: the learned numbers.
+        Returns: (m, dim, dim) lower triangular, or () for all rows; dimensionless. None if this noise is not learned.
         """
         return None
 
@@ -160,7 +168,10 @@ class FactorBatch(ABC):
         return other
 
     def taken(self, rows: Index | slice) -> Self:
-        """Some of the factors, as a batch of their own; variable numbers stay what they were."""
+        """Some of the factors, as a batch of their own; their variables keep their numbers.
+
+        Args: rows: (k,) index of the factors, or a slice.
+        """
         part = copy.copy(self)
         for name in self.row_arrays:
             setattr(part, name, getattr(self, name)[rows])
@@ -177,7 +188,7 @@ B = TypeVar("B", bound=FactorBatch)
 
 
 def merge(batches: Sequence[B]) -> B:
-    """One batch with the rows of several of the same group, in order; variable numbers stay what they were."""
+    """One batch with the rows of several of the same group, in order; variables keep their numbers."""
     if len(batches) == 1:
         return batches[0]
     whole = copy.copy(batches[0])

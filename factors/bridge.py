@@ -44,6 +44,8 @@ class Bridge:
     Attributes:
         calls: how often the batch was evaluated.
         misses: how often a callback found nothing prepared.
+
+    Raises: ValueError: if `on_miss` is neither of the two.
     """
 
     def __init__(self, batch: FactorBatch, on_miss: OnMiss = "changed") -> None:
@@ -74,8 +76,10 @@ class Bridge:
     def prepare(self, rows: Index, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Evaluate rows in one call, check what comes back and keep it for the callbacks.
 
-        Args: rows: (k,) which rows.  inputs: for each variable of a factor the values (k, d).
-        Returns: whitened residuals (k, r) and Jacobians (k, r, d), as kept.
+        Args:
+            rows: (k,) index of the rows.
+            inputs: for each variable of a factor its values (k, d), in the variable's own units.
+        Returns: residuals (k, r) and Jacobians (k, r, d), whitened, as kept.
         Raises: ValueError: if the batch returns a wrong shape, another type than float64 or a value that is not finite.
         """
         inputs = tuple(np.ascontiguousarray(block, dtype=np.float64) for block in inputs)
@@ -88,13 +92,20 @@ class Bridge:
     def keep(self, row: int, inputs: tuple[Array, ...], residual: Array, jacobians: tuple[Array, ...]) -> None:
         """Keep an answer that the caller computed itself and put through `checked`.
 
-        Args: row: which.  inputs: vectors (d,).  residual: (r,), whitened.  jacobians: (r, d) each.
+        Args:
+            row: of the batch.
+            inputs: for each variable of the factor its value (d,), in the variable's own units.
+            residual: (r,) whitened.
+            jacobians: for each variable (r, d) whitened, per unit of the variable.
         """
         self._inputs[row] = tuple([x.tobytes() for x in inputs])
         self._answers[row] = residual, jacobians
 
     def answer(self, row: int, keys: Sequence[int], values: gtsam.Values) -> tuple[Array, tuple[Array, ...]]:
-        """Residual (r,) and Jacobians (r, d) of a row at GTSAM's values."""
+        """Residual (r,) and Jacobians (r, d), whitened, of a row at GTSAM's values.
+
+        Raises: ValueError: as `prepare`.
+        """
         asked = tuple([values.atVector(key).tobytes() for key in keys])
         if asked != self._inputs[row]:
             self.misses += 1

@@ -21,9 +21,9 @@ FIXED = -1
 class CameraFactors(FactorBatch):
     """r = W (project(p_i + tau v_i) - z), tau = delay - d: how much later than the state the camera saw the ball.
 
-    W whitens the pixel noise, W^T W = R^-1. The delay is known; d is what the camera's stamps are later than they were
-    taken to be, a coefficient. Over the milliseconds that tau lasts the path is straight to some micrometres, unless
-    there is a bounce in them.
+    W whitens the pixel noise, W^T W = R^-1. The delay is known. d is a coefficient, the error of the camera's time
+    offset: positive if its stamps are later than was believed. Over the milliseconds that tau lasts the path is
+    straight to some micrometres, unless there is a bounce in them.
 
     Args:
         states: (m,) indices of the observed states.
@@ -32,8 +32,11 @@ class CameraFactors(FactorBatch):
         covariances: (m, 2, 2) px^2.
         bank: the cameras.
         delay: (m,) s, true time of each sighting minus that of its state; zeros where None.
-        columns: (cameras,) which coefficient is each camera's d, or `FIXED`. None: the factors do not see coefficients.
+        columns: (c,) index of the coefficient that is each camera's d, or `FIXED`. None: the factors do not depend on
+            coefficients.
         loss: a robust one where wrong candidates are among the sightings.
+
+    Raises: ValueError: if the shapes of the arrays do not agree.
     """
 
     row_arrays: ClassVar[tuple[str, ...]] = ("variables", "camera", "pixels", "root", "delay", "column")

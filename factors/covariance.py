@@ -23,9 +23,9 @@ class Covariances:
     """Marginal covariances at the minimum.
 
     Attributes:
-        states: (n, 9, 9).
-        coefficients: (p, p).
-        cross: (n, 9, p) between each state and the coefficients.
+        states: (n, 9, 9) in the products of m, m/s and rad/s.
+        coefficients: (p, p) in the products of their own units.
+        cross: (n, 9, p) between each state and the coefficients, in the products of their units.
     """
 
     states: Array

@@ -35,12 +35,14 @@ class DynamicsFactors(FactorBatch):
     """r = W (x_{i+1} - F(x_i, dt_i; coefficients)), W the whitening of the process noise.
 
     Args:
-        model: an `AugmentedModel` adds the coefficients as a third variable of every factor. Its own are the first
-            of them; the motion does not depend on the others, which observations brought along.
-        states: (m,) indices i; each factor ties state i to state i + 1.
+        model: an `AugmentedModel` adds the coefficients as a third variable of every factor. Its own come first; the
+            motion does not depend on the others, which are unknowns of observations.
+        states: (m,) index i; each factor ties state i to state i + 1.
         dt: (m,) s.
-        covariance: (m, 9, 9) of the process noise gathered over dt.
-        kicks: what that covariance is made of, for those who learn it; free flight by default.
+        covariance: (m, 9, 9) m, m/s, rad/s and their products, of the process noise gathered over dt.
+        kicks: the contacts and hits in that covariance, for learning it; free flight by default.
+
+    Raises: ValueError: if a dt is not positive.
     """
 
     costly: ClassVar[bool] = True
@@ -65,7 +67,10 @@ class DynamicsFactors(FactorBatch):
 
     @abstractmethod
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
-        """F and its Jacobian: augmented states (k, 9 + p) to (k, 9 + p) and (k, 9 + p, 9 + p)."""
+        """F and its Jacobian: augmented states (k, 9 + p) to (k, 9 + p) and (k, 9 + p, 9 + p).
+
+        Args: state: (k, 9 + p).  rows: (k,) index of the factors, or a slice.
+        """
 
     @abstractmethod
     def moved(self, state: Tensor) -> Tensor:
@@ -135,7 +140,13 @@ class FlightFactors(DynamicsFactors):
 class SurfaceFactors(DynamicsFactors):
     """Motion in which surfaces take part.
 
-    Args: heights: (m, ...) m of the surfaces.
+    Args:
+        model: as for `DynamicsFactors`, and so are the others but for the heights.
+        states: (m,) index i.
+        dt: (m,) s.
+        covariance: (m, 9, 9) m, m/s, rad/s and their products.
+        heights: (m, ...) m, of the surfaces.
+        kicks: the contacts and hits in the covariance.
     """
 
     row_arrays: ClassVar[tuple[str, ...]] = (*DynamicsFactors.row_arrays, "heights")

@@ -72,7 +72,7 @@ class Minimum:
 
     Attributes:
         values: the point.
-        error: objective there; after a last step that was taken without another look, what the step promised.
+        error: objective there; after a last step without another linearisation, the one that the step promised.
         step: the last undamped linear solution, there or one step before: its Bayes net holds the covariances.
         convergence: why it stopped.
         iterations: number of linear solutions.

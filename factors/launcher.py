@@ -22,10 +22,12 @@ class LauncherSpinFactors(FactorBatch):
 
     Args:
         states: (m,) indices of the states at which the ball leaves the launcher.
-        settings: (m, k) of the launcher.
-        embedding: what they mean; its weights may be learned.
+        settings: (m, k) of the launcher, in the launcher's own units.
+        embedding: from settings to spin; its weights may be learned.
         sigma: (m, 3) rad/s.
-        loss: a robust one where settings were seen to be wrong.
+        loss: a robust one where some settings are wrong.
+
+    Raises: ValueError: a wrong shape, or a sigma that is not positive.
     """
 
     row_arrays: ClassVar[tuple[str, ...]] = ("variables", "settings", "sigma")

@@ -21,9 +21,10 @@ class Step:
     """A solution of the linear subproblem.
 
     Attributes:
-        states: (n, 9) and coefficients: (p,): the step d that minimises |r + J d|^2 (+ damping).
+        states: (n, 9) m, m/s, rad/s, part of the step d that minimises |r + J d|^2 (+ damping).
+        coefficients: (p,) in their own units, the other part of it.
         bayes_net: GTSAM's result of the elimination, states in order, coefficients last.
-        decrease: half of |r|^2 - |r + J d|^2, what the linear model promises.
+        decrease: half of |r|^2 - |r + J d|^2, by which the linear model promises to reduce the objective.
     """
 
     states: Array
@@ -66,11 +67,11 @@ def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> S
         _damp(graph, np.sqrt(damping * _diagonal(pieces, n, p)), n, p)
     try:
         bayes_net = graph.eliminateSequential(_in_order(n + (p > 0)), gtsam.EliminateQR)
+        solution = bayes_net.optimize()
     except RuntimeError as error:  # GTSAM's text changed between versions; the word did not
         if "Indetermin" not in str(error):
             raise
         return None
-    solution = bayes_net.optimize()
     states = solution.vector(list(range(n))).reshape(n, STATE_DIM)
     coefficients = solution.at(n) if p else np.zeros(0)
     if not np.isfinite(states).all():

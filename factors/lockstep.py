@@ -57,7 +57,7 @@ def linearize_together(questions: Sequence[Question]) -> list[list[Rows]]:
 
 
 def _evaluate(batches: Sequence[FactorBatch], points: Sequence[Values]) -> list[Rows]:
-    """Kinds of one group, each linearised at its own point."""
+    """Batches of one group, each linearised at its own point."""
     if len(batches) == 1:
         return [batches[0].linearize(points[0])]
     gathered = [

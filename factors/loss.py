@@ -25,6 +25,8 @@ class Loss:
     Attributes:
         name: `squared`, `huber` (linear beyond `scale`) or `cauchy` (logarithmic: a far outlier pulls less and less).
         scale: in standard deviations.
+
+    Raises: ValueError: another name, or a scale that is not positive.
     """
 
     name: Literal["squared", "huber", "cauchy"] = "squared"
@@ -42,7 +44,7 @@ class Loss:
         return Loss("huber", self.scale) if self.name == "cauchy" else self
 
     def value(self, norm: Array) -> Array:
-        """(n,) rho of norms (n,)."""
+        """(n,) rho, dimensionless, of whitened norms (n,)."""
         if self.name == "huber":
             return np.where(norm <= self.scale, 0.5 * norm**2, self.scale * (norm - 0.5 * self.scale))
         if self.name == "cauchy":
@@ -50,7 +52,11 @@ class Loss:
         return np.asarray(0.5 * norm**2)
 
     def of_square(self, square: Tensor) -> Tensor:
-        """(...) rho in torch as a function of the squared norm; twice differentiable at zero too."""
+        """Values rho in torch of squared norms, twice differentiable at zero too.
+
+        Args: square: (...) whitened, squared norms.
+        Returns: (...) dimensionless.
+        """
         if self.name == "huber":
             far = square > self.scale**2
             norm = torch.where(far, square, self.scale**2).sqrt()
@@ -60,7 +66,7 @@ class Loss:
         return 0.5 * square
 
     def weight(self, norm: Array) -> Array:
-        """(n,) factor on the squared residual in iteratively reweighted least squares: rho'(d) / d."""
+        """(n,) weights rho'(d) / d of squared residuals whose whitened norms are d (n,); dimensionless."""
         if self.name == "huber":
             return np.asarray(self.scale / np.maximum(norm, self.scale))
         if self.name == "cauchy":
@@ -68,9 +74,12 @@ class Loss:
         return np.ones_like(norm)
 
     def stretch(self, norm: Array) -> Array:
-        """(n,) curvature along the residual divided by that across it, rho''(d) d / rho'(d), at least `LEAST_STRETCH`.
+        """(n,) curvature along the residual over that across it, rho''(d) d / rho'(d), at least `LEAST_STRETCH`.
 
         Reweighting alone takes it for 1 and creeps up to a minimum at which some residuals are in the loss's tail.
+
+        Args: norm: (n,) whitened norms d.
+        Returns: (n,) dimensionless.
         """
         if self.name == "huber":
             ratio = (norm <= self.scale).astype(np.float64)
@@ -81,7 +90,7 @@ class Loss:
         return np.maximum(ratio, LEAST_STRETCH)
 
     def noise_model(self, dim: int) -> gtsam.noiseModel.Base:
-        """GTSAM's model of this loss on a residual that is whitened already."""
+        """GTSAM's model of this loss on a whitened residual of `dim` numbers."""
         unit = gtsam.noiseModel.Unit.Create(dim)
         if self.name == "squared":
             return unit

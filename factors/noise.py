@@ -27,10 +27,13 @@ class ProcessNoise:
         spin: rad/s/sqrt(s), density of the spin's random walk. Must be positive: the square-root information of a
             chain of exactly equal spins is singular to working precision.
         contact_velocity: m/s, standard deviation per axis of an impact's outgoing velocity.
-        contact_tangential: m/s, what its two components along the surface have on top: friction, which no track tells.
-        contact_spin: rad/s, the same of its spin.
+        contact_tangential: m/s, the same in addition for its two components along the surface: friction varies, and
+            no track tells it.
+        contact_spin: rad/s, the same for its spin.
         hit_velocity: m/s, of the velocity after a hit (racket, arm, net).
         hit_spin: rad/s, of the spin after a hit.
+
+    Raises: ValueError: a number that is not positive and finite; `contact_tangential` may be zero.
     """
 
     acceleration: float = 0.1
@@ -83,7 +86,7 @@ PROCESS_NOISE = tuple(field.name for field in fields(ProcessNoise))
 
 @dataclass(frozen=True)
 class Kicks:
-    """What happens to a ball within m intervals, as far as the process noise has to know.
+    """The contacts and hits of a ball within m intervals, which add to the process noise.
 
     Attributes:
         times: (m, c) s since the interval's start, of c contacts in each.

@@ -20,7 +20,9 @@ class PositionFactors(FactorBatch):
         states: (m,) indices of the observed states.
         measured: (m, 3) m.
         sigma: (m, 3) m, standard deviation per axis.
-        loss: a robust one where tracks carry outliers.
+        loss: a robust one where tracks have outliers.
+
+    Raises: ValueError: a wrong shape, a position that is not finite, or a sigma that is not positive.
     """
 
     row_arrays: ClassVar[tuple[str, ...]] = ("variables", "measured", "information_root", "_jacobian")

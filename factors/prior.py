@@ -19,9 +19,10 @@ class PriorFactors(FactorBatch):
     """r = W (x_i - mean_i), W (r, d): rows of W may look at a part of the variable only.
 
     Args:
-        variables: (m,) state indices, or `COEFFICIENTS`.
-        mean: (m, d).
-        information_root: (m, r, d) matrices W.
+        variables: (m,) index of each state, or `COEFFICIENTS`.
+        mean: (m, d) in the variable's own units.
+        information_root: (m, r, d) matrices W, one over the variable's own units.
+        loss: on the norm of a whitened residual.
     """
 
     row_arrays: ClassVar[tuple[str, ...]] = ("variables", "mean", "information_root")
@@ -45,7 +46,7 @@ class PriorFactors(FactorBatch):
 
 
 class SpinLabelFactors(PriorFactors):
-    """What labels say of some spins: a prior whose standard deviation can be learned."""
+    """Priors on spins from labels; their standard deviation can be learned."""
 
     def rewhitening(self, noise: Noise) -> Tensor | None:
         """One factor for all axes of all labels."""
@@ -61,8 +62,10 @@ class CoefficientPriorFactors(PriorFactors):
 
     Args:
         model: with the coefficients.
-        sigma: (p,) standard deviations.
-        others: how many coefficients that are not the model's follow its own; nothing is said of them here.
+        sigma: (p,) standard deviations, in the coefficients' own units.
+        others: number of unknowns of observations that follow the model's coefficients; these factors ignore them.
+
+    Raises: ValueError: if a sigma is not positive and finite.
     """
 
     def __init__(self, model: AugmentedModel, sigma: Array, others: int = 0) -> None:
@@ -85,18 +88,41 @@ class CoefficientPriorFactors(PriorFactors):
 
 
 def state_prior(state: int, mean: Array, sigma: Array) -> PriorFactors:
-    """Prior on one state: mean (9,) and standard deviations (9,)."""
+    """A prior on one state.
+
+    Args:
+        state: its index.
+        mean: (9,) m, m/s, rad/s.
+        sigma: (9,) m, m/s, rad/s, standard deviations.
+    Raises: ValueError: if a sigma is not positive and finite.
+    """
     _check_sigma(sigma)
     return PriorFactors(np.array([state]), mean[None], np.diag(1.0 / sigma)[None])
 
 
 def spin_prior(states: Index, spin: Array, sigma: Array, loss: Loss | None = None) -> PriorFactors:
-    """Priors on the spin of some states: spin (m, 3) and sigma (m, 3) rad/s."""
+    """Priors on the spin of some states.
+
+    Args:
+        states: (m,) index of each.
+        spin: (m, 3) rad/s, means.
+        sigma: (m, 3) rad/s, standard deviations.
+        loss: on the norm of a whitened residual.
+    Raises: ValueError: if a sigma is not positive and finite.
+    """
     return PriorFactors(states, *_about_spin(spin, sigma), loss)
 
 
 def spin_label(states: Index, spin: Array, sigma: Array, loss: Loss | None = None) -> SpinLabelFactors:
-    """The same from labels: spin (m, 3) and sigma (m, 3) rad/s."""
+    """Priors on the spin of some states from labels, whose standard deviation can be learned.
+
+    Args:
+        states: (m,) index of each.
+        spin: (m, 3) rad/s, means.
+        sigma: (m, 3) rad/s, standard deviations.
+        loss: on the norm of a whitened residual.
+    Raises: ValueError: if a sigma is not positive and finite.
+    """
     return SpinLabelFactors(states, *_about_spin(spin, sigma), loss)
 
 
@@ -111,7 +137,14 @@ def _about_spin(spin: Array, sigma: Array) -> tuple[Array, Array]:
 
 
 def coefficient_prior(mean: Array, sigma: Array, before: int = 0) -> PriorFactors:
-    """Prior on shared coefficients: mean (p,) and sigma (p,); of those after the first `before`, where it is not 0."""
+    """A prior on shared coefficients.
+
+    Args:
+        mean: (p,) in the coefficients' own units.
+        sigma: (p,) standard deviations, in the same units.
+        before: number of coefficients before these p, which the prior ignores.
+    Raises: ValueError: if a sigma is not positive and finite.
+    """
     _check_sigma(sigma)
     root = np.pad(np.diag(1.0 / sigma), ((0, 0), (before, 0)))
     return PriorFactors(np.array([COEFFICIENTS]), np.append(np.zeros(before), mean)[None], root[None])

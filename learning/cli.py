@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ballfg.cli.errors import guarded
-from ballfg.cli.inputs import default_jobs
+from ballfg.machine import usable_cores
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ def train(
     if isinstance(settings, CalibrationConfig):
         from ballfg.learning.calibration.run import run_calibration
 
-        run_calibration(settings, folder, resume=resume is not None, jobs=default_jobs(), watch=progress)
+        run_calibration(settings, folder, resume=resume is not None, jobs=usable_cores(), watch=progress)
     else:
         _train(settings, folder, resume is not None)
 
@@ -67,7 +67,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool) -> None:
     from ballfg.learning.run.ranks import started_by_launcher
     from ballfg.learning.run.run_folder import check
 
-    workers = config.workers or default_jobs()
+    workers = config.workers or usable_cores()
     if workers == 1 or started_by_launcher():
         _train_here(config, folder, resume)
         return

@@ -9,16 +9,17 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LEVELS = (
-    ("state", "checks", "progress", "registry"),
+    ("state", "checks", "progress", "registry", "machine"),
     ("files",),
     ("tracks",),
     ("vision",),
     ("dynamics",),
     ("simulation", "factors"),
-    ("estimation",),
     ("prediction",),
+    ("estimation",),
     ("learning",),
     ("diagnosis",),
+    ("front",),
     ("benchmarks", "cli"),
 )
 """Rooms from the first to the last; a module imports from its own room and from earlier levels only."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import OwnEffects, check_dataset, default_jobs, open_inputs
+from ballfg.cli.inputs import CORES, Jobs, OwnEffects, check_dataset, open_inputs
 
 if TYPE_CHECKING:
     from ballfg.diagnosis.result import Diagnosis
@@ -20,9 +20,9 @@ def diagnose(
         Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.", callback=check_dataset)
     ],
     out: Annotated[Path, typer.Option(help="Folder of the report: new, empty or with an earlier report.")],
-    model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal table-tennis model.")] = None,
+    model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal model of the ball.")] = None,
     effects: OwnEffects = None,
-    jobs: Annotated[int, typer.Option(min=1, help="Processes to use.", show_default="one per core")] = default_jobs(),
+    jobs: Jobs = CORES,
 ) -> None:
     """Find effects that the model lacks, with their evidence, their alternatives and the gain in prediction.
 

@@ -13,12 +13,14 @@ from typing import Any
 
 import typer
 
-from ballfg.cli.inputs import default_jobs
+from ballfg.machine import usable_cores
 from ballfg.registry import PACKAGE, Registry, source_of
 
 REGISTRIES = (
     ("effects", "ballfg.dynamics", "EFFECTS"),
+    ("observations", "ballfg.estimation", "OBSERVATIONS"),
     ("estimators", "ballfg.estimation", "ESTIMATORS"),
+    ("trainees", "ballfg.learning", "TRAINEES"),
 )
 """Title, module and attribute of each registry, in the order in which they are shown."""
 WIDTH = 110
@@ -26,7 +28,7 @@ WIDTH = 110
 
 
 def info() -> None:
-    """Show the installed versions, the machine, and every effect and estimator with the package it comes from.
+    """Show the installed versions, the machine, and what is registered, with the package it comes from.
 
     Example: ballfg info
     """
@@ -85,7 +87,7 @@ def _machine() -> Iterator[str]:
     memory = ""
     if hasattr(os, "sysconf"):
         memory = f", {os.sysconf('SC_PAGE_SIZE') * os.sysconf('SC_PHYS_PAGES') / 2**30:.1f} GiB memory"
-    yield f"{default_jobs()} cores{memory}"
+    yield f"{usable_cores()} cores{memory}"
     gpus = [torch.cuda.get_device_name(number) for number in range(torch.cuda.device_count())]
     yield f"GPU: {', '.join(gpus) or 'none'}"
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import enum
-import os
 import sys
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -12,6 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
 
 import typer
+
+from ballfg.machine import usable_cores
 
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel
@@ -23,11 +24,6 @@ if TYPE_CHECKING:
 
 MOST_DOUBTS = 3
 """Tracks whose doubts are printed, before the others are counted."""
-
-
-def default_jobs() -> int:
-    """One process per core that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 OwnEffects = Annotated[
@@ -45,7 +41,7 @@ MethodName = Annotated[
 ModelFile = Annotated[
     Path | None, typer.Option("--model", help="Model file; by default the nominal model of the ball.")
 ]
-CORES = default_jobs()
+CORES = usable_cores()
 Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Number of processes.", show_default="one per core")]
 OutTable = Annotated[Path, typer.Option("--out", help="Output table, .csv or .parquet.")]
 Seed = Annotated[int, typer.Option("--seed", help="Random seed.")]
@@ -118,13 +114,15 @@ def _inputs(data: Opened, model: Path | None) -> Inputs[Opened]:
     import torch
 
     from ballfg.dynamics import load_model, nominal_model, nominal_note
-    from ballfg.estimation import dataset_settings, dataset_surfaces
+    from ballfg.estimation import dataset_settings, dataset_surfaces, unused_model
 
     torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
-    guessed = nominal_note(data.info.ball) if model is None else None
-    for note in data.notes if guessed is None else [*data.notes, guessed]:
+    notes = list(data.notes)
+    if model is None:
+        notes += [note for note in (nominal_note(data.ball), *unused_model(data.path, data.ball)) if note]
+    for note in notes:
         print(f"note: {note}", file=sys.stderr)
-    ball = nominal_model(data.info.ball) if model is None else load_model(model, radius=data.info.ball.radius)
+    ball = nominal_model(data.ball) if model is None else load_model(model, radius=data.ball.radius)
     return Inputs(data, ball, dataset_surfaces(data), dataset_settings(data, ball))
 
 

@@ -282,3 +282,7 @@ class Diagnosis:
     residuals_before: Residuals
     residuals_after: Residuals
     excluded: tuple[str, ...] = field(default=())
+
+    def __repr__(self) -> str:
+        effects = ", ".join(finding.name for finding in self.findings) or "none"
+        return f"Diagnosis({self.dataset!r}, effects added: {effects};\n    {self.sentence})"

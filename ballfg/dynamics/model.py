@@ -3,6 +3,7 @@
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Final, TypeVar
 
 import torch
@@ -103,6 +104,12 @@ class BallModel(nn.Module, ABC):
         acceleration = self.rates(state)[0]
         slope = self.surface_slope(state)
         return acceleration[..., Z] if slope is None else acceleration[..., Z] - climb(slope, acceleration)
+
+    def save(self, path: str | Path) -> None:
+        """Write a model file, as `save_model`."""
+        from ballfg.dynamics.model_file import save_model
+
+        save_model(self, path)
 
     @property
     def measures_plainly(self) -> bool:

@@ -8,6 +8,7 @@ from .launcher import Launcher as Launcher
 from .observations.files import write_readings as write_readings
 from .observations.observation import Context as Context
 from .observations.observation import Observation as Observation
+from .observations.observation import Unknowns as Unknowns
 from .observations.reading import RadarSpeed as RadarSpeed
 from .observations.reading import Reading as Reading
 from .observations.reading import SpinReading as SpinReading
@@ -22,6 +23,7 @@ from .observations.sightings import sightings_of as sightings_of
 from .online.online import Online as Online
 from .reading import has_positions as has_positions
 from .reading import read as read
+from .reading import unused_model as unused_model
 from .reading import with_readings as with_readings
 from .registry import ESTIMATORS as ESTIMATORS
 from .registry import make_estimator as make_estimator

@@ -60,7 +60,7 @@ class Estimator(ABC):
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
         """The states of a track, one per stamp.
 
-        A track too short or too wild gives a status that says so.
+        A track that is too short, or that no motion explains, gives a status that says so.
 
         Args:
             track: stamps, positions, observations, labels.
@@ -71,7 +71,12 @@ class Estimator(ABC):
         """
 
     def prepared(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Track:
-        """The track with further factors among its observations, after a check of its units; errors as `estimate`."""
+        """The track with further factors among its observations, after a check of its units.
+
+        Raises:
+            TypeError: if track is not a `Track`.
+            ValueError: if its numbers cannot be metres and seconds, or a factor ties several states.
+        """
         if not hasattr(track, "observations"):
             raise TypeError(
                 f"track must be a Track; got {type(track).__name__}. Make one with Track(times, positions): (n,) s and "
@@ -82,5 +87,5 @@ class Estimator(ABC):
         return track.observed(*given(factors))
 
     def doubts(self, track: Track) -> tuple[str, ...]:
-        """What does not look like a ball above these surfaces, one sentence each; for `Estimate.notes`."""
+        """Signs that the track is no ball above these surfaces, one sentence each; for `Estimate.notes`."""
         return doubts_about(track.times, track.positions, self.surfaces.heights(), self.model.radius)

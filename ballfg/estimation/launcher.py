@@ -30,9 +30,11 @@ class Launcher:
     """Spin from the labels of a track.
 
     Attributes:
-        embedding: what the settings mean.
-        sigma: rad/s, standard deviation per axis of the spin that they tell.
+        embedding: from the settings to a spin.
+        sigma: rad/s, standard deviation per axis of that spin.
         defaults: labels that hold where a track has none, for instance `group` for a dataset that is one group.
+
+    Raises: ValueError: a sigma that is not positive and finite.
     """
 
     embedding: SpinEmbedding
@@ -56,14 +58,14 @@ class Launcher:
         return cls(SpinEmbedding(("topspin", "sidespin"), {}, rows), sigma)
 
     def settings(self, track: Track) -> NDArray[np.float64] | None:
-        """(k,) the settings of a shot; None where the track does not tell them, or has a spin label of its own."""
+        """(k,) settings of a shot, in the launcher's own units; None without them, or with a spin label."""
         if track.spin_label is not None:
             return None
         found = self.embedding.settings({**self.defaults, **track.labels})
         return None if found is None else found.numpy()
 
     def label(self, track: Track) -> SpinLabel | None:
-        """The spin that the settings and the first samples tell; None where they do not.
+        """The spin by the settings and the first samples; None for a track without settings.
 
         For estimators that need the spin before they know the velocity; the smoother estimates both together.
         """

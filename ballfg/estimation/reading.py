@@ -5,9 +5,11 @@ from __future__ import annotations
 from os import PathLike
 from pathlib import Path
 
+from ballfg.dynamics import model_to_dict, nominal_model
 from ballfg.estimation.observations.files import read_readings
 from ballfg.estimation.observations.sighted_dataset import SightedDataset, read_sighted
-from ballfg.tracks import Dataset, read_dataset
+from ballfg.files.strict_yaml import read_mapping
+from ballfg.tracks import Ball, Dataset, read_dataset
 from ballfg.tracks.dataset import TRACK_FILES
 from ballfg.tracks.detections_file import DETECTIONS_FILE
 
@@ -31,17 +33,28 @@ def read(folder: str | PathLike[str]) -> Dataset | SightedDataset:
         FileNotFoundError: the folder or one of its files is missing.
         ValueError: the content breaks a rule; the message names file, line, column and remedy.
     """
-    if not has_positions(folder):
-        return read_sighted(folder)
-    return with_readings(read_dataset(folder))
+    dataset = with_readings(read_dataset(folder)) if has_positions(folder) else read_sighted(folder)
+    dataset.notes = [*dataset.notes, *unused_model(folder, dataset.ball)]
+    return dataset
 
 
 def with_readings(dataset: Dataset) -> Dataset:
     """The dataset whose tracks come with the readings that lie in its folder."""
     readings = read_readings(dataset.path, dataset.names)
-    notes = list(readings.notes)
-    if (dataset.path / MODEL_FILE).is_file():
-        notes.append(
-            f"{dataset.path / MODEL_FILE} lies beside the tracks and is not used. Name it as the model to use it."
-        )
-    return dataset.with_readings(readings.attached, notes) if readings.rows or notes else dataset
+    return dataset.with_readings(readings.attached, readings.notes) if readings.rows else dataset
+
+
+def unused_model(folder: str | PathLike[str], ball: Ball) -> tuple[str, ...]:
+    """A note on a model file beside the tracks that differs from the nominal model of the ball; none otherwise.
+
+    Args: folder: of the dataset.  ball: of the dataset.
+    """
+    path = Path(folder) / MODEL_FILE
+    if not path.is_file():
+        return ()
+    try:
+        if read_mapping(path) == model_to_dict(nominal_model(ball)):
+            return ()
+    except ValueError:
+        pass  # a file that cannot be read is another model too; reading fails where somebody gives it as the model
+    return (f"{path} lies beside the tracks and is not used. Give it as the model to use it.",)

@@ -19,7 +19,10 @@ from ballfg.tracks import Track
 
 @dataclass(frozen=True)
 class Settings:
-    """Noise and priors, the same for all estimators, so that a comparison compares the estimators."""
+    """Noise and priors, the same for all estimators, so that a comparison compares the estimators.
+
+    Raises: ValueError: a standard deviation that is not positive and finite.
+    """
 
     position_noise: tuple[float, float, float] = (0.0015, 0.0015, 0.0015)
     """m, standard deviation of a measured x, y, z, where a track does not bring its own."""
@@ -95,7 +98,7 @@ class Settings:
         return cls(**(usual | changes))
 
     def spin_label(self, track: Track) -> SpinLabel | None:
-        """What is known of a track's first spin: its label, else what its launcher settings say, else None."""
+        """The spin label of a track: its own, else that of its launcher settings, else None."""
         if track.spin_label is not None:
             return SpinLabel(track.spin_label, self.spin_label_noise)
         return None if self.launcher is None else self.launcher.label(track)

@@ -50,6 +50,9 @@ class TrackPrediction:
     measured: Array
     estimate: Estimate
 
+    def __repr__(self) -> str:
+        return f"TrackPrediction({self.name!r}, {len(self.times)} positions, {self.status.name.lower()})"
+
     @property
     def status(self) -> Status:
         """How the estimation of the observed part ended."""
@@ -68,7 +71,7 @@ def predict_tracks(
     """Predictions in the order of the tracks.
 
     Args:
-        estimator: from what it sees of a track comes the belief that is propagated.
+        estimator: estimates the observed part of each track.
         tracks: a stream; some tens at a time are in memory.
         count: how many there are, about.
         observe: s from the track's first stamp; a stamp at its end is observed. A function gives each track its own.
@@ -86,7 +89,11 @@ def predict_tracks(
 
 
 def check_observe(observe: float) -> None:
-    """Raises ValueError if `observe` (s) is not positive."""
+    """Checks the length of the observed part.
+
+    Args: observe: s.
+    Raises: ValueError: if it is not positive.
+    """
     if not observe > 0.0:
         raise ValueError(
             f"observe must be a positive number of seconds; got {observe:g}. A quarter of a second is 0.25."

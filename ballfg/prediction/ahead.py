@@ -32,7 +32,7 @@ class Ahead:
         horizon: s, how far ahead events are looked for.
         times: (k,) s, on the clock of the start.
         states: (k, 9) position m, velocity m/s, spin rad/s.
-        covariances: (k, 9, 9) in the products of those units; no measurement noise in them.
+        covariances: (k, 9, 9) in the products of those units; without measurement noise.
     """
 
     start: BallState
@@ -53,7 +53,7 @@ class Ahead:
 
     @property
     def sigmas(self) -> Array:
-        """(k, 3) m, standard deviations of the positions; no measurement noise in them."""
+        """(k, 3) m, standard deviations of the positions; without measurement noise."""
         return np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2)[:, POSITION])
 
     @cached_property
@@ -96,7 +96,11 @@ class Ahead:
 
 
 def look_ahead(start: BallState, horizon: float, step: float = 0.01) -> Ahead:
-    """The path of a ball from a state on; arguments and errors as those of `BallState.predict`."""
+    """The path of a ball from a state on.
+
+    Args: start: a state with its model.  horizon: s.  step: s between the times of the path.
+    Raises: ValueError: a horizon or step that is not positive, or a state without a model.
+    """
     if not (np.isfinite(horizon) and horizon > 0.0 and np.isfinite(step) and step > 0.0):
         raise ValueError(f"horizon and step must be positive numbers of seconds; got {horizon!r} and {step!r}")
     propagator, belief = carried_by(start)
@@ -107,7 +111,10 @@ def look_ahead(start: BallState, horizon: float, step: float = 0.01) -> Ahead:
 
 
 def carried_by(start: BallState) -> tuple[Propagator, Belief]:
-    """What carries a state forward, and the state as a belief."""
+    """The propagator of a state's model and surfaces, and the state as a belief.
+
+    Raises: ValueError: a state without a model.
+    """
     if start.world is None:
         raise ValueError("a state must know its model to be predicted; this one does not. Give it one with state.on.")
     return Propagator(start.world.surfaces, start.world.process), Belief.of(start.world.model, [start])

@@ -20,13 +20,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Belief:
-    """What is known of n balls, each at its own time.
+    """Gaussian states and coefficients of n balls, each ball at its own time.
 
     Attributes:
         model: the ball; an `AugmentedModel` where coefficients are uncertain.
         time: (n,) s.
-        mean: (n, 9 + p) states, then coefficients.
-        covariance: (n, 9 + p, 9 + p).
+        mean: (n, 9 + p) states, then coefficients in their own units.
+        covariance: (n, 9 + p, 9 + p) in the products of those units.
     """
 
     model: BallModel
@@ -38,7 +38,7 @@ class Belief:
     def of(
         cls, model: BallModel, states: Sequence[BallState], coefficients: Mapping[str, float] | None = None
     ) -> Belief:
-        """The beliefs that some states are, estimated with the same model.
+        """The belief of some states that were estimated with the same model.
 
         A coefficient estimated beyond what its effect accepts (a restitution above 1, say) is held at the bound, and
         the state is what is most probable with it there.
@@ -46,10 +46,10 @@ class Belief:
         Args:
             model: the ball.
             states: n of them.
-            coefficients: prior standard deviations by parameter name, as in `Settings.coefficients`. A state that
-                knows nothing of one of them (the sliding window's, a failed filter's) has the model's value with this
-                spread. None: the coefficients that the states have, the same in all.
-        Raises: ValueError: if there is no state, or states have coefficients that are not asked for.
+            coefficients: prior standard deviations by parameter name, as in `Settings.coefficients`. A state without
+                one of them (of the sliding window, of a filter that failed) gets the model's value with this standard
+                deviation. None: the coefficients of the states, the same in all.
+        Raises: ValueError: if there is no state, or states have coefficients that are not among these.
         """
         if not states:
             raise ValueError("states must hold at least one; got none")

@@ -47,7 +47,7 @@ class Crossing:
     Attributes:
         time: s, on the ball's clock.  time_sigma: s.
         state: (9,) at the event.
-        covariance: (9, 9) of the state at the event, whenever it happens.
+        covariance: (9, 9) of the state at the event, at the event's own uncertain time.
     """
 
     time: float
@@ -69,6 +69,7 @@ def apex(propagator: Propagator, belief: Belief, horizon: float = 3.0, *, after:
 
     Args: as for `next_crossing`; for the apex that follows the next contact give that one's time as `after`.
     Returns: None if there is none within the horizon. A resting ball has none.
+    Raises: ValueError: as `next_crossing`.
     """
     return next_crossing(propagator, belief, _vertical_speed, horizon, after=after)
 
@@ -80,6 +81,7 @@ def next_contact(
 
     Args: as for `next_crossing`; for the second contact give the first one's time as `after`.
     Returns: None if there is none within the horizon. A ball that rests or rolls has none until it falls.
+    Raises: ValueError: as `next_crossing`.
     """
     start, end = _span(belief, horizon)
     model, earliest = belief.model, max(start, after) + JUST_NOW
@@ -109,10 +111,10 @@ def plane_crossing(
 
     Args:
         propagator, belief, horizon, after: as for `next_crossing`.
-        normal: (3,) of the plane, of any length but zero.
+        normal: (3,) dimensionless, of the plane, of any length but zero.
         offset: m, in units of the normal's length.
     Returns: None if the ball does not get there within the horizon. A ball that starts on the plane has crossed it.
-    Raises: ValueError: for another normal or offset.
+    Raises: ValueError: a normal that is zero or not three finite numbers, or as `next_crossing`.
     """
     direction = torch.as_tensor(normal, dtype=torch.float64)
     if direction.shape != (3,) or not bool(direction.isfinite().all()) or not bool(direction.any()):
@@ -144,11 +146,11 @@ def next_crossing(
     after: float = -math.inf,
     either_way: bool = False,
 ) -> Crossing | None:
-    """The first time at which an event's value falls through zero, after however many bounces.
+    """The first time at which an event's value falls through zero, after any number of bounces.
 
     Args:
         propagator: surfaces and noise.  belief: one ball.
-        event: see `EventFunction`; continuous in the state. Where a bounce makes it jump through zero is no crossing.
+        event: see `EventFunction`; continuous in the state. A jump through zero in a bounce is no crossing.
         horizon: s from the belief's time.
         after: s on the ball's clock; only later events count. An event at the belief's own time is past.
         either_way: take a rise through zero as well.

@@ -32,8 +32,8 @@ class Prediction:
 
     Attributes:
         times: (n, k) s, on each track's clock.
-        states: (n, k, 9).
-        covariances: (n, k, 9, 9) of the states; no measurement noise in it.
+        states: (n, k, 9) position m, velocity m/s, spin rad/s.
+        covariances: (n, k, 9, 9) of the states, in the products of those units; without measurement noise.
     """
 
     times: Array
@@ -71,7 +71,10 @@ class Propagator:
         return Prediction(stamps.numpy().copy(), np.stack(states, axis=1), np.stack(covariances, axis=1))
 
     def walk(self, belief: Belief, times: Tensor) -> Iterator[Belief]:
-        """The beliefs at given times (n, k) s, one after the other; errors as for `rollout`."""
+        """The beliefs at given times (n, k) s, one after the other.
+
+        Raises: ValueError: as `rollout`.
+        """
         if times.dim() != 2 or len(times) != len(belief) or times.shape[1] == 0:
             raise ValueError(f"times must have shape ({len(belief)}, k) with k >= 1; got {tuple(times.shape)}")
         steps = torch.diff(times, dim=-1, prepend=belief.time[:, None])

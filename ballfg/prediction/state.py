@@ -56,12 +56,12 @@ class BallState:
 
     def __repr__(self) -> str:
         rows = (("position", POSITION, 3, "m", 1e3, "mm"), ("velocity", VELOCITY, 2, "m/s", 1e2, "cm/s"))
-        parts = [f"t = {self.time:.4f} s"]
+        parts = []
         for label, part, digits, unit, scale, small in (*rows, ("spin", SPIN, 0, "rad/s", 1.0, "rad/s")):
             numbers = ", ".join(f"{x:.{digits}f}" for x in self.mean[part])
             spread = ", ".join(f"{scale * x:.3g}" for x in self.sigmas[part])
             parts.append(f"{label} ({numbers}) {unit} +- ({spread}) {small}")
-        return f"{type(self).__name__}(" + ",\n    ".join(parts) + ")"
+        return f"{type(self).__name__}(t = {self.time:.4f} s, " + ",\n    ".join(parts) + ")"
 
     @property
     def state(self) -> Array:

@@ -148,7 +148,7 @@ def check_scale(
     misses_rate = rate is not None and not 1 / MAX_RATE_RATIO <= step * rate <= MAX_RATE_RATIO
     low, high = positions.min(axis=0), positions.max(axis=0)
     farthest = float(max(high.max(), -low.min()))
-    extent = float(np.linalg.norm(high - low))
+    extent = float(np.hypot.reduce(high - low))
     if extent > MAX_EXTENT:
         raise ValueError(
             f"{label}: x, y, z must be in m, and a track at most {MAX_EXTENT:g} m long; got {extent:.4g}. "

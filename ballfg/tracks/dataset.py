@@ -19,7 +19,23 @@ from ballfg.tracks.track import FloatArray, Label, Track
 TRACK_FILES = ("tracks.csv", "tracks.parquet")
 
 
-class Dataset:
+class TrackFolder:
+    """What every dataset tells of its ball and table."""
+
+    info: DatasetInfo
+
+    @property
+    def ball(self) -> Ball:
+        """The ball that `dataset.yaml` states."""
+        return self.info.ball
+
+    @property
+    def table(self) -> float:
+        """m, height of the table's surface."""
+        return self.info.table_height
+
+
+class Dataset(TrackFolder):
     """The tracks of a folder; made by `read_dataset`.
 
     Iterating streams the file, so that one track at a time is in memory; each `for` loop starts again at the first.
@@ -72,16 +88,6 @@ class Dataset:
     def __getitem__(self, name: str) -> Track:
         """One track by its name, as `track` gives it."""
         return self.track(name)
-
-    @property
-    def ball(self) -> Ball:
-        """The ball that `dataset.yaml` states."""
-        return self.info.ball
-
-    @property
-    def table(self) -> float:
-        """m, height of the table's surface."""
-        return self.info.table_height
 
     def with_readings(self, attached: Callable[[Track], Track], notes: Sequence[str] = ()) -> Dataset:
         """The dataset whose tracks come with further observations.

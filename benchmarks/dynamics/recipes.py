@@ -7,7 +7,7 @@ factor graph have a recipe of their own, which was found on the shots to learn f
 from typing import Any, Final
 
 from ballfg.benchmarks.estimators.measured import HORIZON
-from ballfg.learning.kinds import NETWORKS, SEQUENCES
+from ballfg.learning.registry import NETWORKS, SEQUENCES
 
 RESIDUAL: Final = "analytic+mnn"
 """The method in which a network corrects the nominal model."""

@@ -16,7 +16,7 @@ from ballfg.dynamics import BallModel, load_model
 from ballfg.estimation import Settings
 from ballfg.estimation.configure import launcher_of, learned_process
 from ballfg.learning.config.training import TrainConfig
-from ballfg.learning.kinds import SEQUENCES
+from ballfg.learning.registry import SEQUENCES
 from ballfg.learning.run.metrics import read_metrics
 from ballfg.learning.run.run_folder import METRICS, MODEL
 from ballfg.learning.run.training import run_training

@@ -13,7 +13,15 @@ from numpy.typing import NDArray
 from ballfg.benchmarks.gaussian_settings import StepNoise, gaussian_settings
 from ballfg.benchmarks.metrics import Array
 from ballfg.dynamics import BallModel, Surfaces, contact_time, nominal_model, rollout
-from ballfg.estimation import Estimator, ExtendedKalmanFilter, Online, Settings, SlidingWindow, Smoother
+from ballfg.estimation import (
+    ESTIMATORS,
+    Estimator,
+    ExtendedKalmanFilter,
+    Online,
+    Settings,
+    SlidingWindow,
+    Smoother,
+)
 from ballfg.factors.noise import ProcessNoise
 from ballfg.progress import progress
 from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, simulate, table_tennis
@@ -110,8 +118,15 @@ def paper_protocol(count: int, seed: int) -> Protocol:
         "ekf": Candidate(ExtendedKalmanFilter(*given, initialise="window"), newest="pass"),
         "ekf-no-window": Candidate(ExtendedKalmanFilter(*given), newest="pass"),
         "smoother": Candidate(Smoother(*given)),
+        **others(*given),
     }
     return Protocol("paper", settings, tracks, candidates, surfaces)
+
+
+def others(model: BallModel, surfaces: Surfaces, settings: Settings) -> dict[str, Candidate]:
+    """The registered estimators of the user and of other packages, by name; none unless such a package is installed."""
+    own = (SlidingWindow, ExtendedKalmanFilter, Online, Smoother)
+    return {name: Candidate(sort(model, surfaces, settings)) for name, sort in ESTIMATORS.items() if sort not in own}
 
 
 def _free_flights(model: BallModel, surfaces: Surfaces, count: int, rng: np.random.Generator) -> list[Case]:
@@ -164,6 +179,7 @@ def fair_protocol(count: int, seed: int, name: str = "fair") -> Protocol:
         "ekf+rts": Candidate(ExtendedKalmanFilter(*given, smooth=True), newest="none"),
         "online": Candidate(Online(*given)),
         "smoother": Candidate(Smoother(*given)),
+        **others(*given),
     }
     return Protocol(name, settings, tracks, candidates, kind.surfaces)
 

@@ -9,10 +9,8 @@ import matplotlib.pyplot as plt
 import numpy as np
 import torch
 
-from ballfg.dynamics import nominal_model
-from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation import Smoother
-from ballfg.estimation import predict_tracks
+from ballfg.dynamics import Surfaces, nominal_model
+from ballfg.estimation import Settings, Smoother, predict_tracks
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
 
 OBSERVED = 0.25  # s

@@ -6,7 +6,6 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
-import ballfg.learning.kinds  # noqa: F401 - registers the kinds of the package
 from ballfg.learning.registry import TRAINEES
 
 Positive = Annotated[float, Field(gt=0.0)]

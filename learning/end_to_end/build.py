@@ -13,7 +13,7 @@ from ballfg.learning.end_to_end.first_spins import begin_with_tracks
 from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
 from ballfg.learning.end_to_end.pretrain import Anchor, pretrain
 from ballfg.learning.gradient.implicit import GaussNewtonGradient, GradientMethod, ImplicitGradient, UnrolledGradient
-from ballfg.learning.kinds import NETWORKS
+from ballfg.learning.registry import NETWORKS
 from ballfg.learning.trainee import Prepared
 from ballfg.learning.training_data import read_training_data
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import platform
 from collections.abc import Mapping
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +11,7 @@ import yaml
 
 from ballfg.files.whole_file import write_text
 from ballfg.learning.config.config_file import Config, read_config
+from ballfg.machine import versions
 
 CONFIG, VERSIONS, MODEL = "config.yaml", "versions.json", "model.yaml"
 STEPS, REPORT, PICTURE = "checkpoint.json", "report.json", "calibration.png"
@@ -73,8 +72,7 @@ def start(folder: Path, config: Config) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     text = yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False, allow_unicode=True)
     write_text(folder / CONFIG, text)
-    versions = {"python": platform.python_version()} | {name: metadata.version(name) for name in PACKAGES}
-    write_json(folder / VERSIONS, versions)
+    write_json(folder / VERSIONS, versions(PACKAGES))
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -12,7 +12,6 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 import pytest
 
-from ballfg.cli.estimate import Method
 from ballfg.cli.main import run
 from ballfg.estimation import ESTIMATORS
 from ballfg.simulation import SimulationConfig, write_simulation
@@ -53,7 +52,8 @@ def test_one_row_of_finite_numbers_for_each_stamp(
     out = tmp_path / "states.csv"
     assert status("estimate", dataset, "--method", method, "--out", out) == 0
     said = capsys.readouterr()
-    assert said.err == ""
+    notes = [line for line in said.err.splitlines() if not line.endswith("tracks estimated")]  # progress may show
+    assert notes == []
     assert said.out.startswith(f"{out}: ")
     assert f"states of 4 tracks by {method}" in said.out
     assert "  4 tracks: converged\n" in said.out
@@ -175,7 +175,7 @@ def test_bad_model_files(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFi
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--method", "kalman"], "'kalman' is not one of 'smoother', 'online', 'ekf', 'sliding-window'"),
+        (["--method", "kalman"], "method must be one of smoother, online, ekf, sliding-window; got 'kalman'"),
         (["--jobs", "0"], "'--jobs'"),
         (["--model", "none.yaml"], "none.yaml does not exist"),
         (["--bogus"], "--bogus"),
@@ -255,6 +255,8 @@ assert not loaded, loaded
     assert done.returncode == 0, done.stderr
 
 
-def test_methods_are_the_estimators() -> None:
+def test_help_names_the_estimators(capsys: pytest.CaptureFixture[str]) -> None:
     """The option names them without importing them, so that --help stays quick."""
-    assert {method.value for method in Method} == set(ESTIMATORS)
+    assert status("estimate", "--help") == 0
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in ESTIMATORS)

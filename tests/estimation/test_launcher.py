@@ -208,7 +208,7 @@ def test_topspin_turns_the_top_of_the_ball_forward() -> None:
 
 
 def test_levels_give_the_spin_of_the_simulated_launcher() -> None:
-    simulated = simulate_module.Launcher()
+    simulated = simulate_module.SimulatedLauncher()
     levels = Launcher.of_levels(simulated.topspin_scale, simulated.sidespin_scale, 4.0)
     for made in simulate_module.simulate(simulate_module.SimulationConfig(tracks=12, seed=2, spin_labels=False)):
         labelled = levels.labelled(made.track)

@@ -166,9 +166,9 @@ def test_beliefs_refuse_what_does_not_fit(tracks):
     windowed, smoothed = (estimator(m, settings).estimate(tracks[0]) for m in ("sliding-window", "smoother"))
     with pytest.raises(ValueError, match="at least one"):
         Belief.of(nominal_model(), [])
-    with pytest.raises(ValueError, match="estimates must share their coefficients; track '0'"):
+    with pytest.raises(ValueError, match="states must share their coefficients; that of track '0'"):
         Belief.of(nominal_model(), [smoothed.last, windowed.last])
-    with pytest.raises(ValueError, match="estimates must share their coefficients; track '0'"):
+    with pytest.raises(ValueError, match="states must share their coefficients; that of track '0'"):
         Belief.of(nominal_model(), [smoothed.last], {})
 
 

@@ -48,16 +48,20 @@ def statements(body: list[ast.stmt]) -> Iterator[ast.stmt]:
 
 
 def definition(source: Source, name: str) -> ast.stmt | None:
-    """The function or class of this name at the top of a module."""
+    """The function or class of this name at the top of a module; of an overloaded function, its implementation."""
     for statement in statements(source.tree.body):
-        if isinstance(statement, DEFINITION | ast.ClassDef) and statement.name == name:
+        if isinstance(statement, DEFINITION | ast.ClassDef) and statement.name == name and not _overload(statement):
             return statement
     return None
 
 
+def _overload(node: DEFINITION | ast.ClassDef) -> bool:
+    return any(isinstance(mark, ast.Name) and mark.id == "overload" for mark in node.decorator_list)
+
+
 def methods(node: ast.ClassDef) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
     """The methods in a class's own body."""
-    yield from (s for s in statements(node.body) if isinstance(s, DEFINITION))
+    yield from (s for s in statements(node.body) if isinstance(s, DEFINITION) and not _overload(s))
 
 
 def parsed(annotation: ast.expr | None) -> ast.expr | None:

@@ -23,7 +23,7 @@ from ballfg.estimation.filters.rts import FilterRecord, fly_back, rts_smooth
 from ballfg.estimation.filters.sliding_window import SlidingWindow, first_pair
 from ballfg.estimation.filters.window_velocity import WINDOW
 from ballfg.estimation.observations.innovation import leave_position_out
-from ballfg.estimation.observations.observation import Context
+from ballfg.estimation.observations.observation import Context, refuse_unknowns
 from ballfg.estimation.result import Array, Estimate, Status
 from ballfg.estimation.segmentation import Contact, Quality
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start
@@ -228,7 +228,9 @@ class _Run:
         self.means = coefficient_means(owner.model, owner.settings)
         self.skipped: set[int] = set()
         context = Context(track, owner.model, owner.settings, self.sigma)
-        self.beside = [(one, one.batch(context)) for one in track.observations if not one.locates]
+        beside = [one for one in track.observations if not one.locates]
+        refuse_unknowns(beside, owner.settings, owner.name)
+        self.beside = [(one, one.batch(context)) for one in beside]
         self.innovations = {one.name: np.full((len(batch), batch.dim), np.nan) for one, batch in self.beside}
         self.record = FilterRecord.empty(len(track), STATE_DIM + len(self.means))
         with np.errstate(over="ignore", invalid="ignore"):  # ends in Status.FAILED
@@ -291,6 +293,7 @@ class _Run:
         record.quality[:first] = Quality.OUTLIER
         self.skipped.update(range(first + 1, second))
         ball = _BallFilter(owner.ball, owner.surfaces, mean, covariance)
+        self._correct_beside(ball, start)
         self._store(ball, start, used=True)
         return ball
 
@@ -353,11 +356,18 @@ class _Run:
         return used
 
     def _correct_beside(self, ball: _BallFilter, k: int) -> None:
-        """Update with everything else that was measured at sample k."""
+        """Update with everything else that was measured at sample k.
+
+        At the first sample the velocity is still unknown: a speed, of which no tangent tells anything there, is left
+        out with an innovation of NaN.
+        """
+        begins = k == self.record.start
         for observation, batch in self.beside:
             for row in observation.filter_rows(batch, k):
                 one = batch.taken(np.array([row]))
-                self.innovations[observation.name][row] = ball.correct_by(one, self.settings.find_events)
+                whitened = ball.correct_by(one, self.settings.find_events or begins)
+                if not begins or whitened @ whitened <= chi2.isf(GATE_CHANCE, batch.dim):
+                    self.innovations[observation.name][row] = whitened
 
     def _store(self, ball: _BallFilter, k: int, used: bool) -> None:
         self.record.mean[k] = ball.x

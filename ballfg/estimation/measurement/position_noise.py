@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from ballfg.tracks import Track
 
@@ -32,7 +32,7 @@ MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal variable divided by the median of its absolute value."""
 
 
-def estimate_position_noise(tracks: Iterable[Track | tuple[ArrayLike, ArrayLike]]) -> FloatArray:
+def estimate_position_noise(tracks: Iterable[Track]) -> FloatArray:
     """The standard deviation of each coordinate, for data that states none.
 
     A cubic is fitted to each window of 11 samples, the middle one left out, and predicts that one. The residuals,
@@ -42,14 +42,13 @@ def estimate_position_noise(tracks: Iterable[Track | tuple[ArrayLike, ArrayLike]
     Noise with a memory longer than the window (calibration, a shifted tracker) is not seen; stamp jitter is, along
     the flight.
 
-    Args: tracks: tracks, or pairs of times (n,) s, increasing, and positions (n, 3) m; read until there is enough.
+    Args: tracks: read until there is enough.
     Returns: (3,) m, at least `FLOOR`; `FALLBACK` where every track is shorter than a window.
     """
     blocks: list[FloatArray] = []
     count = 0
     for track in tracks:
-        times, positions = (track.times, track.positions) if isinstance(track, Track) else track
-        block = _window_residuals(np.asarray(times, dtype=np.float64), np.asarray(positions, dtype=np.float64))
+        block = _window_residuals(track.times, track.positions)
         blocks.append(block)
         count += len(block)
         if count >= ENOUGH:

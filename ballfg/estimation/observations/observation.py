@@ -7,7 +7,7 @@ Estimators know this interface only. A sort of measurement of one's own is a sub
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, ClassVar, Self
 
@@ -31,7 +31,7 @@ Index = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Unknowns:
-    """What an observation adds to the unknowns of a track: the time offset of a camera, for instance.
+    """Unknowns that an observation adds to those of a track: the time offset of a camera, for instance.
 
     Attributes:
         names: of q unknowns, different from those of other observations.
@@ -48,7 +48,7 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Context:
-    """What an observation is told when it makes its factors.
+    """All that an observation needs to make its factors.
 
     Attributes:
         track: that it belongs to.
@@ -70,8 +70,8 @@ class Observation(ABC):
 
     Attributes:
         name: of the sort; a track holds one observation of a name.
-        state: (m,) index of the sample of the track that each of the m measurements tells of, ascending.
-        locates: whether it tells where the ball is. The positions of such a track were made from it.
+        state: (m,) index of the sample of the track that each of the m measurements belongs to, ascending.
+        locates: whether it measures where the ball is. The positions of such a track were made from it.
         file: name of its table in the folder of a dataset; None where it has no table of its own.
         columns: of that table, beside `trajectory`, `t` (s) and `sigma`.
     """
@@ -115,7 +115,7 @@ class Observation(ABC):
         )
 
     def unknowns(self, settings: Settings) -> Unknowns:
-        """What the observation adds to the unknowns of the track; nothing by default.
+        """The unknowns that the observation adds to those of the track; none by default.
 
         Raises: ValueError: if the settings ask for unknowns that the observation does not have.
         """
@@ -165,7 +165,7 @@ class Observation(ABC):
         raise ValueError(f"the observation '{self.name}' has no table of its own: {type(self).__name__}.file is None")
 
     def filter_rows(self, batch: FactorBatch, sample: int) -> Index:
-        """(k,) rows of the batch that a filter updates with at a sample; none where positions stand for them."""
+        """(k,) index of the rows of the batch that a filter updates with at a sample; none where positions stand in."""
         return np.zeros(0, dtype=np.int64) if self.locates else np.flatnonzero(self.state == sample)
 
     def single_rows(self, batch: FactorBatch) -> Iterator[tuple[int, FactorBatch]]:
@@ -185,3 +185,17 @@ def unknowns_of(observations: tuple[Observation, ...], settings: Settings) -> Un
         np.concatenate([np.zeros(0), *(one.sigmas for one in found)]),
         np.concatenate([np.zeros(0), *(one.origins for one in found)]),
     )
+
+
+def refuse_unknowns(observations: Iterable[Observation], settings: Settings, estimator: str) -> None:
+    """Refuses observations whose unknowns an estimator does not estimate.
+
+    Raises: ValueError: if one of them has unknowns.
+    """
+    for observation in observations:
+        names = observation.unknowns(settings).names
+        if names:
+            raise ValueError(
+                f"observations of the estimator '{estimator}' must have no unknowns; '{observation.name}' has "
+                f"{', '.join(names)}. Use the smoother."
+            )

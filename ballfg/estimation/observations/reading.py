@@ -74,8 +74,12 @@ class Reading(Observation):
     def at(cls, track: Track, times: ArrayLike, values: ArrayLike, sigma: ArrayLike) -> Self:
         """Readings at times of their own, each with the nearest sample of the track.
 
-        Args: track: with its stamps.  times: (m,) s.  values: (m, dim).  sigma: as for the class.
-        Raises: ValueError: a reading that is farther than `FARTHEST` from every sample.
+        Args:
+            track: with its stamps.
+            times: (m,) s, in any order.
+            values: (m, dim), or (m,) where dim is 1, in the units of the columns.
+            sigma: as for the class.
+        Raises: ValueError: a reading that is farther than `FARTHEST` from every sample, or as for the class.
         """
         when = np.asarray(times, dtype=np.float64)
         order = np.argsort(when, kind="stable")
@@ -113,7 +117,12 @@ class Reading(Observation):
         return ReadingFactors(self, context.model)
 
     def table(self, track: Track) -> Mapping[str, Array]:
-        """Columns of the file, in order, without the trajectory: t (m,) s, the values (m,) and sigma (m,)."""
+        """Columns of the file, in order, without the trajectory: t (m,) s, the values (m,) and sigma (m,).
+
+        Raises: ValueError: if the values of one reading have different sigmas, for which the table has no place.
+        """
+        if (self.sigma != self.sigma[:, :1]).any():
+            raise ValueError(f"sigma of '{self.name}' must be one number a reading in a table; got several.")
         values = dict(zip(self.columns, self.values.T, strict=True))
         return {"t": track.times[self.state] + self.delay, **values, "sigma": self.sigma[:, 0]}
 
@@ -150,9 +159,14 @@ class SpinReading(Reading):
         """(..., 3) rad/s."""
         return state[..., SPIN]
 
-    def turned(self, rotation: Tensor, shift: Tensor) -> SpinReading:
-        """The spins turn along."""
-        return SpinReading(self.state, self.values @ rotation.numpy().T, self.sigma, self.delay)
+    def turned(self, rotation: Tensor, shift: Tensor) -> Self:
+        """The spins turn along.
+
+        Raises: ValueError: if sigma differs between x and y.
+        """
+        if (self.sigma[:, 0] != self.sigma[:, 1]).any():
+            raise ValueError("sigma of 'spin' must be the same along x and y for a turned track. Give one number each.")
+        return type(self)(self.state, self.values @ rotation.numpy().T, self.sigma, self.delay)
 
 
 class ReadingFactors(FactorBatch):

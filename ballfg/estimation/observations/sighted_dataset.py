@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Final
 
 from ballfg.estimation.observations.sightings import NeverSeenByTwoError, sighted_track
+from ballfg.tracks.dataset import TrackFolder
 from ballfg.tracks.detections_file import DETECTIONS_FILE, read_sightings
-from ballfg.tracks.info import INFO_FILE, Ball, DatasetInfo, read_info
+from ballfg.tracks.info import INFO_FILE, DatasetInfo, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.track import Track
@@ -18,7 +19,7 @@ from ballfg.vision.camera import Camera
 from ballfg.vision.camera_file import CAMERAS_FILE, read_cameras
 
 
-class SightedDataset:
+class SightedDataset(TrackFolder):
     """The tracks of a folder as cameras saw them; made by `read_sighted`. A table of tracks need not be there.
 
     Attributes:
@@ -71,16 +72,6 @@ class SightedDataset:
                 f"name must be one of the {len(self)} trajectories of {self.path}; got {name!r}. See names."
             )
         return self._tracks[name]
-
-    @property
-    def ball(self) -> Ball:
-        """The ball that `dataset.yaml` states."""
-        return self.info.ball
-
-    @property
-    def table(self) -> float:
-        """m, height of the table's surface."""
-        return self.info.table_height
 
     @property
     def names(self) -> list[str]:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
-from ballfg.estimation.observations.observation import Context, Observation
+from ballfg.estimation.observations.observation import Context, Observation, refuse_unknowns
 from ballfg.estimation.online.events import SIGMA_FACTOR, EventTracker, contact_step, first_difference
 from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unknown
 from ballfg.estimation.online.isam import Sample, Update
@@ -69,13 +69,15 @@ class Online(Estimator):
     which ends by minimising over the window to a tight tolerance.
 
     Args:
-        model: the ball.  surfaces: what it may bounce on.
+        model: the ball.  surfaces: that it may bounce on.
         settings: noise and priors; time offsets of cameras are not estimated here, see `estimate_time_offsets`.
         lag: the window is cut to this many states whenever it holds twice as many.
         cameras: that sightings come from.
 
     Attributes:
         window: the samples, states and factors that are held; None before the first observation.
+
+    Raises: ValueError: a lag below 2, time offsets in the settings, or as `Estimator`.
     """
 
     name = "online"
@@ -118,7 +120,7 @@ class Online(Estimator):
         sigma: ArrayLike | None = None,
         observations: Sequence[Observation] = (),
     ) -> OnlineState:
-        """Take in a measured position, and what else was measured at that time.
+        """Take in a measured position, and other measurements of that time.
 
         Args:
             time: s, later than the last.
@@ -336,6 +338,7 @@ class Online(Estimator):
 
     def _measurements(self, track: Track) -> dict[str, list[tuple[int, Measurement]]]:
         """What was measured beside positions, by name of the observation: each with the number of its sample."""
+        refuse_unknowns(track.observations, self.settings, self.name)
         context = Context(track, self.model, self.settings, sample_sigmas(self.settings, len(track), track.sigmas))
         found = {}
         for observation in track.observations:

@@ -75,7 +75,7 @@ def effective_sigmas(track: Track, segmentation: Segmentation, settings: Setting
 
 
 class TrackProblem:
-    """What is to be minimised for one track: made once, solved for whatever events are tried.
+    """The minimisation of one track: made once, solved for all arrangements of events that are tried.
 
     Args:
         track: stamps, positions, observations, labels.
@@ -89,7 +89,7 @@ class TrackProblem:
         observations: of the track, positions among them.
         unknowns: that the observations add; they follow the coefficients of the ball.
         observed: the factors of each observation, by its name.
-        added: further factors, for whoever likes to add some before the problem is solved.
+        added: further factors, empty; append to it before the problem is solved.
 
     Raises: ValueError: if the settings ask an observation for unknowns that it does not have.
     """
@@ -139,7 +139,7 @@ class TrackProblem:
         return Values(states, np.append(means, np.zeros(len(self.unknowns.names))))
 
     def innovations(self, values: Values, covariances: Covariances | None) -> dict[str, Array]:
-        """Whitened innovations at a minimum, by name of the observation; NaN without covariances."""
+        """Innovations (m, dim) whitened, at a minimum, by name of the observation; NaN without covariances."""
         if covariances is None:
             return {name: np.full((len(batch), batch.dim), np.nan) for name, batch in self.observed.items()}
         return {

@@ -3,8 +3,7 @@ import pytest
 
 from ballfg.benchmarks.estimators.measured import WHOLE, Measured, _add_smoothing, prediction_rmse
 from ballfg.benchmarks.results import Results
-from ballfg.estimation import Estimate, Status
-from ballfg.prediction import TrackPrediction
+from ballfg.estimation import Estimate, Status, TrackPrediction
 
 
 def test_prediction_rmse_by_hand() -> None:
@@ -26,7 +25,7 @@ def test_innovations_next_to_a_hit_do_not_count_and_marked_ones_count_as_failure
         np.zeros((6, 9)),
         np.tile(np.eye(9), (6, 1, 1)),
         Status.OK,
-        whitened,
+        {"position": whitened},
         hits=np.array([2]),
         quality=quality,
     )

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 from scipy.stats import chi2
 
+from ballfg.dynamics import nominal_model
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.effects.flight import Gravity
-from ballfg.dynamics.model_file import nominal_model
 from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.dynamics.surfaces import Surfaces
@@ -22,7 +24,7 @@ from ballfg.estimation.settings import Settings
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, STATE_DIM, VELOCITY
-from ballfg.tracks import Track, read_dataset
+from ballfg.tracks import SPIN_LABELS, Track, read_dataset
 from tests.places import DATA
 
 LOW = Surfaces(table_height=-100.0)
@@ -405,11 +407,18 @@ def test_coefficients_are_learnt_on_the_way(rng):
     assert abs(float(result.coefficients[0]) - 0.85) < 3 * sigma
 
 
-def test_numbers_out_of_this_world_fail_with_a_status(flight):
+def test_numbers_out_of_this_world_are_refused(flight):
     _, track = flight
-    result = run(with_positions(track, track.positions * 1e170))
+    with pytest.raises(ValueError, match="x, y, z must be in m"):
+        run(with_positions(track, track.positions * 1e170))
+
+
+def test_a_filter_that_overflows_fails_with_a_status(flight):
+    """A label of that spin leaves no number in the first step."""
+    _, track = flight
+    result = run(replace(track, labels=dict.fromkeys(SPIN_LABELS, 1e200)))
     assert result.status is Status.FAILED
-    np.testing.assert_array_equal(result.states[:, POSITION], track.positions * 1e170)
+    np.testing.assert_array_equal(result.states[:, POSITION], track.positions)
 
 
 def test_unknown_start_is_refused():

@@ -18,7 +18,7 @@ from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
-from ballfg.simulation.config import ProcessNoise as TrueNoise
+from ballfg.simulation import MotionNoise as TrueNoise
 from ballfg.tracks import Track
 from tests.estimation.observations.sighted_rig import NOISE, RIG, Scene, World, scene, seen, track_of, world
 

@@ -18,7 +18,7 @@ from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
-from ballfg.simulation.config import ProcessNoise as TrueNoise
+from ballfg.simulation import MotionNoise as TrueNoise
 
 TRACKS = 60
 CONFIG = SimulationConfig(

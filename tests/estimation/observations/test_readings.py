@@ -1,0 +1,244 @@
+"""Radar speeds and spins: factors, and all estimators against dense least squares, each other and known statistics."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import chi2
+
+from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model
+from ballfg.estimation import Context, ExtendedKalmanFilter, Online, RadarSpeed, Smoother, SpinReading
+from ballfg.estimation.observations.reading import FARTHEST, Reading
+from ballfg.factors.batch import Values
+from ballfg.factors.check import check_factor
+from ballfg.factors.graph import LevenbergMarquardt
+from ballfg.tracks import Track
+from tests.estimation.observations.flights import (
+    NOISE,
+    NOWHERE,
+    PLAIN,
+    SPEED_SIGMA,
+    PlainSpeed,
+    PlainSpin,
+    dense,
+    flight,
+    gravity_model,
+    with_speeds,
+    without,
+)
+
+METHODS = (Smoother, Online, ExtendedKalmanFilter)
+DELAYS = (None, (0.004, 0.0, -0.003))
+
+
+def reading(sort: type[Reading], delay: tuple[float, ...] | None) -> Reading:
+    values = np.random.default_rng(1).normal(5.0, 1.0, (3, len(sort.columns)))
+    return sort([0, 1, 1], values, [0.1, 0.2, 0.3], delay)
+
+
+def context_of(track: Track, model: AnalyticModel | None = None) -> Context:
+    return Context(track, model or nominal_model(), PLAIN, np.full((len(track), 3), 0.002))
+
+
+# --- factors
+
+
+@pytest.mark.parametrize("delay", DELAYS)
+@pytest.mark.parametrize("sort", [RadarSpeed, SpinReading])
+def test_jacobians_and_the_residual_in_torch(sort: type[Reading], delay: tuple[float, ...] | None) -> None:
+    track, truth, _ = flight(0, 2)
+    batch = reading(sort, delay).batch(context_of(track))
+    check_factor(batch, Values(truth, np.zeros(0)))
+    inputs = truth[batch.variables[:, 0]]
+    expected, (jacobian,) = batch.compute(slice(None), (inputs,))
+    states = torch.from_numpy(inputs).requires_grad_(True)
+    residual = batch.residual((states,))
+    np.testing.assert_allclose(residual.detach().numpy(), expected, rtol=1e-14)
+    for column in range(batch.dim):
+        (slope,) = torch.autograd.grad(residual[:, column].sum(), states, retain_graph=True)
+        np.testing.assert_allclose(slope.numpy(), jacobian[:, column], rtol=1e-9, atol=1e-12)
+
+
+def test_a_ball_at_rest_has_a_speed_and_no_direction() -> None:
+    batch = RadarSpeed([0], [2.0], 0.5).batch(context_of(flight(0, 1)[0]))
+    residual, (jacobian,) = batch.compute(slice(None), (np.zeros((1, 9)),))
+    np.testing.assert_allclose(residual, [[-4.0]], atol=1e-5)
+    assert not jacobian.any()
+
+
+def test_delays_carry_the_state_in_free_flight() -> None:
+    """Under gravity the vertical velocity falls by g times the delay."""
+    track, truth, _ = flight(0, 2)
+    delay = 0.004
+    batch = RadarSpeed([1], [0.0], 1.0, [delay]).batch(context_of(track, gravity_model()))
+    velocity = truth[1, 3:6] - [0.0, 0.0, 9.81 * delay]
+    np.testing.assert_allclose(batch.linearize(Values(truth, np.zeros(0))).residual, [[np.linalg.norm(velocity)]])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (([0], [[1.0, 2.0]], 0.1), r"values of 'speed' must have shape \(1, 1\); got \(1, 2\)"),
+        (([0], [np.nan], 0.1), "values of 'speed' must be finite"),
+        (([0], [5.0], 0.0), "sigma of 'speed' must be positive and finite"),
+        (([1, 0], [5.0, 5.0], 0.1), "state of 'speed' must ascend"),
+    ],
+)
+def test_readings_that_make_no_sense_are_refused(arguments: tuple[object, ...], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        RadarSpeed(*arguments)
+
+
+def test_readings_find_their_sample() -> None:
+    track = Track(np.array([1.0, 1.01, 1.02]), np.arange(9.0).reshape(3, 3))
+    found = RadarSpeed.at(track, [1.021, 1.004, 0.999], [3.0, 2.0, 1.0], [0.3, 0.2, 0.1])
+    np.testing.assert_array_equal(found.state, [0, 0, 2])
+    np.testing.assert_allclose(found.delay, [-0.001, 0.004, 0.001], atol=1e-12)
+    np.testing.assert_array_equal(found.values[:, 0], [1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(found.sigma[:, 0], [0.1, 0.2, 0.3])
+    with pytest.raises(ValueError, match=f"must lie within {FARTHEST:g} s of a sample; the one at t=1.08 s is 0.06 s"):
+        RadarSpeed.at(track, [1.08], [3.0], 0.1)
+
+
+def test_a_part_of_a_track_keeps_the_right_readings() -> None:
+    track = with_speeds(3, every=3)
+    (speeds,) = track.observations
+    part = track.between(float(track.times[5]), float(track.times[12]))
+    (kept,) = part.observations
+    inside = (speeds.state >= 5) & (speeds.state <= 12)
+    np.testing.assert_array_equal(kept.state, speeds.state[inside] - 5)
+    np.testing.assert_array_equal(kept.values, speeds.values[inside])
+    np.testing.assert_array_equal(part.times[kept.state], track.times[speeds.state[inside]])
+
+
+# --- estimates
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.003])
+def test_the_smoother_is_dense_least_squares(delay: float) -> None:
+    """1e-5 of a standard deviation: where the minimisation ends, the covariances are those at the minimum."""
+    track = with_speeds(5, every=2, delay=delay)
+    estimate = Smoother(gravity_model(), NOWHERE, PLAIN).estimate(track)
+    states, covariances, _ = dense(track)
+    sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    assert np.abs((estimate.states - states) / sigma).max() < 1e-5
+    np.testing.assert_allclose(estimate.sigmas, sigma, rtol=1e-5)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.003])
+def test_all_estimators_agree_at_the_newest_sample_and_know_the_speed_better(delay: float) -> None:
+    """0.05 of a standard deviation: filter and window linearise a speed where the ball was then thought to be."""
+    for seed in range(4):
+        track = with_speeds(seed, every=2, delay=delay)
+        found = {sort.name: sort(gravity_model(), NOWHERE, PLAIN).estimate(track) for sort in METHODS}
+        smoother = found["smoother"]
+        for estimate in found.values():
+            assert np.abs((estimate.states[-1] - smoother.states[-1]) / smoother.sigmas[-1]).max() < 0.05
+            np.testing.assert_allclose(estimate.sigmas[-1], smoother.sigmas[-1], rtol=0.01)
+        for sort in METHODS:
+            alone = sort(gravity_model(), NOWHERE, PLAIN).estimate(without(track))
+            assert speed_sigma(found[sort.name]) < 0.5 * speed_sigma(alone)
+
+
+def speed_sigma(estimate) -> float:
+    direction = estimate.states[-1, 3:6] / np.linalg.norm(estimate.states[-1, 3:6])
+    return float(np.sqrt(direction @ estimate.covariances[-1, 3:6, 3:6] @ direction))
+
+
+@pytest.mark.parametrize("sort", METHODS)
+def test_innovations_of_speeds_are_standard_normal(sort: type) -> None:
+    """The filters' are independent of each other; of the smoother's, one of each track is taken."""
+    found = []
+    for seed in range(60):
+        speeds = sort(gravity_model(), NOWHERE, PLAIN).estimate(with_speeds(seed, every=4)).innovations["speed"]
+        assert speeds.shape == (5, 1)
+        found.append(speeds[2:3] if sort is Smoother else speeds[1:])
+    whitened = np.concatenate(found).ravel()
+    low, high = chi2.ppf([0.005, 0.995], len(whitened))
+    assert low < (whitened**2).sum() < high
+    assert abs(whitened.mean()) < 2.6 / np.sqrt(len(whitened))
+
+
+@pytest.mark.parametrize("sort", METHODS)
+@pytest.mark.parametrize("sample", [0, 12])
+def test_a_spin_reading_combines_with_the_prior(sort: type, sample: int) -> None:
+    """Under gravity alone nothing else tells the spin: prior, random walk and reading make two Gaussians."""
+    track, truth, _ = flight(2)
+    read = truth[sample, 6:] + [4.0, -3.0, 2.0]
+    sigma = np.array([5.0, 10.0, 20.0])
+    seen = track.observed(PlainSpin([sample], read[None], sigma[None]))
+    estimate = sort(gravity_model(), NOWHERE, PLAIN).estimate(seen)
+    prior = PLAIN.spin_prior**2
+    if (
+        sort is not ExtendedKalmanFilter
+    ):  # the graph keeps a wide prior beside, should a robust loss let go of the other
+        prior = 1 / (1 / prior + 1 / 2000.0**2)
+    prior += NOISE.spin**2 * (track.times[sample] - track.times[0])
+    posterior = 1 / (1 / prior + 1 / sigma**2)
+    np.testing.assert_allclose(estimate.states[sample, 6:], posterior * read / sigma**2, rtol=1e-6)
+    np.testing.assert_allclose(estimate.sigmas[sample, 6:], np.sqrt(posterior), rtol=1e-6)
+    later = posterior + NOISE.spin**2 * (track.times[-1] - track.times[sample])
+    np.testing.assert_allclose(estimate.sigmas[-1, 6:], np.sqrt(later), rtol=1e-6)
+
+
+def test_the_filter_leaves_out_a_speed_before_it_knows_a_velocity() -> None:
+    track, truth, _ = flight(2)
+    speeds = PlainSpeed([0, 5], np.linalg.norm(truth[[0, 5], 3:6], axis=1), SPEED_SIGMA)
+    estimate = ExtendedKalmanFilter(gravity_model(), NOWHERE, PLAIN).estimate(track.observed(speeds))
+    assert np.isnan(estimate.innovations["speed"]).tolist() == [[True], [False]]
+    assert np.abs((estimate.states[-1] - truth[-1]) / estimate.sigmas[-1]).max() < 4.0
+
+
+def test_pushed_readings_are_those_of_the_track() -> None:
+    track = with_speeds(7, every=3)
+    (speeds,) = track.observations
+    online = Online(gravity_model(), NOWHERE, PLAIN)
+    for k, (time, position) in enumerate(zip(track.times, track.positions, strict=True)):
+        rows = np.flatnonzero(speeds.state == k)
+        beside = [PlainSpeed(0, speeds.values[row], SPEED_SIGMA) for row in rows]
+        state = online.push(float(time), position, observations=beside)
+    estimate = Smoother(gravity_model(), NOWHERE, PLAIN).estimate(track)
+    assert np.abs((state.state - estimate.states[-1]) / estimate.sigmas[-1]).max() < 0.05
+    np.testing.assert_allclose(state.sigmas, estimate.sigmas[-1], rtol=0.01)
+
+
+# --- another frame
+
+
+def turn(angle: float) -> torch.Tensor:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return torch.tensor([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]], dtype=torch.float64)
+
+
+def test_turned_tracks_have_turned_estimates() -> None:
+    """The same ball with drag and Magnus force, speeds and a spin, seen from elsewhere."""
+    rotation, shift = turn(0.7), torch.tensor([0.3, -0.2, 0.0], dtype=torch.float64)
+    track, truth, _ = flight(4)
+    low = Surfaces(0.2)
+    track = Track(track.times, track.positions - [0.0, 0.0, 0.75], name="low").observed(
+        PlainSpeed([3, 9], np.linalg.norm(truth[[3, 9], 3:6], axis=1), SPEED_SIGMA, [0.002, 0.0]),
+        PlainSpin([6], truth[6:7, 6:], 15.0),
+    )
+    matrix = rotation.numpy()
+    turned = Track(track.times, track.positions @ matrix.T + shift.numpy(), name="turned")
+    turned = turned.observed(*(one.turned(rotation, shift) for one in track.observations))
+    tight = LevenbergMarquardt(tolerance=1e-11, max_iterations=100)
+    one, other = (Smoother(nominal_model(), low, PLAIN, tight).estimate(t) for t in (track, turned))
+    expected = np.hstack((one.states[:, :3] @ matrix.T + shift.numpy(), one.states[:, 3:6] @ matrix.T))
+    assert np.abs((other.states[:, :6] - expected) / one.sigmas[:, :6]).max() < 1e-5
+    assert np.abs((other.states[:, 6:] - one.states[:, 6:] @ matrix.T) / one.sigmas[:, 6:]).max() < 1e-5
+
+
+def test_what_cannot_be_turned_says_so() -> None:
+    with pytest.raises(ValueError, match="sigma of 'spin' must be the same along x and y"):
+        SpinReading([0], [[1.0, 2.0, 3.0]], [[1.0, 2.0, 3.0]]).turned(turn(1.0), torch.zeros(3))
+
+    class Altitude(Reading):
+        name, file, columns = "altitude", None, ("z",)
+
+        def predicted(self, state: torch.Tensor) -> torch.Tensor:
+            return state[..., 2:3]
+
+    with pytest.raises(ValueError, match=r"the observation 'altitude' cannot be turned.*write Altitude.turned"):
+        Altitude([0], [1.0], 0.1).turned(turn(1.0), torch.zeros(3))
