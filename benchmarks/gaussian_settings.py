@@ -1,7 +1,5 @@
 """Settings for Gaussian noise of known size, and process noise that is the same at every step."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Figures from errors and outcomes: root mean squares, NEES, coverage, shares, quantiles, and their intervals."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

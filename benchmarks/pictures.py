@@ -1,7 +1,5 @@
 """Helpers that the pictures of all benchmarks share."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The rows of numbers that a benchmark hands over, as `results.json` and as a table on the terminal."""
 
-from __future__ import annotations
-
 import json
 import math
 import platform

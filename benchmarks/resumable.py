@@ -1,7 +1,5 @@
 """Long runs that go on where they were stopped: records of finished parts, and processes for the missing ones."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path

@@ -5,6 +5,7 @@ from .effect import Effect as Effect
 from .effect import Flight as Flight
 from .effect import FlightEffect as FlightEffect
 from .effect import Impact as Impact
+from .effect import Scene as Scene
 from .effect import length as length
 from .effect import vector as vector
 from .effects.registry import EFFECTS as EFFECTS
@@ -30,6 +31,5 @@ from .networks.learned import build as build
 from .networks.spin_embedding import SpinEmbedding as SpinEmbedding
 from .nominal import nominal_model as nominal_model
 from .nominal import nominal_note as nominal_note
-from .scene import Scene as Scene
 from .surfaces import Surfaces as Surfaces
 from .trained import Trained as Trained

@@ -1,7 +1,6 @@
 """The analytic model: a ball whose motion and measurement are a sum of named physical effects."""
 
-from __future__ import annotations
-
+import functools
 from collections.abc import Iterable, Iterator
 from typing import cast
 
@@ -11,8 +10,7 @@ from torch import Tensor, nn
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact, per_row
 from ballfg.dynamics.measurement import Later, MeasurementEffect
 from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
-from ballfg.dynamics.motion.impact import apply_impulse
-from ballfg.dynamics.motion.tilted import from_plane, to_plane
+from ballfg.dynamics.motion.impact import apply_impulse, from_plane, to_plane
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 _ONE, _ZERO = torch.tensor(1.0, dtype=torch.float64), torch.tensor(0.0, dtype=torch.float64)
@@ -58,33 +56,17 @@ class AnalyticModel(BallModel):
         """Acceleration (..., 3) m/s^2 and angular acceleration (..., 3) rad/s^2, or None, in free flight."""
         flight = Flight(state, self.radius)
         if self._moving_air:
-            flight = self._against_air(flight)
+            wind = _sum(cast(FlightEffect, self.flight[name]).air_velocity(flight) for name in self._moving_air)
+            flight = flight if wind is None else flight.against(wind)
         for name in self._adjusting:
             flight = cast(FlightEffect, self.flight[name]).adjust(flight)
-        acceleration: Tensor | None = None
-        for effect in cast("Iterable[FlightEffect]", self.flight.values()):
-            a = effect.acceleration(flight)
-            if a is not None:
-                acceleration = a if acceleration is None else acceleration + a
-        spin_rate: Tensor | None = None
-        for name in self._turning:
-            w = cast(FlightEffect, self.flight[name]).spin_rate(flight)
-            if w is not None:
-                spin_rate = w if spin_rate is None else spin_rate + w
+        acceleration = _sum(cast(FlightEffect, effect).acceleration(flight) for effect in self.flight.values())
+        spin_rate = _sum(cast(FlightEffect, self.flight[name]).spin_rate(flight) for name in self._turning)
         if acceleration is None:
             return torch.zeros_like(flight.velocity), spin_rate
         if acceleration.shape != flight.velocity.shape:  # gravity alone is one vector for all
             acceleration = acceleration.expand_as(flight.velocity)
         return acceleration, spin_rate
-
-    def _against_air(self, flight: Flight) -> Flight:
-        """The flight as the moving air sees it."""
-        winds = [cast(FlightEffect, self.flight[name]).air_velocity(flight) for name in self._moving_air]
-        total: Tensor | None = None
-        for wind in winds:
-            if wind is not None:
-                total = wind if total is None else total + wind
-        return flight if total is None else flight.against(total)
 
     def bounce(self, state: Tensor) -> Tensor:
         """(..., 9) state just after an impact on a surface, from the state (..., 9) before it."""
@@ -106,11 +88,7 @@ class AnalyticModel(BallModel):
         A ball that touches a slope does so beside its lowest point: its centre is R sqrt(1 + slope^2) above the slope.
         """
         position = state[..., POSITION]
-        total: Tensor | None = None
-        for module in self.contact.values():
-            offset = cast(BounceEffect, module).surface_offset(position)
-            if offset is not None:
-                total = offset if total is None else total + offset
+        total = _sum(cast(BounceEffect, effect).surface_offset(position) for effect in self.contact.values())
         if total is None:
             return 0.0
         slope = self.surface_slope(state)
@@ -120,12 +98,8 @@ class AnalyticModel(BallModel):
 
     def surface_slope(self, state: Tensor) -> Tensor | None:
         """(2,) or (..., 2) dimensionless slope of the surfaces along x and y under the ball; None: horizontal."""
-        total: Tensor | None = None
-        for name in self._sloping:
-            slope = cast(BounceEffect, self.contact[name]).surface_slope(state[..., POSITION])
-            if slope is not None:
-                total = slope if total is None else total + slope
-        return total
+        position = state[..., POSITION]
+        return _sum(cast(BounceEffect, self.contact[name]).surface_slope(position) for name in self._sloping)
 
     @property
     def measures_plainly(self) -> bool:
@@ -192,6 +166,12 @@ def after_needs(effects: Iterable[Effect]) -> list[Effect]:
 def _rank(effect: Effect) -> tuple[int, str]:
     """What sorts measurement effects; the order of all others stays."""
     return (effect.rank, effect.name) if isinstance(effect, MeasurementEffect) else (0, "")
+
+
+def _sum(terms: Iterable[Tensor | None]) -> Tensor | None:
+    """The sum of the terms that there are, in their order; None where there is none."""
+    given = [term for term in terms if term is not None]
+    return functools.reduce(torch.add, given) if given else None
 
 
 def _overriding(group: nn.ModuleDict, base: type[Effect], method: str) -> tuple[str, ...]:

@@ -4,8 +4,6 @@ Augmented states are (..., 9 + p): the state, then p coefficients that do not ch
 written for a `BallModel` (flight, contacts, rollouts, their Jacobians) works on them unchanged.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import torch

@@ -11,12 +11,11 @@ from __future__ import annotations
 from abc import ABC
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
-from ballfg.dynamics.scene import Scene
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 
@@ -64,6 +63,27 @@ def per_row(value: Tensor) -> Tensor:
 
 
 Kind = Literal["flight", "bounce", "measurement"]
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Extent of the data that a set of tracks spans; effects say in which shapes they may act there.
+
+    Attributes:
+        low, high, middle: m, of the positions; the middle is the median.
+        speed: m/s, median over samples.
+        impact_speed: m/s, median normal speed of impacts; NaN without contacts.
+        contacts, labels: how many contacts and spin labels there are.
+    """
+
+    low: Vector
+    high: Vector
+    middle: Vector
+    speed: float
+    impact_speed: float
+    contacts: int
+    labels: int
 
 
 class Flight:
@@ -198,6 +218,11 @@ class Effect(nn.Module, ABC):
                     f"{self.name}.{c.name} must lie in [{c.low:g}, {c.high:g}] {c.unit}; got {value:g}. Check its unit."
                 )
             self.register_parameter(c.name, nn.Parameter(torch.tensor(value, dtype=torch.float64)))
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Tensor:
+            """The value of a coefficient: () or (..., 1)."""
 
     def values(self) -> dict[str, float]:
         """The values of the coefficients by name, each in its own unit."""

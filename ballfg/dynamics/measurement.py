@@ -1,7 +1,5 @@
 """What a measurement effect is: what is written down differs from what happened, the ball's motion stays as it is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import ClassVar
 

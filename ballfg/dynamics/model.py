@@ -1,7 +1,5 @@
 """The contract that every model of a ball keeps, analytic or learned: how it flies, bounces and rolls."""
 
-from __future__ import annotations
-
 import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Model files: which effects a model declares, with the values of their coefficients, and what is learned, as YAML."""
 
-from __future__ import annotations
-
 import difflib
 from collections.abc import Mapping
 from pathlib import Path
@@ -108,16 +106,10 @@ def _nearest(name: object, known: tuple[str, ...]) -> str:
 
 def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
     """What a model file says about this model's effects."""
-
-    def section(group: Mapping[str, object]) -> dict[str, dict[str, float]]:
-        return {name: cast(Effect, effect).values() for name, effect in group.items()}
-
-    return {
-        "flight": section(dict(model.flight.items())),
-        "bounce": section(dict(model.contact.items())),
-        "measurement": section(dict(model.measurement.items())),
-        "learned": None,
-    }
+    content: dict[str, Any] = {}
+    for kind, group in zip(KINDS, (model.flight, model.contact, model.measurement), strict=True):
+        content[kind] = {name: cast(Effect, effect).values() for name, effect in group.items()}
+    return content | {"learned": None}
 
 
 def save_model(model: BallModel, path: str | Path) -> None:

@@ -1,7 +1,5 @@
 """The nominal model of a ball: that of a known ball, else one that is guessed from radius and mass."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from importlib import resources

@@ -1,7 +1,5 @@
 """What training found out beside a model's own parameters: the noise, and what launcher settings mean."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

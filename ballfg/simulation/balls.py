@@ -1,14 +1,12 @@
 """Balls that can be launched: what they are, how they move, and on what they bounce."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 from ballfg.checks import check_number
-from ballfg.dynamics import AnalyticModel, Surfaces, model_from_dict, model_to_dict, nominal_model
+from ballfg.dynamics import AnalyticModel, Surfaces, model_from_dict, nominal_model
 from ballfg.dynamics.model import THIN_SHELL
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR
 from ballfg.files.strict_yaml import read_yaml
@@ -99,7 +97,9 @@ def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:
         inertia_factor=check_number("inertia_factor", content.get("inertia_factor", THIN_SHELL)),
         where="ball",
     )
-    surface = _surface(content.get("surface", "table"))
+    surface = content.get("surface", "table")
+    if surface not in ("table", "court"):
+        raise ValueError(f"surface must be 'table' or 'court'; got {surface!r}. Choose one of them.")
     launcher = TABLE_LAUNCHER if surface == "table" else TENNIS_LAUNCHER
     return BallKind(
         str(content.get("name", default_name)),
@@ -108,12 +108,6 @@ def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:
         TABLE if surface == "table" else COURT,
         launcher.with_fields(content.get("launcher", {})),
     )
-
-
-def _surface(value: Any) -> Literal["table", "court"]:
-    if value not in ("table", "court"):
-        raise ValueError(f"surface must be 'table' or 'court'; got {value!r}. Choose one of them.")
-    return "table" if value == "table" else "court"
 
 
 def with_model(kind: BallKind, model: AnalyticModel) -> BallKind:
@@ -126,13 +120,4 @@ def with_model(kind: BallKind, model: AnalyticModel) -> BallKind:
             f"model must have the ball's radius {kind.ball.radius:g} m; got {model.radius:g} m. "
             "Load it with radius=ball.radius."
         )
-    return BallKind(kind.name, kind.ball, model, kind.surfaces, kind.launcher)
-
-
-def describe(kind: BallKind) -> dict[str, Any]:
-    """What the truth file says about a ball: radius m, mass kg, inertia factor and the declared model."""
-    return {
-        "ball": {"name": kind.name, "radius": kind.ball.radius, "mass": kind.ball.mass},
-        "inertia_factor": kind.model.inertia_factor,
-        "model": model_to_dict(kind.model),
-    }
+    return replace(kind, model=model)

@@ -1,7 +1,5 @@
 """Fields of configurations that are numbers within bounds, each bound stated where the field is."""
 
-from __future__ import annotations
-
 from dataclasses import field, fields
 from typing import Any
 

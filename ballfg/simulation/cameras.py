@@ -1,7 +1,5 @@
 """A rig of cameras over a table-tennis table, for synthetic scenes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final
 

@@ -1,7 +1,5 @@
 """The true ball: the declared model with the undeclared effects, and kicks at contacts."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import cast
 

@@ -1,7 +1,5 @@
 """The configuration of a simulation: number of tracks, ball, noise, and undeclared effects."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 

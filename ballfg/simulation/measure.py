@@ -1,7 +1,5 @@
 """From the true motion to what is measured: stamps, positions and labels with noise, dropped frames, outliers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,7 +52,7 @@ def measure(
     noise, shape = config.noise, motion.states.shape[:2]
     frames = np.arange(shape[1])
     exists = frames < motion.lengths[:, None]
-    kept = exists & _kept_frames(noise, config.seed, block, motion.lengths, shape)
+    kept = exists & _kept_frames(noise, config.seed, block, exists)
     true_times = frames / config.rate
     jitter = noise.jitter * cut_normal(generator(config.seed, Purpose.JITTER, block), shape)
     stamps = model.stamps(torch.from_numpy(true_times)).numpy() + jitter
@@ -74,13 +72,10 @@ def measure(
     return tracks
 
 
-def _kept_frames(
-    noise: MeasurementNoise, seed: int, block: int, lengths: NDArray[np.int64], shape: tuple[int, ...]
-) -> NDArray[np.bool_]:
+def _kept_frames(noise: MeasurementNoise, seed: int, block: int, exists: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """(n, k) bool: the frame was not dropped. The luckiest frames of a track stay, however many are dropped."""
-    luck = generator(seed, Purpose.DROPOUT, block).random(shape)
+    luck = generator(seed, Purpose.DROPOUT, block).random(exists.shape)
     kept = luck >= noise.dropout
-    exists = np.arange(shape[1]) < lengths[:, None]
     order = np.argsort(np.where(exists, -luck, 1.0), axis=1)
     np.put_along_axis(kept, order[:, :LEAST_SAMPLES], True, axis=1)
     return kept

@@ -1,7 +1,5 @@
 """The true motion of a block of shots: frame by frame, through contacts, with process noise."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The launcher's integer settings: which combinations there are, and in which order they are shot."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import Final

@@ -4,8 +4,6 @@ Separate streams keep what is not changed the same: with the same seed, a simula
 measurement noise of the one without.
 """
 
-from __future__ import annotations
-
 from enum import IntEnum
 
 import numpy as np

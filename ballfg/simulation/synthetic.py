@@ -1,7 +1,5 @@
 """Synthetic tracks, one after the other: launch, fly, measure, in blocks of bounded size."""
 
-from __future__ import annotations
-
 import itertools
 from collections.abc import Iterator
 
@@ -31,7 +29,6 @@ def simulate(config: SimulationConfig) -> Iterator[SimulatedTrack]:
 
 
 def _block(config: SimulationConfig, model: AnalyticModel, block: int, first: int) -> list[SimulatedTrack]:
-    """The tracks of one block."""
     kind, seed = config.ball, config.seed
     count = min(config.block, config.tracks - first)
     settings = settings_of_shots(config.combinations(), first, count, seed)

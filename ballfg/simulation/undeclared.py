@@ -3,12 +3,11 @@
 Those three test whether a diagnosis reports an unexplained part where the catalogue lacks the explanation.
 """
 
-from __future__ import annotations
-
 import difflib
 import math
-from collections.abc import Iterable, Iterator, Mapping
-from typing import Final
+from collections import ChainMap
+from collections.abc import Iterable, Mapping
+from typing import Final, cast
 
 import torch
 from torch import Tensor
@@ -35,11 +34,6 @@ class Pull(FlightEffect):
         Coefficient("z", 1.5, 0.5, "m", -100.0, 100.0, absent=None),
         Coefficient("soft", 0.3, 0.1, "m", 0.01, 100.0, absent=None),
     )
-    strength: Tensor
-    x: Tensor
-    y: Tensor
-    z: Tensor
-    soft: Tensor
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2 toward the place; zero in it."""
@@ -61,8 +55,6 @@ class ThickAir(FlightEffect):
         Coefficient("start_x", 0.0, 0.5, "m", -100.0, 100.0, absent=None),
     )
     needs = ("drag",)
-    growth: Tensor
-    start_x: Tensor
 
     def adjust(self, flight: Flight) -> Flight:
         """The flight with more drag the farther it has come."""
@@ -77,7 +69,6 @@ class SideLean(FlightEffect):
     sentence = "A force across the flight that changes its side at the apex."
     decide = "Nothing to decide: no catalogue holds it."
     coefficients = (Coefficient("strength", 0.0, 0.3, "1/s", -20.0, 20.0),)
-    strength: Tensor
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2, horizontal."""
@@ -90,22 +81,10 @@ NOWHERE: Final[dict[str, type[Effect]]] = {effect.name: effect for effect in (Pu
 """Effects that no model file can declare."""
 
 
-class _Undeclared(Mapping[str, type[Effect]]):
-    """Registered effects, those registered later too; behind them those that no model file can declare."""
-
-    def __getitem__(self, name: str) -> type[Effect]:
-        return NOWHERE[name] if name in NOWHERE else EFFECTS[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter({**EFFECTS, **NOWHERE})
-
-    def __len__(self) -> int:
-        return len({**EFFECTS, **NOWHERE})
-
-
-UNDECLARED: Final = _Undeclared()
-"""Every effect by name. What a model file may declare can be left undeclared: an effect
-that the model lacks (wind), or another value of one that it has (restitution.e)."""
+UNDECLARED: Final[Mapping[str, type[Effect]]] = ChainMap(NOWHERE, cast(dict[str, type[Effect]], EFFECTS))
+"""Every effect by name: the registered ones, those registered later too, and behind them those of `NOWHERE`. What a
+model file may declare can be left undeclared: an effect that the model lacks (wind), or another value of one that it
+has (restitution.e)."""
 
 
 def parse_effects(texts: Iterable[str]) -> tuple[Effect, ...]:

@@ -1,7 +1,5 @@
 """A simulation as files: the dataset, the declared model, and the truth beside them."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict
@@ -10,10 +8,9 @@ from typing import Any, Final, Literal, cast
 
 import yaml
 
-from ballfg.dynamics import Effect, save_model
+from ballfg.dynamics import Effect, model_to_dict, save_model
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
-from ballfg.simulation.balls import describe
 from ballfg.simulation.config import SimulationConfig
 from ballfg.simulation.measure import SimulatedTrack
 from ballfg.simulation.synthetic import dataset_info, simulate
@@ -76,13 +73,14 @@ def check_format(name: str) -> FileFormat:
 
 def truth_content(config: SimulationConfig) -> dict[str, Any]:
     """The content of `truth.yaml`: everything that determines the tracks; undeclared effects have values and units."""
-    content = describe(config.ball)
-    surfaces = config.ball.surfaces
+    kind, surfaces = config.ball, config.ball.surfaces
     return {
         "seed": config.seed,
         "tracks": config.tracks,
         "rate": config.rate,
-        **content,
+        "ball": {"name": kind.name, "radius": kind.ball.radius, "mass": kind.ball.mass},
+        "inertia_factor": kind.model.inertia_factor,
+        "model": model_to_dict(kind.model),
         "undeclared": {effect.name: _effect_content(effect) for effect in config.undeclared},
         "measurement_noise": asdict(config.noise),
         "process_noise": asdict(config.process),
@@ -93,7 +91,7 @@ def truth_content(config: SimulationConfig) -> dict[str, Any]:
             "floor_height": surfaces.floor_height,
             "extent": None if surfaces.extent is None else list(surfaces.extent),
         },
-        "launcher": asdict(config.ball.launcher),
+        "launcher": asdict(kind.launcher),
     }
 
 

@@ -1,7 +1,5 @@
 """Cameras whose shutters do not open together: velocities from camera factors and from points, and clock offsets."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -66,14 +64,10 @@ def compare(filmed: Filmed) -> dict[str, Velocities]:
     All estimates are the smoother's or the online estimator's with the same model, priors and process noise; the noise
     of points is what they scatter by. Each is judged at its own stamps.
     """
-    rate, cameras = filmed.recording.config.rate, filmed.recording.cameras
+    rate, cameras, balls = filmed.recording.config.rate, filmed.recording.cameras, filmed.tracking.balls
     ways: dict[str, Callable[[], list[Estimate]]] = {
-        NAIVE: lambda: _from_points(
-            filmed, [_as_if_synchronised(ball, cameras, rate) for ball in filmed.tracking.balls]
-        ),
-        "smoother, interpolated": lambda: _from_points(
-            filmed, [(ball.times, ball.points) for ball in filmed.tracking.balls]
-        ),
+        NAIVE: lambda: _from_points(filmed, [_as_if_synchronised(ball, cameras, rate) for ball in balls]),
+        "smoother, interpolated": lambda: _from_points(filmed, [(ball.times, ball.points) for ball in balls]),
         FACTORS: lambda: _from_sightings(filmed, Smoother),
         "online, camera factors": lambda: _from_sightings(filmed, Online),
     }

@@ -1,7 +1,5 @@
 """Filmed recordings with known truth: rendered, tracked from their videos, and judged point by point."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path

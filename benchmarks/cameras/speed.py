@@ -1,7 +1,5 @@
 """Times of tracking: three video streams through detection and association, and live updates from sightings."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """The suite of `ballfg-bench cameras`: from rendered videos to states, against the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,5 @@
 """A camera that was turned after its calibration: does the check of the cameras' agreement name it?"""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final

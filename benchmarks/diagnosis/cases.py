@@ -1,7 +1,5 @@
 """The cases of the loop's benchmark: datasets to be made, and the effects that a diagnosis of each should find."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -84,7 +82,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is computed.
+    """How much is computed; by default everything.
 
     Attributes:
         effects, sizes: planted one by one, each in every size.
@@ -98,36 +96,22 @@ class Plan:
         timed: diagnoses that are timed alone.
     """
 
-    effects: tuple[str, ...]
-    unlabelled: tuple[str, ...]
-    pairs: tuple[tuple[str, str], ...]
-    sizes: tuple[float, ...]
-    seeds: int
-    side_seeds: int
-    unlabelled_seeds: int
-    ratios: tuple[float, ...]
-    detection_seeds: int
-    nulls: int
-    unknown: tuple[str, ...]
-    unknown_seeds: int
-    timed: int
+    effects: tuple[str, ...] = tuple(PLANTS)
+    unlabelled: tuple[str, ...] = tuple(name for name in PLANTS if not name.startswith("spin_label"))
+    pairs: tuple[tuple[str, str], ...] = PAIRS
+    sizes: tuple[float, ...] = (0.5, 1.0, 2.0)
+    seeds: int = 4
+    side_seeds: int = 1
+    unlabelled_seeds: int = 2
+    ratios: tuple[float, ...] = (1.0, 1.5, 2.0)
+    detection_seeds: int = 2
+    nulls: int = 100
+    unknown: tuple[str, ...] = tuple(UNKNOWN)
+    unknown_seeds: int = 3
+    timed: int = 3
 
 
-FULL: Final = Plan(
-    effects=tuple(PLANTS),
-    unlabelled=tuple(name for name in PLANTS if not name.startswith("spin_label")),
-    pairs=PAIRS,
-    sizes=(0.5, 1.0, 2.0),
-    seeds=4,
-    side_seeds=1,
-    unlabelled_seeds=2,
-    ratios=(1.0, 1.5, 2.0),
-    detection_seeds=2,
-    nulls=100,
-    unknown=tuple(UNKNOWN),
-    unknown_seeds=3,
-    timed=3,
-)
+FULL: Final = Plan()
 QUICK: Final = Plan(
     effects=FULL.effects[:8],
     unlabelled=FULL.unlabelled[:3],
@@ -218,3 +202,19 @@ def timed_cases(plan: Plan, seed: int) -> Iterator[Case]:
     """Diagnoses that have the machine for themselves, with two processes: a wind, 50 tracks."""
     for number in range(seed, seed + plan.timed):
         yield replace(planted_case("time", "wind", 1.0, number), jobs=2)
+
+
+def all_cases(plan: Plan, seed: int, ideal: Mapping[str, float], data: Sequence[Path]) -> list[Case]:
+    """Everything that may run side by side, parts evenly mixed: an early look sees something of all.
+
+    Args: ideal: by effect, the size that the ideal test needs.  data: folders of measured tracks.
+    """
+    parts = [
+        list(measured_cases(data)),
+        list(naming_cases(plan, seed)),
+        list(null_cases(plan, seed)),
+        list(unknown_cases(plan, seed)),
+        list(detection_cases(plan, seed, ideal)),
+    ]
+    placed = [(number / len(part), case) for part in parts for number, case in enumerate(part)]
+    return [case for _, case in sorted(placed, key=lambda pair: pair[0])]

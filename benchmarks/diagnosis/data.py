@@ -1,7 +1,5 @@
 """From a case to its data: simulated tracks in a folder, the declared model, and the true one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -4,8 +4,6 @@ Typical sizes are those that docs/physics.md lists under what matters, or the no
 declared model is made to lack.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

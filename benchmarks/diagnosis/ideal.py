@@ -9,8 +9,6 @@ weight is one.
 Source: D. R. Cox and D. V. Hinkley, Theoretical Statistics, 1974, section 9.3.
 """
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory

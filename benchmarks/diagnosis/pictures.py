@@ -1,7 +1,5 @@
 """Pictures of the loop's benchmark: power against size, effects named against effects planted, and repaired errors."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """The probability that an effect is named against its size, and the size from which on it is named nearly always."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

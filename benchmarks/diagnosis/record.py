@@ -1,7 +1,5 @@
 """The record of a diagnosis: names, evidence, errors and seconds, as a JSON file that a later run reads."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Mapping

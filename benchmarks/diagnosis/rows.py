@@ -1,7 +1,5 @@
 """Rows of results from the records of the loop's cases; docs/benchmarks_loop.md says what each metric is."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 

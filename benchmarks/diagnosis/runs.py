@@ -1,7 +1,5 @@
 """Running cases and ideal tests, each in a process of its own; finished ones are kept."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable, Iterable, Sequence

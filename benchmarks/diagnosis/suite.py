@@ -1,21 +1,10 @@
 """The suite of `ballfg-bench loop`: does the diagnosis find what was planted, and stay silent where nothing was?"""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ballfg.benchmarks.diagnosis.cases import (
-    Case,
-    Plan,
-    detection_cases,
-    measured_cases,
-    naming_cases,
-    null_cases,
-    timed_cases,
-    unknown_cases,
-)
+from ballfg.benchmarks.diagnosis.cases import Case, Plan, all_cases, timed_cases
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.ideal import Ideal, ideal_of
 from ballfg.benchmarks.diagnosis.record import Record
@@ -49,7 +38,7 @@ def run_loop(
     if not data:
         print("note: no --data: nothing measured is diagnosed", file=sys.stderr)
     ideals = collect_ideals([n for n in plan.effects if PLANTS[n].sized], results.seed, folder, jobs, ideal)
-    cases = all_cases(plan, results.seed, ideals, data)
+    cases = all_cases(plan, results.seed, detectable(ideals), data)
     records = collect_records(cases, folder, jobs, run)
     timed = list(timed_cases(plan, results.seed))
     records |= collect_records(timed, folder, 1, run)  # alone, one after the other
@@ -59,16 +48,3 @@ def run_loop(
         confusion_picture(cases, records, out / "loop_first_finding.png"),
         repair_picture(results.rows, out / "loop_repair.png"),
     ]
-
-
-def all_cases(plan: Plan, seed: int, ideals: dict[str, Ideal], data: Sequence[Path]) -> list[Case]:
-    """Everything that may run side by side, parts evenly mixed: an early look sees something of all."""
-    parts = [
-        list(measured_cases(data)),
-        list(naming_cases(plan, seed)),
-        list(null_cases(plan, seed)),
-        list(unknown_cases(plan, seed)),
-        list(detection_cases(plan, seed, detectable(ideals))),
-    ]
-    placed = [(number / len(part), case) for part in parts for number, case in enumerate(part)]
-    return [case for _, case in sorted(placed, key=lambda pair: pair[0])]

@@ -1,7 +1,5 @@
 """The error that a diagnosis could reach: that of the true model, on the same halves of the tracks."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import torch

@@ -1,7 +1,5 @@
 """Whether a diagnosis was right: which names are accepted for the planted effects."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from ballfg.benchmarks.diagnosis.effects import PLANTS

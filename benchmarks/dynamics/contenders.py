@@ -1,7 +1,5 @@
 """The contenders of the dynamics comparison: the contract, models in the factor graph, and those without training."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path

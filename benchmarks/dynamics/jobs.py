@@ -1,9 +1,7 @@
 """Making and judging the methods of the dynamics comparison, each in a process of its own; finished ones are kept."""
 
-from __future__ import annotations
-
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -34,21 +32,17 @@ def collect_records(
     look compares them.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    listed = list(_jobs(tuple(tasks), methods, seeds, folder, quick))
+    listed = [
+        Job(tuple(tasks), name, seed, folder / f"{name}-{seed}", quick)
+        for name in methods
+        if METHODS[name].fits(tasks)
+        for seed in (seeds if METHODS[name].trained else seeds[:1])
+    ]
     by_seed = sorted(listed, key=lambda job: job.seed)
     made = collect(by_seed, read, finish, jobs, "methods and seeds finished")
     finished = {job.folder: records for job, records in zip(by_seed, made, strict=True)}
     every = [finished[job.folder] or {} for job in listed]
     return [[records[k] for records in every if k in records] for k in range(len(tasks))]
-
-
-def _jobs(
-    tasks: tuple[Task, ...], methods: Sequence[str], seeds: Sequence[int], folder: Path, quick: bool
-) -> Iterator[Job]:
-    for name in methods:
-        if METHODS[name].fits(tasks):
-            for seed in seeds if METHODS[name].trained else seeds[:1]:
-                yield Job(tasks, name, seed, folder / f"{name}-{seed}", quick)
 
 
 def judged(job: Job) -> list[int]:

@@ -1,7 +1,5 @@
 """Measured tracks as tasks: learn from every second shot, observe a quarter of a second, predict what follows."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import islice
@@ -76,7 +74,8 @@ def measured_task(dataset: Dataset, jobs: int, tracks: int | None = None, *, lea
     listed = list(islice(dataset, tracks))
     found = estimate_tracks(Smoother(model, surfaces, given), listed, len(listed), jobs)
     smoothed = progress(found, len(listed), "tracks smoothed for their bounces")
-    made = [measured_shot(_grouped(t, dataset), estimate) for t, estimate in zip(listed, smoothed, strict=True)]
+    grouped = [replace(t, labels={**t.labels, GROUP: t.labels.get(GROUP, dataset.info.name)}) for t in listed]
+    made = [measured_shot(track, estimate) for track, estimate in zip(grouped, smoothed, strict=True)]
     shots = tuple(shot for shot in made if shot is not None)
     least = 2 if learn else 1
     if len(shots) < least:
@@ -97,10 +96,6 @@ def measured_task(dataset: Dataset, jobs: int, tracks: int | None = None, *, lea
         train=shots[::2] if learn else (),
         validation=shots[1::2] if learn else shots,
     )
-
-
-def _grouped(track: Track, dataset: Dataset) -> Track:
-    return track if GROUP in track.labels else replace(track, labels={**track.labels, GROUP: dataset.info.name})
 
 
 def measured_shot(track: Track, estimate: Estimate) -> Shot | None:

@@ -1,18 +1,11 @@
 """The methods of the dynamics comparison."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
-from ballfg.benchmarks.dynamics.contenders import (
-    Contender,
-    Job,
-    adapting_contender,
-    nominal_contender,
-    truth_contender,
-)
+from ballfg.benchmarks.dynamics import contenders
+from ballfg.benchmarks.dynamics.contenders import Contender, Job
 from ballfg.benchmarks.dynamics.recipes import RESIDUAL
 from ballfg.benchmarks.dynamics.task import Task
 from ballfg.benchmarks.dynamics.trained import trained_contender
@@ -45,9 +38,9 @@ TRAINED: Final = (*SEQUENCES, "a-tune+aug", "mlp+aug", "mlp+gs", "skip+gs", "mnn
 """As in the paper's table."""
 
 METHODS: Final = {
-    "truth": Method(truth_contender, trained=False, takes_part="simulated"),
-    "nominal": Method(nominal_contender, trained=False),
-    "nominal+track": Method(adapting_contender, trained=False, takes_part="measured"),
+    "truth": Method(contenders.truth_contender, trained=False, takes_part="simulated"),
+    "nominal": Method(contenders.nominal_contender, trained=False),
+    "nominal+track": Method(contenders.adapting_contender, trained=False, takes_part="measured"),
     **{name: Method(trained_contender, transfers=name not in SEQUENCES) for name in TRAINED},
     RESIDUAL: Method(trained_contender, takes_part="measured"),
 }

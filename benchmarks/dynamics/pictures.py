@@ -1,7 +1,5 @@
 """Pictures of the dynamics comparison: errors by method, apex errors by flight, and a launch fanned out by its spin."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final

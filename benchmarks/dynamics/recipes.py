@@ -4,8 +4,6 @@ On measured tracks there are few shots, real noise, and launchers whose spin nob
 factor graph have a recipe of their own, which was found on the shots to learn from, parted into folds.
 """
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 from ballfg.benchmarks.estimators.measured import HORIZON

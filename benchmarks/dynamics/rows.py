@@ -1,7 +1,5 @@
 """From the errors of finished contenders to rows: pooled over tracks, averaged over seeds."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The suite of `ballfg-bench dynamics`: every method learns from the same shots and predicts the same others."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

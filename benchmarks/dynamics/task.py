@@ -1,7 +1,5 @@
 """The tracks of the dynamics comparison: shots to train on, shots to judge by, and the settings that all models get."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The trained contenders: models in the factor graph, and sequence models."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass, replace

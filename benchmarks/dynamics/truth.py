@@ -17,8 +17,6 @@ known of spheres and from measured tracks; `EFFECTS` has them:
 - Tangential restitution one prior standard deviation above its nominal value (tangential_restitution).
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

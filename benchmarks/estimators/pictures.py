@@ -1,7 +1,5 @@
 """Pictures of the comparison of estimators."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -138,7 +136,6 @@ def tracks_picture(measured: Measured, path: Path) -> Path:
 
 
 def _draw_track(column: Iterable[Any], prediction: TrackPrediction) -> None:
-    """One column: x, y, z against time."""
     observed, start = prediction.estimate, prediction.estimate.times[0]
     later = prediction.times - start
     for i, axes in enumerate(column):

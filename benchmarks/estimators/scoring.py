@@ -1,7 +1,5 @@
 """Errors of estimates against the truth, track by track, on all cores."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,5 @@
 """The suite of `ballfg-bench estimators`: synthetic tracks by two protocols, or a dataset of measured ones."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass

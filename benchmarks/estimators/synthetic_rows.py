@@ -1,7 +1,5 @@
 """Rows of the comparison on synthetic tracks, and of the smoother's consistency."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Cost of the gradient through an estimate next to the estimate: 80 observations, a network for the dynamics."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from functools import partial
 from typing import Final

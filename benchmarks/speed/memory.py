@@ -3,8 +3,6 @@
 Linux only: it reads each process's high-water mark (VmHWM) from /proc while the command runs.
 """
 
-from __future__ import annotations
-
 import argparse
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """A small network in place of the aerodynamics, fitted to the analytic model; it stands for learned models."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Wall-clock times of warm, repeated runs, next to a control that shows the momentary speed of the machine."""
 
-from __future__ import annotations
-
 import gc
 import time
 from collections.abc import Callable

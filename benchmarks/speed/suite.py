@@ -1,7 +1,5 @@
 """The suite of `ballfg-bench speed`: times of an estimate, an update, a prediction and a Jacobian on one thread."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial

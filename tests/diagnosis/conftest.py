@@ -16,10 +16,8 @@ from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
 from ballfg.dynamics.effect import Effect
-from ballfg.dynamics.effects.bounce.restitution import Restitution
-from ballfg.dynamics.effects.flight.drag import Drag
-from ballfg.dynamics.effects.flight.gravity import Gravity
-from ballfg.dynamics.effects.flight.magnus import Magnus
+from ballfg.dynamics.effects.bounce import Restitution
+from ballfg.dynamics.effects.flight import Drag, Gravity, Magnus
 from ballfg.dynamics.motion.paths import paths
 from ballfg.estimation.settings import Settings
 

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ballfg.dynamics import BallModel, contact_time, fly
 from ballfg.dynamics.model import take_rows
-from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, rk4_from
+from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, rk4_step
 from ballfg.dynamics.motion.paths import hermite
 from ballfg.state import VELOCITY
 
@@ -114,7 +114,7 @@ def _fly_arc(model: BallModel, rows: Tensor, state: Tensor, begun: Tensor, durat
     step = (duration / count).unsqueeze(-1)
     nodes, slopes = [state], [derivative(model.rates, state)]
     for _ in range(count):
-        state = rk4_from(model.rates, state, slopes[-1], step)
+        state = rk4_step(model.rates, state, step, slopes[-1])
         nodes.append(state)
         slopes.append(derivative(model.rates, state))
     return Arc(rows, begun, step, torch.stack(nodes), torch.stack(slopes))

@@ -10,7 +10,7 @@ import numpy as np
 
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.dynamics import AnalyticModel, Coefficient, Effect
-from ballfg.dynamics.scene import Scene, Vector
+from ballfg.dynamics.effect import Scene, Vector
 
 SECTION = {"flight": "flight", "bounce": "contact", "measurement": "measurement"}
 """Attribute of the model that holds the effects of a kind."""

@@ -14,7 +14,7 @@ from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.problem import LABEL_LOSS, Fit
 from ballfg.diagnosis.result import Array
 from ballfg.diagnosis.search.hypothesis import Hypothesis
-from ballfg.dynamics.effects.measurement.spin_labels import signed_permutations
+from ballfg.dynamics.effects.measurement import signed_permutations
 from ballfg.state import SPIN
 
 UNLABELLED_SPIN = 200.0

@@ -22,7 +22,7 @@ from ballfg.diagnosis.search.hypothesis import has_effect, hypotheses, scene_of
 from ballfg.diagnosis.search.label_frames import frame_hypotheses
 from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.dynamics import AnalyticModel, Effect
-from ballfg.dynamics.effects.measurement.spin_labels import SpinLabelFrame
+from ballfg.dynamics.effects.measurement import SpinLabelFrame
 
 MOST_EFFECTS = 4
 """Effects that are added before the search ends; further ones would be found in what earlier wrong ones left."""

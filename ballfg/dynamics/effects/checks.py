@@ -1,7 +1,5 @@
 """Which effect classes are accepted: what each must say, and what must not contradict itself."""
 
-from __future__ import annotations
-
 from torch import nn
 
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, FlightEffect
@@ -16,11 +14,6 @@ def check_effect(effect: type[Effect]) -> None:
 
     Raises: ValueError: the message names the class, the attribute and the rule.
     """
-    _check_words(effect)
-    _check_coefficients(effect)
-
-
-def _check_words(effect: type[Effect]) -> None:
     said = effect.__qualname__
     for word in ("sentence", "decide"):
         if not (isinstance(getattr(effect, word, None), str) and getattr(effect, word).strip()):
@@ -30,6 +23,7 @@ def _check_words(effect: type[Effect]) -> None:
     kind = next(base.kind for base in BASES if issubclass(effect, base))
     if effect.kind != kind:
         raise ValueError(f"{said}.kind must be that of its base, '{kind}'; got '{effect.kind}'. Leave it out.")
+    _check_coefficients(effect)
 
 
 def _check_coefficients(effect: type[Effect]) -> None:

@@ -1,7 +1,5 @@
 """Generic effects: sums of terms in place, velocity and spin, for what nobody can name; one for each kind."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Final
 
@@ -14,17 +12,11 @@ from ballfg.state import POSITION, VELOCITY
 
 WORLD_AXES: Final = ("x", "y", "z")
 FLIGHT_AXES: Final = ("along", "across", "lift")
+SQUARES: Final = ("xx", "yy", "zz", "xy", "xz", "yz")
 PLACE_TERMS: Final = {
     "one": (0.5, "m/s^2"),
-    "x": (0.5, "1/s^2"),
-    "y": (0.5, "1/s^2"),
-    "z": (0.5, "1/s^2"),
-    "xx": (0.5, "1/(m s^2)"),
-    "yy": (0.5, "1/(m s^2)"),
-    "zz": (0.5, "1/(m s^2)"),
-    "xy": (0.5, "1/(m s^2)"),
-    "xz": (0.5, "1/(m s^2)"),
-    "yz": (0.5, "1/(m s^2)"),
+    **dict.fromkeys(WORLD_AXES, (0.5, "1/s^2")),
+    **dict.fromkeys(SQUARES, (0.5, "1/(m s^2)")),
 }
 """Terms along the world's axes, in x, y, z from the centre: standard deviation of the prior and unit. Priors of all
 terms are such that each is worth about 0.5 m/s^2 at 1 m, 5 m/s and 100 rad/s."""
@@ -33,39 +25,21 @@ MOTION_TERMS: Final = {
     "v": (0.1, "1/s"),
     "vz": (0.2, "1/s"),
     "vv": (0.02, "1/m"),
-    "vvx": (0.02, "1/m^2"),
-    "vvy": (0.02, "1/m^2"),
-    "vvz": (0.02, "1/m^2"),
-    "vsa": (0.001, "1"),
-    "vsc": (0.001, "1"),
-    "vsl": (0.001, "1"),
-    "vs": (0.001, "1"),
+    **dict.fromkeys(("vvx", "vvy", "vvz"), (0.02, "1/m^2")),
+    **dict.fromkeys(("vsa", "vsc", "vsl", "vs"), (0.001, "1")),
 }
 """Terms along the flight, across it to the left, and along the lift: speed less its reference (v), its square (vv),
 that times x, y, z from the centre, vertical velocity, speed times the spin about each of these axes, and times all."""
 CONTACT_TERMS: Final = {
     "one": (0.1, "m/s"),
-    "vx": (0.03, "1"),
-    "vy": (0.03, "1"),
-    "vz": (0.03, "1"),
-    "wx": (0.001, "m"),
-    "wy": (0.001, "m"),
-    "wz": (0.001, "m"),
+    **dict.fromkeys(("vx", "vy", "vz"), (0.03, "1")),
+    **dict.fromkeys(("wx", "wy", "wz"), (0.001, "m")),
 }
 """Terms in the incoming velocity and spin: standard deviation of the prior and unit; each worth about 0.1 m/s."""
 MEASUREMENT_TERMS: Final = {
-    "x": (0.005, "1"),
-    "y": (0.005, "1"),
-    "z": (0.005, "1"),
-    "xx": (0.005, "1/m"),
-    "yy": (0.005, "1/m"),
-    "zz": (0.005, "1/m"),
-    "xy": (0.005, "1/m"),
-    "xz": (0.005, "1/m"),
-    "yz": (0.005, "1/m"),
-    "vx": (0.001, "s"),
-    "vy": (0.001, "s"),
-    "vz": (0.001, "s"),
+    **dict.fromkeys(WORLD_AXES, (0.005, "1")),
+    **dict.fromkeys(SQUARES, (0.005, "1/m")),
+    **dict.fromkeys(("vx", "vy", "vz"), (0.001, "s")),
 }
 """Terms in the place from the centre and the velocity: standard deviation of the prior and unit; each is worth 5 mm."""
 SOFT_SPEED: Final = 0.1
@@ -116,10 +90,6 @@ class GenericFlight(FlightEffect):
         *_center(),
         Coefficient("speed", 5.0, 0.0, "m/s", 0.0, 100.0, absent=None),
     )
-    center_x: Tensor
-    center_y: Tensor
-    center_z: Tensor
-    speed: Tensor
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2."""
@@ -160,9 +130,6 @@ class GenericMeasurement(MeasurementEffect):
     decide = "Measure a ball that hangs still at known places, then one that moves slowly and fast on a known path."
     coefficients = (*_coefficients(WORLD_AXES, MEASUREMENT_TERMS, MEASUREMENT_BOUND), *_center())
     rank = 2
-    center_x: Tensor
-    center_y: Tensor
-    center_z: Tensor
 
     def positions(self, states: Tensor, later: Later) -> Tensor:
         """(..., 3) m, with the error."""

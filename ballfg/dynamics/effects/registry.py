@@ -1,29 +1,16 @@
 """The effects a model file may name: one line for each. docs/add_an_effect.md shows how to add one, here or outside."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final
 
 from ballfg.dynamics.effect import Effect, Kind
-from ballfg.dynamics.effects.bounce.friction import Friction, TangentialRestitution
-from ballfg.dynamics.effects.bounce.restitution import Restitution, RestitutionSpeed
-from ballfg.dynamics.effects.bounce.table import TableHeight, TableTilt
+from ballfg.dynamics.effects import bounce, flight, generic, measurement
 from ballfg.dynamics.effects.checks import BASES, REMEDY, check_effect
-from ballfg.dynamics.effects.flight.drag import Drag, DragSpeed, DragSpin
-from ballfg.dynamics.effects.flight.gravity import Buoyancy, Gravity
-from ballfg.dynamics.effects.flight.magnus import Magnus, MagnusSaturation
-from ballfg.dynamics.effects.flight.spin_decay import SpinDecay
-from ballfg.dynamics.effects.flight.wind import GustRegion, Wind, WindShear
-from ballfg.dynamics.effects.generic import GenericContact, GenericFlight, GenericMeasurement
-from ballfg.dynamics.effects.measurement.clock import TimeOffset, TimeScale, VelocityLag
-from ballfg.dynamics.effects.measurement.frame import FrameTilt, RadialBias, Scale
-from ballfg.dynamics.effects.measurement.spin_labels import SpinLabelFrame, SpinLabelOffset, SpinLabelScale
 from ballfg.files.python_file import run_file
 from ballfg.registry import Registry
 
 GENERIC: Final[dict[str, type[Effect]]] = {
-    effect.name: effect for effect in (GenericFlight, GenericContact, GenericMeasurement)
+    effect.name: effect for effect in (generic.GenericFlight, generic.GenericContact, generic.GenericMeasurement)
 }
 """Sums of terms that a model file may name too. They describe without explaining, so no search for causes has them."""
 
@@ -44,32 +31,32 @@ EFFECTS: Final = Registry[Effect](
 """Every effect that a search for causes may find, by the name that model files use."""
 
 for _effect in (
-    Gravity,
-    Drag,
-    Magnus,
-    SpinDecay,
-    Wind,
-    WindShear,
-    GustRegion,
-    DragSpeed,
-    DragSpin,
-    MagnusSaturation,
-    Buoyancy,
-    Restitution,
-    Friction,
-    TangentialRestitution,
-    TableHeight,
-    RestitutionSpeed,
-    TableTilt,
-    TimeOffset,
-    VelocityLag,
-    FrameTilt,
-    Scale,
-    RadialBias,
-    TimeScale,
-    SpinLabelFrame,
-    SpinLabelScale,
-    SpinLabelOffset,
+    flight.Gravity,
+    flight.Drag,
+    flight.Magnus,
+    flight.SpinDecay,
+    flight.Wind,
+    flight.WindShear,
+    flight.GustRegion,
+    flight.DragSpeed,
+    flight.DragSpin,
+    flight.MagnusSaturation,
+    flight.Buoyancy,
+    bounce.Restitution,
+    bounce.Friction,
+    bounce.TangentialRestitution,
+    bounce.TableHeight,
+    bounce.RestitutionSpeed,
+    bounce.TableTilt,
+    measurement.TimeOffset,
+    measurement.VelocityLag,
+    measurement.FrameTilt,
+    measurement.Scale,
+    measurement.RadialBias,
+    measurement.TimeScale,
+    measurement.SpinLabelFrame,
+    measurement.SpinLabelScale,
+    measurement.SpinLabelOffset,
 ):
     EFFECTS.register(_effect)
 

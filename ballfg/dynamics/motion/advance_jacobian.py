@@ -1,7 +1,5 @@
 """Motion with events of one ball, with its Jacobian: what a filter's prediction and a belief's propagation need."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import partial
 
@@ -48,8 +46,9 @@ def advance_jacobian(model: BallModel, state: Tensor, dt: float, surfaces: Surfa
 def _advance_step(model: BallModel, start: Tensor, h: float, surfaces: Surfaces) -> Motion:
     """One step of at most `integrate.MAX_STEP`, cut at its contacts, by the rules of `rollout`."""
     state, height = start, surfaces.level_below(start)
-    if _stays(model, state, height, surfaces):
-        after, jacobian = batch_jacobian(partial(_rolled, model, h, height), state)
+    # the look at the vertical speed spares most states the rest of it
+    if abs(float(state[0, VZ])) <= REST_SPEED and bool(stays(model, state, height, surfaces)):
+        after, jacobian = batch_jacobian(lambda at: roll(model, at, at.new_tensor([h]), height), state)
         return Motion(after, jacobian[0], ())
     so_far = torch.eye(state.shape[-1], dtype=state.dtype)
     contacts: list[tuple[float, float]] = []
@@ -76,12 +75,3 @@ def _advanced(model: BallModel, h: float, surfaces: Surfaces, state: Tensor) -> 
     """`advance` on a batch with further leading dimensions: coming to rest is rare enough for plain autograd."""
     flat = state.reshape(-1, state.shape[-1])
     return advance(model, flat, torch.full_like(flat[:, 0], h), surfaces).reshape(state.shape)
-
-
-def _stays(model: BallModel, state: Tensor, height: Tensor, surfaces: Surfaces) -> bool:
-    """`rollout.stays`; a look at the vertical speed spares most states the rest of it."""
-    return abs(float(state[0, VZ])) <= REST_SPEED and bool(stays(model, state, height, surfaces))
-
-
-def _rolled(model: BallModel, h: float, height: Tensor, state: Tensor) -> Tensor:
-    return roll(model, state, state.new_tensor([h]), height)

@@ -6,8 +6,6 @@ to the third, so that both the saltation term of a Jacobian and the Hessian of a
 (docs/derivations/contact.md).
 """
 
-from __future__ import annotations
-
 import math
 
 import torch

@@ -7,8 +7,6 @@ parameters - it does for all stages in one batch. With t_k the tangents and c_k 
 the gradient of u . F is u + sum A_k^T c_k, and its derivative along v collects A_k^T dc_k + (grad^2 c_k . d_k) t_k.
 """
 
-from __future__ import annotations
-
 from functools import cached_property
 from typing import Any
 

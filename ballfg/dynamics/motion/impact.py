@@ -1,10 +1,11 @@
-"""The impulse of one impact on a horizontal plane: normal restitution, and Coulomb friction that slides or grips.
+"""The impulse of one impact on a plane: normal restitution, and Coulomb friction that slides or grips.
+
+The plane is horizontal; vectors at a tilted one are turned into its axes first, by the shortest turn that takes the
+vertical into its normal.
 
 Derivation in docs/derivations/impact.md. Source: A. Nakashima et al., "Modeling of rebound phenomenon of a rigid
 ball with friction and elastic effects", American Control Conference 2010, sections II and III.
 """
-
-from __future__ import annotations
 
 import torch
 from torch import Tensor
@@ -55,3 +56,25 @@ def _smooth_minimum(slide: Tensor, grip: Tensor) -> Tensor:
     width = (BLEND * grip).clamp_min(TINY_SLIP)  # e_t = -1 leaves no grip at all
     rounding = (width - (slide - grip).abs()).clamp_min(0.0).square() / (4.0 * width)
     return torch.minimum(slide, grip.expand_as(slide)) - rounding
+
+
+def to_plane(vector: Tensor, slope: Tensor) -> Tensor:
+    """A vector (..., 3) of the world in the axes of a plane that rises by `slope` (..., 2) along x and y.
+
+    With the normal n and q = n_x v_x + n_y v_y the turn of n into the vertical is (v_t - n_t (q / (1 + n_z) + v_z),
+    q + n_z v_z), t for the two horizontal components; turning back has the opposite sign of n_t.
+    """
+    upright = (1.0 + slope.square().sum(-1, keepdim=True)).rsqrt()
+    return _turn(vector, -slope * upright, upright)
+
+
+def from_plane(vector: Tensor, slope: Tensor) -> Tensor:
+    """The vector (..., 3) of the world whose components in the plane's axes are given; undoes `to_plane`."""
+    upright = (1.0 + slope.square().sum(-1, keepdim=True)).rsqrt()
+    return _turn(vector, slope * upright, upright)
+
+
+def _turn(vector: Tensor, across: Tensor, upright: Tensor) -> Tensor:
+    along, vertical = vector[..., :2], vector[..., 2:]
+    part = (across * along).sum(-1, keepdim=True)
+    return torch.cat((along - across * (part / (1.0 + upright) + vertical), part + upright * vertical), dim=-1)

@@ -5,8 +5,6 @@ model's rates at the four stages in one batch, and the chain rule through the st
 about half of what autograd through the whole step costs.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
@@ -37,13 +35,8 @@ def derivative(rates: RateFunction, state: Tensor) -> Tensor:
     return torch.cat((state[..., VELOCITY], acceleration, spin_rate, torch.zeros_like(state[..., SPIN.stop :])), dim=-1)
 
 
-def rk4_step(rates: RateFunction, state: Tensor, h: Tensor) -> Tensor:
-    """One Runge-Kutta step of h (..., 1) s from `state` (..., 9)."""
-    return stages_of(rates, state, h)[0]
-
-
-def rk4_from(rates: RateFunction, state: Tensor, slope: Tensor, h: Tensor) -> Tensor:
-    """`rk4_step` where the derivative at the start, (..., 9), is known already."""
+def rk4_step(rates: RateFunction, state: Tensor, h: Tensor, slope: Tensor | None = None) -> Tensor:
+    """One Runge-Kutta step of h (..., 1) s from `state` (..., 9); `slope` is its derivative, where that is known."""
     return stages_of(rates, state, h, slope)[0]
 
 

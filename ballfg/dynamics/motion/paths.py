@@ -7,8 +7,6 @@ A contact is solved once an arc, for all balls together. What does not simply fl
 below a surface) is handed to `rollout`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import torch
@@ -16,7 +14,7 @@ from torch import Tensor
 
 from ballfg.dynamics.model import BallModel, take_rows
 from ballfg.dynamics.motion.contact import contact_time
-from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, fly, rk4_from
+from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, fly, rk4_step
 from ballfg.dynamics.motion.rollout import LONGEST_MOTION, REST_SPEED, next_surface, rollout, stays
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, VELOCITY, VZ
@@ -90,12 +88,7 @@ class _Arc:
         theta = (place - step).unsqueeze(-1)
         index = step.unsqueeze(-1).expand(-1, -1, self.nodes.shape[-1])
         nodes, slopes = self.nodes.transpose(0, 1), self.slopes.transpose(0, 1)
-        ends = (
-            nodes.gather(1, index),
-            slopes.gather(1, index),
-            nodes.gather(1, index + 1),
-            slopes.gather(1, index + 1),
-        )
+        ends = [values.gather(1, end) for end in (index, index + 1) for values in (nodes, slopes)]
         return hermite(theta, MAX_STEP, *ends)
 
 
@@ -134,7 +127,7 @@ def _fly_arc(model: BallModel, state: Tensor, left: Tensor, surfaces: Surfaces) 
     slopes: list[Tensor] = []
     while not slopes or not bool(done.all()):
         slope = derivative(model.rates, state)
-        after = rk4_from(model.rates, state, slope, h)
+        after = rk4_step(model.rates, state, h, slope)
         height = surfaces.level_below(state.detach())
         height, landing = next_surface(model, state.detach(), after.detach(), height, ~done, surfaces)
         step = torch.where(landing, len(slopes), step)

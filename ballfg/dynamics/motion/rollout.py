@@ -12,8 +12,6 @@ What is defined where nature is not asked:
   ball that rolls over the edge falls from the end of the integration step in which it does.
 """
 
-from __future__ import annotations
-
 import math
 
 import torch
@@ -43,15 +41,10 @@ def is_resting(model: BallModel, state: Tensor, height: Tensor | float) -> Tenso
 
 def place_on(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
     """The state moved onto a surface, its vertical velocity zero."""
-    z = state[..., Z] - model.gap(state, height)
-    parts = (
-        state[..., :Z],
-        z[..., None],
-        state[..., Z + 1 : VZ],
-        torch.zeros_like(z)[..., None],
-        state[..., VZ + 1 :],
-    )
-    return torch.cat(parts, dim=-1)
+    placed = state.clone()
+    placed[..., Z] = state[..., Z] - model.gap(state, height)
+    placed[..., VZ] = 0.0
+    return placed
 
 
 def roll(model: BallModel, state: Tensor, dt: Tensor, height: Tensor | float) -> Tensor:

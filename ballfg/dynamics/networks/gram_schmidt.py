@@ -6,8 +6,6 @@ Everything is smooth, also at rest, without spin and where both are parallel: th
 one more constant component (docs/derivations/gram_schmidt.md).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

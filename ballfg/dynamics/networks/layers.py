@@ -4,8 +4,6 @@ All map features (..., f) to outputs (..., o) in float64. The last layer starts 
 says nothing; the others start at random from a generator.
 """
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 from typing import Literal

@@ -1,14 +1,12 @@
 """The learned model: networks say how the ball flies and bounces, alone or as a correction of another model."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import torch
 from torch import Tensor, nn
 
 from ballfg.dynamics.effect import Coefficient, per_row
-from ballfg.dynamics.effects.bounce.table import TableHeight
+from ballfg.dynamics.effects.bounce import TableHeight
 from ballfg.dynamics.measurement import Later
 from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
 from ballfg.dynamics.networks.architecture import Architecture
@@ -20,7 +18,7 @@ from ballfg.dynamics.networks.learned_parts import (
     RawContact,
     RawFlight,
 )
-from ballfg.state import POSITION, SPIN, VELOCITY, VZ
+from ballfg.state import POSITION, SPIN, VZ
 
 START_OFFSET: Final = -0.003
 """m by which an untrained model takes surfaces to lie above their declared heights: as in the nominal model."""
@@ -102,7 +100,11 @@ class LearnedModel(BallModel):
 
     def bounce(self, state: Tensor) -> Tensor:
         """(..., 9) state just after an impact on a horizontal plane, from the state (..., 9) before it."""
-        guess = _vertical_bounce(state) if self.base is None else self.base.bounce(state)
+        if self.base is None:
+            up = -START_RESTITUTION * state[..., VZ : VZ + 1]
+            guess = torch.cat((state[..., :VZ], up, state[..., SPIN]), dim=-1)
+        else:
+            guess = self.base.bounce(state)
         after: Tensor = self.contact(state, guess)
         return after
 
@@ -152,9 +154,3 @@ def build(
 ) -> LearnedModel:
     """An untrained model; the same seed gives the same weights."""
     return LearnedModel(architecture, radius=radius, inertia_factor=inertia_factor, base=base, seed=seed)
-
-
-def _vertical_bounce(state: Tensor) -> Tensor:
-    """The state with its vertical velocity reversed and `START_RESTITUTION` of it left."""
-    up = -START_RESTITUTION * state[..., VZ : VZ + 1]
-    return torch.cat((state[..., POSITION], state[..., VELOCITY.start : VZ], up, state[..., SPIN]), dim=-1)

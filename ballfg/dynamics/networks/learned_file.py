@@ -4,8 +4,6 @@ Safe loaders only. The folder's name ends with a digest of its content: a model 
 saving again never changes one that a file names.
 """
 
-from __future__ import annotations
-
 import hashlib
 import shutil
 from pathlib import Path
@@ -33,25 +31,23 @@ _MODEL, _LAUNCHER, _BASE = "model.", "launcher.", "base."
 stand in the model file itself."""
 
 
-class _LauncherConfig(BaseModel):
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+class _Section(BaseModel):
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
+
+class _LauncherConfig(_Section):
     labels: Annotated[tuple[str, ...], Field(strict=False)]
     categories: dict[str, Annotated[tuple[str, ...], Field(strict=False)]]
 
 
-class _TrainedConfig(BaseModel):
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
-
+class _TrainedConfig(_Section):
     process_noise: dict[str, float]
     position_scale: float
     spin_noise: float | None
     launcher: _LauncherConfig | None
 
 
-class _Config(BaseModel):
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
-
+class _Config(_Section):
     architecture: Architecture | None
     trained: _TrainedConfig | None
 

@@ -1,26 +1,13 @@
 """The flight and the contact of a learned ball, with Gram-Schmidt features or with raw velocity and spin."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import torch
 from torch import Tensor, nn
 
 from ballfg.dynamics.model import Rates
-from ballfg.dynamics.networks.gram_schmidt import (
-    CONTACT_FEATURES,
-    CONTACT_TERMS,
-    FLIGHT_FEATURES,
-    FLIGHT_TERMS,
-    SPEED_SCALE,
-    SPIN_SCALE,
-    acceleration,
-    angular_acceleration,
-    contact_change,
-    contact_frame,
-    flight_frame,
-)
+from ballfg.dynamics.networks import gram_schmidt
+from ballfg.dynamics.networks.gram_schmidt import SPEED_SCALE, SPIN_SCALE
 from ballfg.dynamics.networks.layers import NETWORKS, NetworkKind
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, VELOCITY, VZ
 
@@ -52,19 +39,19 @@ class GramSchmidtFlight(nn.Module):
     ) -> None:
         super().__init__()
         self.spin_rate = spin_rate
-        outputs = FLIGHT_TERMS * (2 if spin_rate else 1)
-        self.network = NETWORKS[kind](FLIGHT_FEATURES, outputs, width, depth, generator)
+        outputs = gram_schmidt.FLIGHT_TERMS * (2 if spin_rate else 1)
+        self.network = NETWORKS[kind](gram_schmidt.FLIGHT_FEATURES, outputs, width, depth, generator)
         self.bias = nn.Parameter(torch.tensor(-STANDARD_GRAVITY if falls else 0.0, dtype=torch.float64))
 
     def forward(self, state: Tensor) -> Rates:
         """Acceleration and angular acceleration (or None) of states (..., 9)."""
-        frame = flight_frame(state)
+        frame = gram_schmidt.flight_frame(state)
         coefficients = self.network(frame.features)
         bias = self.bias * _UP
         if not self.spin_rate:
-            return acceleration(frame, coefficients, bias), None
-        linear, angular = coefficients.split(FLIGHT_TERMS, dim=-1)
-        return acceleration(frame, linear, bias), angular_acceleration(frame, angular)
+            return gram_schmidt.acceleration(frame, coefficients, bias), None
+        linear, angular = coefficients.split(gram_schmidt.FLIGHT_TERMS, dim=-1)
+        return gram_schmidt.acceleration(frame, linear, bias), gram_schmidt.angular_acceleration(frame, angular)
 
 
 class RawFlight(nn.Module):
@@ -104,25 +91,22 @@ class GramSchmidtContact(nn.Module):
     ) -> None:
         super().__init__()
         self.radius, self.first = radius, first
-        self.network = NETWORKS[kind](CONTACT_FEATURES, CONTACT_TERMS + 1, width, depth, generator)
+        outputs = gram_schmidt.CONTACT_TERMS + 1
+        self.network = NETWORKS[kind](gram_schmidt.CONTACT_FEATURES, outputs, width, depth, generator)
 
     def forward(self, state: Tensor, guess: Tensor) -> Tensor:
         """(..., 9) after the contact, from the states before it and a guess of those after it."""
-        frame = contact_frame(state, self.radius)
+        frame = gram_schmidt.contact_frame(state, self.radius)
         coefficients = self.network(frame.features)
-        tangential, normal = coefficients.split((CONTACT_TERMS, 1), dim=-1)
-        velocity, spin = contact_change(frame, tangential, self.radius)
+        tangential, normal = coefficients.split((gram_schmidt.CONTACT_TERMS, 1), dim=-1)
+        velocity, spin = gram_schmidt.contact_change(frame, tangential, self.radius)
         return _changed(guess, velocity, normal, spin, self.first)
 
 
 class RawContact(nn.Module):
     """A bounce: a network of velocity and spin as they are changes a first guess of it.
 
-    Args:
-        kind, width, depth: of the network.
-        radius: m; not used: raw velocity and spin are all that the network sees.
-        first: restitution of the guess; 1 where the guess is another model's bounce.
-        generator: of the first weights.
+    Args: as for `GramSchmidtContact`. The radius is not used: raw velocity and spin are all that the network sees.
     """
 
     def __init__(
@@ -140,12 +124,9 @@ class RawContact(nn.Module):
 
 
 def _changed(guess: Tensor, velocity: Tensor, normal: Tensor, spin: Tensor, first: float) -> Tensor:
-    """A guess of the state after a contact, changed; the normal velocity by a factor that keeps its sign.
+    """A guess (..., 9) of the state after a contact, changed; the normal velocity by a factor that keeps its sign.
 
-    Args:
-        guess: (..., 9), with a restitution of `first`.
-        velocity: (..., 2) m/s and spin: (..., 3) rad/s to add.
-        normal: (..., 1); takes the restitution from 0 (very negative) over `first` (0) to `HIGHEST_RESTITUTION`.
+    `normal` takes the restitution from 0 (very negative) over `first`, that of the guess (0), to `HIGHEST_RESTITUTION`.
     """
     t = torch.tanh(normal)
     room = HIGHEST_RESTITUTION - first

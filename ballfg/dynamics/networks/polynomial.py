@@ -5,8 +5,6 @@ states are gone through once, for the coefficients, instead of once for each sta
 docs/derivations/mnn.md.
 """
 
-from __future__ import annotations
-
 import functools
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
@@ -19,7 +17,7 @@ Weights = tuple[Tensor, Tensor]
 
 
 def expand(first: Weights, step: Weights, last: Weights, depth: int) -> Tensor:
-    """Coefficients (outputs, m) of the monomials of degree `depth` + 1 in (1, features), in the order of `_monomials`.
+    """Coefficients (outputs, m) of the monomials of degree `depth` + 1 in (1, features), in lexical order.
 
     Args: first, step, last: layers of the network h_0 = first(x), h_k = h_0 step(h_{k-1}) + h_{k-1}, y = last(h_N).
     """
@@ -79,7 +77,8 @@ class _Tables:
 
 @functools.cache
 def _tables(variables: int, depth: int) -> _Tables:
-    number = [{m: i for i, m in enumerate(_monomials(variables, k))} for k in range(depth + 2)]
+    monomials = [combinations_with_replacement(range(variables), k) for k in range(depth + 2)]
+    number = [{m: i for i, m in enumerate(of_degree)} for of_degree in monomials]
     raised = tuple(
         (
             torch.tensor([[number[k + 1][tuple(sorted((*m, v)))] for m in number[k]] for v in range(variables)]),
@@ -96,8 +95,3 @@ def _tables(variables: int, depth: int) -> _Tables:
     pairs = torch.tensor([[number[degree][tuple(sorted(a + b))] for b in number[high]] for a in number[degree - high]])
     counts = torch.bincount(pairs.flatten())
     return _Tables(raised, powers, degree - high - 1, pairs, (1.0 / counts.double())[pairs])
-
-
-def _monomials(variables: int, degree: int) -> list[tuple[int, ...]]:
-    """Monomials by the variables they multiply, the power of the first variable first."""
-    return list(combinations_with_replacement(range(variables), degree))

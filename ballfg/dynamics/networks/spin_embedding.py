@@ -6,8 +6,6 @@ its sign), so there is no mirror symmetry to keep.
 Source: Q. Xiao, Z. Wu, M. Gombolay 2024, section III-B-2.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Final
 

@@ -1,7 +1,5 @@
 """What a camera sees when nothing moves: every ray of the image is followed to what it hits in the room."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -5,18 +5,13 @@ outline of a sphere through the full camera model, the small ellipse of perspect
 outline is averaged along the path.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ballfg.simulation.scene.view import Rect, clipped
+from ballfg.simulation.scene.view import Array, Rect, clipped
 from ballfg.vision.camera import Camera
-
-Array = NDArray[np.float64]
 
 STEP: Final = 0.25
 """px, longest step of the path along which the outline is averaged."""

@@ -1,7 +1,5 @@
 """The configuration of a synthetic recording: shots, clocks of the cameras, shutter, noise."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal

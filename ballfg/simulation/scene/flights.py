@@ -4,8 +4,6 @@ Between knots the simulator's own integration runs on to the very moment that is
 is one: nothing is interpolated, so that a bounce stays as sharp as it is in the simulator.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Final
 

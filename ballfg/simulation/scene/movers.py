@@ -3,8 +3,6 @@
 All are capsules (a ball swept along a segment) that stand in the world, so that every camera sees the same thing.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 
@@ -12,10 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.simulation.scene.room import Colour
-from ballfg.simulation.scene.view import Rect, clipped
+from ballfg.simulation.scene.view import Array, Rect, clipped
 from ballfg.vision.camera import Camera
-
-Array = NDArray[np.float64]
 
 PEOPLE: Final = ((0.35, -3.1, 1.5, 0.0), (2.6, 3.2, -1.7, 0.4))
 """m, m, rad, s: x and y of each, which way they face (from +x), how late they sway and swing. They watch from the

@@ -1,9 +1,8 @@
-"""A recording before it is drawn: the balls, the cameras, and what each camera's frames hold."""
-
-from __future__ import annotations
+"""A recording before it is drawn: the balls, the cameras, and what each camera's frames hold and show."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +10,8 @@ from numpy.typing import NDArray
 from ballfg.simulation.scene.config import Clock, SceneConfig
 from ballfg.simulation.scene.flights import Flight, duration, fly_shots
 from ballfg.simulation.scene.renderer import Renderer
-from ballfg.simulation.scene.shutter import Frames, Passage, frames_of, passages_of
+from ballfg.simulation.scene.shutter import PATH_POINTS, Frames, Passage, frames_of, passages_of
+from ballfg.simulation.scene.view import inside
 from ballfg.vision.camera import Camera
 
 
@@ -68,3 +68,38 @@ def record(config: SceneConfig, cameras: Sequence[Camera]) -> Recording:
     frames = [frames_of(config, camera, number, until) for number, camera in enumerate(cameras)]
     passages = [tuple(passages_of(config, flights, taken)) for taken in frames]
     return Recording(config, tuple(cameras), tuple(flights), tuple(frames), tuple(passages))
+
+
+def visible_columns(recording: Recording, number: int) -> dict[str, Any]:
+    """The table of one camera, against which tracks are judged: a row for each frame and ball centre in the image.
+
+    Columns: `camera`; `frame`, counted from 0 over the frames that were written; `t` (s), its stamp; `t_true` (s), the
+    true time of the middle of its exposure; `trajectory`, the ball's; `u,v` (px), where its centre is in the middle of
+    the exposure; `u_open,v_open,u_close,v_close` (px), where it is as the shutter opens and closes; `radius` (px),
+    the mean one of its outline; `whole`, 1 if all of its outline lies in the image throughout the exposure, else 0.
+    """
+    camera, frames = recording.cameras[number], recording.frames[number]
+    rows: list[dict[str, Any]] = []
+    for passage in recording.passages[number]:
+        pixels = camera.project(passage.paths)
+        seen = inside(camera, pixels[:, PATH_POINTS // 2])
+        pixels, frame = pixels[seen], passage.frames[seen]
+        focal = np.sqrt(camera.matrix[0, 0] * camera.matrix[1, 1])
+        radius = focal * recording.config.ball.ball.radius / camera.depth(passage.centres[seen])
+        rows.append(
+            {
+                "frame": frame,
+                "t": frames.stamps[frame],
+                "t_true": frames.times[frame],
+                "trajectory": np.full(len(frame), passage.name),
+                "u": pixels[:, PATH_POINTS // 2, 0],
+                "v": pixels[:, PATH_POINTS // 2, 1],
+                "u_open": pixels[:, 0, 0],
+                "v_open": pixels[:, 0, 1],
+                "u_close": pixels[:, -1, 0],
+                "v_close": pixels[:, -1, 1],
+                "radius": radius,
+                "whole": inside(camera, pixels, radius[:, None]).all(axis=1).astype(np.int64),
+            }
+        )
+    return {"camera": camera.name} | {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}

@@ -3,8 +3,6 @@
 The room is drawn once. A frame redraws only where something moves; the lens and the level of noise are redone there.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Final
 
@@ -18,11 +16,10 @@ from ballfg.simulation.scene.config import SceneConfig
 from ballfg.simulation.scene.movers import draw, movers
 from ballfg.simulation.scene.room import Colour
 from ballfg.simulation.scene.shutter import Frames, Passage
-from ballfg.simulation.scene.view import Rect, grown
+from ballfg.simulation.scene.view import Array, Rect, grown
 from ballfg.simulation.streams import Purpose, generator
 from ballfg.vision.camera import Camera
 
-Array = NDArray[np.float64]
 Image = NDArray[np.float32]
 Pixels = NDArray[np.uint8]
 
@@ -81,9 +78,10 @@ class Renderer:
             paths: of each ball that is there, (m, 3) m, its centre from the shutter's opening to its closing. Balls are
                 drawn in front of everything else.
         """
-        changed = [rect for rect in self._draw_movers(time) if rect is not None]
-        changed += [rect for path in paths if (rect := self._draw_ball(path)) is not None]
-        changed = [self._through_lens(rect) for rect in changed]
+        moving = movers(time) if self._config.distractors else []
+        drawn = [draw(self._sharp, self._distance, self._camera, thing, self._config.exposure) for thing in moving]
+        drawn += [self._draw_ball(path) for path in paths]
+        changed = [self._through_lens(rect) for rect in drawn if rect is not None]
         image = self._developed(time)
         for left, top, right, bottom in changed:
             window = (slice(top, bottom), slice(left, right))
@@ -91,12 +89,6 @@ class Renderer:
             self._image[window] = self._still[window]
             self._sigma[window] = self._still_noise[window]
         return image
-
-    def _draw_movers(self, time: float) -> list[Rect | None]:
-        if not self._config.distractors:
-            return []
-        exposure = self._config.exposure
-        return [draw(self._sharp, self._distance, self._camera, thing, exposure) for thing in movers(time)]
 
     def _draw_ball(self, path: Array) -> Rect | None:
         ball = ball_image(self._camera, path, self._config.ball.ball.radius)
@@ -134,6 +126,5 @@ class Renderer:
 
 
 def _blurred(image: Image) -> Image:
-    """An image as a lens shows it."""
     side = 2 * _REACH + 1
     return np.asarray(cv2.GaussianBlur(image, (side, side), LENS_BLUR, borderType=cv2.BORDER_REPLICATE))

@@ -1,7 +1,5 @@
 """The room that a recording is made in: boxes, their colours, the table's lines. Geometry; nothing is drawn here."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -1,7 +1,5 @@
 """When each camera's shutter is open, what it writes about that, and where the balls are meanwhile."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

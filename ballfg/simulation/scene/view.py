@@ -1,7 +1,5 @@
 """Where points appear in an image, and parts of images."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,8 +1,7 @@
 """A recording as files: videos or images, stamps, cameras, and the truth about every ball and frame."""
 
-from __future__ import annotations
-
 import glob
+import itertools
 import os
 from collections.abc import Iterator
 from dataclasses import asdict
@@ -17,8 +16,7 @@ from numpy.typing import NDArray
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
-from ballfg.simulation.scene.recording import Recording
-from ballfg.simulation.scene.visible import visible_columns
+from ballfg.simulation.scene.recording import Recording, visible_columns
 from ballfg.state import STATE_NAMES
 from ballfg.tracks import TableWriter
 from ballfg.vision.camera import Camera
@@ -47,7 +45,7 @@ def write_scene(
       a frame) for each camera;
     - `cameras.yaml`: the exact cameras, without undeclared delays of their stamps;
     - `truth.csv`: `trajectory,t` and the true state, every millisecond of true time;
-    - `visible.csv`: the place of each ball in each frame: see `visible.visible_columns`;
+    - `visible.csv`: the place of each ball in each frame: see `recording.visible_columns`;
     - `scene.yaml`: all settings, with the clocks.
 
     Args:
@@ -66,8 +64,11 @@ def write_scene(
     for camera in recording.cameras:
         if camera.name != Path(camera.name).name or camera.name.startswith("."):
             raise ValueError(f"camera names must be good as file names; got {camera.name!r}. Rename it.")
-    with whole_folder(path, earlier=_earlier(path / SCENE_FILE), last=SCENE_FILE) as stage:
-        drawn = watch(_all_images(recording), recording.image_count, "frames drawn")
+    scene = path / SCENE_FILE
+    earlier = [glob.escape(name) for name in read_yaml(scene)["files"]] if scene.is_file() else []
+    with whole_folder(path, earlier=earlier, last=SCENE_FILE) as stage:
+        every_image = itertools.chain.from_iterable(map(recording.images, range(len(recording.cameras))))
+        drawn = watch(every_image, recording.image_count, "frames drawn")
         for number, camera in enumerate(recording.cameras):
             _write_images(
                 stage, camera, recording.config.rate, drawn, len(recording.frames[number].times), images=images
@@ -101,11 +102,6 @@ def scene_content(recording: Recording) -> dict[str, Any]:
     }
 
 
-def _all_images(recording: Recording) -> Iterator[Pixels]:
-    for number in range(len(recording.cameras)):
-        yield from recording.images(number)
-
-
 def _write_images(
     stage: Path, camera: Camera, rate: float, drawn: Iterator[Pixels], count: int, *, images: bool
 ) -> None:
@@ -113,7 +109,9 @@ def _write_images(
     if images:
         (stage / camera.name).mkdir()
         for number in range(count):
-            _write_png(stage / camera.name / f"{number:06d}.png", next(drawn))
+            path = stage / camera.name / f"{number:06d}.png"
+            if not cv2.imwrite(str(path), next(drawn)):
+                raise OSError(f"{path}: OpenCV could not write the image. Check the space on the disk.")
         return
     path = stage / f"{camera.name}.mp4"
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*CODEC), rate, camera.size)
@@ -126,11 +124,6 @@ def _write_images(
         writer.release()
 
 
-def _write_png(path: Path, image: Pixels) -> None:
-    if not cv2.imwrite(str(path), image):
-        raise OSError(f"{path}: OpenCV could not write the image. Check the space on the disk.")
-
-
 def _write_truth(path: Path, recording: Recording) -> None:
     with TableWriter(path) as table:
         for flight in recording.flights:
@@ -138,8 +131,3 @@ def _write_truth(path: Path, recording: Recording) -> None:
             times = np.minimum(flight.start + np.arange(count) / TRUTH_RATE, flight.end)
             states = dict(zip(STATE_NAMES, flight.states(times).T, strict=True))
             table.write({"trajectory": flight.name, "t": times, **states})
-
-
-def _earlier(scene: Path) -> list[str]:
-    """Patterns of the names of an earlier scene's files."""
-    return [glob.escape(name) for name in read_yaml(scene)["files"]] if scene.is_file() else []

@@ -6,12 +6,21 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.benchmarks.diagnosis.cases import QUICK, Case, Plan, Recording, naming_cases, planted_case, timed_cases
+from ballfg.benchmarks.diagnosis.cases import (
+    QUICK,
+    Case,
+    Plan,
+    Recording,
+    all_cases,
+    naming_cases,
+    planted_case,
+    timed_cases,
+)
 from ballfg.benchmarks.diagnosis.ideal import Ideal
 from ballfg.benchmarks.diagnosis.record import Found, Ranked, Record, case_digest, read_record, record_of
 from ballfg.benchmarks.diagnosis.rows import ALL, FAILED, HIDDEN, add_all, detectable
 from ballfg.benchmarks.diagnosis.runs import collect_records
-from ballfg.benchmarks.diagnosis.suite import all_cases, run_loop
+from ballfg.benchmarks.diagnosis.suite import run_loop
 from ballfg.benchmarks.diagnosis.true_model import planted_free
 from ballfg.benchmarks.diagnosis.verdicts import alarmed, complete, honest, named, right
 from ballfg.benchmarks.results import Results
@@ -159,7 +168,7 @@ def outcome(case: Case) -> Record:
 def test_rows_say_what_was_planned_and_found() -> None:
     ideals = {"wind": Ideal("", 3, 900.0), "scale": Ideal("", 3, 60.0), "velocity_lag": Ideal("", 0, 0.0)}
     assert set(detectable(ideals)) == {"wind", "scale"}
-    cases = [*all_cases(SMALL, 0, ideals, []), *timed_cases(SMALL, 0)]
+    cases = [*all_cases(SMALL, 0, detectable(ideals), []), *timed_cases(SMALL, 0)]
     results = Results("test", 0)
     add_all(results, cases, {case.name: outcome(case) for case in cases}, ideals)
     labels, typical, half = "naming, spin labels", "1 typical", "0.5 typical"

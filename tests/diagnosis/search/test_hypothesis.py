@@ -17,9 +17,8 @@ from ballfg.diagnosis.search.hypothesis import (
     without_effect,
 )
 from ballfg.dynamics import EFFECTS
-from ballfg.dynamics.effects.flight.drag import DragSpeed
-from ballfg.dynamics.effects.flight.wind import GustRegion, Wind
-from ballfg.dynamics.scene import Scene
+from ballfg.dynamics.effect import Scene
+from ballfg.dynamics.effects.flight import DragSpeed, GustRegion, Wind
 
 SCENE = Scene((-0.2, -0.8, 0.8), (3.0, 0.9, 1.5), (1.2, 0.1, 1.0), 4.5, 2.5, 20, 12)
 WIND = Hypothesis(Wind, {}, ("x", "y", "z"))

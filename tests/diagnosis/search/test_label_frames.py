@@ -11,7 +11,7 @@ import torch
 from ballfg.diagnosis.search.candidates import Scored, refit
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.diagnosis.search.label_frames import FRAMES_FITTED, frame_hypotheses
-from ballfg.dynamics.effects.measurement.spin_labels import SpinLabelFrame, signed_permutations
+from ballfg.dynamics.effects.measurement import SpinLabelFrame, signed_permutations
 
 GENERAL = Hypothesis(SpinLabelFrame, {}, tuple(c.name for c in SpinLabelFrame.coefficients))
 MIRROR = np.diag([1.0, -1.0, 1.0])

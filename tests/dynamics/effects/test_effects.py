@@ -9,9 +9,8 @@ import torch
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, advance, fly
 from ballfg.dynamics.analytic import coefficient_sigmas
-from ballfg.dynamics.effects import effect_class
-from ballfg.dynamics.effects.flight.drag import Drag
-from ballfg.dynamics.effects.flight.gravity import Gravity
+from ballfg.dynamics.effects.flight import Drag, Gravity
+from ballfg.dynamics.effects.registry import effect_class
 
 SURFACES = Surfaces(0.0, -0.76)
 

@@ -125,7 +125,7 @@ def test_no_effect(tmp_path: Path) -> None:
     with pytest.raises(TypeError, match=r"^effect must be a subclass of FlightEffect, .*Coefficient"):
         register(Coefficient)
     path = tmp_path / "empty.py"
-    path.write_text("from ballfg.dynamics.effects.flight.wind import Wind\n", encoding="utf-8")
+    path.write_text("from ballfg.dynamics.effects.flight import Wind\n", encoding="utf-8")
     with pytest.raises(ValueError, match=r"empty\.py must define an effect, a class; it defines none\. docs/"):
         load_effects(path)
 
@@ -156,7 +156,7 @@ COEFFICIENT = Coefficient("a", 0.0, 0.1, "m/s^2", -5.0, 5.0)
         ({"coefficients": (dataclasses.replace(COEFFICIENT, absent=None),)}, r"^own_push must have a coefficient that"),
         (
             {"name": "wind"},
-            r"^name of an effect must be its own; got 'wind', that of ballfg\.dynamics\.effects\.flight\.wind\.W",
+            r"^name of an effect must be its own; got 'wind', that of ballfg\.dynamics\.effects\.flight\.W",
         ),
         ({"name": "generic_flight"}, r"^name of an effect must be its own; got 'generic_flight', that of "),
         ({"needs": ("gale",)}, r"^own_push\.needs must name known effects; got 'gale'\. Register that one first"),

@@ -21,7 +21,7 @@ from ballfg.dynamics import (
     substitute,
 )
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.effects.bounce.table import TableTilt
+from ballfg.dynamics.effects.bounce import TableTilt
 from ballfg.dynamics.motion.integrate import batch_jacobian
 
 TILT = (0.08, -0.05)

@@ -12,7 +12,7 @@ from scipy.stats import chi2
 from ballfg.dynamics import nominal_model
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.effects.flight.gravity import Gravity
+from ballfg.dynamics.effects.flight import Gravity
 from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.dynamics.surfaces import Surfaces

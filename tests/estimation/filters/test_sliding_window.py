@@ -8,7 +8,7 @@ import torch
 
 from ballfg.dynamics import nominal_model
 from ballfg.dynamics.analytic import AnalyticModel
-from ballfg.dynamics.effects.flight.gravity import Gravity
+from ballfg.dynamics.effects.flight import Gravity
 from ballfg.dynamics.motion.rollout import rollout
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.filters.sliding_window import SlidingWindow, may_touch

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, advance, nominal_model
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.effects.measurement.spin_labels import signed_permutations
+from ballfg.dynamics.effects.measurement import signed_permutations
 from ballfg.dynamics.measurement import Later
 from ballfg.estimation.measurement.as_measured import (
     LabelMap,

@@ -9,7 +9,7 @@ import pytest
 
 from ballfg.diagnosis.search.hypothesis import with_effects
 from ballfg.dynamics import nominal_model
-from ballfg.dynamics.effects.flight.drag import DragSpin
+from ballfg.dynamics.effects.flight import DragSpin
 from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import Settings

@@ -13,8 +13,8 @@ from ballfg.simulation import SimulationConfig, parse_effects, simulate
 from ballfg.simulation.cameras import looking_at, table_rig
 from ballfg.simulation.scene import Clock, Recording, Renderer, SceneConfig, free_running, record
 from ballfg.simulation.scene.backdrop import backdrop
+from ballfg.simulation.scene.recording import visible_columns
 from ballfg.simulation.scene.shutter import PATH_POINTS
-from ballfg.simulation.scene.visible import visible_columns
 
 SMALL = (320, 180)
 CLEAN: dict[str, Any] = {"noise": 0.0, "flicker": 0.0, "distractors": False}

@@ -1,1 +1,0 @@
-"""Effects on the impact and on the place of the surfaces."""

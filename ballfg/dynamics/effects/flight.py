@@ -1,0 +1,226 @@
+"""Effects on the free ball: gravity, drag, Magnus force, spin decay, moving air."""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from ballfg.dynamics.effect import Coefficient, Flight, FlightEffect, Scene, length, vector
+from ballfg.state import STANDARD_GRAVITY, Z
+
+TINY_SPEED: Final = 1e-9
+"""m/s. Keeps 0/0 away for a ball that neither moves nor spins; its saturated lift is zero anyway."""
+PLACES: Final = (4, 2, 2)
+"""Centres of gust regions that are tried along x, y and z."""
+REGION_SHARE: Final = 0.25
+"""Size of a region that is tried, as a share of the longest extent of the data."""
+LARGEST_REGION: Final = 50.0
+"""m. Of a region that is tried, at most."""
+_DOWN = torch.tensor((0.0, 0.0, -1.0), dtype=torch.float64)
+_UP = torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64)
+
+
+class Gravity(FlightEffect):
+    """a = (0, 0, -g). Buoyancy of the air is the same as a smaller g."""
+
+    name = "gravity"
+    sentence = (
+        "The weight of the ball: a constant downward acceleration; the same as buoyancy and, once drag and Magnus "
+        "force are free, as another time scale."
+    )
+    decide = "Look up the local g, known to four digits: a ball that falls otherwise shows a wrong clock or length."
+    coefficients = (Coefficient("g", STANDARD_GRAVITY, 0.0, "m/s^2", 0.0, 30.0),)
+
+    def acceleration(self, flight: Flight) -> Tensor:
+        """(..., 3) m/s^2, straight down."""
+        return self.g * _DOWN
+
+
+class Buoyancy(FlightEffect):
+    """An acceleration (0, 0, a): rho V g / m, 0.146 m/s^2 for a ball of 40 mm and 2.7 g in air of 1.2 kg/m^3."""
+
+    name = "buoyancy"
+    sentence = "The displaced air carries a part of the weight: exactly the same as a smaller g."
+    decide = "Weigh the ball and measure its diameter: rho V g / m is known; tracks show only the sum with gravity."
+    coefficients = (Coefficient("a", 0.0, 0.15, "m/s^2", -5.0, 5.0),)
+
+    def acceleration(self, flight: Flight) -> Tensor:
+        """(..., 3) m/s^2, straight up."""
+        return self.a * _UP
+
+
+class Drag(FlightEffect):
+    """a = -k |v| v, with k = rho Cd A / (2 m): 0.14 1/m for Cd = 0.49; fits of real tracks give 0.08 to 0.16."""
+
+    name = "drag"
+    sentence = "Quadratic air drag with a constant coefficient."
+    decide = "Vary the speed of still-air shots: drag grows with its square and points backwards, whatever the spin."
+    coefficients = (Coefficient("k", 0.12, 0.035, "1/m", 0.0, 2.0, varies=True),)
+
+    def acceleration(self, flight: Flight) -> Tensor:
+        """(..., 3) m/s^2, opposite to the velocity; zero, with zero derivative, at rest."""
+        k = self.k if flight.drag_gain is None else self.k * flight.drag_gain
+        return -(k * flight.speed) * flight.velocity
+
+
+class DragSpeed(FlightEffect):
+    """k (1 + slope (|v| - reference)) in place of the declared drag's k."""
+
+    name = "drag_speed"
+    sentence = (
+        "The drag coefficient changes with speed (with the Reynolds number); another reference is the same as another "
+        "drag and slope."
+    )
+    decide = "Shoot without spin at very different speeds, in both directions so that a wind cancels."
+    coefficients = (
+        Coefficient("slope", 0.0, 0.02, "s/m", -0.2, 0.2),
+        Coefficient("reference", 5.0, 0.0, "m/s", 0.0, 20.0, absent=None),
+    )
+    needs = ("drag",)
+
+    @classmethod
+    def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
+        """The reference in the middle of the data."""
+        return ({"reference": scene.speed},)
+
+    def adjust(self, flight: Flight) -> Flight:
+        """The flight with more drag where it is fast."""
+        return flight.more_drag(self.slope * (flight.speed - self.reference))
+
+
+class DragSpin(FlightEffect):
+    """k (1 + gain S) in place of the declared drag's k, with the spin ratio S = R |w| / |v|."""
+
+    name = "drag_spin"
+    sentence = "The drag coefficient grows with the ratio of surface speed to flight speed."
+    decide = "Shoot at one speed with and without spin; sidespin and topspin must slow the ball alike."
+    coefficients = (Coefficient("gain", 0.0, 0.3, "1", -10.0, 10.0),)
+    needs = ("drag",)
+
+    def adjust(self, flight: Flight) -> Flight:
+        """The flight with more drag where it spins; the force, with S |v| = R |w|, has no pole at rest."""
+        return flight.more_drag(self.gain * flight.spin_ratio)
+
+
+class Magnus(FlightEffect):
+    """a = k (spin x v), k dimensionless: sources differ by 3.6 times (0.0010 to 0.0036)."""
+
+    name = "magnus"
+    multiplies_spin = True
+    sentence = "Lift of a spinning ball, proportional to spin x velocity."
+    decide = (
+        "Shoot with spins of opposite sign at one speed: the lift changes its sign with the spin, nothing else does."
+    )
+    coefficients = (Coefficient("k", 0.0028, 0.0008, "1", -0.1, 0.1),)
+
+    def acceleration(self, flight: Flight) -> Tensor:
+        """(..., 3) m/s^2, perpendicular to velocity and spin."""
+        k = self.k if flight.lift_gain is None else self.k * flight.lift_gain
+        return k * torch.linalg.cross(flight.spin, flight.velocity)
+
+
+class MagnusSaturation(FlightEffect):
+    """k / (1 + strength S) in place of the declared Magnus k, with the spin ratio S = R |w| / |v|.
+
+    Measured lift coefficients have this shape: Cl = 1 / (2 + |v| / (R |w|)) is S / (1 + 2 S), strength 2
+    (A. Stepanek, "The aerodynamics of tennis balls - the topspin lob", American Journal of Physics 56, 1988).
+    """
+
+    name = "magnus_saturation"
+    sentence = "Lift grows more slowly than the spin: it saturates with the spin ratio."
+    decide = "Shoot at one speed with little, medium and much spin: the lift per spin must fall."
+    coefficients = (Coefficient("strength", 0.0, 0.5, "1", 0.0, 20.0),)
+    needs = ("magnus",)
+
+    def adjust(self, flight: Flight) -> Flight:
+        """The flight with the lift multiplied by 1 / (1 + strength S)."""
+        lost = self.strength * (flight.radius * length(flight.spin))
+        return flight.more_lift(-lost / (flight.speed + lost).clamp_min(TINY_SPEED))
+
+
+class SpinDecay(FlightEffect):
+    """dw/dt = -rate w. No measured value was found for table tennis; 0 switches it off, 0.2 1/s is a slow decay."""
+
+    name = "spin_decay"
+    sentence = "Viscous torque of the air: the spin falls exponentially."
+    decide = "Film a mark on the ball at launch and at the end of a long flight, or label the spin at both ends."
+    coefficients = (Coefficient("rate", 0.2, 0.2, "1/s", 0.0, 20.0),)
+
+    def spin_rate(self, flight: Flight) -> Tensor:
+        """(..., 3) rad/s^2, opposite to the spin."""
+        return -self.rate * flight.spin
+
+
+class Wind(FlightEffect):
+    """All air forces act on v - u, with a constant air velocity u; drag alone becomes -k |v - u| (v - u)."""
+
+    name = "wind"
+    sentence = "The air moves at a constant velocity: drag and Magnus force act on the velocity against the air."
+    decide = "Shoot in the opposite direction, or across: the wind keeps its direction, drag turns with the shot."
+    coefficients = tuple(Coefficient(axis, 0.0, 0.3, "m/s", -20.0, 20.0) for axis in "xyz")
+
+    def air_velocity(self, flight: Flight) -> Tensor:
+        """(3,) or (..., 3) m/s, the same everywhere."""
+        return vector(self.x, self.y, self.z)
+
+
+class WindShear(FlightEffect):
+    """Air velocity (x, y, 0) (p_z - reference): a horizontal wind that grows linearly with height."""
+
+    name = "wind_shear"
+    sentence = (
+        "The air moves horizontally, in proportion to the height above a reference; another reference is the same as a "
+        "wind on top."
+    )
+    decide = "Shoot at different heights in one direction, or hold a thread at two heights."
+    coefficients = (
+        *(Coefficient(axis, 0.0, 0.3, "1/s", -20.0, 20.0) for axis in "xy"),
+        Coefficient("reference", 1.0, 0.5, "m", -100.0, 100.0, absent=None),
+    )
+
+    @classmethod
+    def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
+        """The reference in the middle of the data."""
+        return ({"reference": scene.middle[2]},)
+
+    def air_velocity(self, flight: Flight) -> Tensor:
+        """(..., 3) m/s at the height of the ball."""
+        above = flight.position[..., Z : Z + 1] - self.reference
+        return above * vector(self.x, self.y, torch.zeros_like(self.x))
+
+
+class GustRegion(FlightEffect):
+    """Air velocity u exp(-|p - c|^2 / (2 size^2)) round a centre c, smooth so that integration stays accurate."""
+
+    name = "gust_region"
+    sentence = (
+        "The air moves in one part of the room and is still elsewhere; a region much larger than the flights is a wind."
+    )
+    decide = "Shoot past the suspected place on both sides: the wind is everywhere, the gust in one place."
+    coefficients = (
+        *(Coefficient(axis, 0.0, 0.5, "m/s", -20.0, 20.0) for axis in "xyz"),
+        Coefficient("center_x", 1.4, 1.0, "m", -100.0, 100.0, absent=None),
+        Coefficient("center_y", 0.0, 0.5, "m", -100.0, 100.0, absent=None),
+        Coefficient("center_z", 1.1, 0.5, "m", -100.0, 100.0, absent=None),
+        Coefficient("size", 0.4, 0.2, "m", 0.01, 100.0, absent=None),
+    )
+
+    @classmethod
+    def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
+        """Regions of one size at places over the extent of the data."""
+        extent = [high - low for low, high in zip(scene.low, scene.high, strict=True)]
+        axes = [
+            [low + span * (i + 0.5) / count for i in range(count)]
+            for low, span, count in zip(scene.low, extent, PLACES, strict=True)
+        ]
+        size = min(REGION_SHARE * max(extent), LARGEST_REGION)
+        return [{"center_x": x, "center_y": y, "center_z": z, "size": size} for x, y, z in itertools.product(*axes)]
+
+    def air_velocity(self, flight: Flight) -> Tensor:
+        """(..., 3) m/s at the ball's place."""
+        center = vector(self.center_x, self.center_y, self.center_z)
+        distance = (flight.position - center).square().sum(-1, keepdim=True)
+        share = torch.exp(-distance / (2 * self.size.square()))
+        return share * vector(self.x, self.y, self.z)

@@ -1,0 +1,214 @@
+"""Effects on what is written down: the clock, the frame of the positions, the spin labels."""
+
+import itertools
+from typing import Final
+
+import torch
+from torch import Tensor
+
+from ballfg.dynamics.effect import TINY_LENGTH, Coefficient, length, per_row, vector
+from ballfg.dynamics.measurement import Later, MeasurementEffect
+from ballfg.state import POSITION, VELOCITY
+
+SOFT_DISTANCE: Final = 0.05
+"""m. Nearer to its centre than this a radial bias falls to zero, so that it has a direction nowhere and a derivative
+everywhere; 2 m away it is 0.03 % smaller than its coefficient."""
+
+
+class TimeOffset(MeasurementEffect):
+    """Each coordinate is read x, y or z seconds after the stamp, less the smallest of the three.
+
+    Cameras without a common shutter do that: the coordinate across one camera comes from another moment than the one
+    along it. The same offset on all three is a shift of the clock, which tracks cannot show; it is left out, so that
+    offsets may be negative and delays are not.
+    """
+
+    name = "time_offset"
+    sentence = (
+        "The coordinates of one sample come from different moments: the cameras are not synchronous; the same offset "
+        "on all three axes changes nothing."
+    )
+    decide = (
+        "Flash a light before all cameras, or shoot along another axis: the lag of a coordinate grows with its speed."
+    )
+    coefficients = tuple(Coefficient(axis, 0.0, 0.002, "s", -0.1, 0.1) for axis in "xyz")
+    rank = 0
+
+    def positions(self, states: Tensor, later: Later) -> Tensor:
+        """(..., 3) m, each coordinate from its own moment; a contact on the way is passed through exactly."""
+        offsets = vector(self.x, self.y, self.z)
+        delays = offsets - offsets.amin(-1, keepdim=True)
+        columns = [later(per_row(delays[..., axis : axis + 1]))[..., axis] for axis in range(3)]
+        return torch.stack(columns, dim=-1)
+
+
+class TimeScale(MeasurementEffect):
+    """Written durations are 1 + s times the true ones: a frame rate that is not what the file takes it to be."""
+
+    name = "time_scale"
+    sentence = (
+        "Written durations are too long or too short by a factor: the same as another g once drag and Magnus force, or "
+        "the spin, are free."
+    )
+    decide = "Film a clock, or trust the local g: gravity then gives the scale of the time."
+    coefficients = (Coefficient("s", 0.0, 0.01, "1", -0.5, 0.5),)
+    rank = 100
+
+    def true_stamps(self, stamps: Tensor) -> Tensor:
+        """(...) s of true time."""
+        return stamps / (1.0 + self.s)
+
+    def stamps(self, times: Tensor) -> Tensor:
+        """(...) s as written."""
+        return times * (1.0 + self.s)
+
+
+class VelocityLag(MeasurementEffect):
+    """p - lag v in place of p, with the velocity at the stamp: what an extrapolating or smoothing tracker reports.
+
+    Within a flight that is the track of a ball that started `lag` later, up to lag^2 / 2 times its acceleration (0.1 mm
+    at 5 ms); what shows is the step of lag times the jump of the velocity at a contact.
+    """
+
+    name = "velocity_lag"
+    sentence = (
+        "Positions are reported late, by a lag times the velocity: within one flight the same as a shift of the clock."
+    )
+    decide = (
+        "Let the ball bounce often and steeply: each bounce must show a step of the lag times the change of velocity."
+    )
+    coefficients = (Coefficient("lag", 0.0, 0.003, "s", -0.2, 0.2),)
+    rank = 1
+
+    def positions(self, states: Tensor, later: Later) -> Tensor:
+        """(..., 3) m, behind the ball."""
+        return states[..., POSITION] - self.lag * states[..., VELOCITY]
+
+
+class FrameTilt(MeasurementEffect):
+    """Positions turned about the origin by the rotation vector (x, y, 0); labels stay in the true frame."""
+
+    name = "frame_tilt"
+    sentence = (
+        "The frame of the measurements is tilted against the vertical: the same as a gravity that leans the other way "
+        "and a table that tilts."
+    )
+    decide = "Film a plumb line, or a ball rolling on a levelled table."
+    coefficients = tuple(Coefficient(axis, 0.0, 0.01, "rad", -0.5, 0.5) for axis in "xy")
+    rank = 10
+
+    def positions(self, states: Tensor, later: Later) -> Tensor:
+        """(..., 3) m, in the tilted frame: Rodrigues' formula, p + sin(a)/a r x p + (1 - cos(a))/a^2 r x (r x p)."""
+        position = states[..., POSITION]
+        axis = vector(self.x, self.y, torch.zeros_like(self.x))
+        angle = length(axis).clamp_min(TINY_LENGTH)
+        once = torch.linalg.cross(axis.expand_as(position), position)
+        twice = torch.linalg.cross(axis.expand_as(position), once)
+        half = torch.sin(angle / 2) / angle
+        return position + torch.sin(angle) / angle * once + 2 * half.square() * twice
+
+
+class Scale(MeasurementEffect):
+    """Each coordinate times 1 + its error, about the origin of the frame."""
+
+    name = "scale"
+    sentence = (
+        "Measured lengths are too long or too short by a factor along each axis; the same factor on all is another g, "
+        "drag, radius and table height."
+    )
+    decide = "Measure a rod of known length along each axis."
+    coefficients = tuple(Coefficient(axis, 0.0, 0.01, "1", -0.5, 0.5) for axis in "xyz")
+    rank = 11
+
+    def positions(self, states: Tensor, later: Later) -> Tensor:
+        """(..., 3) m, stretched."""
+        return states[..., POSITION] * (1.0 + vector(self.x, self.y, self.z))
+
+
+class RadialBias(MeasurementEffect):
+    """Positions moved away from a centre c, such as a camera: p + offset d / sqrt(|d|^2 + soft^2) with d = p - c."""
+
+    name = "radial_bias"
+    sentence = "Positions lie a constant distance too far from one place, as with a wrong range of a camera."
+    decide = "Measure a ball at rest in several known places: the error points away from the centre."
+    coefficients = (
+        Coefficient("offset", 0.0, 0.005, "m", -0.5, 0.5),
+        Coefficient("x", 0.0, 1.0, "m", -100.0, 100.0, absent=None),
+        Coefficient("y", 0.0, 1.0, "m", -100.0, 100.0, absent=None),
+        Coefficient("z", 0.0, 1.0, "m", -100.0, 100.0, absent=None),
+    )
+    rank = 12
+
+    def positions(self, states: Tensor, later: Later) -> Tensor:
+        """(..., 3) m, pushed outwards."""
+        position = states[..., POSITION]
+        away = position - vector(self.x, self.y, self.z)
+        distance = (away.square().sum(-1, keepdim=True) + SOFT_DISTANCE**2).sqrt()
+        return position + self.offset * away / distance
+
+
+class SpinLabelFrame(MeasurementEffect):
+    """label = M spin with M = ((xx, xy, xz), (yx, yy, yz), (zx, zy, zz)), row by row; the identity at absence.
+
+    Labels with exchanged or reversed axes have one of the `signed_permutations` for M.
+    """
+
+    name = "spin_label_frame"
+    sentence = (
+        "Spin labels are given in other axes or with other signs than the positions; a multiple of the identity is a "
+        "spin label scale."
+    )
+    decide = "Shoot with pure topspin, then pure sidespin, and compare the way the balls curve with their labels."
+    coefficients = tuple(
+        Coefficient(row + column, float(row == column), 0.5, "1", -10.0, 10.0, absent=float(row == column))
+        for row in "xyz"
+        for column in "xyz"
+    )
+    rank = 101
+
+    def label(self, spin: Tensor) -> Tensor:
+        """(..., 3) rad/s as labelled."""
+        rows = (vector(*(getattr(self, row + column) for column in "xyz")) for row in "xyz")
+        return torch.cat([(row * spin).sum(-1, keepdim=True) for row in rows], dim=-1)
+
+
+def signed_permutations() -> Tensor:
+    """(48, 3, 3) all matrices that exchange and reverse axes, the identity first; half of them mirror."""
+    eye = torch.eye(3, dtype=torch.float64)
+    signs = [torch.tensor(s, dtype=torch.float64) for s in itertools.product((1.0, -1.0), repeat=3)]
+    orders = [torch.tensor(order) for order in itertools.permutations(range(3))]
+    return torch.stack([sign.unsqueeze(-1) * eye[order] for order in orders for sign in signs])
+
+
+class SpinLabelScale(MeasurementEffect):
+    """label = (1 + s) spin: another unit, a slipping wheel, a count of half turns."""
+
+    name = "spin_label_scale"
+    sentence = (
+        "Spin labels are too large or too small by a factor: in flight the same as another Magnus coefficient, only "
+        "bounces tell."
+    )
+    decide = "Film a mark on the ball, or use bounces that grip: they show the spin itself."
+    coefficients = (Coefficient("s", 0.0, 0.1, "1", -10.0, 10.0),)
+    rank = 102
+
+    def label(self, spin: Tensor) -> Tensor:
+        """(..., 3) rad/s as labelled."""
+        return (1.0 + self.s) * spin
+
+
+class SpinLabelOffset(MeasurementEffect):
+    """label = spin + (x, y, z), in the axes of the labels."""
+
+    name = "spin_label_offset"
+    sentence = (
+        "Spin labels are wrong by one constant vector: in flight the same as a rotating room, whose Coriolis "
+        "acceleration is the Magnus force of a constant extra spin."
+    )
+    decide = "Shoot without spin: what curves then is not in the labels' scale; film a mark on the ball."
+    coefficients = tuple(Coefficient(axis, 0.0, 10.0, "rad/s", -2000.0, 2000.0) for axis in "xyz")
+    rank = 103
+
+    def label(self, spin: Tensor) -> Tensor:
+        """(..., 3) rad/s as labelled."""
+        return spin + vector(self.x, self.y, self.z)

@@ -1,1 +1,0 @@
-"""Effects on what is written down."""
