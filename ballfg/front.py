@@ -1,7 +1,5 @@
 """The front door: estimate and predict for arrays, tracks, datasets and folders alike."""
 
-from __future__ import annotations
-
 from os import PathLike
 from pathlib import Path
 from typing import TypeAlias, TypedDict, Unpack, overload

@@ -1,7 +1,5 @@
 """The machine and the installed packages, as results and runs record them."""
 
-from __future__ import annotations
-
 import os
 import platform
 from collections.abc import Iterable

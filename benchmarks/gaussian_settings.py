@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ballfg.benchmarks.metrics import Array
+from ballfg.arrays import Array
 from ballfg.estimation import Settings
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise

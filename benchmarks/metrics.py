@@ -7,8 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import binomtest, chi2, norm
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
+from ballfg.arrays import Array, Index
 
 RESAMPLES = 1000
 """Of the bootstrap: the ends of a 95 % interval then move by about a tenth of its length."""

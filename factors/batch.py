@@ -17,13 +17,10 @@ from dataclasses import dataclass
 from typing import ClassVar, Self, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
+from ballfg.arrays import Array, Index
 from ballfg.factors.loss import Loss
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 COEFFICIENTS = -1
 """The variable number of the coefficients shared by all factors; states have their index."""

@@ -5,15 +5,14 @@ and Jacobians of every row together with the very bytes of the inputs they belon
 is answered from there; any other question is a miss. docs/custom_factors.md is the contract.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Literal
 
 import gtsam
 import numpy as np
 
-from ballfg.factors.batch import COEFFICIENTS, Array, FactorBatch, Index, Values
+from ballfg.arrays import Array, Index
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
 from ballfg.factors.graph import BallGraph
 
 OnMiss = Literal["changed", "row"]

@@ -1,7 +1,5 @@
 """Camera factor: where a camera saw the ball is where the state's position projects to, plus noise."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable
 from typing import ClassVar
 
@@ -9,7 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.factors.batch import COEFFICIENTS, Array, FactorBatch, Index
+from ballfg.arrays import Array, Index
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch
 from ballfg.factors.loss import Loss
 from ballfg.state import POSITION, STATE_DIM, VELOCITY
 from ballfg.vision.projection import CameraBank

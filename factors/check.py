@@ -1,12 +1,11 @@
 """Every Jacobian block of a batch of factors against central differences."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 
-from ballfg.factors.batch import COEFFICIENTS, Array, FactorBatch, Values
+from ballfg.arrays import Array
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
 
 STEP = 1e-4
 """Step of the differences, relative to a number's size, absolute below 1. The five-point rule's own error is of order

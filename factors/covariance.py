@@ -6,15 +6,14 @@ K_i = -R_i^-1 S_i the covariance of x_i follows from that of y. Only the triangu
 `Marginals` goes through Cholesky, which fails for a loose prior beside a tight process noise.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import gtsam
 import numpy as np
 
-from ballfg.factors.batch import COEFFICIENTS, Array, Index
+from ballfg.arrays import Array, Index
+from ballfg.factors.batch import COEFFICIENTS
 from ballfg.state import STATE_DIM
 
 

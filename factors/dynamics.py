@@ -4,8 +4,6 @@ Three classes share everything but the motion over the interval: free flight, fl
 a surface. A hit is a flight whose process noise contains the hit.
 """
 
-from __future__ import annotations
-
 from abc import abstractmethod
 from collections.abc import Hashable
 from functools import partial
@@ -15,13 +13,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ballfg.arrays import Array, Index
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import fly_through, fly_through_jacobian
 from ballfg.dynamics.motion.flight_step import flight_step
 from ballfg.dynamics.motion.integrate import batch_jacobian, fly_jacobian, step_count, steps_over
 from ballfg.dynamics.motion.rollout import roll
-from ballfg.factors.batch import COEFFICIENTS, Array, FactorBatch, Index, Noise, Values
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Noise, Values
 from ballfg.factors.noise import Kicks, whitening, whitening_tensor
 from ballfg.state import STATE_DIM
 

@@ -1,7 +1,5 @@
 """A factor graph over one track: its factors, its objective, and the loop that minimises it."""
 
-from __future__ import annotations
-
 import enum
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Launcher factor: the first spin is what a launcher's settings mean, along the direction of flight."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable
 from functools import partial
 from typing import ClassVar
@@ -10,9 +8,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ballfg.arrays import Array, Index
 from ballfg.dynamics.motion.integrate import batch_jacobian
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
-from ballfg.factors.batch import Array, FactorBatch, Index, Noise
+from ballfg.factors.batch import FactorBatch, Noise
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, VELOCITY
 

@@ -1,7 +1,5 @@
 """The linear subproblem: GTSAM eliminates the linearised graph, by QR, state by state along the track."""
 
-from __future__ import annotations
-
 import functools
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -9,7 +7,8 @@ from dataclasses import dataclass
 import gtsam
 import numpy as np
 
-from ballfg.factors.batch import COEFFICIENTS, Array, Index, Rows, Values
+from ballfg.arrays import Array, Index
+from ballfg.factors.batch import COEFFICIENTS, Rows, Values
 from ballfg.state import STATE_DIM
 
 Piece = tuple[Index, Array, tuple[Array, ...]]

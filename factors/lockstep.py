@@ -4,8 +4,6 @@ A search (`ballfg.factors.graph.Search`) asks for linearisations. `run_together`
 of the same sort, of whatever graph, are evaluated in one call, which costs little more than a single graph's.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Hashable, Sequence
 

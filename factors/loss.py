@@ -8,11 +8,9 @@ from typing import Literal
 import gtsam
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
-Array = NDArray[np.float64]
-
+from ballfg.arrays import Array
 
 LEAST_STRETCH = 0.05
 """Where the loss is straight or concave along the residual, this much curvature keeps the step finite."""

@@ -13,9 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ballfg.arrays import Array
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

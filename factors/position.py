@@ -1,14 +1,13 @@
 """Position factor: a measured position is the state's position plus noise."""
 
-from __future__ import annotations
-
 from typing import ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.factors.batch import Array, FactorBatch, Index, Noise
+from ballfg.arrays import Array, Index
+from ballfg.factors.batch import FactorBatch, Noise
 from ballfg.factors.loss import Loss
 from ballfg.state import POSITION, STATE_DIM
 

@@ -1,7 +1,5 @@
 """Priors: a state, its spin alone, or the shared coefficients are known to some standard deviation."""
 
-from __future__ import annotations
-
 from collections.abc import Hashable
 from typing import ClassVar
 
@@ -9,8 +7,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ballfg.arrays import Array, Index
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.factors.batch import COEFFICIENTS, Array, FactorBatch, Index, Noise
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Noise
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, STATE_DIM
 

@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LEVELS = (
-    ("state", "checks", "progress", "registry", "machine"),
+    ("state", "arrays", "checks", "progress", "registry", "machine"),
     ("files",),
     ("tracks",),
     ("vision",),

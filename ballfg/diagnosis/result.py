@@ -4,15 +4,8 @@ import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-import numpy as np
-from numpy.typing import NDArray
-
+from ballfg.arrays import Array, Index
 from ballfg.dynamics import BallModel
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
-Mask = NDArray[np.bool_]
-"""Arrays of the whole room."""
 
 
 class Verdict(enum.Enum):

@@ -1,7 +1,5 @@
 """Many tracks on several cores, one after the other out of a stream into a stream."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Settings for a dataset: what it says about its noise, and where it says nothing, what its tracks show."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import islice
 

@@ -1,7 +1,5 @@
 """The picture of an estimate: each component of the state over time, with its uncertainty."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from matplotlib.figure import Figure

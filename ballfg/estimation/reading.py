@@ -1,7 +1,5 @@
 """A folder opened for estimation: its tracks, or what cameras saw, with all other readings that lie beside them."""
 
-from __future__ import annotations
-
 from os import PathLike
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The estimators by name: those of the package, of the user, and of other installed packages."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from ballfg.dynamics.model import BallModel

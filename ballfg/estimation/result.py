@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.estimation.segmentation import Contact
 from ballfg.prediction.ahead import Ahead
 from ballfg.prediction.state import BallState, World
@@ -18,8 +19,6 @@ from ballfg.state import SIGMA_NAMES, STATE_DIM, STATE_NAMES
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
-
-Array = NDArray[np.float64]
 
 
 class Status(enum.Enum):

@@ -1,7 +1,5 @@
 """Prediction of whole tracks: observe the first part, predict what will be measured at every later stamp."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
@@ -11,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.estimation.batch import estimate_tracks
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.measurement.as_measured import measured_positions, true_times
@@ -20,8 +19,6 @@ from ballfg.prediction.belief import Belief
 from ballfg.prediction.propagate import Propagator
 from ballfg.state import POSITION
 from ballfg.tracks import Track
-
-Array = NDArray[np.float64]
 
 BLOCK = 64
 """Tracks that are propagated together; memory grows with it."""

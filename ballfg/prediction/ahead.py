@@ -7,8 +7,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.crossing import Crossing, apex, next_contact, plane_crossing
 from ballfg.prediction.propagate import Propagator
@@ -18,7 +18,6 @@ from ballfg.state import POSITION
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-Array = NDArray[np.float64]
 
 AXES = ("x", "y", "z")
 

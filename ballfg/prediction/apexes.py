@@ -1,15 +1,11 @@
 """The apex, the highest point of a flight between bounces: of true states, of predicted and of measured positions."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.state import POSITION, VELOCITY, VZ
-
-Array = NDArray[np.float64]
 
 HALF_WIDTH: Final = 0.05
 """s to each side of the highest sample over which a parabola is fitted. Drag bends a path off its parabola by less than

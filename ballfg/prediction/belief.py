@@ -7,15 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from ballfg.arrays import Array
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
 from ballfg.prediction.state import BallState
 from ballfg.state import STATE_DIM
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

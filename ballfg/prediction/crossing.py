@@ -4,8 +4,6 @@ An event is a function g of the state that changes sign. At the crossing time th
 g = 0: a ball that is late is further back but crosses at the same place (docs/derivations/prediction.md).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -13,9 +11,10 @@ from functools import partial
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import contact_time
 from ballfg.dynamics.motion.integrate import MAX_STEP, RateFunction, batch_jacobian, derivative, fly
@@ -24,8 +23,6 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.propagate import Propagator
 from ballfg.state import POSITION, STATE_DIM, VZ
-
-Array = NDArray[np.float64]
 
 EventFunction = Callable[[Tensor], Tensor]
 """(..., d) states to (..., 1) values; the event is where the value falls through zero."""

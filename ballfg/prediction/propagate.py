@@ -4,16 +4,15 @@ The mean is the rollout of the mean. The covariance goes through the derivative 
 (docs/derivations/prediction.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from torch import Tensor
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
 from ballfg.dynamics.motion.integrate import fly_jacobian, step_count
@@ -22,8 +21,6 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.belief import Belief
 from ballfg.state import STATE_DIM, VZ
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

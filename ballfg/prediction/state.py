@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
@@ -15,8 +15,6 @@ from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 if TYPE_CHECKING:
     from ballfg.prediction.ahead import Ahead
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ballfg.arrays import Array
 from ballfg.dynamics import BallModel, advance
 from ballfg.simulation.config import MeasurementNoise, SimulationConfig
 from ballfg.simulation.motion import Motion
@@ -18,8 +19,6 @@ from ballfg.tracks import SPIN_LABELS, Track
 LEAST_SAMPLES = 2
 """A track of fewer samples is refused by every reader."""
 
-FloatArray = NDArray[np.float64]
-
 
 @dataclass(frozen=True)
 class SimulatedTrack:
@@ -28,10 +27,10 @@ class SimulatedTrack:
     track: Track
     """Stamps, positions and labels with all their noise."""
 
-    true_times: FloatArray
+    true_times: Array
     """(n,) s, when the frames were taken."""
 
-    true_states: FloatArray
+    true_states: Array
     """(n, 9) the ball's state at those times."""
 
 
@@ -81,7 +80,7 @@ def _kept_frames(noise: MeasurementNoise, seed: int, block: int, exists: NDArray
     return kept
 
 
-def _position_noise(noise: MeasurementNoise, seed: int, block: int, shape: tuple[int, ...]) -> FloatArray:
+def _position_noise(noise: MeasurementNoise, seed: int, block: int, shape: tuple[int, ...]) -> Array:
     """(n, k, 3) m, Gaussian noise and outliers."""
     added = noise.position * generator(seed, Purpose.POSITION, block).standard_normal((*shape, 3))
     rng = generator(seed, Purpose.OUTLIER, block)
@@ -92,9 +91,7 @@ def _position_noise(noise: MeasurementNoise, seed: int, block: int, shape: tuple
     return added + np.where(is_outlier, distance, 0.0)[..., None] * direction
 
 
-def _apparent_positions(
-    config: SimulationConfig, model: BallModel, states: FloatArray, exists: NDArray[np.bool_]
-) -> FloatArray:
+def _apparent_positions(config: SimulationConfig, model: BallModel, states: Array, exists: NDArray[np.bool_]) -> Array:
     """(n, k, 3) m, where the ball seems to be before noise."""
     apparent, flat = states[..., POSITION].copy(), torch.from_numpy(states[exists])
 

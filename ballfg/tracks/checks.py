@@ -10,9 +10,9 @@ from typing import Final
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.state import STANDARD_GRAVITY, Z
 from ballfg.tracks.grouping import RowGroup
-from ballfg.tracks.track import FloatArray
 
 MERGE_DISTANCE = 0.1
 """m: two rows at one stamp farther apart than this are refused; one frame of a ball at 15 m/s and 150 Hz."""
@@ -79,7 +79,7 @@ class Findings:
         return notes
 
 
-def check_step(label: str, stamps: FloatArray) -> None:
+def check_step(label: str, stamps: Array) -> None:
     """Refuses stamps that cannot be seconds of a camera.
 
     Args: label: names the stamps in an error.  stamps: (n,) s, increasing; fewer than three tell nothing.
@@ -93,7 +93,7 @@ def check_step(label: str, stamps: FloatArray) -> None:
         )
 
 
-def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> FloatArray:
+def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> Array:
     """The samples of one trajectory, one for each stamp, in time order.
 
     Returns: (n, 4) or (n, 7), columns as in Block; what is repaired is added to the findings.
@@ -117,7 +117,7 @@ def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> Flo
     return values
 
 
-def fuse(values: FloatArray) -> FloatArray:
+def fuse(values: Array) -> Array:
     """The mean of different measurements of one position at one stamp.
 
     With sigmas it is weighted by 1 / sigma^2, and sigma becomes that of the weighted mean times a factor >= 1,
@@ -138,9 +138,7 @@ def fuse(values: FloatArray) -> FloatArray:
     return np.concatenate([values[0, :1], mean, scale / np.sqrt(total)])
 
 
-def check_scale(
-    label: str, times: FloatArray, positions: FloatArray, sigmas: FloatArray | None, rate: float | None
-) -> None:
+def check_scale(label: str, times: Array, positions: Array, sigmas: Array | None, rate: float | None) -> None:
     """Refuses a track whose numbers cannot be metres and seconds.
 
     Args: times: (n,) s, n >= 2, increasing.  positions: (n, 3) m.  sigmas: (n, 3) m.  rate: as declared, Hz.
@@ -182,7 +180,7 @@ def check_scale(
         )
 
 
-def doubts_about(times: FloatArray, positions: FloatArray, surfaces: Sequence[float], radius: float) -> tuple[str, ...]:
+def doubts_about(times: Array, positions: Array, surfaces: Sequence[float], radius: float) -> tuple[str, ...]:
     """What does not look like a ball that falls along -z and bounces on the declared surfaces.
 
     Args: times: (n,) s.  positions: (n, 3) m.  surfaces: heights, m.  radius: m, of the ball.
@@ -195,7 +193,7 @@ def doubts_about(times: FloatArray, positions: FloatArray, surfaces: Sequence[fl
     return (*_other_axis(times, positions, reach), *_other_surface(times, positions, reach, surfaces, radius))
 
 
-def _one_per_stamp(group: RowGroup, where: Where, findings: Findings) -> FloatArray:
+def _one_per_stamp(group: RowGroup, where: Where, findings: Findings) -> Array:
     values = group.values
     starts = np.flatnonzero(np.concatenate([[True], np.diff(values[:, 0]) != 0]))
     kept = values[starts].copy()
@@ -238,7 +236,7 @@ def _some(names: list[str]) -> str:
     return ", ".join(names[:_NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
-def _other_axis(times: FloatArray, positions: FloatArray, reach: int) -> tuple[str, ...]:
+def _other_axis(times: Array, positions: Array, reach: int) -> tuple[str, ...]:
     before, middle, after = positions[: -2 * reach], positions[reach:-reach], positions[2 * reach :]
     span = (times[2 * reach :] - times[: -2 * reach]) / 2
     acceleration = np.median((after - 2 * middle + before) / span[:, None] ** 2, axis=0)
@@ -254,7 +252,7 @@ def _other_axis(times: FloatArray, positions: FloatArray, reach: int) -> tuple[s
 
 
 def _other_surface(
-    times: FloatArray, positions: FloatArray, reach: int, surfaces: Sequence[float], radius: float
+    times: Array, positions: Array, reach: int, surfaces: Sequence[float], radius: float
 ) -> tuple[str, ...]:
     z = positions[:, Z]
     inner = np.arange(reach, len(z) - reach)

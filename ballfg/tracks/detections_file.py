@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.csv as pa_csv
 from numpy.typing import ArrayLike, NDArray
 
+from ballfg.arrays import Array
 from ballfg.checks import did_you_mean
 from ballfg.tracks import csv_files
 from ballfg.tracks.checks import check_step
@@ -18,7 +19,6 @@ from ballfg.tracks.rows import KEY
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.table import TableWriter
 
-Array = NDArray[np.float64]
 Texts = NDArray[np.str_]
 Rule = tuple[str, Callable[[Array], NDArray[np.bool_]]]
 """What the numbers of a column must be, in words and as a test."""

@@ -15,9 +15,9 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.tracks.csv_files import no_rows
 from ballfg.tracks.rows import Block, RowSource
-from ballfg.tracks.track import FloatArray
 
 LARGEST = 1e100
 """Any number beyond this is refused at once, so that no later step overflows."""
@@ -35,7 +35,7 @@ class RowGroup:
     rows: NDArray[np.int64]
     """(n,) number of each row in the file, from 0."""
 
-    values: FloatArray
+    values: Array
     """(n, 4) or (n, 7), as in Block."""
 
 

@@ -11,8 +11,8 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.tracks import csv_files
-from ballfg.tracks.track import FloatArray
 
 KEY = "trajectory"
 VALUES = ("t", "x", "y", "z")
@@ -37,7 +37,7 @@ class Block:
     codes: NDArray[np.int32]
     """(n,) index into `names` for each row."""
 
-    values: FloatArray
+    values: Array
     """(n, 4) t, x, y, z in s and m, or (n, 7) with the sigmas in m."""
 
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ballfg.arrays import Array
 from ballfg.checks import check_array
-
-Array = NDArray[np.float64]
 
 ROUNDING = 1e-6
 """Relative to the trace: a covariance that was computed in single precision is symmetric up to this."""

@@ -9,12 +9,12 @@ from typing import Any, Protocol, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ballfg.arrays import Array
 from ballfg.checks import check_array
 
 SPIN_LABELS = ("spin_x", "spin_y", "spin_z")
 
 Label = float | str
-FloatArray = NDArray[np.float64]
 
 
 class Measurements(Protocol):
@@ -41,13 +41,13 @@ class Track:
         is not positive, or a bad label; the message names the index. TypeError: a name that is not a str.
     """
 
-    times: FloatArray
+    times: Array
     """(n,) s, n >= 1, strictly increasing. The origin is the data's own."""
 
-    positions: FloatArray
+    positions: Array
     """(n, 3) m, world frame, z up."""
 
-    sigmas: FloatArray | None = None
+    sigmas: Array | None = None
     """(n, 3) m, standard deviation of each coordinate, positive; None where the data states none."""
 
     labels: Mapping[str, Label] = field(default_factory=dict)
@@ -120,7 +120,7 @@ class Track:
         return float(self.times[-1] - self.times[0])
 
     @property
-    def spin_label(self) -> FloatArray | None:
+    def spin_label(self) -> Array | None:
         """(3,) rad/s: the labelled spin at the first sample; None unless all three components are labelled."""
         values = [self.labels.get(key) for key in SPIN_LABELS]
         if any(value is None for value in values):
@@ -183,7 +183,7 @@ def _check_name(name: object) -> None:
         )
 
 
-def _finite(track: str, argument: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> FloatArray:
+def _finite(track: str, argument: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
     array = check_array(f"track {track!r}: {argument}", value, shape, "Pass one row per sample.")
     if not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])

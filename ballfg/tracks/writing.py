@@ -7,6 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Literal, TextIO
 
+from ballfg.arrays import Array
 from ballfg.files.whole_folder import whole_folder
 from ballfg.tracks.checks import check_scale
 from ballfg.tracks.dataset import TRACK_FILES
@@ -15,7 +16,7 @@ from ballfg.tracks.info import INFO_FILE, DatasetInfo, write_info
 from ballfg.tracks.labels import LABELS_FILE
 from ballfg.tracks.rows import KEY, SIGMAS, VALUES
 from ballfg.tracks.table import TableWriter
-from ballfg.tracks.track import FloatArray, Track
+from ballfg.tracks.track import Track
 
 DATASET_FILES = (INFO_FILE, *TRACK_FILES, LABELS_FILE)
 """All names that the files of a dataset can have."""
@@ -93,8 +94,8 @@ def _check_track(track: Track, names: set[str], info: DatasetInfo, has_sigmas: b
     check_scale(f"track {track.name!r}", track.times, track.positions, track.sigmas, info.rate)
 
 
-def _columns(track: Track) -> dict[str, FloatArray | str]:
-    columns: dict[str, FloatArray | str] = {KEY: track.name, VALUES[0]: track.times}
+def _columns(track: Track) -> dict[str, Array | str]:
+    columns: dict[str, Array | str] = {KEY: track.name, VALUES[0]: track.times}
     columns |= {name: track.positions[:, axis] for axis, name in enumerate(VALUES[1:])}
     if track.sigmas is not None:
         columns |= {name: track.sigmas[:, axis] for axis, name in enumerate(SIGMAS)}

@@ -3,10 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
 Array32 = NDArray[np.float32]
 Image = NDArray[np.uint8]
 """(h, w, 3) blue, green, red, or (h, w) grey."""
-Flags = NDArray[np.bool_]
-Rows = NDArray[np.int64]
-"""Numbers of rows of other arrays."""

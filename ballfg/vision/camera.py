@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ballfg.vision.arrays import Array, Flags
+from ballfg.arrays import Array, Mask
 
 DISTORTIONS: Final = (0, 4, 5, 8, 12, 14)
 """Lengths of distortion vectors in OpenCV: none; k1 k2 p1 p2; k3; k4 k5 k6; thin prism s1-s4; tilt tau_x tau_y."""
@@ -166,7 +166,7 @@ class Camera:
         directions = np.concatenate((plane, np.ones((*plane.shape[:-1], 1))), axis=-1) @ self.rotation
         return np.asarray(directions / np.linalg.norm(directions, axis=-1, keepdims=True))
 
-    def in_view(self, points: ArrayLike) -> Flags:
+    def in_view(self, points: ArrayLike) -> Mask:
         """Whether points lie in front of the camera and within its image.
 
         Args: points: (..., 3) m, world.

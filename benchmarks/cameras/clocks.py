@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.benchmarks.cameras.scenes import Filmed, truth_at
-from ballfg.benchmarks.metrics import Array
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import (
     Estimate,

@@ -9,7 +9,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.benchmarks.metrics import Array, nees, root_mean_square
+from ballfg.arrays import Array
+from ballfg.benchmarks.metrics import nees, root_mean_square
 from ballfg.simulation.cameras import table_rig
 from ballfg.simulation.scene import Flight, Recording, SceneConfig, free_running, record, write_scene
 from ballfg.vision.association.gathering import SeenBall, nearest

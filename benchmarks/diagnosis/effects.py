@@ -9,7 +9,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.benchmarks.metrics import Array
+from ballfg.arrays import Array
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.dynamics import EFFECTS
 

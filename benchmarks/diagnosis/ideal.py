@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import optimize, stats
 
+from ballfg.arrays import Array
 from ballfg.benchmarks.diagnosis.cases import Case, Recording, planted_case
 from ballfg.benchmarks.diagnosis.data import declared_model, make_dataset
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.record import case_digest
-from ballfg.benchmarks.metrics import Array
 from ballfg.benchmarks.resumable import read_record, write_record
 from ballfg.diagnosis.fit.fit import fit_model
 from ballfg.diagnosis.fit.holdout import launcher_labels

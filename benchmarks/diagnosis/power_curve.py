@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy import optimize, special
 
-from ballfg.benchmarks.metrics import Array
+from ballfg.arrays import Array
 
 NAMED = 0.9
 """Share of seeds from which on an effect of some size counts as named."""

@@ -8,8 +8,8 @@ from typing import Final, Protocol
 import numpy as np
 import torch
 
+from ballfg.arrays import Array
 from ballfg.benchmarks.dynamics.task import Task
-from ballfg.benchmarks.metrics import Array
 from ballfg.dynamics import BallModel, Surfaces, nominal_model
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.motion.paths import paths

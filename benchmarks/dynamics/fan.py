@@ -7,8 +7,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.benchmarks.dynamics.contenders import GraphContender
-from ballfg.benchmarks.metrics import Array
 from ballfg.simulation import SETTING_LEVELS, table_tennis
 from ballfg.simulation.settings import Settings
 from ballfg.state import POSITION, SPIN, VELOCITY

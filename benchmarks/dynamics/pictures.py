@@ -10,10 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize
 
+from ballfg.arrays import Array
 from ballfg.benchmarks.dynamics.record import Record
 from ballfg.benchmarks.dynamics.task import APEXES, Task
 from ballfg.benchmarks.estimators.measured import HORIZON
-from ballfg.benchmarks.metrics import Array
 from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, curve, save
 from ballfg.benchmarks.results import Row
 from ballfg.simulation import SETTING_LEVELS

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.benchmarks.dynamics.task import Shot
-from ballfg.benchmarks.metrics import Array, square_norms
+from ballfg.benchmarks.metrics import square_norms
 from ballfg.prediction.apexes import FLIGHTS, flight_bounds, path_apex
 
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
-from ballfg.benchmarks.metrics import Array
+from ballfg.arrays import Array
 from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation import Launcher, Settings
 from ballfg.tracks import DatasetInfo, Track, write_dataset

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.benchmarks.dynamics.contenders import Contender, GraphContender, Job
 from ballfg.benchmarks.dynamics.recipes import content_of, kind_of
 from ballfg.benchmarks.dynamics.record import task_digest
 from ballfg.benchmarks.dynamics.task import Task
-from ballfg.benchmarks.metrics import Array
 from ballfg.dynamics import BallModel, load_model
 from ballfg.estimation import Settings
 from ballfg.estimation.configure import launcher_of, learned_process

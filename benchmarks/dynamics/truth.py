@@ -23,9 +23,9 @@ from typing import Final
 import numpy as np
 import torch
 
+from ballfg.arrays import Array
 from ballfg.benchmarks.dynamics.task import Shot, Task
 from ballfg.benchmarks.estimators.protocols import gaussian_settings
-from ballfg.benchmarks.metrics import Array
 from ballfg.dynamics import BallModel, Surfaces, contact_time
 from ballfg.estimation import Launcher
 from ballfg.factors.noise import ProcessNoise

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.benchmarks.gaussian_settings import StepNoise, gaussian_settings
-from ballfg.benchmarks.metrics import Array
 from ballfg.dynamics import BallModel, Surfaces, contact_time, nominal_model, rollout
 from ballfg.estimation import (
     ESTIMATORS,

@@ -7,8 +7,9 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.benchmarks.estimators.protocols import Candidate, Case
-from ballfg.benchmarks.metrics import Array, inside, nees, square_norms
+from ballfg.benchmarks.metrics import inside, nees, square_norms
 from ballfg.benchmarks.resumable import in_processes
 from ballfg.estimation import Status
 from ballfg.estimation.filters.sliding_window import WINDOW

@@ -4,18 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.benchmarks.estimators.protocols import Protocol
 from ballfg.benchmarks.estimators.scoring import LEVELS, Scores, TrackScore, covered, every, pooled, score_tracks
-from ballfg.benchmarks.metrics import (
-    Array,
-    Figure,
-    Statistic,
-    bootstrap,
-    chi_square_band,
-    pooled_mean,
-    pooled_rms,
-    ratio,
-)
+from ballfg.benchmarks.metrics import Figure, Statistic, bootstrap, chi_square_band, pooled_mean, pooled_rms, ratio
 from ballfg.benchmarks.results import CURVE_MARK, Results
 from ballfg.state import STATE_DIM, VELOCITY
 

@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_settings, dataset_surfaces, estimate_tracks
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
-from ballfg.learning.calibration.population import Array, Evidence, evidence, fit_population
+from ballfg.learning.calibration.population import Evidence, evidence, fit_population
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import TrackScore, judge_tracks
 from ballfg.learning.split import Split, split_tracks, tracks_of

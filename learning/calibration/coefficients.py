@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ballfg.arrays import Array
 from ballfg.checks import did_you_mean
 from ballfg.dynamics import AnalyticModel
-from ballfg.learning.calibration.population import Array
 
 NEED_SPIN_LABELS = ("flight.magnus.k", "flight.spin_decay.rate")
 """Coefficients that act through the spin alone: without measured spin only their product with it is observable."""

@@ -13,10 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 
-Array = NDArray[np.float64]
+from ballfg.arrays import Array
 
 MAX_STEPS = 20_000
 """Of the iteration: some tens are usual, thousands where the spread is close to zero. A step takes 50 us."""

@@ -12,10 +12,10 @@ from typing import Final
 import numpy as np
 import torch
 
+from ballfg.arrays import Array
 from ballfg.dynamics.analytic import AnalyticModel, coefficient_sigmas
 from ballfg.dynamics.networks.spin_embedding import SPIN_UNIT, SpinEmbedding
 from ballfg.estimation import Smoother, Status
-from ballfg.factors.batch import Array
 from ballfg.learning.shots import Shot
 from ballfg.state import SPIN, VELOCITY
 

@@ -7,13 +7,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import Smoother
 from ballfg.estimation.segmentation import Contact
 from ballfg.estimation.smoother.problem import effective_sigmas
 from ballfg.estimation.smoother.smoother import Earlier
 from ballfg.estimation.smoother.solution import Solution
-from ballfg.factors.batch import Array, Values
+from ballfg.factors.batch import Values
 from ballfg.factors.graph import Convergence, LevenbergMarquardt, Search
 from ballfg.factors.lockstep import run_together
 from ballfg.learning.augment import apply, rotate, undo

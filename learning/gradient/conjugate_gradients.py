@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.factors.batch import Array
+from ballfg.arrays import Array
 from ballfg.factors.covariance import SquareRootInformation
 from ballfg.state import STATE_DIM
 

@@ -14,7 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.factors.batch import Array, FactorBatch, Noise, Rows, Values
+from ballfg.arrays import Array
+from ballfg.factors.batch import FactorBatch, Noise, Rows, Values
 from ballfg.factors.covariance import NeighbourCovariances
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.linear import weighted

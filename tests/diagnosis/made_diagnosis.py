@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.diagnosis.result import (
     Candidate,
     ContactResiduals,
@@ -24,8 +25,6 @@ from ballfg.diagnosis.result import (
     Verdict,
 )
 from ballfg.dynamics import nominal_model
-
-Array = NDArray[np.float64]
 
 WIND, DRAG = 0.2, 0.12
 SHOTS, BINS, SAMPLES = 50, 8, 60

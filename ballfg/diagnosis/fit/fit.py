@@ -12,11 +12,12 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from ballfg.arrays import Mask
 from ballfg.diagnosis.fit.problem import Fit, Noise, Problem, Robust, Unknowns, declared_free
 from ballfg.diagnosis.fit.sensitivity import Predicted, predict
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System
-from ballfg.diagnosis.result import Mask, Value
+from ballfg.diagnosis.result import Value
 from ballfg.dynamics import AnalyticModel
 from ballfg.estimation import Settings
 from ballfg.state import SPIN, STATE_DIM

@@ -6,8 +6,8 @@ from functools import partial
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, Stretches, stretches_of
-from ballfg.diagnosis.result import Array
 from ballfg.dynamics import AnalyticModel, SpinEmbedding, Surfaces
 from ballfg.estimation import Launcher, Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.batch import map_tracks

@@ -7,10 +7,10 @@ from typing import Self
 
 import numpy as np
 
+from ballfg.arrays import Array, Index
 from ballfg.diagnosis.fit.sensitivity import Predicted, predict, sensitivity
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System
-from ballfg.diagnosis.result import Array, Index
 from ballfg.dynamics import AnalyticModel, Coefficient
 from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED
 from ballfg.factors.loss import Loss

@@ -15,11 +15,11 @@ import torch
 import torch.autograd.forward_ad as forward
 from torch import Tensor
 
+from ballfg.arrays import Array, Index
 from ballfg.diagnosis.fit.dual import dual_level, make_dual
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.sensitivity import with_values
 from ballfg.diagnosis.fit.shooting import LEAST_ARC, Arc, Trajectories, shoot
-from ballfg.diagnosis.result import Array, Index
 from ballfg.state import STATE_DIM, VELOCITY
 
 NODE = 0.01

@@ -11,10 +11,10 @@ import torch
 import torch.autograd.forward_ad as forward
 from torch import Tensor
 
+from ballfg.arrays import Array
 from ballfg.diagnosis.fit.dual import dual_level, make_dual
 from ballfg.diagnosis.fit.shooting import Trajectories, shoot
 from ballfg.diagnosis.fit.stretches import Stretches
-from ballfg.diagnosis.result import Array
 from ballfg.dynamics import BallModel, substitute
 from ballfg.state import SPIN, STATE_DIM
 

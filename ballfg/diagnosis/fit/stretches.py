@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.diagnosis.result import Array, Index, Mask
+from ballfg.arrays import Array, Index, Mask
 from ballfg.estimation import Launcher, Smoother
 from ballfg.estimation.batch import map_tracks
 from ballfg.tracks import Track

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ballfg.diagnosis.result import Array, Index
+from ballfg.arrays import Array, Index
 from ballfg.state import STATE_DIM
 
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
 from ballfg.diagnosis.remains.label_check import LABEL, check_labels
@@ -22,7 +23,7 @@ from ballfg.diagnosis.remains.patterns import (
     drift_block,
 )
 from ballfg.diagnosis.remains.whiteness import whiteness
-from ballfg.diagnosis.result import Array, GenericTest
+from ballfg.diagnosis.result import GenericTest
 from ballfg.diagnosis.search.score import pattern_tests
 from ballfg.diagnosis.search.signatures import signatures_of
 

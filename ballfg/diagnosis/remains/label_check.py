@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from ballfg.arrays import Array, Index
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
-from ballfg.diagnosis.result import Array, Index
 from ballfg.state import SPIN, STATE_DIM
 
 LABEL = "label"

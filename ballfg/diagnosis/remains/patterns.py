@@ -13,10 +13,10 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from ballfg.arrays import Array
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.response import ArcResponse, FittedPath, fitted_path, responses, weighted
 from ballfg.diagnosis.fit.system import System
-from ballfg.diagnosis.result import Array
 from ballfg.dynamics.effects.generic import flight_axes
 from ballfg.state import POSITION, SPIN, VELOCITY
 

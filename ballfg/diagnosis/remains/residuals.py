@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.response import ArcResponse, FittedPath, fitted_path, responses, weighted
-from ballfg.diagnosis.result import Array, ContactResiduals, FlightResiduals, MeasurementResiduals, Residuals
+from ballfg.diagnosis.result import ContactResiduals, FlightResiduals, MeasurementResiduals, Residuals
 from ballfg.state import STATE_DIM
 
 BIN = 0.04

@@ -10,9 +10,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.result import Array
 from ballfg.diagnosis.search.candidates import with_hypothesis
 from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect
 from ballfg.diagnosis.search.signatures import hypothesis_signatures

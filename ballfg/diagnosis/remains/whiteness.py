@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import stats
 
+from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
-from ballfg.diagnosis.result import Array, Mask
 
 REACHES = (0.02, 0.06, 0.18)
 """s. Widths of the Gaussian kernels in the time between two samples: from the size of a contact to that of an arc."""

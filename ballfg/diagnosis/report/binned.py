@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ballfg.diagnosis.result import Array, ContactResiduals, FlightResiduals, Index
+from ballfg.arrays import Array, Index
+from ballfg.diagnosis.result import ContactResiduals, FlightResiduals
 from ballfg.dynamics.motion.impact import slip_velocity
 from ballfg.state import SPIN, VELOCITY
 

@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array, Index
 from ballfg.diagnosis.report.binned import at_contact, binned, in_flight, slip_speed
-from ballfg.diagnosis.result import Array, Candidate, Errors, Index, Outcome, Residuals
+from ballfg.diagnosis.result import Candidate, Errors, Outcome, Residuals
 from ballfg.state import SPIN, VELOCITY, VZ
 
 Series = Mapping[str, Residuals]

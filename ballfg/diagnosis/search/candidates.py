@@ -7,9 +7,9 @@ import numpy as np
 import torch
 from scipy import stats
 
+from ballfg.arrays import Array
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.problem import Fit, Problem
-from ballfg.diagnosis.result import Array
 from ballfg.diagnosis.search.hypothesis import Hypothesis, with_effects
 from ballfg.diagnosis.search.label_frames import FRAMES
 from ballfg.diagnosis.search.score import Score, score_tests

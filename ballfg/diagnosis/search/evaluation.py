@@ -5,12 +5,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.diagnosis.fit.fit import fit_problem, reachable
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import Fit, Noise
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import by_track
-from ballfg.diagnosis.result import Array, Errors
+from ballfg.diagnosis.result import Errors
 from ballfg.diagnosis.search.score import score_tests
 from ballfg.diagnosis.search.signatures import Signatures
 from ballfg.dynamics import BallModel, Surfaces

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
-from ballfg.diagnosis.result import Array, Index
+from ballfg.arrays import Array, Index
 from ballfg.diagnosis.search.signatures import Efficient, Signatures, visible_directions
 
 PRIOR_TRACKS = 10.0

@@ -10,10 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.sensitivity import sensitivity
 from ballfg.diagnosis.fit.system import System, by_track
-from ballfg.diagnosis.result import Array
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 
 LEAST_SHARE = 1e-8

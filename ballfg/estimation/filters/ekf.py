@@ -15,6 +15,7 @@ from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.advance_jacobian import Motion, advance_jacobian
 from ballfg.dynamics.surfaces import Surfaces
@@ -24,7 +25,7 @@ from ballfg.estimation.filters.sliding_window import SlidingWindow, first_pair
 from ballfg.estimation.filters.window_velocity import WINDOW
 from ballfg.estimation.observations.innovation import leave_position_out
 from ballfg.estimation.observations.observation import Context, refuse_unknowns
-from ballfg.estimation.result import Array, Estimate, Status
+from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact, Quality
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start
 from ballfg.estimation.smoother.near_contact import widen_near_contacts

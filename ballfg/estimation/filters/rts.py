@@ -12,14 +12,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import fly_jacobian
 from ballfg.estimation.segmentation import Contact, Quality
 from ballfg.factors.batch import Rows
 from ballfg.factors.loss import Loss
 from ballfg.state import POSITION, STATE_DIM
-
-Array = NDArray[np.float64]
 
 
 @dataclass

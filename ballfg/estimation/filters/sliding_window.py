@@ -4,8 +4,6 @@ Source: Q. Xiao, Z. Wu, M. Gombolay, "Learning Dynamics of a Ball with Different
 Roto-Translational Invariant Representations", section IV: the average velocity within a sliding window of size 5.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import combinations
 
@@ -13,12 +11,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import rate_jacobian
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import WINDOW
-from ballfg.estimation.result import Array, Estimate, Status
+from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import sample_sigmas, spin_start
 from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z

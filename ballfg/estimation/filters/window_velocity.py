@@ -1,13 +1,10 @@
 """Velocities from line fits in windows of a few samples: where estimates start, and what a launch looks like."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ballfg.arrays import Array
 from ballfg.state import STANDARD_GRAVITY, Z
-
-Array = NDArray[np.float64]
 
 WINDOW = 5
 """Samples in a window."""

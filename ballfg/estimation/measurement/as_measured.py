@@ -7,15 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, STATE_DIM
-
-Array = NDArray[np.float64]
 
 _MEASUREMENT = "measurement"
 """Attribute of an `AnalyticModel` that holds its measurement effects."""

@@ -4,17 +4,15 @@ Only the forward map is asked, so any effect will do. With h(x) the position tha
 track is shifted by h(x) - p(x), x the states that the smoother finds in the shifted track, until the shift stays.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from ballfg.arrays import Array
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.rollout import advance
@@ -33,8 +31,6 @@ from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks import SPIN_LABELS, Track
-
-Array = NDArray[np.float64]
 
 ROUNDS: Final = 20
 """How often the track is estimated at most; a lag of 5 ms takes four or five rounds, an offset of 30 ms a dozen."""

@@ -1,16 +1,12 @@
 """Position noise of a tracker, read off its tracks: how far a sample lies from a smooth path through its neighbours."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.tracks import Track
-
-FloatArray = NDArray[np.float64]
 
 HALF_WINDOW = 5
 """Samples on each side of the one that is judged."""
@@ -32,7 +28,7 @@ MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal variable divided by the median of its absolute value."""
 
 
-def estimate_position_noise(tracks: Iterable[Track]) -> FloatArray:
+def estimate_position_noise(tracks: Iterable[Track]) -> Array:
     """The standard deviation of each coordinate, for data that states none.
 
     A cubic is fitted to each window of 11 samples, the middle one left out, and predicts that one. The residuals,
@@ -45,7 +41,7 @@ def estimate_position_noise(tracks: Iterable[Track]) -> FloatArray:
     Args: tracks: read until there is enough.
     Returns: (3,) m, at least `FLOOR`; `FALLBACK` where every track is shorter than a window.
     """
-    blocks: list[FloatArray] = []
+    blocks: list[Array] = []
     count = 0
     for track in tracks:
         block = _window_residuals(track.times, track.positions)
@@ -58,7 +54,7 @@ def estimate_position_noise(tracks: Iterable[Track]) -> FloatArray:
     return np.maximum(_robust_sigma(np.concatenate(blocks)), FLOOR)
 
 
-def _window_residuals(times: FloatArray, positions: FloatArray) -> FloatArray:
+def _window_residuals(times: Array, positions: Array) -> Array:
     """(w, 11, 3) m, residuals of the cubic through each window, scaled to the standard deviation of one sample.
 
     A residual of least squares has variance sigma^2 (1 - h) with h the leverage; predicted with its own sample left
@@ -76,11 +72,11 @@ def _window_residuals(times: FloatArray, positions: FloatArray) -> FloatArray:
     basis, _ = np.linalg.qr(scaled[..., None] ** np.arange(DEGREE + 1))
     leverage = np.einsum("wij,wij->wi", basis, basis)
     residuals = values - basis @ (basis.transpose(0, 2, 1) @ values)
-    scaled_residuals: FloatArray = residuals / np.sqrt(1.0 - leverage)[..., None].clip(min=1e-3)
+    scaled_residuals: Array = residuals / np.sqrt(1.0 - leverage)[..., None].clip(min=1e-3)
     return scaled_residuals
 
 
-def _robust_sigma(residuals: FloatArray) -> FloatArray:
+def _robust_sigma(residuals: Array) -> Array:
     """(3,) m from window residuals (w, 11, 3): MAD of the middle ones, over windows without large residuals."""
     middle = residuals[:, HALF_WINDOW]
     largest = np.abs(residuals).max(axis=1)

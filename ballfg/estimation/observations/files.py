@@ -1,7 +1,5 @@
 """Readings in the folder of a dataset: one table a sort, `trajectory,t,<values>,sigma`."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
@@ -9,14 +7,12 @@ from os import PathLike
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.observations.registry import OBSERVATIONS
 from ballfg.tracks import TableWriter, Track, csv_files
 from ballfg.tracks.rows import KEY
-
-Array = NDArray[np.float64]
 
 
 @dataclass

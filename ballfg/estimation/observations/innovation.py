@@ -1,16 +1,12 @@
 """Whitened innovations of a smoother: each measurement against its prediction from all others."""
 
-from __future__ import annotations
-
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.factors.batch import Rows
 from ballfg.factors.covariance import Covariances
 from ballfg.factors.linear import weighted
 from ballfg.state import POSITION
-
-Array = NDArray[np.float64]
 
 LEAST_INFORMATION = 1e-6
 """Share of the posterior's information that the other measurements are given at least."""

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ballfg.arrays import Array, Index
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.observations.innovation import leave_one_out
 from ballfg.estimation.settings import Settings
@@ -24,9 +25,6 @@ from ballfg.tracks import Track
 
 if TYPE_CHECKING:
     from ballfg.estimation.result import Estimate
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -7,8 +7,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.estimation.observations.innovation import leave_position_out
-from ballfg.estimation.observations.observation import Array, Context, Observation
+from ballfg.estimation.observations.observation import Context, Observation
 from ballfg.factors.batch import Rows, Values
 from ballfg.factors.covariance import Covariances
 from ballfg.factors.position import PositionFactors

@@ -16,12 +16,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array, Index
 from ballfg.state import STANDARD_GRAVITY, Z
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.camera import Camera
-
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 AROUND: Final = ((-1.6, 1.6), (-2.2, 0.0), (0.0, 2.2), (-1.2, 0.0), (0.0, 1.2))
 """Windows about a moment, in periods of the slowest camera: each holds two sightings or more of every camera."""

@@ -12,9 +12,10 @@ import torch
 from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
+from ballfg.arrays import Array, Index
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import batch_jacobian, rk4_step
-from ballfg.estimation.observations.observation import Array, Context, Index, Observation
+from ballfg.estimation.observations.observation import Context, Observation
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, VELOCITY

@@ -1,7 +1,5 @@
 """The balls of a dataset as its cameras saw them: `detections.csv` and `cameras.yaml` of its folder."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from os import PathLike

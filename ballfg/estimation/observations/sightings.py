@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, ClassVar, Final, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array, Index
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns
 from ballfg.estimation.observations.ray_path import Path, Rays, rough_path
 from ballfg.estimation.settings import Settings
@@ -23,8 +24,6 @@ from ballfg.vision.projection import CameraBank
 if TYPE_CHECKING:
     from ballfg.estimation.result import Estimate
 
-Array = NDArray[np.float64]
-Index = NDArray[np.int64]
 
 TIME_OFFSET: Final = "time_offset."
 """What the name of a camera's time offset begins with among the unknowns of a track."""

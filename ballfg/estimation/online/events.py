@@ -1,14 +1,12 @@
 """Events as a stream brings them: what the segmenter believes now, laid over the samples of the window."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.online.isam import Sample
 from ballfg.estimation.segmentation import Event, EventKind, Segmentation, SegmentationPhysics, Segmenter
@@ -19,8 +17,6 @@ from ballfg.estimation.segmentation.settings import SegmentationSettings
 from ballfg.estimation.smoother.motion import Motion
 from ballfg.estimation.smoother.problem import QUALITY_SIGMA
 from ballfg.state import STANDARD_GRAVITY, VZ, Z
-
-Array = NDArray[np.float64]
 
 SIGMA_FACTOR = np.array([QUALITY_SIGMA.get(quality, 1.0) for quality in Quality])
 """Standard deviation of a sample of each quality, in multiples of a good one's."""

@@ -1,7 +1,5 @@
 """The last word on a track: the window minimised to a tight tolerance, and the states that left it before."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -9,6 +7,7 @@ import gtsam
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array, Index
 from ballfg.estimation.online.events import SIGMA_FACTOR
 from ballfg.estimation.online.isam import Sample
 from ballfg.estimation.online.window import Window
@@ -16,7 +15,7 @@ from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation import Contact, Segmentation
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Earlier, Smoother
-from ballfg.factors.batch import COEFFICIENTS, Array, FactorBatch, Index, Values
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track

@@ -1,15 +1,13 @@
 """What happens between two samples, as a dynamics factor of its own that joins others in one batch."""
 
-from __future__ import annotations
-
 import copy
 import math
 from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import steps_over
 from ballfg.estimation.smoother.motion import FLIGHT, Motion
@@ -18,8 +16,6 @@ from ballfg.factors.bridge import Bridge, checked
 from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors
 from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
-
-Array = NDArray[np.float64]
 
 
 class Interval:

@@ -5,15 +5,13 @@ before an update which states GTSAM will relinearise, and evaluates their factor
 torch call; the callbacks find their answers ready. docs/derivations/online.md explains the choices.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.online.interval import Interval, IntervalMaker, evaluate, store
@@ -27,8 +25,6 @@ from ballfg.factors.dynamics import model_width
 from ballfg.factors.position import PositionFactors
 from ballfg.factors.prior import coefficient_prior
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
-
-Array = NDArray[np.float64]
 
 VELOCITY_THRESHOLD = 0.3
 """m/s. Linearised this far off, drag is wrong by k dv^2 = 0.012 m/s^2, and by 0.04 m/s^2 where the spin is off by

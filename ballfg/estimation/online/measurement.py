@@ -1,18 +1,14 @@
 """One measurement in the window of iSAM2: its factor, and the last answer that its torch batch gave."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Hashable, Sequence
 
 import gtsam
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.factors.batch import FactorBatch, merge
 from ballfg.factors.bridge import Bridge, checked
-
-Array = NDArray[np.float64]
 
 
 class Measurement:

@@ -1,13 +1,12 @@
 """The online estimator: iSAM2, one observation at a time, within a window of bounded length."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
@@ -28,8 +27,6 @@ from ballfg.factors.batch import FactorBatch
 from ballfg.prediction.state import BallState
 from ballfg.tracks import Ball, Track
 from ballfg.vision.camera import Camera
-
-Array = NDArray[np.float64]
 
 LAG = 128
 """States that stay when the window is cut: 0.7 s at 180 Hz, after which new samples say nothing about an old state."""

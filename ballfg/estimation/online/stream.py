@@ -5,14 +5,12 @@ before it, the newest among them. As long as rays leave it open, at the start of
 single camera later on gets positions carried on from the last that was firm.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ballfg.estimation.observations.ray_path import AROUND, BEFORE, Path, Rays, rough_path
 from ballfg.estimation.observations.sightings import LOOSE, SAME_MOMENT, filled
@@ -23,8 +21,6 @@ from ballfg.factors.loss import Loss
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.camera import Camera
 from ballfg.vision.projection import CameraBank
-
-Array = NDArray[np.float64]
 
 MOST_RAYS: Final = 96
 """Rays that are remembered: more than the windows of four cameras hold."""

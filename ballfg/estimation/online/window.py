@@ -1,7 +1,5 @@
 """A window that can also go back, change its mind, let go of its oldest state, and start anew."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 

@@ -1,7 +1,5 @@
 """From a chain of events to the parts of a segmentation."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.estimation.segmentation.events import Event, Node
 
 FLYING = -1
 """Value of `Bank.surface` for a ball in the air."""
 
-FloatArray = NDArray[np.float64]
 IntArray = NDArray[np.int64]
 
 
@@ -31,12 +31,12 @@ class Bank:
         tips: (h,) the last `Node` of each hypothesis, or None.
     """
 
-    mean: FloatArray
-    cov: FloatArray
+    mean: Array
+    cov: Array
     surface: IntArray
-    score: FloatArray
+    score: Array
     age: IntArray
-    shift: FloatArray
+    shift: Array
     tips: NDArray[np.object_]
 
     def __len__(self) -> int:

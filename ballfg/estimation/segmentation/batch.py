@@ -1,13 +1,11 @@
 """Segmentation of a whole track: the forward pass over all samples, then a second look."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.segmentation.assembly import BREAKS, contacts_of, intervals_of, quality_of, rests_of
-from ballfg.estimation.segmentation.bank import FloatArray
 from ballfg.estimation.segmentation.events import Event, EventKind
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.result import Quality, Segmentation
@@ -53,8 +51,8 @@ def segment(
 
 
 def _assemble(
-    times: FloatArray,
-    positions: FloatArray,
+    times: Array,
+    positions: Array,
     events: list[Event],
     physics: SegmentationPhysics,
     settings: SegmentationSettings,
@@ -73,7 +71,7 @@ def _assemble(
     )
 
 
-def _checked(times: ArrayLike, positions: ArrayLike, sigma: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _checked(times: ArrayLike, positions: ArrayLike, sigma: ArrayLike) -> tuple[Array, Array, Array]:
     t = np.asarray(times, dtype=np.float64)
     x = np.asarray(positions, dtype=np.float64)
     s = np.asarray(sigma, dtype=np.float64)

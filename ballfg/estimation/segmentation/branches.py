@@ -1,12 +1,11 @@
 """Events that no surface explains: starts, hits, tracker shifts, a resting ball that leaves."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 
-from ballfg.estimation.segmentation.bank import FLYING, Bank, FloatArray, concatenate
+from ballfg.arrays import Array
+from ballfg.estimation.segmentation.bank import FLYING, Bank, concatenate
 from ballfg.estimation.segmentation.events import Event, EventKind, Node
 from ballfg.estimation.segmentation.evidence import OUTLIER, update
 from ballfg.estimation.segmentation.motion import lift, put_down
@@ -18,7 +17,7 @@ SHIFTED_PREDICTIONS = 3
 """How many of the best predictions are tried with a shift; beside a bounce the right one may be the third."""
 
 
-def fresh(position: FloatArray, position_variance: FloatArray | float, scene: Scene) -> Bank:
+def fresh(position: Array, position_variance: Array | float, scene: Scene) -> Bank:
     """One flying hypothesis at a position (3,) with a variance (3,) m^2, of which nothing else is known."""
     mean, cov = np.zeros((1, 3, 3)), np.zeros((1, 3, 3, 3))
     mean[0, :, 0] = position
@@ -37,7 +36,7 @@ def fresh(position: FloatArray, position_variance: FloatArray | float, scene: Sc
 
 
 def starts(
-    tip: Node | None, score: float, position: FloatArray, sigma: FloatArray, scene: Scene, sample: int, time: float
+    tip: Node | None, score: float, position: Array, sigma: Array, scene: Scene, sample: int, time: float
 ) -> Bank:
     """Hypotheses after a first sample: a flying ball, one that rests on a surface nearby, or the sample an outlier.
 
@@ -64,7 +63,7 @@ def starts(
     return concatenate([used, lost])
 
 
-def hits(best: Bank, position: FloatArray, dt: float, scene: Scene, interval: int, time: float) -> list[Bank]:
+def hits(best: Bank, position: Array, dt: float, scene: Scene, interval: int, time: float) -> list[Bank]:
     """The best explanation of the past, its velocity forgotten: in the air, and on a surface if it is near one.
 
     Over a short interval the ball reappears close to where it was; over a long one it may be anywhere.
@@ -81,7 +80,7 @@ def hits(best: Bank, position: FloatArray, dt: float, scene: Scene, interval: in
 
 
 def shifts(
-    predicted: Bank, position: FloatArray, sigma: FloatArray, dt: float, scene: Scene, interval: int, time: float
+    predicted: Bank, position: Array, sigma: Array, dt: float, scene: Scene, interval: int, time: float
 ) -> list[Bank]:
     """The best predictions, with the measurements jumping by an unknown offset: off from now on, or until now.
 
@@ -118,7 +117,7 @@ def departures(predicted: Bank, dt: float, scene: Scene, interval: int, time: fl
     return [bank]
 
 
-def _rested(bank: Bank, position: FloatArray, scene: Scene, interval: int, time: float) -> list[Bank]:
+def _rested(bank: Bank, position: Array, scene: Scene, interval: int, time: float) -> list[Bank]:
     """A flying hypothesis as one that rests, for each surface that the sample is near."""
     rested = []
     for surface in (np.abs(position[2] - scene.centres) < scene.settings.rest_range).nonzero()[0]:

@@ -1,10 +1,9 @@
 """Evidence: what a sample says about each hypothesis, and which hypotheses are worth keeping."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from ballfg.estimation.segmentation.bank import Bank, FloatArray, IntArray, concatenate
+from ballfg.arrays import Array
+from ballfg.estimation.segmentation.bank import Bank, IntArray, concatenate
 from ballfg.estimation.segmentation.events import Event, EventKind
 from ballfg.estimation.segmentation.scene import Scene
 from ballfg.estimation.segmentation.settings import SegmentationSettings
@@ -17,9 +16,7 @@ NONE = np.zeros(0, dtype=np.int64)
 """No rows."""
 
 
-def update(
-    bank: Bank, position: FloatArray, sigma: FloatArray, scene: Scene, sample: int, time: float
-) -> tuple[Bank, FloatArray]:
+def update(bank: Bank, position: Array, sigma: Array, scene: Scene, sample: int, time: float) -> tuple[Bank, Array]:
     """Takes a sample into every hypothesis: its most likely noise component, the Kalman update, the evidence.
 
     Where the prediction is too vague to tell, the sample is also tried as an outlier: those hypotheses come last.
@@ -76,7 +73,7 @@ def update(
     return updated, np.add.reduce(whitened[GOOD], axis=-1)[rows]
 
 
-def _doubtful(score: FloatArray, outlier: FloatArray, best: FloatArray, settings: SegmentationSettings) -> IntArray:
+def _doubtful(score: Array, outlier: Array, best: Array, settings: SegmentationSettings) -> IntArray:
     """Rows that take the sample for the ball, but barely rather than for an outlier: later samples have to decide.
 
     That is so where little is known of where the ball is: its second sample, the first ones after a hit or a gap.

@@ -1,10 +1,9 @@
 """Flight and rest of all hypotheses over a time step: gravity, drag, and a slack acceleration per axis."""
 
-from __future__ import annotations
-
 import numpy as np
 
-from ballfg.estimation.segmentation.bank import FLYING, Bank, FloatArray, IntArray
+from ballfg.arrays import Array
+from ballfg.estimation.segmentation.bank import FLYING, Bank, IntArray
 from ballfg.estimation.segmentation.scene import Scene
 
 STRONGEST_DRAG = 0.5
@@ -18,7 +17,7 @@ LANDING_SIGMA = 0.2
 """m/s. Change of the horizontal velocity of a ball that stays down."""
 
 
-def fly(mean: FloatArray, cov: FloatArray, dt: FloatArray, scene: Scene) -> tuple[FloatArray, FloatArray]:
+def fly(mean: Array, cov: Array, dt: Array, scene: Scene) -> tuple[Array, Array]:
     """Free flight; negative steps go back, and add noise like positive ones.
 
     Drag is linearised at the present speed, the same on the three axes: v' = (1 - k |v| dt) v + (b - g) dt.
@@ -44,7 +43,7 @@ def fly(mean: FloatArray, cov: FloatArray, dt: FloatArray, scene: Scene) -> tupl
     return after, F @ cov @ Ft + process_noise(dt, scene)[:, None]
 
 
-def process_noise(dt: FloatArray, scene: Scene) -> FloatArray:
+def process_noise(dt: Array, scene: Scene) -> Array:
     """(h, 3, 3) random walks of velocity and slack over steps of dt (h,) s, the same on each axis."""
     step = np.abs(dt)[:, None, None]
     first, second, third = scene.drift

@@ -1,7 +1,5 @@
 """What the segmentation needs to know of a ball, read off any ball model by asking it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, fields
 

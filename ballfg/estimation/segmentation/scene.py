@@ -1,14 +1,12 @@
 """Everything that stays the same during a segmentation: the ball, the surfaces, the settings."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.segmentation.bank import FloatArray
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.settings import SegmentationSettings
 
@@ -27,10 +25,10 @@ class Scene:
     physics: SegmentationPhysics
     surfaces: Surfaces
     settings: SegmentationSettings
-    centres: FloatArray = field(init=False)
-    restitution_sigmas: FloatArray = field(init=False)
-    log_shares: FloatArray = field(init=False)
-    drift: FloatArray = field(init=False)
+    centres: Array = field(init=False)
+    restitution_sigmas: Array = field(init=False)
+    log_shares: Array = field(init=False)
+    drift: Array = field(init=False)
 
     def __post_init__(self) -> None:
         heights = np.array(self.surfaces.heights())
@@ -51,7 +49,7 @@ class Scene:
         """m, declared height of a surface."""
         return self.surfaces.heights()[surface]
 
-    def reaches(self, surface: int, places: FloatArray) -> NDArray[np.bool_]:
+    def reaches(self, surface: int, places: Array) -> NDArray[np.bool_]:
         """(h,) whether x, y (h, 2) m lie within a surface, as far as is known."""
         extent = self.surfaces.extent
         if surface != 0 or extent is None:

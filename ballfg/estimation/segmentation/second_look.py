@@ -3,14 +3,12 @@
 The forward pass takes such an event for a contact, whose unknown friction it pays less for than for a hit.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.estimation.segmentation.bank import FloatArray
+from ballfg.arrays import Array
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.result import Contact
 from ballfg.estimation.segmentation.settings import SegmentationSettings
@@ -26,8 +24,8 @@ LEEWAY = 0.3
 
 
 def hits_at_contacts(
-    times: FloatArray,
-    positions: FloatArray,
+    times: Array,
+    positions: Array,
     usable: NDArray[np.bool_],
     contacts: Sequence[Contact],
     hits: Sequence[int],
@@ -64,14 +62,14 @@ def hits_at_contacts(
 
 
 def _velocity(
-    times: FloatArray,
-    positions: FloatArray,
+    times: Array,
+    positions: Array,
     usable: NDArray[np.bool_],
     first: int,
     last: int,
     at: float,
     physics: SegmentationPhysics,
-) -> FloatArray | None:
+) -> Array | None:
     """(3,) m/s at time `at`: least squares of flight under gravity and drag through the usable samples first..last."""
     rows = first + np.flatnonzero(usable[first : last + 1])
     if len(rows) < LEAST_SIDE:
@@ -81,5 +79,5 @@ def _velocity(
     pull = -physics.drag * np.linalg.norm(chord) * chord - np.array([0.0, 0.0, physics.gravity])
     straight = positions[rows] - 0.5 * pull * since[:, None] ** 2
     centred = since - since.mean()
-    slope: FloatArray = centred @ (straight - straight.mean(axis=0)) / (centred @ centred)
+    slope: Array = centred @ (straight - straight.mean(axis=0)) / (centred @ centred)
     return slope

@@ -1,16 +1,15 @@
 """The forward pass: a multi-hypothesis (Viterbi) Kalman filter, one sample at a time, with bounded memory."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.segmentation import branches
-from ballfg.estimation.segmentation.bank import FLYING, Bank, FloatArray, concatenate
+from ballfg.estimation.segmentation.bank import FLYING, Bank, concatenate
 from ballfg.estimation.segmentation.events import Event, EventKind, Node, contains, make_final, open_nodes
 from ballfg.estimation.segmentation.evidence import prune, update
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
@@ -83,7 +82,7 @@ class Segmenter:
         self._count += 1
         return self._decide()
 
-    def _next(self, bank: Bank, position: FloatArray, sigma: FloatArray, time: float) -> Bank:
+    def _next(self, bank: Bank, position: Array, sigma: Array, time: float) -> Bank:
         """The hypotheses after the next sample, not pruned, from those before it, best first."""
         scene, sample, dt = self._scene, self._count, time - self._time
         settings = scene.settings
@@ -125,7 +124,7 @@ class Segmenter:
         self._bank = self._bank.take(agreeing)
         return Decision(make_final(old), tuple(node.event for node in pending[len(old) :]))
 
-    def _checked(self, time: float, position: ArrayLike, sigma: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    def _checked(self, time: float, position: ArrayLike, sigma: ArrayLike) -> tuple[Array, Array]:
         if not math.isfinite(time) or time <= self._time:
             raise ValueError(f"time must be finite and increase; got {time} s after {self._time} s. Sort the samples.")
         return _triple("position", position), _triple("sigma", sigma)

@@ -1,7 +1,5 @@
 """The numbers of the segmentation: noise, prior spreads, prices of events, bounds of the search."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,11 +1,10 @@
 """Contacts: a hypothesis that may meet a surface branches: it did not, it bounced, it stayed down."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.estimation.segmentation.bank import FLYING, Bank, FloatArray, concatenate
+from ballfg.arrays import Array
+from ballfg.estimation.segmentation.bank import FLYING, Bank, concatenate
 from ballfg.estimation.segmentation.events import Event, EventKind
 from ballfg.estimation.segmentation.motion import carry, fly, put_down
 from ballfg.estimation.segmentation.scene import Scene
@@ -65,7 +64,7 @@ def _near(after: Bank, scene: Scene) -> list[int]:
 
 def _meetings(
     bank: Bank, surface: int, dt: float, scene: Scene, *, strict: bool
-) -> tuple[FloatArray, FloatArray, NDArray[np.bool_]]:
+) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Time (h,) s and speed (h,) m/s at which each mean path comes down to a surface, and whether it is to be tried."""
     height = bank.mean[:, 2, 0] - bank.shift[:, 2] - scene.centres[surface]
     rise = bank.mean[:, 2, 1]
@@ -87,7 +86,7 @@ def _meetings(
     return time, speed, ok
 
 
-def _touch(bank: Bank, times: FloatArray, surface: int, scene: Scene, interval: int, start: float) -> Bank:
+def _touch(bank: Bank, times: Array, surface: int, scene: Scene, interval: int, start: float) -> Bank:
     """The hypotheses just before their contacts, priced and with the event; changes and returns the bank."""
     bank.mean, bank.cov = fly(bank.mean, bank.cov, times, scene)
     bank.score -= scene.settings.contact_cost
@@ -97,7 +96,7 @@ def _touch(bank: Bank, times: FloatArray, surface: int, scene: Scene, interval: 
     return bank
 
 
-def _bounce(bank: Bank, rest_of_step: FloatArray, surface: int, scene: Scene) -> Bank:
+def _bounce(bank: Bank, rest_of_step: Array, surface: int, scene: Scene) -> Bank:
     """Hypotheses at a contact, bounced and flown on: mirrored in z, slowed by the friction of an unknown spin.
 
     Friction changes the tangential velocity by mu (1 + e) v_n at most, either way: half of that is expected, but no
@@ -127,7 +126,7 @@ def _bounce(bank: Bank, rest_of_step: FloatArray, surface: int, scene: Scene) ->
     return bank
 
 
-def _stay(bank: Bank, rest_of_step: FloatArray, surface: int, scene: Scene, interval: int, time: float) -> Bank:
+def _stay(bank: Bank, rest_of_step: Array, surface: int, scene: Scene, interval: int, time: float) -> Bank:
     """Hypotheses at a contact that stay down for the rest of the step."""
     put_down(bank, np.full(len(bank), surface), scene)
     height_mean, height_cov = bank.mean[:, 2].copy(), bank.cov[:, 2].copy()

@@ -1,13 +1,11 @@
 """A first guess of all states from the samples and the events, for the minimisation to start from."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import fly_through
 from ballfg.estimation.filters.window_velocity import window_velocities
@@ -17,8 +15,6 @@ from ballfg.factors.batch import Values
 from ballfg.factors.dynamics import model_width
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
 from ballfg.tracks import Track
-
-Array = NDArray[np.float64]
 
 
 def initial_states(

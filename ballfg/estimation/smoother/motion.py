@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.estimation.segmentation import Contact, Segmentation
 from ballfg.factors.noise import ProcessNoise
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -1,19 +1,15 @@
 """Stamps so close to a contact that the sample may lie on either side of it."""
 
-from __future__ import annotations
-
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.stats import norm
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.segmentation import Contact
 from ballfg.state import VZ, Z
-
-Array = NDArray[np.float64]
 
 FAR = 4.0
 """Standard deviations of a contact's time beyond which a stamp is taken to lie on one side of it."""

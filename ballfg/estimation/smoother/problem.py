@@ -5,14 +5,12 @@ rest on a surface; a hit adds its jump to the process noise. An interval that no
 it) gets none. Every observation of the track gives its factors; the first state of each linked piece gets a prior.
 """
 
-from __future__ import annotations
-
 from collections import defaultdict
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import steps_over
@@ -38,8 +36,6 @@ from ballfg.factors.prior import (
 )
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
-
-Array = NDArray[np.float64]
 
 START_POSITION_SIGMA = 5.0
 """m, prior of the first position about its measurement: wide enough to say nothing."""

@@ -5,8 +5,6 @@ any more; the search then ends in another minimum, or on a slope. Where a label 
 where it holds, and the search begins again from there; the lower minimum is the answer.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from ballfg.factors.batch import Values

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
@@ -32,8 +32,6 @@ from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Min
 from ballfg.factors.prior import PriorFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Ball, Track
-
-Array = NDArray[np.float64]
 
 MAX_REFINEMENTS = 6
 """How often contacts may move to a neighbouring interval; two were the most seen on measured tracks."""

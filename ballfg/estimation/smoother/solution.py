@@ -1,13 +1,11 @@
 """A minimised graph, and where it says that the contacts are."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.segmentation import Contact
@@ -16,8 +14,6 @@ from ballfg.estimation.smoother.problem import Events, contact_batches
 from ballfg.factors.dynamics import model_width
 from ballfg.factors.graph import BallGraph, Minimum
 from ballfg.state import VZ
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

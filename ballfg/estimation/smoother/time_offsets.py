@@ -1,7 +1,5 @@
 """Time offsets of a rig's cameras from a whole recording: every track says a little, together they say it well."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final
@@ -9,6 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.sightings import sightings_of
@@ -17,8 +16,6 @@ from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.tracks import Track
 from ballfg.vision.camera import Camera
-
-Array = NDArray[np.float64]
 
 PRIOR: Final = 0.01
 """s, standard deviation of a time offset beforehand, about the camera's own: a frame or so."""

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.simulation.balls import BallKind
 from ballfg.simulation.scene.room import (
     CEILING_COLOUR,
@@ -23,7 +24,6 @@ from ballfg.simulation.scene.room import (
 from ballfg.vision.camera import Camera
 
 Image = NDArray[np.float32]
-Array = NDArray[np.float64]
 
 SAMPLES: Final = 6
 """Rays along each axis of a pixel on an edge: an edge is drawn to a twelfth of a pixel."""

@@ -10,7 +10,8 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.simulation.scene.view import Array, Rect, clipped
+from ballfg.arrays import Array
+from ballfg.simulation.scene.view import Rect, clipped
 from ballfg.vision.camera import Camera
 
 STEP: Final = 0.25

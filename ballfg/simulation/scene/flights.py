@@ -9,8 +9,9 @@ from typing import Final
 
 import numpy as np
 import torch
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel, Surfaces, advance
 from ballfg.simulation.config import MotionNoise
 from ballfg.simulation.motion import simulate_motion
@@ -18,8 +19,6 @@ from ballfg.simulation.scene.config import SceneConfig
 from ballfg.simulation.settings import settings_of_shots
 from ballfg.simulation.streams import Purpose, generator
 from ballfg.state import STATE_DIM
-
-Array = NDArray[np.float64]
 
 KNOT_RATE: Final = 200.0
 """Hz. A knot every 5 ms is one step of the simulator's integration."""

@@ -9,8 +9,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.simulation.scene.room import Colour
-from ballfg.simulation.scene.view import Array, Rect, clipped
+from ballfg.simulation.scene.view import Rect, clipped
 from ballfg.vision.camera import Camera
 
 PEOPLE: Final = ((0.35, -3.1, 1.5, 0.0), (2.6, 3.2, -1.7, 0.4))

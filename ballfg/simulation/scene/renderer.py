@@ -10,13 +10,14 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.simulation.scene.backdrop import backdrop
 from ballfg.simulation.scene.ball_image import ball_image
 from ballfg.simulation.scene.config import SceneConfig
 from ballfg.simulation.scene.movers import draw, movers
 from ballfg.simulation.scene.room import Colour
 from ballfg.simulation.scene.shutter import Frames, Passage
-from ballfg.simulation.scene.view import Array, Rect, grown
+from ballfg.simulation.scene.view import Rect, grown
 from ballfg.simulation.streams import Purpose, generator
 from ballfg.vision.camera import Camera
 

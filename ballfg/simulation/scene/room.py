@@ -6,9 +6,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.simulation.balls import BallKind
 
-Array = NDArray[np.float64]
 Colour = tuple[float, float, float]
 """Blue, green, red, grey levels 0 to 255 in the light of the lamps."""
 

@@ -7,13 +7,12 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.simulation.scene.config import Clock, SceneConfig
 from ballfg.simulation.scene.flights import Flight
 from ballfg.simulation.streams import Purpose, cut_normal, generator
 from ballfg.state import POSITION
 from ballfg.vision.camera import Camera
-
-Array = NDArray[np.float64]
 
 PATH_POINTS: Final = 17
 """Points of a ball's path through one exposure, the first at the opening, the last at the closing, the middle one at

@@ -3,9 +3,9 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.vision.camera import Camera
 
-Array = NDArray[np.float64]
 Rect = tuple[int, int, int, int]
 """Left, top, right, bottom in pixels; right and bottom are the first that are out."""
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 from scipy.stats import chi2
 
-from ballfg.vision.arrays import Array
+from ballfg.arrays import Array
 from ballfg.vision.association.gathering import SeenBall
 from ballfg.vision.association.paths import path
 from ballfg.vision.association.triangulate import triangulate

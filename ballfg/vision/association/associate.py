@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 
+from ballfg.arrays import Index
 from ballfg.tracks.sightings import Sightings
-from ballfg.vision.arrays import Rows
 from ballfg.vision.association.completing import complete
 from ballfg.vision.association.flights import is_ball, successions
 from ballfg.vision.association.gathering import SAME_SHUTTER, Footage, Gathered, SeenBall, gather, shared_stamps
@@ -97,7 +97,7 @@ def _pieces(footage: Footage) -> list[Piece]:
     return pieces
 
 
-def _rows_of(pieces: Sequence[Piece], cameras: int) -> list[Rows]:
+def _rows_of(pieces: Sequence[Piece], cameras: int) -> list[Index]:
     none = np.zeros(0, dtype=np.int64)
     return [np.sort(np.concatenate([none, *(p.rows for p in pieces if p.camera == c)])) for c in range(cameras)]
 
@@ -132,7 +132,7 @@ def _may_follow(footage: Footage, one: Gathered, other: Gathered) -> bool:
     return all(np.isin(frame[mine], frame[theirs]).sum() <= _DISPUTED for frame, mine, theirs in pairs)
 
 
-def _undisputed(seen: Detections, rows: Rows) -> Rows:
+def _undisputed(seen: Detections, rows: Index) -> Index:
     """Ascending, without those of frames that have two."""
     _, position, count = np.unique(seen.frame[rows], return_inverse=True, return_counts=True)
     return np.sort(rows[count[position] == 1])

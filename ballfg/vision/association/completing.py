@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.vision.arrays import Array, Flags, Rows
+from ballfg.arrays import Array, Index, Mask
 from ballfg.vision.association.gathering import Footage, Gathered, gather
 from ballfg.vision.camera import Camera
 
@@ -50,7 +50,7 @@ def complete(footage: Footage, balls: Sequence[Gathered]) -> list[Gathered]:
     return done
 
 
-def _wanted(footage: Footage, ball: Gathered, taken: Sequence[Flags]) -> list[Rows]:
+def _wanted(footage: Footage, ball: Gathered, taken: Sequence[Mask]) -> list[Index]:
     """For each camera the unassigned candidates near the ball's predicted track."""
     wanted = []
     for number, camera in enumerate(footage.cameras):

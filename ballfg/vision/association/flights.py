@@ -10,8 +10,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.state import STANDARD_GRAVITY
-from ballfg.vision.arrays import Array
 from ballfg.vision.association.paths import Path
 
 LONGEST_GAP: Final = 0.3

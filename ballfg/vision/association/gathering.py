@@ -7,8 +7,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array, Index
 from ballfg.tracks.sightings import Sightings
-from ballfg.vision.arrays import Array, Rows
 from ballfg.vision.association.paths import Path, path
 from ballfg.vision.association.triangulate import triangulate
 from ballfg.vision.camera import Camera
@@ -34,7 +34,7 @@ class Footage:
         """(f,) s, true times of a camera's frames."""
         return np.asarray(self.detections[camera].frames - self.cameras[camera].time_offset)
 
-    def path(self, camera: int, rows: Rows) -> Path:
+    def path(self, camera: int, rows: Index) -> Path:
         """Candidates of one camera as a path over true time."""
         seen = self.detections[camera]
         return path(self.frames(camera)[seen.frame[rows]], seen.pixels[rows], seen.covariances[rows])
@@ -44,13 +44,13 @@ class Footage:
 class Gathered:
     """A ball in the making."""
 
-    rows: tuple[Rows, ...]
+    rows: tuple[Index, ...]
     """For each camera the numbers of its candidates, ascending; never two of one frame."""
     track: Path
     """Its points in space over true time, with the covariances that noise gives them."""
     covariances: Array
     """(n, 3, 3) m^2, the calibration's error included."""
-    views: Rows
+    views: Index
     """(n,) cameras that made each point."""
 
 
@@ -70,14 +70,14 @@ class SeenBall:
     sightings: Sightings
     """What the points come from, each at its own camera's stamp."""
 
-    views: Rows
+    views: Index
     """(n,) number of cameras that made each point."""
 
     def __len__(self) -> int:
         return len(self.times)
 
 
-def gather(footage: Footage, rows: Sequence[Rows]) -> Gathered:
+def gather(footage: Footage, rows: Sequence[Index]) -> Gathered:
     """The points that candidates of several cameras make; none where fewer than two agree.
 
     Args: rows: for each camera the numbers of its candidates, one a frame at most, ascending.
@@ -97,7 +97,7 @@ def gather(footage: Footage, rows: Sequence[Rows]) -> Gathered:
     return Gathered(tuple(rows), track, made.covariances[found], used.sum(axis=1).astype(np.int64))
 
 
-def _stamps(footage: Footage, rows: Sequence[Rows]) -> Array:
+def _stamps(footage: Footage, rows: Sequence[Index]) -> Array:
     """(k,) s, true times at which a point is wanted: stamps of the shared shutter or of the camera that saw most."""
     most = int(np.argmax([len(mine) for mine in rows]))
     stamps = footage.shared if footage.shared is not None else footage.frames(most)

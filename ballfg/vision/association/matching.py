@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.vision.arrays import Array, Rows
+from ballfg.arrays import Array, Index
 from ballfg.vision.association.paths import Path
 from ballfg.vision.camera import Camera
 
@@ -47,7 +47,7 @@ class Piece:
     camera: int
     """Number of the camera."""
 
-    rows: Rows
+    rows: Index
     """(k,) its candidates."""
 
     path: Path

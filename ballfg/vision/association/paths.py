@@ -10,12 +10,9 @@ from itertools import pairwise
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from ballfg.vision.arrays import Array, Flags, Rows
-
-Index = NDArray[np.intp]
+from ballfg.arrays import Array, Index, Mask
 
 MAX_GAP: Final = 0.06
 """s, longest gap between two samples of a smooth part that is bridged: three frames lost at 60 Hz."""
@@ -47,7 +44,7 @@ class Path:
     covariances: Array
     """(n, d, d)"""
 
-    parts: Rows
+    parts: Index
     """(n,) number of the smooth part that a sample belongs to, from 0, rising by at most one."""
 
     def at(self, times: Array) -> tuple[Array, Array]:
@@ -73,7 +70,7 @@ class Path:
         side = np.full(len(times), len(self.times) - 1 if last else 0)
         return self._fitted(times, side, _ASIDE)
 
-    def _side(self, times: Array, right: Index, kinked: Flags) -> Index:
+    def _side(self, times: Array, right: Index, kinked: Mask) -> Index:
         """The sample, before or after a kink, on whose side of the kink each time lies; (k,)."""
         side = right.copy()
         which = np.flatnonzero(kinked)
@@ -147,7 +144,7 @@ def _least_squares(design: Array) -> Array:
     return np.asarray(np.linalg.solve(transposed @ design, transposed))
 
 
-def _kinks(times: Array, values: Array, covariances: Array) -> Flags:
+def _kinks(times: Array, values: Array, covariances: Array) -> Mask:
     """(n - 1) whether the path bends sharply in an interval: one cubic does not fit three samples on either side.
 
     A kink spoils the fits of the neighbouring intervals too; the worst of five marks it. Where the path as a whole is

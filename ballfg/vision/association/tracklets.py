@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.vision.arrays import Rows
+from ballfg.arrays import Index
 from ballfg.vision.association.paths import RATE_OF_CHANGE
 from ballfg.vision.detection.detections import Detections
 
@@ -54,7 +54,7 @@ class _Piece:
     answers: list[tuple[float, _Seen]] = field(default_factory=list)
 
 
-def find_tracklets(detections: Detections, focal: float) -> list[Rows]:
+def find_tracklets(detections: Detections, focal: float) -> list[Index]:
     """The pieces of one camera's candidates, by the row of their first candidate.
 
     Args: focal: px, of the camera: turns speeds across the view into pixels.

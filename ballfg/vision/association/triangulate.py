@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
-from ballfg.vision.arrays import Array, Flags
+from ballfg.arrays import Array, Mask
 from ballfg.vision.camera import Camera
 
 MISSED: Final = 1e-6
@@ -40,7 +40,7 @@ class Triangulated:
     covariances: Array
     """(n, 3, 3) m^2."""
 
-    used: Flags
+    used: Mask
     """(n, c) whether the view took part; wrong ones do not."""
 
     residuals: Array
@@ -55,7 +55,7 @@ class _Views:
     translations: Array  # (c, 3) m
     planes: Array  # (n, c, 2); zero where nothing is seen
     weights: Array  # (n, c, 2, 2) inverse covariances of `planes`
-    seen: Flags  # (n, c)
+    seen: Mask  # (n, c)
 
     def project(self, points: Array) -> tuple[Array, Array, Array]:
         """Points (n, 3) -> their planes' coordinates (n, c, 2), derivatives (n, c, 2, 3) and depths (n, c) m."""
@@ -130,7 +130,7 @@ def _views(cameras: list[Camera], pixels: Array, covariances: Array) -> _Views:
     return _Views(rotations, np.stack([camera.tvec for camera in cameras]), planes, weights, seen)
 
 
-def _consensus(views: _Views) -> tuple[Array, Flags]:
+def _consensus(views: _Views) -> tuple[Array, Mask]:
     """For every row the proposal with most views, then least error: points (n, 3) (NaN: none), its views (n, c)."""
     n, c = views.seen.shape
     points = np.full((n, 3), np.nan)
@@ -153,7 +153,7 @@ def _consensus(views: _Views) -> tuple[Array, Flags]:
     return points, used
 
 
-def _proposal(views: _Views, i: int, j: int) -> tuple[Array, Flags, Array]:
+def _proposal(views: _Views, i: int, j: int) -> tuple[Array, Mask, Array]:
     """The point (n, 3) of views i and j, who agrees with it (n, c), and their squared whitened error (n,).
 
     A further view is judged by its residual's covariance, its own and that of the point: S + J P J'.
@@ -197,7 +197,7 @@ def _directions(views: _Views, c: int) -> Array:
     return np.asarray(local @ views.rotations[c] / np.linalg.norm(local, axis=1, keepdims=True))
 
 
-def _refined(views: _Views, points: Array, used: Flags) -> tuple[Array, Array]:
+def _refined(views: _Views, points: Array, used: Mask) -> tuple[Array, Array]:
     """Gauss-Newton on the weighted error in the planes: points (n, 3) and covariances (n, 3, 3); NaN where it fails."""
     points = points.copy()
     spread = np.full((len(points), 3, 3), np.nan)

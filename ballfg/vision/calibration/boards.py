@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.vision.arrays import Array, Image
+from ballfg.arrays import Array
+from ballfg.vision.arrays import Image
 from ballfg.vision.detection.video import IMAGE_ENDINGS
 
 MIN_CORNERS: Final = 8

@@ -6,7 +6,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from ballfg.vision.arrays import Array
+from ballfg.arrays import Array
 from ballfg.vision.calibration.table_points import Marked
 from ballfg.vision.camera import Camera
 

@@ -8,7 +8,7 @@ from typing import Final
 import cv2
 import numpy as np
 
-from ballfg.vision.arrays import Array
+from ballfg.arrays import Array
 from ballfg.vision.calibration.boards import View
 from ballfg.vision.calibration.lens_covariance import covariance_of_lens, pixel_grid, sigma_of_rays
 from ballfg.vision.camera import DISTORTIONS, Camera

@@ -6,7 +6,7 @@ from typing import Final, TypeAlias
 import cv2
 import numpy as np
 
-from ballfg.vision.arrays import Array
+from ballfg.arrays import Array
 from ballfg.vision.camera import Camera
 
 PosedBoard: TypeAlias = tuple[Array, Array, Array, Array]

@@ -9,7 +9,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 
-from ballfg.vision.arrays import Array, Image
+from ballfg.arrays import Array
+from ballfg.vision.arrays import Image
 from ballfg.vision.calibration.extrinsics import Extrinsics
 from ballfg.vision.calibration.intrinsics import CELLS, RAYS, FittedView, Intrinsics
 from ballfg.vision.calibration.table_points import TABLE_HEIGHT, table_outline

@@ -9,10 +9,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.checks import check_keys, did_you_mean, is_number
 from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.tracks.info import MAX_HEIGHT
-from ballfg.vision.arrays import Array
 
 TABLE_LENGTH: Final = 2.74
 TABLE_WIDTH: Final = 1.525

@@ -7,7 +7,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.vision.arrays import Array, Array32, Image
+from ballfg.arrays import Array
+from ballfg.vision.arrays import Array32, Image
 
 SHRINK: Final = 4
 """Pixels of the image per pixel of the small picture in which candidates are looked for."""

@@ -9,9 +9,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ballfg.arrays import Array, Index, Mask
 from ballfg.checks import check_array
 from ballfg.tracks.sightings import are_covariances
-from ballfg.vision.arrays import Array, Flags, Image, Rows
+from ballfg.vision.arrays import Image
 
 _SHAPES: Final = {"pixels": (2,), "covariances": (2, 2), "scores": (), "streaks": (2, 2)}
 """What is known of each candidate, of a frame and of a recording alike, and its shape."""
@@ -79,7 +80,7 @@ class Detections:
     frames: Array
     """(f,) s, stamps of all frames, strictly increasing, as the camera writes them."""
 
-    frame: Rows
+    frame: Index
     """(n,) number of the frame in which each candidate was seen, not decreasing."""
 
     pixels: Array
@@ -129,7 +130,7 @@ class Detections:
         rows = slice(*np.searchsorted(self.frame, (number, number + 1)))
         return Candidates(*(getattr(self, field)[rows] for field in _SHAPES))
 
-    def select(self, keep: Flags) -> Detections:
+    def select(self, keep: Mask) -> Detections:
         """Some of the candidates.
 
         Args: keep: (n,) bool, whether a candidate stays.
@@ -194,6 +195,6 @@ def _check_fields(owner: Candidates | Detections, what: str) -> None:
     _refuse((owner.scores < 0.0) | (owner.scores > 1.0), what, "scores", "lie in [0, 1]")
 
 
-def _refuse(wrong: Flags, what: str, field: str, rule: str) -> None:
+def _refuse(wrong: Mask, what: str, field: str, rule: str) -> None:
     if wrong.any():
         raise ValueError(f"{what}: {field} must {rule}; those of candidate {int(np.argmax(wrong))} do not.")

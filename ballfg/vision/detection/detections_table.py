@@ -6,10 +6,10 @@ from typing import Final
 
 import numpy as np
 
+from ballfg.arrays import Array, Mask
 from ballfg.tracks import detections_file
 from ballfg.tracks.checks import check_step
 from ballfg.tracks.rows import KEY
-from ballfg.vision.arrays import Array, Flags
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
 
@@ -66,7 +66,7 @@ def read_detections(
     return found, notes
 
 
-def _of_camera(name: str, rows: Flags, values: dict[str, Array]) -> Detections:
+def _of_camera(name: str, rows: Mask, values: dict[str, Array]) -> Detections:
     mine = {column: numbers[rows] for column, numbers in values.items()}
     frames, frame = np.unique(mine["t"], return_inverse=True)
     order = np.argsort(frame, kind="stable")

@@ -8,7 +8,8 @@ from typing import Final, Literal
 
 import numpy as np
 
-from ballfg.vision.arrays import Array, Image
+from ballfg.arrays import Array
+from ballfg.vision.arrays import Image
 from ballfg.vision.detection.background import Background
 from ballfg.vision.detection.detections import Candidates
 from ballfg.vision.detection.regions import Region, find_regions

@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.vision.arrays import Flags, Image
+from ballfg.arrays import Mask
+from ballfg.vision.arrays import Image
 from ballfg.vision.detection.background import SHRINK, Background, shrunk
 
 MARGIN: Final = 6
@@ -29,7 +30,7 @@ class Region:
 
     rows: slice
     columns: slice
-    free: Flags | None
+    free: Mask | None
     mass: float
 
     def free_of(self, values: NDArray[np.float32]) -> NDArray[np.float32]:

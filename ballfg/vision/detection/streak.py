@@ -15,7 +15,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.vision.arrays import Array, Array32
+from ballfg.arrays import Array
+from ballfg.vision.arrays import Array32
 
 LONGEST_HALF: Final = 15.0
 """px, prior sigma of half a streak. It only matters below a pixel, where the length hardly shows in the image."""

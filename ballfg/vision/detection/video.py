@@ -10,9 +10,10 @@ from typing import Final
 import cv2
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.tracks import csv_files
 from ballfg.tracks.checks import check_step
-from ballfg.vision.arrays import Array, Image
+from ballfg.vision.arrays import Image
 
 IMAGE_ENDINGS: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
 """Endings of what counts as an image in a folder; other files are left alone."""

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ballfg.vision.arrays import Array
+from ballfg.arrays import Array
 from ballfg.vision.tracking.pipeline import Tracking
 from ballfg.vision.tracking.strobe import EXPOSURES, HEIGHT, WIDTH, ZOOM, AllCandidates, Picture, Strobe
 from ballfg.vision.tracking.view_painter import hexadecimal

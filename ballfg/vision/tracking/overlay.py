@@ -12,8 +12,9 @@ from typing import Final
 import cv2
 import numpy as np
 
+from ballfg.arrays import Array, Index
 from ballfg.progress import Watch, unwatched
-from ballfg.vision.arrays import Array, Image, Rows
+from ballfg.vision.arrays import Image
 from ballfg.vision.association.gathering import nearest
 from ballfg.vision.camera import Camera
 from ballfg.vision.detection.detections import Detections
@@ -48,7 +49,7 @@ class Schedule:
     times: Array
     """(k,) s, true time of each moment, increasing."""
 
-    frames: Rows
+    frames: Index
     """(k, c) number of the frame of each camera; -1 where it has none within `HELD`."""
 
 
@@ -138,7 +139,7 @@ def schedule(detections: Sequence[Detections], cameras: Sequence[Camera]) -> Sch
     return Schedule(times, np.column_stack([shown(clock, times) for clock in clocks]))
 
 
-def shown(clock: Array, times: Array) -> Rows:
+def shown(clock: Array, times: Array) -> Index:
     """(k,) index into `clock` (f,), increasing, of the stamp nearest to each of `times` (k,); -1 beyond `HELD`."""
     if len(clock) == 0:
         return np.full(len(times), -1, dtype=np.int64)

@@ -7,9 +7,9 @@ from typing import Final
 
 import numpy as np
 
+from ballfg.arrays import Array, Index
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Track
-from ballfg.vision.arrays import Array, Rows
 from ballfg.vision.association.agreement import Agreement, check_agreement
 from ballfg.vision.association.associate import AssociationSettings, associate
 from ballfg.vision.association.gathering import SeenBall
@@ -29,7 +29,7 @@ DIGITS: Final = 3
 class Seen:
     """One ball in one camera."""
 
-    frames: Rows
+    frames: Index
     """(m,) numbers of the camera's frames, increasing."""
 
     pixels: Array
@@ -84,7 +84,7 @@ class Tracking:
         frames = np.searchsorted(self.detections[camera].frames, ball.sightings.times[rows])
         return Seen(frames.astype(np.int64), ball.sightings.pixels[rows])
 
-    def rows(self, ball: SeenBall, camera: int) -> Rows:
+    def rows(self, ball: SeenBall, camera: int) -> Index:
         """The candidates of a camera that are sightings of a ball.
 
         Args: ball: one of `balls`.  camera: number of the camera.

@@ -6,7 +6,8 @@ from typing import Final, Protocol
 import cv2
 import numpy as np
 
-from ballfg.vision.arrays import Array, Image
+from ballfg.arrays import Array
+from ballfg.vision.arrays import Image
 from ballfg.vision.tracking.pipeline import Tracking
 from ballfg.vision.tracking.view_painter import bgr, by_score, polyline, ring, uncover, write
 

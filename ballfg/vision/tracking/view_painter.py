@@ -6,7 +6,8 @@ from typing import Final
 import cv2
 import numpy as np
 
-from ballfg.vision.arrays import Array, Image
+from ballfg.arrays import Array
+from ballfg.vision.arrays import Image
 from ballfg.vision.tracking.pipeline import Tracking
 
 Colour = tuple[int, int, int]

@@ -6,15 +6,13 @@ from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
 from ballfg.estimation import RadarSpeed, Settings, SpinReading
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.tracks import Track
-
-Array = NDArray[np.float64]
 
 G = 9.81
 NOWHERE = Surfaces(-1000.0)

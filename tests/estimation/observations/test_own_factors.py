@@ -9,10 +9,11 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from ballfg.arrays import Array, Index
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Context, ExtendedKalmanFilter, Online, RadarSpeed, Settings, Smoother
 from ballfg.estimation.observations.observation import Unknowns
-from ballfg.factors.batch import COEFFICIENTS, Array, FactorBatch, Index, Values
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
 from ballfg.factors.check import check_factor
 from ballfg.factors.loss import Loss
 from ballfg.state import STATE_DIM, VELOCITY

@@ -2,12 +2,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.stats import multivariate_normal
 
+from ballfg.arrays import Array
 from ballfg.learning.calibration.population import Evidence, evidence, fit_population
 
-Array = NDArray[np.float64]
 WIDE = 1e6
 """Prior sigma that says nothing: the posterior is the likelihood to 1e-12."""
 
