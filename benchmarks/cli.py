@@ -180,9 +180,10 @@ def _start(command: str, data: Sequence[Path], quick: bool, seed: int, more: Seq
 
 def _open(data: Path) -> Dataset:
     """A dataset; repairs in it are noted on stderr."""
+    from ballfg.estimation import with_readings
     from ballfg.tracks import read_dataset
 
-    dataset = read_dataset(data)
+    dataset = with_readings(read_dataset(data))
     for note in dataset.notes:
         print(f"note: {note}", file=sys.stderr)
     return dataset
