@@ -115,12 +115,7 @@ def spin_prior(states: Index, spin: Array, sigma: Array, loss: Loss | None = Non
 def spin_label(states: Index, spin: Array, sigma: Array, loss: Loss | None = None) -> SpinLabelFactors:
     """Priors on the spin of some states from labels, whose standard deviation can be learned.
 
-    Args:
-        states: (m,) index of each.
-        spin: (m, 3) rad/s, means.
-        sigma: (m, 3) rad/s, standard deviations.
-        loss: on the norm of a whitened residual.
-    Raises: ValueError: if a sigma is not positive and finite.
+    Args and errors as for `spin_prior`: (m,) indices, (m, 3) rad/s.  Raises: ValueError: as there.
     """
     return SpinLabelFactors(states, *_about_spin(spin, sigma), loss)
 
