@@ -115,7 +115,8 @@ def spin_prior(states: Index, spin: Array, sigma: Array, loss: Loss | None = Non
 def spin_label(states: Index, spin: Array, sigma: Array, loss: Loss | None = None) -> SpinLabelFactors:
     """Priors on the spin of some states from labels, whose standard deviation can be learned.
 
-    Args and errors as for `spin_prior`: (m,) indices, (m, 3) rad/s.  Raises: ValueError: as there.
+    Args: states: (m,) index.  spin: (m, 3) rad/s.  sigma: (m, 3) rad/s.  loss: as for `spin_prior`.
+    Raises: ValueError: if a sigma is not positive and finite.
     """
     return SpinLabelFactors(states, *_about_spin(spin, sigma), loss)
 
