@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from ballfg.arrays import Array
 from ballfg.state import STANDARD_GRAVITY, Z
@@ -258,7 +259,7 @@ def _other_surface(
     inner = np.arange(reach, len(z) - reach)
     fall = (z[inner] - z[inner - reach]) / (times[inner] - times[inner - reach])
     rise = (z[inner + reach] - z[inner]) / (times[inner + reach] - times[inner])
-    lowest = np.array([z[i] == z[i - reach : i + reach + 1].min() for i in inner])
+    lowest = z[inner] == sliding_window_view(z, 2 * reach + 1).min(axis=1)
     bounces = z[inner[lowest & (fall < -LEAST_REVERSAL) & (rise > LEAST_REVERSAL)]] - radius
     if not len(bounces) or not len(surfaces):
         return ()
