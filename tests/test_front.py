@@ -245,7 +245,7 @@ def test_reprs_are_short_and_say_what_a_thing_holds(shots: bf.Dataset, track: bf
     speeds = bf.RadarSpeed([0, 3], [5.0, 5.0], 0.1)
     crossing = estimate.predict(1.0).next_contact
     expected = {
-        "Estimate": (estimate, ("'000'", f"{len(track)} states over 0.3", "ok", "m/s at the start")),
+        "Estimate": (estimate, ("'000'", f"{len(track)} states over 0.3", "ok", "up to")),
         "Smoother": (smoother, ("AnalyticModel", "table at 0.76 m", "noise 1.5 / 1.5 / 1.5 mm")),
         "Online": (bf.Online(shots.ball, shots.table), ("table at 0.76 m",)),
         "Track": (track.observed(speeds), ("'000'", f"{len(track)} samples", "RadarSpeed(2 of 2 samples)")),

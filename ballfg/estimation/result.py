@@ -94,11 +94,11 @@ class Estimate:
         return len(self.times)
 
     def __repr__(self) -> str:
-        speed = float(np.linalg.norm(self.states[0, 3:6]))
+        speed = float(np.linalg.norm(self.states[:, 3:6], axis=1).max())
         status = self.status.name.lower().replace("_", " ")
         return (
             f"Estimate({self.name!r}, {len(self)} states over {self.times[-1] - self.times[0]:.3f} s, {status};\n"
-            f"    {len(self.contacts)} contacts, {len(self.hits)} hits, {speed:.2f} m/s at the start"
+            f"    {len(self.contacts)} contacts, {len(self.hits)} hits, up to {speed:.2f} m/s"
             + "".join(f"\n    note: {note}" for note in self.notes)
             + ")"
         )
