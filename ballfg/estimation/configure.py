@@ -1,6 +1,7 @@
 """Settings for a dataset: what it says about its noise, and where it says nothing, what its tracks show."""
 
 from dataclasses import replace
+from functools import lru_cache
 from itertools import islice
 
 from ballfg.dynamics.model import BallModel
@@ -30,8 +31,7 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
     elif dataset.rough:
         noise = Settings().position_noise
     else:
-        x, y, z = estimate_position_noise(islice(iter(dataset), TRACKS_FOR_NOISE)).tolist()
-        noise = (x, y, z)
+        noise = _noise_of(dataset)
     if trained is None:
         settings = Settings.for_measured(model, position_noise=noise)
     else:
@@ -44,6 +44,13 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
         if trained.launcher is None and trained.spin_noise is not None:
             settings = replace(settings, spin_label_noise=trained.spin_noise)
     return settings if info.spin_noise is None else replace(settings, spin_label_noise=info.spin_noise)
+
+
+@lru_cache(maxsize=8)
+def _noise_of(dataset: Dataset | SightedDataset) -> tuple[float, float, float]:
+    """m, along x, y, z, from the first tracks; once for a dataset, whose tracks may be estimated one by one."""
+    x, y, z = estimate_position_noise(islice(iter(dataset), TRACKS_FOR_NOISE)).tolist()
+    return x, y, z
 
 
 def learned_process(trained: Trained) -> ProcessNoise:

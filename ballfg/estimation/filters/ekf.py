@@ -364,7 +364,7 @@ class _Run:
         """
         begins = k == self.record.start
         for observation, batch in self.beside:
-            for row in observation.filter_rows(batch, k):
+            for row in observation.filter_rows(k):
                 one = batch.taken(np.array([row]))
                 whitened = ball.correct_by(one, self.settings.find_events or begins)
                 if not begins or whitened @ whitened <= chi2.isf(GATE_CHANCE, batch.dim):

@@ -162,7 +162,7 @@ class Observation(ABC):
         """
         raise ValueError(f"the observation '{self.name}' has no table of its own: {type(self).__name__}.file is None")
 
-    def filter_rows(self, batch: FactorBatch, sample: int) -> Index:
+    def filter_rows(self, sample: int) -> Index:
         """(k,) index of the rows of the batch that a filter updates with at a sample; none where positions stand in."""
         return np.zeros(0, dtype=np.int64) if self.locates else np.flatnonzero(self.state == sample)
 
