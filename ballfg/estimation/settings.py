@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.launcher import Launcher, SpinLabel

@@ -14,9 +14,9 @@ from ballfg.arrays import Array
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import steps_over
+from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns, unknowns_of
-from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.observations.positions import Positions, observations_of
 from ballfg.estimation.segmentation import Contact, Quality, Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
