@@ -1,5 +1,6 @@
 """The config of a calibration; each field with its meaning."""
 
+from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
 from pydantic import Field
@@ -15,6 +16,8 @@ class CalibrationConfig(Section):
 
     FREE_TO_CHANGE: ClassVar[tuple[str, ...]] = ("out", "data", "model", "max_iterations", "tolerance", "jobs")
     """Fields that a resumed run may change: without effect on the result, or compared by content (data, model)."""
+
+    EARLIER: ClassVar[Mapping[str, str]] = {"observe": "observed_share"}
 
     kind: Literal["calibrate"] = "calibrate"
     """Distinguishes this config from that of a training."""
@@ -42,7 +45,7 @@ class CalibrationConfig(Section):
     seed: Annotated[int, Field(ge=0)] = 0
     """Seed of the random split."""
 
-    observe: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.4
+    observed_share: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.4
     """Share of a judged track's duration that is observed; the rest is predicted."""
 
     horizon: Positive | None = None
