@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.earlier_names import todays_name
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.launcher import Launcher, SpinLabel
 from ballfg.factors.loss import Loss
@@ -96,6 +97,14 @@ class Settings:
         """
         usual: dict[str, Any] = {"coefficients": coefficient_sigmas(model), "process": MEASURED}
         return cls(**(usual | changes))
+
+    def renamed(self, model: BallModel) -> Settings:
+        """These settings with coefficients under the names that the model has today."""
+        earlier = [name for name in self.coefficients if todays_name(name) != name]
+        if not earlier:
+            return self
+        known = {name for name, _ in model.named_parameters()}
+        return replace(self, coefficients={todays_name(name, known): s for name, s in self.coefficients.items()})
 
     def spin_label(self, track: Track) -> SpinLabel | None:
         """The spin label of a track: its own, else that of its launcher settings, else None."""

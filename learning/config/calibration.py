@@ -3,9 +3,16 @@
 from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
+from ballfg.dynamics.earlier_names import todays_name
 from ballfg.learning.config.training import Count, Positive, Section, Share
+
+Coefficients = Annotated[
+    tuple[str, ...],
+    Field(min_length=1, strict=False),
+    AfterValidator(lambda names: tuple(todays_name(name) for name in names)),
+]
 
 
 class CalibrationConfig(Section):
@@ -31,12 +38,12 @@ class CalibrationConfig(Section):
     out: str = "calibration"
     """Folder that is written. `--out` replaces it."""
 
-    coefficients: Annotated[tuple[str, ...], Field(min_length=1, strict=False)] = (
+    coefficients: Coefficients = (
         "flight.drag.k",
-        "contact.restitution.e",
-        "contact.table_height.offset",
+        "bounce.restitution.e",
+        "bounce.table_height.offset",
     )
-    """Calibrated parameters by name: `flight.` or `contact.`, the effect, its coefficient."""
+    """Calibrated parameters by name: `flight.` or `bounce.`, the effect, its coefficient."""
 
     split: Literal["random", "label"] = "random"
     """random: half of the tracks are fitted and half judge, by the seed. label: by the label `split` of the dataset,
