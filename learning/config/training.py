@@ -29,7 +29,11 @@ class Section(BaseModel):
 
     @classmethod
     def renamed(cls, content: Mapping[str, Any]) -> dict[str, Any]:
-        """The content under the names of today. Raises: ValueError: if it has a field under both names."""
+        """The content under the names of today.
+
+        Args: content: fields by name.
+        Raises: ValueError: if it has a field under both names.
+        """
         for earlier, name in cls.EARLIER.items():
             if earlier in content and name in content:
                 raise ValueError(f"'{earlier}' is the earlier name of '{name}'; got both. Delete '{earlier}'.")
