@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.earlier_names import todays_name
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.launcher import Launcher, SpinLabel
 from ballfg.factors.loss import Loss
@@ -123,6 +124,14 @@ class Settings:
     def bias_sigmas(self) -> NDArray[np.float64]:
         """(3,) m, standard deviations of the errors that last; an axis without any has as good as none."""
         return np.maximum(self.memory, LEAST_BIAS)
+
+    def renamed(self, model: BallModel) -> Settings:
+        """These settings with coefficients under the names that the model has today."""
+        earlier = [name for name in self.coefficients if todays_name(name) != name]
+        if not earlier:
+            return self
+        known = {name for name, _ in model.named_parameters()}
+        return replace(self, coefficients={todays_name(name, known): s for name, s in self.coefficients.items()})
 
     def spin_label(self, track: Track) -> SpinLabel | None:
         """The spin label of a track: its own, else that of its launcher settings, else None."""
