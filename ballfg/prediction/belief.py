@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -75,6 +75,16 @@ class Belief:
 
     def __len__(self) -> int:
         return len(self.time)
+
+    @staticmethod
+    def joined(beliefs: Sequence[Belief]) -> Belief:
+        """All balls of some beliefs, which share their model; one belief or more."""
+        parts = {name: torch.cat([getattr(b, name) for b in beliefs]) for name in ("time", "mean", "covariance")}
+        return replace(beliefs[0], **parts)
+
+    def take(self, rows: Tensor | slice) -> Belief:
+        """Some of the balls, by their indices, a mask (n,) or a slice."""
+        return replace(self, time=self.time[rows], mean=self.mean[rows], covariance=self.covariance[rows])
 
 
 def _joint(state: BallState, names: tuple[str, ...], prior_mean: Array, prior_sigma: Array) -> tuple[Array, Array]:
