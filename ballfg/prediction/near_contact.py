@@ -29,12 +29,14 @@ LEAST_SIGMA = 1e-12
 
 @dataclass(frozen=True)
 class Unbounced:
-    """Balls whose mean has bounced a short while ago, as if they had not: flown on below the surface.
+    """Balls on their way through a surface as if it were not there.
+
+    Those whose mean has bounced a short while ago fly on below it; those that fall towards it are still above.
 
     Attributes:
         rows: (m,) their places in a batch of balls.
         heights: (m,) m of the surfaces.
-        since: (m,) s, about when the mean bounced.
+        since: (m,) s, from when on they are followed; for a ball that bounced about the time of that.
         belief: of these m balls.
     """
 
@@ -59,10 +61,13 @@ class Unbounced:
         """Some of the balls, by a mask (m,)."""
         return Unbounced(self.rows[chosen], self.heights[chosen], self.since[chosen], self.belief.take(chosen))
 
+    def recent(self) -> "Unbounced":
+        """Those that are followed any further: a contact is looked for no longer ago."""
+        return self.take(self.belief.time - self.since < BEYOND)
+
     def followed_by(self, later: "Unbounced") -> "Unbounced":
-        """With the balls of a later contact, which counts instead of an earlier one, and without what is long past."""
-        recent = self.belief.time - self.since < BEYOND
-        return Unbounced.joined([self.take(recent & ~torch.isin(self.rows, later.rows)), later])
+        """With the balls of a later contact, which counts instead of an earlier one."""
+        return Unbounced.joined([self.take(~torch.isin(self.rows, later.rows)), later])
 
 
 def spread_over_contacts(belief: Belief, unbounced: Unbounced, surfaces: Surfaces, noise: ProcessNoise) -> Belief:
@@ -74,12 +79,13 @@ def spread_over_contacts(belief: Belief, unbounced: Unbounced, surfaces: Surface
         surfaces: what they may bounce on.
         noise: of an impact.
     """
-    balls = unbounced.followed_by(_approaching(belief, unbounced, surfaces))
+    balls = Unbounced.joined([unbounced, _approaching(belief, surfaces)])
     if not len(balls.rows):
         return belief
     c, k = _below(balls)
-    near = c.abs() < FAR
-    balls, c, k = balls.take(near), c[near], k[near]
+    nearest = torch.full_like(belief.time, FAR).scatter_reduce(0, balls.rows, c.abs(), "amin")
+    chosen = (c.abs() < FAR) & (c.abs() <= nearest[balls.rows])  # of two contacts of a ball the nearer one
+    balls, c, k = balls.take(chosen), c[chosen], k[chosen]
     if not len(balls.rows):
         return belief
     mean, covariance = _mixture(balls, c, k, noise)
@@ -92,12 +98,11 @@ def spread_over_contacts(belief: Belief, unbounced: Unbounced, surfaces: Surface
     )
 
 
-def _approaching(belief: Belief, unbounced: Unbounced, surfaces: Surfaces) -> Unbounced:
-    """The balls that fall towards a surface and did not touch it a short while ago."""
+def _approaching(belief: Belief, surfaces: Surfaces) -> Unbounced:
+    """The balls that fall towards a surface."""
     heights = surfaces.level_below(belief.mean)
     falling = (belief.mean[:, VZ] < 0) & heights.isfinite()
     falling &= (heights != surfaces.table_height) | surfaces.over_table(belief.mean)
-    falling[unbounced.rows] = False
     rows = falling.nonzero()[:, 0]
     return Unbounced.just_now(belief, rows, heights[rows])
 
@@ -138,13 +143,13 @@ def _truncated(belief: Belief, c: Tensor, k: Tensor, u: Tensor) -> tuple[Tensor,
 
 
 def _bounced(balls: Unbounced, mean: Tensor, covariance: Tensor, noise: ProcessNoise) -> tuple[Tensor, Tensor]:
-    """The balls below the surface after the bounce in which they would have gone through it, linear about their mean."""
+    """The balls below the surface after the bounce that they have gone through, linear about their mean."""
     model = balls.belief.model
     now = torch.zeros(len(mean), dtype=mean.dtype)
     after, times, jacobian = fly_through_jacobian(model, mean, now, (balls.heights,))
     with torch.no_grad():
         sensible = (times[:, 0] <= 0) & (model.gap(after, balls.heights) >= 0)
-    since = torch.where(sensible, -times[:, 0], now)
+    elapsed = torch.where(sensible, -times[:, 0], now)
     covariance = jacobian @ covariance @ jacobian.mT
-    covariance[:, :STATE_DIM, :STATE_DIM] += torch.from_numpy(noise.contact(since.numpy(), now.numpy()))
+    covariance[:, :STATE_DIM, :STATE_DIM] += torch.from_numpy(noise.contact(elapsed.numpy(), now.numpy()))
     return after, torch.where(sensible[:, None, None], covariance, torch.nan)

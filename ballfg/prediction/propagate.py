@@ -1,6 +1,7 @@
 """Propagation of a belief: mean and covariance through flight, contacts and rest, with process noise.
 
-The mean is the rollout of the mean. The covariance goes through the derivative of that rollout, contact times included
+The mean is the rollout of the mean. The covariance goes through the derivative of that rollout, contact times included.
+Near a contact of uncertain time the reported mean and covariance are those of the balls on both sides of it
 (docs/derivations/prediction.md).
 """
 
@@ -25,7 +26,7 @@ from ballfg.state import STATE_DIM, VZ
 
 @dataclass(frozen=True)
 class Prediction:
-    """Future states.
+    """Future states. Near a contact, means and covariances of the balls that have bounced and of those that have not.
 
     Attributes:
         times: (n, k) s, on each track's clock.
@@ -126,7 +127,7 @@ class Propagator:
         level = self.surfaces.level_below(mean)
         everyone = Belief.joined([belief, unbounced.belief]) if len(unbounced.rows) else belief
         flown = self.in_flight(everyone, torch.cat((h, h[unbounced.rows])))
-        after, unbounced = flown.take(slice(n)), replace(unbounced, belief=flown.take(slice(n, None)))
+        after, unbounced = flown.take(slice(n)), replace(unbounced, belief=flown.take(slice(n, None))).recent()
         with torch.no_grad():
             falls_below = (model.gap(after.mean, level) < 0) & (after.mean[:, VZ] < 0)
             touching = is_resting(model, mean, level) | falls_below
