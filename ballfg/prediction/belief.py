@@ -78,12 +78,24 @@ class Belief:
 
     @staticmethod
     def joined(beliefs: Sequence[Belief]) -> Belief:
-        """All balls of some beliefs, which share their model; one belief or more."""
-        parts = {name: torch.cat([getattr(b, name) for b in beliefs]) for name in ("time", "mean", "covariance")}
-        return replace(beliefs[0], **parts)
+        """All balls of some beliefs.
+
+        Args:
+            beliefs: one or more, of the same model.
+        """
+        return Belief(
+            beliefs[0].model,
+            torch.cat([belief.time for belief in beliefs]),
+            torch.cat([belief.mean for belief in beliefs]),
+            torch.cat([belief.covariance for belief in beliefs]),
+        )
 
     def take(self, rows: Tensor | slice) -> Belief:
-        """Some of the balls, by their indices, a mask (n,) or a slice."""
+        """Some of the balls.
+
+        Args:
+            rows: their (m,) indices, a (n,) mask or a slice.
+        """
         return replace(self, time=self.time[rows], mean=self.mean[rows], covariance=self.covariance[rows])
 
 
