@@ -13,6 +13,10 @@ from ballfg.state import Z
 
 TABLE_ABOVE_FLOOR: Final = 0.76
 """m, height of a table-tennis table (ITTF Laws 2.1.1)."""
+TABLE_LENGTH: Final = 2.74
+"""m (ITTF Laws 2.1.1)."""
+TABLE_WIDTH: Final = 1.525
+"""m (ITTF Laws 2.1.1)."""
 
 
 @dataclass(frozen=True)
