@@ -18,7 +18,7 @@ from ballfg.tracks import Dataset, DatasetInfo
 TRACKS_FOR_NOISE = 50
 """How many tracks the measurement noise is estimated from, when a dataset does not state it."""
 TRACKS_FOR_TABLE = 200
-"""The same for the table's ends. Few balls miss the table; 200 tracks hold some of them and take a tenth of a second."""
+"""The same for the table's ends. Few balls miss the table; 200 tracks hold some of them and take 0.1 s."""
 
 
 def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Settings:

@@ -158,7 +158,7 @@ def _arcs(
 def _fit(bounces: Array, falls: Array) -> TableExtent | None:
     """The ends of the table that best divides bounces (b, 2+) m from falls (f, 2+) m."""
     sizes = ((TABLE_LENGTH, TABLE_WIDTH), (TABLE_WIDTH, TABLE_LENGTH))
-    middles = [[_grid(bounces[:, axis], size[axis]) for axis in (0, 1)] for size in sizes]
+    middles = [(_grid(bounces[:, 0], size[0]), _grid(bounces[:, 1], size[1])) for size in sizes]
     costs = [_contradicting(bounces, falls, *place, size) for place, size in zip(middles, sizes, strict=True)]
     least = min(float(cost.min()) for cost in costs)
     if least > MOST_CONTRADICTING * (len(bounces) + len(falls)):
