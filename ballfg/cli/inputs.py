@@ -119,10 +119,10 @@ def _inputs(data: Opened, model: Path | None) -> Inputs[Opened]:
     import torch
 
     from ballfg.dynamics import load_model, nominal_model, nominal_note
-    from ballfg.estimation import dataset_settings, dataset_surfaces, unused_model
+    from ballfg.estimation import dataset_settings, dataset_surfaces, table_note, unused_model
 
     torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
-    notes = list(data.notes)
+    notes = [*data.notes, *filter(None, [table_note(data)])]
     if model is None:
         notes += [note for note in (nominal_note(data.ball), *unused_model(data.path, data.ball)) if note]
     print_notes(notes)

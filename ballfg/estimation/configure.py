@@ -1,4 +1,4 @@
-"""Settings for a dataset: what it says about its noise, and where it says nothing, what its tracks show."""
+"""Settings and surfaces for a dataset: what it states of noise and table, else what its tracks show of them."""
 
 from dataclasses import replace
 from functools import lru_cache
@@ -11,11 +11,14 @@ from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.estimation.settings import MEASURED, Settings
+from ballfg.estimation.table_extent import TableExtent, find_table_extent
 from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
 from ballfg.tracks import Dataset, DatasetInfo
 
 TRACKS_FOR_NOISE = 50
 """How many tracks the measurement noise is estimated from, when a dataset does not state it."""
+TRACKS_FOR_TABLE = 200
+"""The same for the table's ends. Few balls miss the table; 200 tracks hold some of them and take 0.1 s."""
 
 
 def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Settings:
@@ -73,5 +76,23 @@ def launcher_of(info: DatasetInfo, model: BallModel) -> Launcher | None:
 
 
 def dataset_surfaces(dataset: Dataset | SightedDataset) -> Surfaces:
-    """The dataset's table, of unknown extent, and the floor below it."""
-    return Surfaces.table_tennis(dataset.info.table_height)
+    """The dataset's table and the floor below it.
+
+    The table ends where `dataset.yaml` says; where it does not, beside the sides past which balls fell.
+    """
+    info = dataset.info
+    found = found_table(dataset) if info.table_extent is None else None
+    return Surfaces.table_tennis(info.table_height, info.table_extent if found is None else found.sides)
+
+
+@lru_cache(maxsize=8)
+def found_table(dataset: Dataset | SightedDataset) -> TableExtent | None:
+    """The table's ends as the first tracks show them, whatever `dataset.yaml` says; None where they do not."""
+    tracks = islice(iter(dataset), TRACKS_FOR_TABLE)
+    return find_table_extent(tracks, dataset.info.table_height, dataset.ball.radius)
+
+
+def table_note(dataset: Dataset | SightedDataset) -> str | None:
+    """A sentence on ends of the table that were found from the tracks; None if there are none."""
+    found = found_table(dataset) if dataset.info.table_extent is None else None
+    return None if found is None else str(found)

@@ -51,7 +51,7 @@ class Estimator(ABC):
     def __repr__(self) -> str:
         effects = type(self.model).__name__
         noise = " / ".join(f"{1e3 * s:g}" for s in self.settings.position_noise)
-        return f"{type(self).__name__}({effects}, table at {self.surfaces.table_height:g} m, noise {noise} mm)"
+        return f"{type(self).__name__}({effects}, {self.surfaces}, noise {noise} mm)"
 
     @abstractmethod
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
