@@ -162,9 +162,7 @@ def sample_sigmas(settings: Settings, count: int, own: NDArray[np.float64] | Non
     return settings.position_scale * sigmas
 
 
-def total_sigmas(
-    settings: Settings, white: NDArray[np.float64], velocities: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def total_sigmas(settings: Settings, white: Array, velocities: Array) -> Array:
     """Standard deviations of whole position errors: the white part, the one with a memory, and that of the stamps.
 
     Args:

@@ -44,8 +44,8 @@ class NoisyImpacts(AugmentedModel):
         super().__init__(model, names)
         self.rng = torch.Generator().manual_seed(3)
 
-    def bounce(self, state: Tensor) -> Tensor:
-        after = super().bounce(state).clone()
+    def after_bounce(self, state: Tensor) -> Tensor:
+        after = super().after_bounce(state).clone()
         kick = torch.randn((len(after), 6), generator=self.rng, dtype=torch.float64)
         after[:, 3:6] += NOISE.contact_velocity * kick[:, :3]
         after[:, 6:9] += NOISE.contact_spin * kick[:, 3:]
