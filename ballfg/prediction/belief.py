@@ -106,6 +106,8 @@ def _joint(state: BallState, names: tuple[str, ...], prior_mean: Array, prior_si
     own = np.array([*range(STATE_DIM), *(STATE_DIM + names.index(name) for name in state.coefficient_names)])
     mean[own] = state.mean
     covariance[np.ix_(own, own)] = state.joint
+    if state.other_side is not None:
+        covariance[:STATE_DIM, :STATE_DIM] -= state.other_side
     return mean, (covariance + covariance.T) / 2
 
 

@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import ballfg as bf
 from ballfg.dynamics import Surfaces
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.motion.rollout import advance
@@ -174,6 +175,21 @@ def test_a_contact_that_is_known_widens_nothing(model, beliefs):
     times = torch.arange(1, 31, dtype=torch.float64) / 100
     covariances = Propagator(Surfaces(0.0), ProcessNoise(1e-9, 1e-9, 1e-9, 0.0, 1e-9)).rollout(belief, times)
     assert np.abs(covariances.covariances).max() < 1e-6
+
+
+def test_an_estimate_that_ends_just_before_a_contact_predicts_no_wider_than_one_that_ends_earlier(gravity):
+    """Its last covariance holds the ball's other side; carried on, that would be metres after 0.2 s."""
+    times = np.arange(31) / 100
+    end = 0.3 + 2e-4  # s, of the contact
+    path = np.stack((3.0 * times, 0.1 * times, 0.02 + 3.0 * (end - times) - 9.81 / 2 * (end - times) ** 2), axis=1)
+    path += np.random.default_rng(2).normal(0.0, 0.001, path.shape)
+    smoother = bf.Smoother(gravity, 0.0, bf.Settings.for_measured(gravity, position_noise=(0.001,) * 3))
+    close, early = smoother.estimate(bf.Track(times, path)), smoother.estimate(bf.Track(times[:-3], path[:-3]))
+    assert not close.contacts
+    assert close.last.sigmas[VZ] > 0.5  # the other side is 5 m/s off
+    assert early.last.sigmas[VZ] < 0.1
+    sigmas = [estimate.predict(0.53 - estimate.times[-1], 1.0).sigmas[0] for estimate in (close, early)]
+    assert (sigmas[0] < 1.1 * sigmas[1]).all()
 
 
 def test_the_path_ahead_and_its_contact(model, beliefs):

@@ -28,7 +28,7 @@ from ballfg.estimation.observations.observation import Context, refuse_unknowns
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact, Quality
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start
-from ballfg.estimation.smoother.near_contact import widen_near_contacts
+from ballfg.estimation.smoother.near_contact import other_sides
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
@@ -173,14 +173,14 @@ class ExtendedKalmanFilter(Estimator):
     def _result(self, track: Track, run: _Run, mean: Array, covariance: Array, whitened: Array) -> Estimate:
         states = mean[:, :STATE_DIM]
         contacts = tuple(contact for i in sorted(run.record.contacts) for contact in run.record.contacts[i])
-        honest = widen_near_contacts(
-            track.times, states, covariance[:, :STATE_DIM, :STATE_DIM], contacts, self.model, self.surfaces
-        )
+        of_states = covariance[:, :STATE_DIM, :STATE_DIM]
+        others = other_sides(track.times, states, of_states, contacts, self.model, self.surfaces)
         return Estimate(
             name=track.name,
             times=track.times,
             states=states,
-            covariances=honest,
+            covariances=of_states + others,
+            other_sides=others,
             status=_status(run.record.used),
             innovations={"position": whitened, **run.innovations},
             world=self.world,
