@@ -20,6 +20,7 @@ from ballfg.dynamics.motion.rollout import LONGEST_MOTION, is_resting
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.belief import Belief
+from ballfg.prediction.edges import edge_doubt
 from ballfg.state import STATE_DIM, VZ
 
 
@@ -113,10 +114,10 @@ class Propagator:
             touching = is_resting(model, mean, level) | ((model.gap(after, level) < 0) & (after[:, VZ] < 0))
         rows = touching.nonzero()[:, 0]
         if len(rows):
-            after[rows], jacobian[rows], noise[rows] = self._touch(model, mean[rows], h[rows])
+            after[rows], jacobian[rows], noise[rows] = self._touch(model, mean[rows], belief.covariance[rows], h[rows])
         return _moved(belief, h, after, jacobian, noise)
 
-    def _touch(self, model: BallModel, mean: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def _touch(self, model: BallModel, mean: Tensor, covariance: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Mean, Jacobian and noise of balls that reach a surface's level, or rest, within a step."""
         after, jacobian = torch.empty_like(mean), mean.new_empty((*mean.shape, mean.shape[-1]))
         noise = torch.from_numpy(self.noise.flight(h.numpy()))
@@ -127,6 +128,7 @@ class Propagator:
             if motion.contacts:
                 times = mean.new_tensor([[time for time, _ in motion.contacts]])
                 noise[row] = self._bounce_noise(model, mean[row], h[row], times, jacobian[row])
+            noise[row] += edge_doubt(model, mean[row], covariance[row], h[row], self.surfaces)
         return after, jacobian, noise
 
     def _bounce_noise(self, model: BallModel, mean: Tensor, h: Tensor, times: Tensor, jacobian: Tensor) -> Tensor:
