@@ -28,10 +28,9 @@ class Surfaces:
         floor_height: m, z of the floor; None where there is no floor below (a court is its own floor).
         extent: (x_low, x_high, y_low, y_high) m of the table; infinite where an end is not known, None where none is:
             the table is taken to lie under every ball whose centre is above its surface and within the known ends.
-
         edge_sigmas: (x_low, x_high, y_low, y_high) m, standard deviations of those ends, for predictions near them.
 
-    Raises: ValueError: if a height is not finite, the floor not below the table, or the extent not in order.
+    Raises: ValueError: if a height is not finite, the floor not below the table, the extent not in order, or a sigma negative.
     """
 
     table_height: float = 0.0
@@ -48,6 +47,8 @@ class Surfaces:
             )
         if self.extent is not None and not (self.extent[0] < self.extent[1] and self.extent[2] < self.extent[3]):
             raise ValueError(f"extent must be (x_low, x_high, y_low, y_high); got {self.extent}")
+        if not all(0.0 <= sigma < math.inf for sigma in self.edge_sigmas):
+            raise ValueError(f"edge_sigmas must be finite and not negative, in m; got {self.edge_sigmas}")
 
     @classmethod
     def table_tennis(cls, table_height: float) -> Surfaces:
