@@ -30,7 +30,7 @@ class Surfaces:
             the table is taken to lie under every ball whose centre is above its surface and within the known ends.
         edge_sigmas: (x_low, x_high, y_low, y_high) m, standard deviations of those ends, for predictions near them.
 
-    Raises: ValueError: if a height is not finite, the floor not below the table, the extent not in order, or a sigma negative.
+    Raises: ValueError: a height that is not finite, a floor above the table, an extent out of order, a negative sigma.
     """
 
     table_height: float = 0.0
