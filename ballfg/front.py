@@ -160,9 +160,7 @@ def estimator_for(
     source = data.dataset if isinstance(data, Track) else data
     ball = _model(model, source)
     if surfaces is None:
-        surfaces = Surfaces.table_tennis(0.0) if source is None else dataset_surfaces(source)
-    elif isinstance(surfaces, int | float):
-        surfaces = Surfaces.table_tennis(surfaces)
+        surfaces = 0.0 if source is None else dataset_surfaces(source)
     if settings is None:
         settings = Settings.for_measured(ball) if source is None else dataset_settings(source, ball)
     return make_estimator(method, ball, surfaces, settings)

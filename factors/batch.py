@@ -21,6 +21,7 @@ from torch import Tensor
 
 from ballfg.arrays import Array, Index
 from ballfg.factors.loss import Loss
+from ballfg.state import STATE_DIM
 
 COEFFICIENTS = -1
 """The variable number of the coefficients shared by all factors; states have their index."""
@@ -33,26 +34,40 @@ class Values:
     Attributes:
         states: (n, 9) position m, velocity m/s, spin rad/s.
         coefficients: (p,) the coefficients that are estimated, in their own units; (0,) where there are none.
+        biases: (n, b) m, errors of the tracker that last from sample to sample; b is 3, or 0 where it has no memory.
     """
 
     states: Array
     coefficients: Array
+    biases: Array | None = None
 
-    def gather(self, variables: Index) -> Array:
+    @property
+    def width(self) -> int:
+        """Numbers at each time: 9 + b."""
+        return STATE_DIM if self.biases is None else STATE_DIM + self.biases.shape[1]
+
+    def gather(self, variables: Index, with_biases: bool = False) -> Array:
         """(m, d) values, in the variables' own units.
 
-        Args: variables: (m,) index of each; all are states, or all are `COEFFICIENTS`.
+        Args:
+            variables: (m,) index of each; all are states, or all are `COEFFICIENTS`.
+            with_biases: whether the biases follow the states.
         """
         if len(variables) and variables[0] == COEFFICIENTS:
             return np.broadcast_to(self.coefficients, (len(variables), len(self.coefficients)))
+        if with_biases and self.biases is not None:
+            return np.concatenate((self.states[variables], self.biases[variables]), axis=1)
         return self.states[variables]
 
     def moved(self, states: Array, coefficients: Array) -> Values:
         """These values plus a step.
 
-        Args: states: (n, 9) m, m/s, rad/s.  coefficients: (p,) in their own units.
+        Args: states: (n, 9 + b) m, m/s, rad/s, m.  coefficients: (p,) in their own units.
         """
-        return Values(self.states + states, self.coefficients + coefficients)
+        if self.biases is None:
+            return Values(self.states + states, self.coefficients + coefficients)
+        own, biases = states[:, :STATE_DIM], states[:, STATE_DIM:]
+        return Values(self.states + own, self.coefficients + coefficients, self.biases + biases)
 
 
 @dataclass(frozen=True)
@@ -101,9 +116,11 @@ class FactorBatch(ABC):
         loss: the loss on the norm of a whitened residual.
         row_arrays: names of the attributes that hold one entry a factor.
         costly: whether an evaluation is a torch call, worth sharing between graphs.
+        sees_biases: whether its variables are states with the tracker's biases behind them.
     """
 
     costly: ClassVar[bool] = False
+    sees_biases: ClassVar[bool] = False
 
     row_arrays: ClassVar[tuple[str, ...]] = ("variables",)
 
@@ -174,10 +191,29 @@ class FactorBatch(ABC):
             setattr(part, name, getattr(self, name)[rows])
         return part
 
+    def inputs(self, values: Values) -> tuple[Array, ...]:
+        """For each variable of a factor the values (m, d) that `compute` takes, in the variable's own units."""
+        return tuple(values.gather(column, self.sees_biases) for column in self.variables.T)
+
     def linearize(self, values: Values) -> Rows:
         """All factors at a point."""
-        inputs = tuple(values.gather(column) for column in self.variables.T)
-        residual, jacobians = self.compute(slice(None), inputs)
+        return self.rows(values, *self.compute(slice(None), self.inputs(values)))
+
+    def rows(self, values: Values, residual: Array, jacobians: tuple[Array, ...]) -> Rows:
+        """The linearised factors from what `compute` returned for all of them.
+
+        Args:
+            values: the point.
+            residual: (m, dim) whitened.
+            jacobians: (m, dim, d) whitened, each per unit of its variable; they get columns of zeros for biases.
+        """
+        more = values.width - STATE_DIM
+        if more and not self.sees_biases:
+            shared = (self.variables == COEFFICIENTS).any(axis=0)
+            jacobians = tuple(
+                j if of_coefficients else np.pad(j, ((0, 0), (0, 0), (0, more)))
+                for j, of_coefficients in zip(jacobians, shared, strict=True)
+            )
         return Rows(self.variables, residual, jacobians, self.loss)
 
 

@@ -14,7 +14,6 @@ import numpy as np
 
 from ballfg.arrays import Array, Index
 from ballfg.factors.batch import COEFFICIENTS
-from ballfg.state import STATE_DIM
 
 
 @dataclass(frozen=True)
@@ -22,9 +21,9 @@ class Covariances:
     """Marginal covariances at the minimum.
 
     Attributes:
-        states: (n, 9, 9) in the products of m, m/s and rad/s.
+        states: (n, 9 + b, 9 + b) of states and biases, in the products of m, m/s and rad/s.
         coefficients: (p, p) in the products of their own units.
-        cross: (n, 9, p) between each state and the coefficients, in the products of their units.
+        cross: (n, 9 + b, p) between each of them and the coefficients, in the products of their units.
     """
 
     states: Array
@@ -34,11 +33,11 @@ class Covariances:
 
 @dataclass(frozen=True)
 class NeighbourCovariances:
-    """Covariances of t tracks with up to n states and p coefficients each.
+    """Covariances of t tracks with up to n states of w numbers (biases among them) and p coefficients each.
 
     Attributes:
-        states: (t, n, 9, 9).
-        cross: (t, n, 9, 9 + p), of each state with the next one and with the coefficients.
+        states: (t, n, w, w).
+        cross: (t, n, w, w + p), of each state with the next one and with the coefficients.
         coefficients: (t, p, p).
     """
 
@@ -56,12 +55,12 @@ class NeighbourCovariances:
                 return np.broadcast_to(self.coefficients[track], (len(left), *self.coefficients.shape[1:]))
             if left[0] == COEFFICIENTS:
                 return self.joint(track, right, left).swapaxes(-1, -2)
-            return self.cross[track, left][:, :, STATE_DIM:]
+            return self.cross[track, left][:, :, self.states.shape[-1] :]
         if (left == right).all():
             return self.states[track, left]
         if left[0] > right[0]:
             return self.joint(track, right, left).swapaxes(-1, -2)
-        return self.cross[track, left][:, :, :STATE_DIM]
+        return self.cross[track, left][:, :, : self.states.shape[-1]]
 
 
 class SquareRootInformation:
@@ -73,19 +72,21 @@ class SquareRootInformation:
         coefficients: number p of coefficients of each.
 
     Attributes:
-        inverse: (t, n, 9, 9) inverses of the diagonal blocks; identities beyond a track's end.
-        following: (t, n, 9, 9) blocks that couple a state to the next one.
-        shared: (t, n, 9, p) blocks that couple it to the coefficients.
+        width: numbers w of a state, biases among them.
+        inverse: (t, n, w, w) inverses of the diagonal blocks; identities beyond a track's end.
+        following: (t, n, w, w) blocks that couple a state to the next one.
+        shared: (t, n, w, p) blocks that couple it to the coefficients.
         last: (t, p, p) inverses of the coefficients' own blocks.
     """
 
     def __init__(self, bayes_nets: Sequence[gtsam.GaussianBayesNet], lengths: Sequence[int], coefficients: int) -> None:
         self.tracks, self.lengths, self.coefficients = len(bayes_nets), np.array(lengths), coefficients
         t, n = self.tracks, max(lengths)
-        root = np.zeros((t, n, STATE_DIM, STATE_DIM))
-        root[:] = np.eye(STATE_DIM)  # shorter tracks are filled up with variables that nothing depends on
-        self.following = np.zeros((t, n, STATE_DIM, STATE_DIM))
-        self.shared = np.zeros((t, n, STATE_DIM, coefficients))
+        self.width = w = len(bayes_nets[0].at(0).R())
+        root = np.zeros((t, n, w, w))
+        root[:] = np.eye(w)  # shorter tracks are filled up with variables that nothing depends on
+        self.following = np.zeros((t, n, w, w))
+        self.shared = np.zeros((t, n, w, coefficients))
         last = np.zeros((t, coefficients, coefficients))
         for k, (net, length) in enumerate(zip(bayes_nets, lengths, strict=True)):
             for i in range(length):
@@ -116,17 +117,18 @@ class SquareRootInformation:
         states, cross = self.inverse @ self.inverse.mT, np.empty_like(gain)
         coefficients = self.last @ self.last.mT
         later = np.zeros((self.tracks, gain.shape[-1], gain.shape[-1]))  # covariance of (x_{i+1}, c)
-        later[:, STATE_DIM:, STATE_DIM:] = coefficients
+        w = self.width
+        later[:, w:, w:] = coefficients
         for i in range(states.shape[1] - 1, -1, -1):
             cross[:, i] = gain[:, i] @ later
             states[:, i] += cross[:, i] @ gain[:, i].mT
-            later[:, :STATE_DIM, :STATE_DIM] = states[:, i]
-            own = cross[:, i, :, STATE_DIM:]
-            later[:, :STATE_DIM, STATE_DIM:], later[:, STATE_DIM:, :STATE_DIM] = own, own.mT
+            later[:, :w, :w] = states[:, i]
+            own = cross[:, i, :, w:]
+            later[:, :w, w:], later[:, w:, :w] = own, own.mT
         return NeighbourCovariances(states, cross, coefficients)
 
 
 def marginal_covariances(bayes_net: gtsam.GaussianBayesNet, n: int, p: int) -> Covariances:
     """Covariances of one track from a net over states 0..n-1 in order, then p coefficients (none if p is 0)."""
     found = SquareRootInformation([bayes_net], [n], p).covariances()
-    return Covariances(found.states[0], found.coefficients[0], found.cross[0, :, :, STATE_DIM:])
+    return Covariances(found.states[0], found.coefficients[0], found.cross[0, :, :, found.states.shape[-1] :])

@@ -9,7 +9,6 @@ import numpy as np
 
 from ballfg.arrays import Array, Index
 from ballfg.factors.batch import COEFFICIENTS, Rows, Values
-from ballfg.state import STATE_DIM
 
 Piece = tuple[Index, Array, tuple[Array, ...]]
 """Variables (m, a), weighted residuals (m, r) and weighted Jacobians of some factors."""
@@ -20,7 +19,7 @@ class Step:
     """A solution of the linear subproblem.
 
     Attributes:
-        states: (n, 9) m, m/s, rad/s, part of the step d that minimises |r + J d|^2 (+ damping).
+        states: (n, 9 + b) m, m/s, rad/s, and m of biases: part of the step d that minimises |r + J d|^2 (+ damping).
         coefficients: (p,) in their own units, the other part of it.
         bayes_net: GTSAM's result of the elimination, states in order, coefficients last.
         decrease: half of |r|^2 - |r + J d|^2, by which the linear model promises to reduce the objective.
@@ -57,13 +56,13 @@ def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> S
         damping: Marquardt's lambda, relative to the diagonal of J^T J.
     Returns: None where the system is singular or its solution is not finite.
     """
-    n, p = len(values.states), len(values.coefficients)
+    n, p, width = len(values.states), len(values.coefficients), values.width
     pieces = [(rows.variables, *weighted(rows)) for rows in linearized]
     graph = gtsam.GaussianFactorGraph()
     for variables, residual, jacobians in _folded(pieces, n):
         _append(graph, np.where(variables == COEFFICIENTS, n, variables), residual, jacobians)
     if damping:
-        _damp(graph, np.sqrt(damping * _diagonal(pieces, n, p)), n, p)
+        _damp(graph, np.sqrt(damping * _diagonal(pieces, n, p, width)), n, p, width)
     try:
         bayes_net = graph.eliminateSequential(_in_order(n + (p > 0)), gtsam.EliminateQR)
         solution = bayes_net.optimize()
@@ -71,7 +70,7 @@ def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> S
         if "Indetermin" not in str(error):
             raise
         return None
-    states = solution.vector(list(range(n))).reshape(n, STATE_DIM)
+    states = solution.vector(list(range(n))).reshape(n, width)
     coefficients = solution.at(n) if p else np.zeros(0)
     if not np.isfinite(states).all():
         return None
@@ -121,9 +120,9 @@ def _distinct_states(variables: Index) -> bool:
     return len(variables) > 1 and bool(variables.min() >= 0) and len(np.unique(variables)) == len(variables)
 
 
-def _diagonal(pieces: Sequence[Piece], n: int, p: int) -> Array:
-    """(n + 1, 9 + p) diagonal of J^T J; the coefficients stand in row n."""
-    diagonal = np.zeros((n + 1, STATE_DIM + p))
+def _diagonal(pieces: Sequence[Piece], n: int, p: int, width: int) -> Array:
+    """(n + 1, 9 + b + p) diagonal of J^T J; the coefficients stand in row n."""
+    diagonal = np.zeros((n + 1, width + p))
     for variables, _, jacobians in pieces:
         for column, jacobian in zip(variables.T, jacobians, strict=True):
             squares = (jacobian**2).sum(axis=1)
@@ -143,8 +142,8 @@ def _append(graph: gtsam.GaussianFactorGraph, keys: Index, residual: Array, jaco
             push(factor(key[0], blocks[0], key[1], blocks[1], key[2], blocks[2], b, unit))
 
 
-def _damp(graph: gtsam.GaussianFactorGraph, root: Array, n: int, p: int) -> None:
-    for key, d in [(i, STATE_DIM) for i in range(n)] + [(n, p)] * (p > 0):
+def _damp(graph: gtsam.GaussianFactorGraph, root: Array, n: int, p: int, width: int) -> None:
+    for key, d in [(i, width) for i in range(n)] + [(n, p)] * (p > 0):
         graph.push_back(gtsam.JacobianFactor(key, np.diag(root[key, :d]), np.zeros(d), gtsam.noiseModel.Unit.Create(d)))
 
 

@@ -58,15 +58,10 @@ def _evaluate(batches: Sequence[FactorBatch], points: Sequence[Values]) -> list[
     """Batches of one group, each linearised at its own point."""
     if len(batches) == 1:
         return [batches[0].linearize(points[0])]
-    gathered = [
-        [values.gather(column) for column in batch.variables.T] for batch, values in zip(batches, points, strict=True)
-    ]
+    gathered = [batch.inputs(values) for batch, values in zip(batches, points, strict=True)]
     inputs = tuple(np.concatenate(pieces) for pieces in zip(*gathered, strict=True))
     residual, jacobians = merge(batches).compute(slice(None), inputs)
     ends = np.cumsum([len(batch) for batch in batches])[:-1]
     residuals = np.split(residual, ends)
     blocks = [np.split(jacobian, ends) for jacobian in jacobians]
-    return [
-        Rows(batch.variables, residuals[i], tuple(block[i] for block in blocks), batch.loss)
-        for i, batch in enumerate(batches)
-    ]
+    return [batch.rows(points[i], residuals[i], tuple(block[i] for block in blocks)) for i, batch in enumerate(batches)]

@@ -38,9 +38,9 @@ def check_dataset(folder: Path) -> Path:
 DatasetFolder = Annotated[
     Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.", callback=check_dataset)
 ]
-OwnEffects = Annotated[
+EffectsFiles = Annotated[
     list[Path] | None,
-    typer.Option("--effects", help="Trusted Python file that defines custom effects; may be repeated."),
+    typer.Option("--effects-file", help="Trusted Python file that defines custom effects; may be repeated."),
 ]
 """The option of every command that reads or names effects."""
 MethodName = Annotated[
@@ -96,20 +96,22 @@ def know_effects(files: Iterable[Path] | None) -> None:
         load_effects(file)
 
 
-def open_inputs(dataset: Path, model: Path | None, effects: Iterable[Path] | None = None) -> Inputs[Dataset]:
+def open_inputs(dataset: Path, model: Path | None, effects_files: Iterable[Path] | None = None) -> Inputs[Dataset]:
     """Open and check everything before any work starts; what was repaired is said on stderr."""
     from ballfg.estimation import with_readings
     from ballfg.tracks import read_dataset
 
-    know_effects(effects)
+    know_effects(effects_files)
     return _inputs(with_readings(read_dataset(dataset)), model)
 
 
-def open_sighted(dataset: Path, model: Path | None, effects: Iterable[Path] | None = None) -> Inputs[SightedDataset]:
+def open_sighted(
+    dataset: Path, model: Path | None, effects_files: Iterable[Path] | None = None
+) -> Inputs[SightedDataset]:
     """`open_inputs` for what cameras saw."""
     from ballfg.estimation import read_sighted
 
-    know_effects(effects)
+    know_effects(effects_files)
     return _inputs(read_sighted(dataset), model)
 
 

@@ -20,12 +20,16 @@ from ballfg.cli.render import render
 from ballfg.cli.simulate import simulate
 from ballfg.cli.track import track
 
+EARLIER_OPTIONS = {"effects": "effects-file"}
+"""Options, without their dashes, that scripts may still write under an earlier name; `--help` shows today's alone."""
+
 app = typer.Typer(
     name="ballfg",
     help="From noisy measurements of a flying, bouncing ball to states, predictions and knowledge.",
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
+    context_settings={"token_normalize_func": lambda name: EARLIER_OPTIONS.get(name, name)},
 )
 
 app.command()(estimate)

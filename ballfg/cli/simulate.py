@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import OwnEffects, Seed, know_effects
+from ballfg.cli.inputs import EffectsFiles, Seed, know_effects
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ def simulate(
         list[str] | None,
         _ball_option(help="Undeclared effect, in no dataset or model file, as wind.x=0.3; may be repeated."),
     ] = None,
-    effects: OwnEffects = None,
+    effects_file: EffectsFiles = None,
     format: Annotated[str, _files(help="Format of the tables: csv or parquet.")] = "csv",
     force: Annotated[bool, _files("--force", help="Replace a simulated dataset.")] = False,
 ) -> None:
@@ -57,7 +57,7 @@ def simulate(
     from ballfg.simulation.writing import check_format
 
     file_format = check_format(format)
-    know_effects(effects)
+    know_effects(effects_file)
     config = simulation.SimulationConfig(
         tracks=tracks,
         rate=rate,

@@ -79,7 +79,7 @@ class BallModel(nn.Module, ABC):
         """Acceleration (..., 3) m/s^2 and angular acceleration (..., 3) rad/s^2, or None, of states (..., 9)."""
 
     @abstractmethod
-    def bounce(self, state: Tensor) -> Tensor:
+    def after_bounce(self, state: Tensor) -> Tensor:
         """State (..., 9) just after an impact on a surface, from the state (..., 9) before it; the position stays."""
 
     def surface_offset(self, state: Tensor) -> Tensor | float:

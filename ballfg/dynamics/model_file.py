@@ -107,7 +107,7 @@ def _nearest(name: object, known: tuple[str, ...]) -> str:
 def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
     """What a model file says about this model's effects."""
     content: dict[str, Any] = {}
-    for kind, group in zip(KINDS, (model.flight, model.contact, model.measurement), strict=True):
+    for kind, group in zip(KINDS, (model.flight, model.bounce, model.measurement), strict=True):
         content[kind] = {name: cast(Effect, effect).values() for name, effect in group.items()}
     return content | {"learned": None}
 

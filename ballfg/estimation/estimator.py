@@ -37,7 +37,7 @@ class Estimator(ABC):
     def __init__(self, model: BallModel | Ball, surfaces: Surfaces | float, settings: Settings | None = None) -> None:
         model = nominal_model(model) if isinstance(model, Ball) else model
         surfaces = Surfaces.table_tennis(surfaces) if isinstance(surfaces, int | float) else surfaces
-        settings = Settings.for_measured(model) if settings is None else settings
+        settings = Settings.for_measured(model) if settings is None else settings.renamed(model)
         if not (model.measures_plainly or self.undoes_measurement):
             raise ValueError(
                 f"model must have no measurement effects for the estimator '{self.name}' by itself. "

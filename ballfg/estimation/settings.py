@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.arrays import Array
 from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.earlier_names import todays_name
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.launcher import Launcher, SpinLabel
 from ballfg.factors.loss import Loss
@@ -25,10 +27,20 @@ class Settings:
     """
 
     position_noise: tuple[float, float, float] = (0.0015, 0.0015, 0.0015)
-    """m, standard deviation of a measured x, y, z, where a track does not bring its own."""
+    """m, standard deviation of the error of a measured x, y, z that is new in each sample, where a track does not
+    bring its own."""
 
     position_scale: float = 1.0
     """By which the standard deviations of all positions are multiplied, those that a track brings too."""
+
+    memory: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """m, standard deviation per axis of the tracker's error that lasts from sample to sample; zeros: there is none."""
+
+    memory_time: float = 0.02
+    """s, over which the correlation of that error falls to 1 / e."""
+
+    stamp_jitter: float = 0.0
+    """s, standard deviation of the error of a stamp: the ball was measured where it was that much earlier or later."""
 
     process: ProcessNoise = field(default_factory=ProcessNoise)
     """How far the ball strays from its model, per root second, per impact, per hit."""
@@ -79,6 +91,12 @@ class Settings:
         for name in ("position_scale", "spin_prior", "spin_label_noise", "velocity_prior"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ValueError(f"{name} must be positive and finite; got {getattr(self, name)}")
+        if np.shape(self.memory) != (3,) or not (np.isfinite(self.memory).all() and min(self.memory) >= 0.0):
+            raise ValueError(f"memory must be three numbers in m, zero or more; got {self.memory}. Give one per axis.")
+        if not (np.isfinite(self.memory_time) and self.memory_time > 0.0):
+            raise ValueError(f"memory_time must be positive and finite, in s; got {self.memory_time}")
+        if not (np.isfinite(self.stamp_jitter) and self.stamp_jitter >= 0.0):
+            raise ValueError(f"stamp_jitter must be zero or more and finite, in s; got {self.stamp_jitter}")
         for name, sigma in self.coefficients.items():
             if not (np.isfinite(sigma) and sigma > 0):
                 raise ValueError(f"coefficients['{name}'] must be a positive standard deviation; got {sigma}")
@@ -97,12 +115,33 @@ class Settings:
         usual: dict[str, Any] = {"coefficients": coefficient_sigmas(model), "process": MEASURED}
         return cls(**(usual | changes))
 
+    @property
+    def has_memory(self) -> bool:
+        """Whether the tracker's errors last from sample to sample."""
+        return max(self.memory) > 0.0
+
+    @property
+    def bias_sigmas(self) -> NDArray[np.float64]:
+        """(3,) m, standard deviations of the errors that last; an axis without any has as good as none."""
+        return np.maximum(self.memory, LEAST_BIAS)
+
+    def renamed(self, model: BallModel) -> Settings:
+        """These settings with coefficients under the names that the model has today."""
+        earlier = [name for name in self.coefficients if todays_name(name) != name]
+        if not earlier:
+            return self
+        known = {name for name, _ in model.named_parameters()}
+        return replace(self, coefficients={todays_name(name, known): s for name, s in self.coefficients.items()})
+
     def spin_label(self, track: Track) -> SpinLabel | None:
         """The spin label of a track: its own, else that of its launcher settings, else None."""
         if track.spin_label is not None:
             return SpinLabel(track.spin_label, self.spin_label_noise)
         return None if self.launcher is None else self.launcher.label(track)
 
+
+LEAST_BIAS = 1e-6
+"""m. Errors of this size are none; the linear algebra needs a number above zero."""
 
 MEASURED = ProcessNoise(contact_tangential=0.2, contact_spin=10.0)
 """Process noise on measured tracks: what friction does in a bounce is known to some 0.2 m/s only. Friction and
@@ -115,6 +154,24 @@ def spin_start(label: SpinLabel | None, settings: Settings) -> tuple[NDArray[np.
 
 
 def sample_sigmas(settings: Settings, count: int, own: NDArray[np.float64] | None) -> NDArray[np.float64]:
-    """(n, 3) m, the caller's to change: a track's own sigmas where it has them, else the settings', both scaled."""
+    """(n, 3) m, the caller's to change: a track's own sigmas where it has them, else the settings', both scaled.
+
+    They are those of the white part of a position's error.
+    """
     sigmas = np.broadcast_to(np.array(settings.position_noise), (count, 3)) if own is None else own
     return settings.position_scale * sigmas
+
+
+def total_sigmas(settings: Settings, white: Array, velocities: Array) -> Array:
+    """Standard deviations of whole position errors: the white part, the one with a memory, and that of the stamps.
+
+    Args:
+        settings: with memory and jitter.
+        white: (n, 3) m, of the white part.
+        velocities: (n, 3) m/s, of the ball.
+    Returns: (n, 3) m.
+    """
+    if not settings.has_memory and settings.stamp_jitter == 0.0:
+        return white
+    variance = white**2 + np.square(settings.memory) + (settings.stamp_jitter * velocities) ** 2
+    return np.asarray(np.sqrt(variance))

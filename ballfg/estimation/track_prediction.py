@@ -14,10 +14,10 @@ from ballfg.estimation.batch import estimate_tracks
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.measurement.as_measured import measured_positions, true_times
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.settings import sample_sigmas
+from ballfg.estimation.settings import sample_sigmas, total_sigmas
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.propagate import Propagator
-from ballfg.state import POSITION
+from ballfg.state import POSITION, VELOCITY
 from ballfg.tracks import Track
 
 BLOCK = 64
@@ -132,13 +132,15 @@ def _predict_block(
     times = _padded([clock[mask] for clock, mask in zip(clocks, later, strict=True)], ends)
     belief = Belief.of(estimator.model, [e.last for e in estimates], estimator.settings.coefficients)
     belief = replace(belief, time=torch.tensor(ends, dtype=torch.float64))
-    positions, variances = np.zeros((*times.shape, 3)), np.zeros((*times.shape, 3))
+    positions, velocities, variances = (np.zeros((*times.shape, 3)) for _ in range(3))
     for k, predicted in enumerate(propagator.walk(belief, torch.from_numpy(times)) if times.size else ()):
+        velocities[:, k] = predicted.mean[:, VELOCITY].numpy()
         positions[:, k] = measured_positions(predicted.model, predicted.mean, estimator.surfaces).numpy()
         variances[:, k] = torch.diagonal(predicted.covariance, dim1=-2, dim2=-1)[:, POSITION].numpy()
     for i, (track, result, mask) in enumerate(zip(tracks, estimates, later, strict=True)):
         k = int(mask.sum())
-        noise = sample_sigmas(estimator.settings, len(track), track.sigmas)[mask]
+        white = sample_sigmas(estimator.settings, len(track), track.sigmas)[mask]
+        noise = total_sigmas(estimator.settings, white, velocities[i, :k])
         sigmas = np.sqrt(variances[i, :k] + noise**2)
         yield TrackPrediction(track.name, track.times[mask], positions[i, :k], sigmas, track.positions[mask], result)
 

@@ -125,7 +125,7 @@ def score(
     horizon = np.inf if config.horizon is None else config.horizon
     estimator = problem.estimator(values, settings or problem.settings)
     tracks = tracks_of(problem.dataset, names)
-    scores = judge_tracks(estimator, tracks, config.observe, horizon, problem.jobs, len(names))
+    scores = judge_tracks(estimator, tracks, config.observed_share, horizon, problem.jobs, len(names))
     return tuple(watch(scores, len(names), "tracks judged"))
 
 

@@ -23,7 +23,7 @@ from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.rts import FilterRecord, fly_back, rts_smooth
 from ballfg.estimation.filters.sliding_window import SlidingWindow, first_pair
 from ballfg.estimation.filters.window_velocity import WINDOW
-from ballfg.estimation.observations.innovation import leave_position_out
+from ballfg.estimation.observations.innovation import FilterInnovation, leave_position_out
 from ballfg.estimation.observations.observation import Context, refuse_unknowns
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact, Quality
@@ -101,23 +101,15 @@ class _BallFilter(FilterpyEKF):
         """The update of filterpy with a measured position."""
         self.update(measured, lambda _: self.H, lambda x: x[POSITION])
 
-    def correct_by(self, factors: FactorBatch, gated: bool) -> Array:
+    def correct_by(self, factor: FactorBatch, gated: bool) -> Array:
         """(dim,) whitened innovation of a factor on the present state; the update of filterpy with its residual.
 
         The factor's loss gives the noise its weight; with a gate, a measurement beyond it is not used.
         """
-        inputs = (self.x[None, :STATE_DIM], self.x[None, STATE_DIM:])[: factors.variables.shape[1]]
-        (residual,), blocks = factors.compute(slice(None), inputs)
-        H = np.zeros((factors.dim, len(self.x)))
-        H[:, :STATE_DIM] = blocks[0][0]
-        if len(blocks) > 1:
-            H[:, STATE_DIM:] = blocks[1][0]
-        unit = np.eye(factors.dim)
-        whitened = np.linalg.solve(np.linalg.cholesky(H @ self.P @ H.T + unit), -residual)
-        if not gated or whitened @ whitened <= chi2.isf(GATE_CHANCE, factors.dim):
-            (weight,) = factors.loss.weight(np.array([np.linalg.norm(whitened)]))
-            self.update(np.zeros(factors.dim), lambda _: H, lambda _: residual, R=unit / weight)
-        return np.asarray(whitened)
+        found = FilterInnovation.of(factor, self.x, self.P)
+        if not gated or found.whitened @ found.whitened <= chi2.isf(GATE_CHANCE, factor.dim):
+            self.update(np.zeros(factor.dim), lambda _: found.H, lambda _: found.residual, R=found.R)
+        return found.whitened
 
 
 class ExtendedKalmanFilter(Estimator):

@@ -52,7 +52,9 @@ class Context:
         track: that it belongs to.
         model: the ball.
         settings: noise, losses and priors.
-        sigma: (n, 3) m, standard deviation of each position of the track, samples of bad quality included.
+        sigma: (n, 3) m, standard deviation of the white error of each position of the track, samples of bad quality
+            included.
+        velocities: (n, 3) m/s, rough, of the ball; None where stamps are exact.
         columns: place of each unknown, by name, among the coefficients that all factors of the track share.
     """
 
@@ -61,6 +63,7 @@ class Context:
     settings: Settings
     sigma: Array
     columns: Mapping[str, int] = field(default_factory=dict)
+    velocities: Array | None = None
 
 
 class Observation(ABC):

@@ -8,11 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.estimation.observations.innovation import leave_position_out
+from ballfg.estimation.observations.innovation import leave_one_out, leave_position_out
 from ballfg.estimation.observations.observation import Context, Observation
 from ballfg.factors.batch import Rows, Values
 from ballfg.factors.covariance import Covariances
 from ballfg.factors.position import PositionFactors
+from ballfg.factors.tracker import BiasedPositionFactors
+from ballfg.state import STATE_DIM
 from ballfg.tracks import Track
 
 
@@ -29,9 +31,16 @@ class Positions(Observation):
         self.positions = positions
         self.state = np.arange(len(positions))
 
-    def batch(self, context: Context) -> PositionFactors:
-        """Position factors with the standard deviations and the loss of the context."""
-        return PositionFactors(self.state, self.positions, context.sigma, context.settings.loss)
+    def batch(self, context: Context) -> PositionFactors | BiasedPositionFactors:
+        """Position factors with the noise and the loss of the context."""
+        settings = context.settings
+        if not settings.has_memory and context.velocities is None:
+            return PositionFactors(self.state, self.positions, context.sigma, settings.loss)
+        covariance = context.sigma[:, :, None] ** 2 * np.eye(3)
+        if context.velocities is not None:
+            way = settings.stamp_jitter * context.velocities
+            covariance += way[:, :, None] * way[:, None, :]
+        return BiasedPositionFactors(self.state, self.positions, covariance, settings.loss, settings.has_memory)
 
     def taken(self, samples: NDArray[np.bool_]) -> Positions:
         """The positions of some samples."""
@@ -39,6 +48,8 @@ class Positions(Observation):
 
     def innovations(self, context: Context, rows: Rows, values: Values, covariances: Covariances) -> Array:
         """(n, 3) whitened: each position against its prediction from all others."""
+        if rows.jacobians[0].shape[-1] > STATE_DIM or context.velocities is not None:
+            return leave_one_out(rows, covariances)
         return leave_position_out(values.states, covariances.states, self.positions, context.sigma, rows)
 
 

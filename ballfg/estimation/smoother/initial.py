@@ -1,6 +1,7 @@
 """A first guess of all states from the samples and the events, for the minimisation to start from."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -30,7 +31,7 @@ def initial_states(
     rests is put on its surface and rolls.
     """
     states = np.zeros((len(track), STATE_DIM))
-    states[:, POSITION] = _bridged_positions(track, segmentation)
+    states[:, POSITION] = bridged_positions(track, segmentation)
     breaks = np.unique([c.interval for c in contacts] + segmentation.hits.tolist() + segmentation.restarts.tolist())
     states[:, VELOCITY] = window_velocities(track.times, states[:, POSITION], breaks.astype(np.int64))
     if label is not None:
@@ -42,8 +43,8 @@ def initial_states(
     return states
 
 
-def _bridged_positions(track: Track, segmentation: Segmentation) -> Array:
-    """Measured positions, those of outliers and shifted runs replaced by a line between their neighbours."""
+def bridged_positions(track: Track, segmentation: Segmentation) -> Array:
+    """(n, 3) m: measured positions, those of outliers and shifted runs replaced by a line between their neighbours."""
     trusted = segmentation.quality <= Quality.WIDE
     if trusted.all() or not trusted.any():
         return track.positions.copy()
@@ -59,7 +60,7 @@ def _start_contact(states: Array, contact: Contact, model: BallModel) -> None:
         if gap < 0.0:
             states[contact.interval, Z] -= gap
         states[contact.interval, VZ] = before[VZ] = min(float(before[VZ]), -LEAST_FALL)
-        states[contact.interval + 1 :, SPIN] = model.bounce(before)[SPIN].numpy()
+        states[contact.interval + 1 :, SPIN] = model.after_bounce(before)[SPIN].numpy()
 
 
 def _start_rest(states: Array, height: float, model: BallModel) -> None:
@@ -100,4 +101,4 @@ def move_contacts(
             after, _ = fly_through(model, start, torch.from_numpy(np.diff(times[interval : interval + 2])), heights)
         if bool(after.isfinite().all()):
             states[interval + 1] = after[0, :STATE_DIM].numpy()
-    return Values(states, values.coefficients)
+    return replace(values, states=states)

@@ -58,7 +58,7 @@ def widen_near_contacts(
     )
     if margin < FAR and last[VZ] < 0.0:
         with torch.no_grad():
-            widened[-1] += _mixture(margin, model.bounce(last).numpy() - states[-1])
+            widened[-1] += _mixture(margin, model.after_bounce(last).numpy() - states[-1])
     return widened
 
 

@@ -14,11 +14,13 @@ from ballfg.arrays import Array
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import steps_over
+from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns, unknowns_of
-from ballfg.estimation.observations.positions import observations_of
+from ballfg.estimation.observations.positions import Positions, observations_of
 from ballfg.estimation.segmentation import Contact, Quality, Segmentation
-from ballfg.estimation.settings import Settings, sample_sigmas, spin_start
+from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
+from ballfg.estimation.smoother.initial import bridged_positions
 from ballfg.estimation.smoother.motion import motions_of
 from ballfg.factors.batch import FactorBatch, Values
 from ballfg.factors.covariance import Covariances
@@ -34,6 +36,7 @@ from ballfg.factors.prior import (
     spin_prior,
     state_prior,
 )
+from ballfg.factors.tracker import BIAS_DIM, BiasFactors, BiasStartFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 
@@ -63,10 +66,12 @@ def coefficient_means(model: BallModel, settings: Settings) -> Array:
 
 
 def effective_sigmas(track: Track, segmentation: Segmentation, settings: Settings) -> Array:
-    """(n, 3) m: standard deviations of the samples, larger for those that are wide, shifted or outliers."""
+    """(n, 3) m: standard deviations of the samples' white errors, larger for wide, shifted ones and outliers."""
     sigma = sample_sigmas(settings, len(track), track.sigmas)
+    whole = total_sigmas(settings, sigma, window_velocities(track.times, track.positions))
     for quality, factor in QUALITY_SIGMA.items():
-        sigma[segmentation.quality == quality] *= factor
+        bad = segmentation.quality == quality
+        sigma[bad] = factor * whole[bad]
     return sigma
 
 
@@ -108,7 +113,8 @@ class TrackProblem:
         self.unknowns: Unknowns = unknowns_of(self.observations, settings)
         self.width = model_width(self.ball)
         columns = {name: self.width + k for k, name in enumerate(self.unknowns.names)}
-        self.context = Context(track, model, settings, self.sigma, columns)
+        self.biased = settings.has_memory and any(one.name == Positions.name for one in self.observations)
+        self.context = Context(track, model, settings, self.sigma, columns, _velocities(track, segmentation, settings))
         self.observed = {one.name: one.batch(self.context) for one in self.observations}
         self.added: list[FactorBatch] = []
 
@@ -122,6 +128,8 @@ class TrackProblem:
         batches: list[FactorBatch] = [*self.observed.values(), *self.added]
         batches += _dynamics(self.track.times, self.ball, events, self.settings)
         batches += _priors(self.track, events.segmentation, self.settings)
+        if self.biased:
+            batches += _biases(self.track.times, self.settings)
         own, others = self.coefficient_sigmas[: self.width], len(self.unknowns.names)
         if isinstance(self.ball, AugmentedModel):
             batches.append(CoefficientPriorFactors(self.ball, own, others))
@@ -130,9 +138,10 @@ class TrackProblem:
         return BallGraph(tuple(batches))
 
     def start(self, states: Array) -> Values:
-        """Values to start from: states (n, 9), the model's own coefficients, unknowns of zero."""
+        """Values to start from: states (n, 9), the model's own coefficients, unknowns and biases of zero."""
         means = coefficient_means(self.model, self.settings)
-        return Values(states, np.append(means, np.zeros(len(self.unknowns.names))))
+        biases = np.zeros((len(states), BIAS_DIM)) if self.biased else None
+        return Values(states, np.append(means, np.zeros(len(self.unknowns.names))), biases)
 
     def innovations(self, values: Values, covariances: Covariances | None) -> dict[str, Array]:
         """Innovations (m, dim) whitened, at a minimum, by name of the observation; NaN without covariances."""
@@ -142,6 +151,22 @@ class TrackProblem:
             one.name: one.innovations(self.context, self.observed[one.name].linearize(values), values, covariances)
             for one in self.observations
         }
+
+
+def _velocities(track: Track, segmentation: Segmentation, settings: Settings) -> Array | None:
+    """(n, 3) m/s, along which the errors of stamps move the samples; None where stamps are exact."""
+    if settings.stamp_jitter == 0.0:
+        return None
+    breaks = np.array([c.interval for c in segmentation.contacts], dtype=np.int64)
+    breaks = np.unique(np.concatenate((breaks, segmentation.hits, segmentation.restarts)))
+    return window_velocities(track.times, bridged_positions(track, segmentation), breaks)
+
+
+def _biases(times: Array, settings: Settings) -> list[FactorBatch]:
+    """The tracker's errors that last: about zero at the start, fading from sample to sample."""
+    sigma, before = settings.bias_sigmas, np.arange(len(times) - 1)
+    fading = BiasFactors(before, np.diff(times), sigma, settings.memory_time)
+    return [BiasStartFactors(np.array([0]), sigma), fading]
 
 
 def contact_batches(graph: BallGraph) -> list[ContactFactors]:

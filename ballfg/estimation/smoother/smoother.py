@@ -11,9 +11,10 @@ from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
+from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Segmentation, physics_of, segment
-from ballfg.estimation.settings import Settings, sample_sigmas
+from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
 from ballfg.estimation.smoother.initial import initial_states, move_contacts
 from ballfg.estimation.smoother.near_contact import widen_near_contacts
 from ballfg.estimation.smoother.problem import Events, TrackProblem
@@ -125,7 +126,8 @@ class Smoother(Estimator):
 
     def segment(self, track: Track) -> Segmentation:
         """The events in a track."""
-        sigma = sample_sigmas(self.settings, len(track), track.sigmas)
+        white = sample_sigmas(self.settings, len(track), track.sigmas)
+        sigma = total_sigmas(self.settings, white, window_velocities(track.times, track.positions))
         physics = physics_of(self.model)
         found = segment(track.times, track.positions, sigma, surfaces=self.surfaces, physics=physics)
         return found if self.settings.find_events else found.only_contacts()
@@ -208,19 +210,20 @@ class Smoother(Estimator):
         else:
             known = covariances = marginal_covariances(minimum.step.bayes_net, n, p)
         own, rest = slice(0, problem.width), slice(problem.width, p)
+        own_covariances = covariances.states[:, :STATE_DIM, :STATE_DIM]
         return Estimate(
             name=track.name,
             times=track.times,
             states=values.states,
             covariances=widen_near_contacts(
-                track.times, values.states, covariances.states, contacts, self.model, self.surfaces
+                track.times, values.states, own_covariances, contacts, self.model, self.surfaces
             ),
             status=_status(minimum, n),
             innovations=problem.innovations(values, known),
             coefficient_names=tuple(self.settings.coefficients),
             coefficients=values.coefficients[own],
             coefficient_covariance=covariances.coefficients[own, own],
-            cross_covariances=covariances.cross[..., own],
+            cross_covariances=covariances.cross[:, :STATE_DIM, own],
             unknown_names=problem.unknowns.names,
             unknowns=problem.unknowns.origins + values.coefficients[rest],
             unknown_covariance=covariances.coefficients[rest, rest],

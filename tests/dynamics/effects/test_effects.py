@@ -104,7 +104,7 @@ def test_effects_add_up(build, states):
 
 
 def test_order_of_effects_does_not_matter(model, states):
-    effects = [*model.flight.values(), *model.contact.values()]
+    effects = [*model.flight.values(), *model.bounce.values()]
     torch.testing.assert_close(moved(AnalyticModel(reversed(effects)), states(20)), moved(model, states(20)))
 
 
