@@ -28,13 +28,15 @@ class Surfaces:
         floor_height: m, z of the floor; None where there is no floor below (a court is its own floor).
         extent: (x_low, x_high, y_low, y_high) m of the table; infinite where an end is not known, None where none is:
             the table is taken to lie under every ball whose centre is above its surface and within the known ends.
+        edge_sigmas: (x_low, x_high, y_low, y_high) m, standard deviations of those ends, for predictions near them.
 
-    Raises: ValueError: if a height is not finite, the floor not below the table, or the extent not in order.
+    Raises: ValueError: a height that is not finite, a floor above the table, an extent out of order, a negative sigma.
     """
 
     table_height: float = 0.0
     floor_height: float | None = None
     extent: tuple[float, float, float, float] | None = None
+    edge_sigmas: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.table_height):
@@ -45,11 +47,13 @@ class Surfaces:
             )
         if self.extent is not None and not (self.extent[0] < self.extent[1] and self.extent[2] < self.extent[3]):
             raise ValueError(f"extent must be (x_low, x_high, y_low, y_high); got {self.extent}")
+        if not all(0.0 <= sigma < math.inf for sigma in self.edge_sigmas):
+            raise ValueError(f"edge_sigmas must be finite and not negative, in m; got {self.edge_sigmas}")
 
     @classmethod
-    def table_tennis(cls, table_height: float, extent: tuple[float, float, float, float] | None = None) -> Surfaces:
-        """A table with the floor 0.76 m below its surface; of unknown place in the room without an extent (m)."""
-        return cls(table_height, table_height - TABLE_ABOVE_FLOOR, extent)
+    def table_tennis(cls, table_height: float) -> Surfaces:
+        """A table of unknown place in the room, with the floor 0.76 m below its surface."""
+        return cls(table_height, table_height - TABLE_ABOVE_FLOOR)
 
     def __str__(self) -> str:
         names = ("x >= {:.2f} m", "x <= {:.2f} m", "y >= {:.2f} m", "y <= {:.2f} m")

@@ -17,6 +17,8 @@ from ballfg.tracks import Dataset, DatasetInfo
 
 TRACKS_FOR_NOISE = 50
 """How many tracks the measurement noise is estimated from, when a dataset does not state it."""
+STATED_EDGE_SIGMA = 0.01
+"""m, of the ends of a table that a dataset states: a ball touches an edge up to its radius beside it."""
 TRACKS_FOR_TABLE = 200
 """The same for the table's ends. Few balls miss the table; 200 tracks hold some of them and take 0.1 s."""
 
@@ -81,8 +83,11 @@ def dataset_surfaces(dataset: Dataset | SightedDataset) -> Surfaces:
     The table ends where `dataset.yaml` says; where it does not, beside the sides past which balls fell.
     """
     info = dataset.info
-    found = found_table(dataset) if info.table_extent is None else None
-    return Surfaces.table_tennis(info.table_height, info.table_extent if found is None else found.sides)
+    surfaces = Surfaces.table_tennis(info.table_height)
+    if info.table_extent is not None:
+        return replace(surfaces, extent=info.table_extent, edge_sigmas=(STATED_EDGE_SIGMA,) * 4)
+    found = found_table(dataset)
+    return surfaces if found is None else replace(surfaces, extent=found.sides, edge_sigmas=found.sigmas)
 
 
 @lru_cache(maxsize=8)

@@ -42,7 +42,7 @@ class TableExtent:
 
     Attributes:
         sides: (x_low, x_high, y_low, y_high) m; infinite where no ball fell beyond the side.
-        sigmas: m, of each side; infinite likewise.
+        sigmas: m, of each side; 0 where it is infinite.
         bounces: number of bounces on the table.
         falls: number of balls that fell past it.
     """
@@ -170,10 +170,8 @@ def _fit(bounces: Array, falls: Array) -> TableExtent | None:
         weight = np.concatenate([w.sum(axis=1 - axis) for w in weights])
         places = np.concatenate([m[axis] + sign * s[axis] / 2 for m, s in zip(middles, sizes, strict=True)])
         ends.append(_side(places, weight / weight.sum(), falls[:, axis], sign))
-    (x_low, x_high, y_low, y_high), sigmas = zip(*ends, strict=True)
-    if all(map(math.isinf, sigmas)):
-        return None
-    return TableExtent((x_low, x_high, y_low, y_high), sigmas, len(bounces), len(falls))
+    sides, sigmas = zip(*ends, strict=True)
+    return None if all(map(math.isinf, sides)) else TableExtent(sides, sigmas, len(bounces), len(falls))
 
 
 def _grid(bounces: Array, size: float) -> Array:
@@ -203,7 +201,7 @@ def _side(places: Array, weight: Array, falls: Array, sign: float) -> tuple[floa
     """A side and its sigma (m), from its probable places; infinite where no ball surely fell beyond it."""
     beyond = (weight * (sign * (falls[:, None] - places) > -EDGE_TOLERANCE)).sum(axis=1)
     if beyond.max() < SURE:
-        return sign * math.inf, math.inf
+        return sign * math.inf, 0.0
     order = np.argsort(places)
     middle = float(places[order][np.searchsorted(np.cumsum(weight[order]), 0.5)])
     return middle, math.sqrt(float(weight @ (places - middle) ** 2))

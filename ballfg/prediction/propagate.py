@@ -20,6 +20,7 @@ from ballfg.dynamics.motion.rollout import LONGEST_MOTION, is_resting
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.belief import Belief
+from ballfg.prediction.edges import edge_doubt
 from ballfg.prediction.near_contact import Unbounced, spread_over_contacts
 from ballfg.state import STATE_DIM, VZ
 
@@ -156,6 +157,7 @@ class Propagator:
             if motion.contacts:
                 times = mean.new_tensor([[time for time, _ in motion.contacts]])
                 noise[row] = self._bounce_noise(model, mean[row], h[row], times, jacobian[row])
+            noise[row] += edge_doubt(model, mean[row], belief.covariance[row], h[row], self.surfaces)
             if len(motion.contacts) == 1:
                 heights[row] = motion.contacts[0][1]
         return _moved(belief, h, after, jacobian, noise), heights
