@@ -7,18 +7,22 @@ from functools import partial
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.diagnosis.fit.stamps import Stamps, look_at_stamps
 from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, Stretches, stretches_of
 from ballfg.dynamics import AnalyticModel, SpinEmbedding, Surfaces
 from ballfg.estimation import Launcher, Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.measurement.as_measured import plainly_measured
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
+from ballfg.state import STANDARD_GRAVITY
 from ballfg.tracks import Dataset, Track
 
 MOST_TRACKS = 200
 """Tracks that are used, evenly over the dataset. Computing time grows with their number; verdicts do not change."""
 LEAST_TRACKS = 6
 """Fewer tracks leave fewer than three to search, whose scatter cannot measure the noise."""
+USUAL = {"flight.gravity.g": STANDARD_GRAVITY, "flight.drag.k": 0.12}
+"""Gravity and drag by parameter name, for a model that has none."""
 LAUNCHER_LABELS = ("topspin", "sidespin", "speed")
 """Launcher settings that a dataset's labels may hold as numbers."""
 
@@ -42,6 +46,7 @@ class Holdout:
         launcher: which labels of a shot tell its spin; its weights mean nothing.
         search, held_out: stretches of the two halves.
         search_tracks, held_out_tracks: tracks of the two halves up to their first hit.
+        stamps: what is wrong with the stamps of all tracks; the stretches have frames in their places.
         excluded: sentences on tracks that are not used.
     """
 
@@ -53,6 +58,7 @@ class Holdout:
     held_out: Stretches
     search_tracks: tuple[EvaluationTrack, ...]
     held_out_tracks: tuple[EvaluationTrack, ...]
+    stamps: Stamps
     excluded: tuple[str, ...]
 
 
@@ -78,6 +84,10 @@ def hold_out(
     tracks, excluded = _chosen(dataset, most_tracks)
     settings, surfaces = dataset_settings(dataset, model), dataset_surfaces(dataset)
     launcher = launcher_labels(dataset, tracks, settings)
+    stamps = stamps_of(tracks, model)
+    written = {track.name: track for track in tracks}
+    tracks = [stamps.repaired(track) for track in tracks]
+    named = {track.name: track for track in tracks}
     excess = _excess_noise(tracks, settings)
     noisy = replace(settings, position_scale=excess * settings.position_scale)
     smoother = Smoother(plainly_measured(model), surfaces, noisy)
@@ -85,15 +95,36 @@ def hold_out(
         watch(f"estimating {len(tracks)} tracks")
     halves = tracks[::2], tracks[1::2]
     found = [stretches_of(smoother, half, launcher, jobs) for half in halves]
-    search, held_out = (replace(half, sigmas=half.sigmas / excess) for half in found)
+    search, held_out = (replace(half, sigmas=half.sigmas / excess, times=half.times / stamps.stretch) for half in found)
     parts = [map_tracks(partial(_evaluation_track, smoother), half, len(half), jobs) for half in halves]
-    search_tracks, held_out_tracks = (tuple(part for part in half if part is not None) for half in parts)
+    search_tracks, held_out_tracks = (
+        tuple(_as_written(p, named[p.track.name], written[p.track.name]) for p in half if p is not None)
+        for half in parts
+    )
     lost = len(tracks) - len(np.unique(search.track)) - len(np.unique(held_out.track))
     if lost:
         excluded.append(f"{lost} of {len(tracks)} tracks hold no free flight that is long enough")
     return Holdout(
-        dataset, settings, surfaces, launcher, search, held_out, search_tracks, held_out_tracks, tuple(excluded)
+        dataset, settings, surfaces, launcher, search, held_out, search_tracks, held_out_tracks, stamps, tuple(excluded)
     )
+
+
+def stamps_of(tracks: Sequence[Track], model: AnalyticModel) -> Stamps:
+    """What is wrong with the stamps of tracks; nothing where the model says how they are written."""
+    if {"time_scale", "counted_frames"} & set(model.measurement):
+        return Stamps()
+    values = {name: value.detach() for name, value in model.named_parameters()}
+    gravity, drag = (float(values[name]) if name in values else usual for name, usual in USUAL.items())
+    return look_at_stamps(tracks, gravity, drag)
+
+
+def _as_written(part: EvaluationTrack, repaired: Track, written: Track) -> EvaluationTrack:
+    """A part of a track whose stamps were repaired, with its stamps as they were written."""
+    if repaired is written:
+        return part
+    times = written.times[np.searchsorted(repaired.times, part.track.times)]
+    bounces = np.interp(part.bounces, repaired.times, written.times)
+    return EvaluationTrack(replace(part.track, times=times), bounces)
 
 
 def _chosen(dataset: Dataset, most: int) -> tuple[list[Track], list[str]]:

@@ -84,7 +84,7 @@ def fitted_path(fit: Fit) -> FittedPath:
         model = with_values(fit.problem.model, fit.unknowns.values, len(stretches))
         times = model.true_stamps(stretches.times.T.unsqueeze(-1)).squeeze(-1)
         starts = torch.from_numpy(fit.unknowns.starts)
-        motion = shoot(model, starts, stretches.heights, stretches.contacts, stretches.ends)
+        motion = shoot(model, starts, stretches.heights, stretches.contacts, times[-1])
         states = motion.states(times).transpose(0, 1).numpy()
     return FittedPath(motion, times, states)
 
@@ -105,7 +105,7 @@ def weighted(fit: Fit, positions: Array, rows: Index) -> Array:
 def _arc_response(fit: Fit, path: FittedPath, number: int, part: Tensor) -> ArcResponse:
     arc = path.motion.arcs[number]
     rows, begun = arc.rows[part], arc.begun[part]
-    contacts, until = path.motion.contacts[rows, number:], fit.problem.stretches.ends[rows]
+    contacts, until = path.motion.contacts[rows, number:], path.times[-1, rows]
     if contacts.shape[1]:
         until = torch.where(contacts[:, 0].isnan(), until, contacts[:, 0])
     duration = (until - begun).clamp_min(LEAST_ARC).numpy()
@@ -150,7 +150,7 @@ def _shot(fit: Fit, path: FittedPath, number: int, part: Tensor, nodes: Tensor) 
     with dual_level():
         first = make_dual(start, torch.eye(STATE_DIM, dtype=torch.float64).repeat_interleave(m, dim=0))
         guesses = path.motion.contacts[rows, number:] - begun.unsqueeze(-1)
-        motion = shoot(model, first, stretches.heights[rows, number:], guesses, stretches.ends[rows] - begun)
+        motion = shoot(model, first, stretches.heights[rows, number:], guesses, times[-1])
 
         def at(asked: Tensor) -> Tensor:
             moved = motion.states(asked.clamp_min(0.0))

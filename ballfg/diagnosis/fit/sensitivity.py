@@ -128,7 +128,7 @@ def _measured(model: BallModel, stretches: Stretches, starts: Tensor) -> tuple[T
     """Positions (r, k, 3) and labels (r, 3) as they are measured, and the motion behind them."""
     # stamps run along the first axis: a coefficient of shape (r, 1) then goes with (k, r, 1)
     times = model.true_stamps(stretches.times.T.unsqueeze(-1)).squeeze(-1)
-    motion = shoot(model, starts, stretches.heights, stretches.contacts, stretches.ends)
+    motion = shoot(model, starts, stretches.heights, stretches.contacts, times[-1].detach())
 
     def later(delay: Tensor | float) -> Tensor:
         shift = delay.squeeze(-1) if isinstance(delay, Tensor) and delay.dim() else delay

@@ -147,7 +147,8 @@ def scene_of(fit: Fit) -> Scene:
     """
     stretches = fit.problem.stretches
     used = stretches.used.numpy()
-    positions, times = stretches.positions.numpy()[used], stretches.times.numpy()
+    positions = stretches.positions.numpy()[used]
+    times = fit.problem.model.true_stamps(stretches.times).detach().numpy()
     gaps = np.maximum(np.gradient(times, axis=1), LEAST_GAP)[..., None]
     velocities = np.gradient(fit.predicted.positions, axis=1) / gaps
     impacts = [

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 
-from ballfg.diagnosis.fit.fit import fit_model, fit_problem
+from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Candidate, Errors, Finding, Outcome, Refusal
@@ -22,9 +22,10 @@ from ballfg.diagnosis.search.evaluation import HeldOutGain, held_out_gain
 from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect, hypotheses, scene_of, without_effect
 from ballfg.diagnosis.search.label_frames import frame_hypotheses
 from ballfg.diagnosis.search.parsimony import halves_differ, insignificant
-from ballfg.diagnosis.search.plausible import implausible
+from ballfg.diagnosis.search.plausible import implausible, in_table
 from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.diagnosis.search.ranking import NO_NAME, as_left, finding_of, fitted_values, ranking
+from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
 from ballfg.dynamics import AnalyticModel, BallModel, Effect
 from ballfg.dynamics.effects.measurement import SpinLabelFrame
 
@@ -107,10 +108,13 @@ class SearchLoop:
     def run(self, model: AnalyticModel) -> Search:
         """Add effects to the declared model until none helps, then take out those without which it predicts better."""
         self.watch(f"fitting the declared model to {len(self.holdout.search)} flights")
-        first = fit_model(model, self.holdout.search, self.holdout.settings)
+        stamps = self.holdout.stamps
+        first = first_fit(model, self.holdout)
         declared = self.predictive(first)
         judged = self.judge(declared.model)
-        search, helped = Search(first, declared, first, declared, judged, judged), True
+        before = self.judge(as_declared(declared.model, stamps)) if stamps.found else judged
+        named, findings = stamp_hypotheses(stamps), stamp_findings(first, stamps)
+        search, helped = Search(first, declared, first, declared, before, judged, named, findings), True
         while helped and len(search.rounds) < MOST_EFFECTS:
             search, helped = self._round(search)
         search = self._pruned(search)
@@ -198,8 +202,9 @@ class SearchLoop:
         known = [implausible(f"{hypothesis.name}.{n}", values[n], radius) for n in hypothesis.strengths]
         if any(known):
             return next(text for text in known if text)
-        if hypothesis.strain(fit.unknowns.values) > self.plausible:
-            return f"that is more than {self.plausible:g} times as far from usual as is typical"
+        ranged = all(in_table(f"{hypothesis.name}.{n}", radius) for n in hypothesis.strengths)
+        if not ranged and hypothesis.strain(fit.unknowns.values) > self.plausible:
+            return f"more than {self.plausible:g} times its typical distance from the usual value"
         return ""
 
     def _refusal(self, candidate: Refit, outcome: Outcome) -> Refusal:
@@ -215,6 +220,8 @@ class SearchLoop:
         The last one was judged when it was added. The others are judged again, beside those that came after them.
         """
         for hypothesis in reversed(search.named[:-1]):
+            if hypothesis.name in self.holdout.stamps.found:
+                continue
             fit = _without(search.fit, hypothesis, search.first)
             fit = fit_problem(fit.problem, fit.unknowns, fit.noise)
             predictive = self.predictive(fit)

@@ -61,10 +61,18 @@ RANGES: Final[dict[str, Range]] = (
         "tangential_restitution.e_t": Range(0.0, 1.0, "none of the slip is reversed, or all of it; Cross 2002"),
         "table_height.offset": Range(-0.03, 0.03, _CAMERAS),
         "velocity_lag.lag": Range(-0.1, 0.1, "a tracker's filter delays by a few frames"),
+        "distortion.k": Range(-0.05, 0.05, _CAMERAS),
+        "time_scale.s": Range(-0.8, 0.9, "cameras of 30 to 240 Hz taken for one another"),
+        "counted_frames.missing": Range(0.0, 6.0, "of seven frames one is kept"),
         "radial_bias.offset": Range(-0.1, 0.1, _CAMERAS),
     }
 )
 """By effect and coefficient, in the coefficient's unit."""
+
+
+def in_table(name: str, radius: float) -> bool:
+    """Whether a coefficient has a range, for a ball of some radius in m."""
+    return name in RANGES and abs(radius / TABLE_TENNIS.radius - 1.0) <= NEAR
 
 
 def implausible(name: str, value: Value, radius: float) -> str:
@@ -72,8 +80,7 @@ def implausible(name: str, value: Value, radius: float) -> str:
 
     Args: name: of effect and coefficient, `wind.x`.  radius: of the ball, m.
     """
-    known = RANGES.get(name)
-    if known is None or abs(radius / TABLE_TENNIS.radius - 1.0) > NEAR or known.holds(value):
+    if not in_table(name, radius) or (known := RANGES[name]).holds(value):
         return ""
     unit = "" if value.unit == "1" else f" {value.unit}"
     return f"{name} = {value.value:.3g}{unit} lies outside of {known.low:g} to {known.high:g}{unit} ({known.source})"

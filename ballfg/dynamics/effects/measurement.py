@@ -1,12 +1,13 @@
 """Effects on what is written down: the clock, the frame of the positions, the spin labels."""
 
 import itertools
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import torch
 from torch import Tensor
 
-from ballfg.dynamics.effect import TINY_LENGTH, Coefficient, length, per_row, vector
+from ballfg.dynamics.effect import TINY_LENGTH, Coefficient, Scene, length, per_row, vector
 from ballfg.dynamics.measurement import Later, MeasurementEffect
 from ballfg.state import POSITION, VELOCITY
 
@@ -51,7 +52,7 @@ class TimeScale(MeasurementEffect):
         "the spin, are free."
     )
     decide = "Film a clock, or trust the local g: gravity then gives the scale of the time."
-    coefficients = (Coefficient("s", 0.0, 0.01, "1", -0.5, 0.5),)
+    coefficients = (Coefficient("s", 0.0, 0.01, "1", -0.9, 0.9),)
     rank = 100
 
     def true_stamps(self, stamps: Tensor) -> Tensor:
@@ -61,6 +62,36 @@ class TimeScale(MeasurementEffect):
     def stamps(self, times: Tensor) -> Tensor:
         """(...) s as written."""
         return times * (1.0 + self.s)
+
+
+class CountedFrames(MeasurementEffect):
+    """Stamps count the frames that were kept: for each sample, `missing` frames were dropped on average.
+
+    Which frames are missing is not in the stamps, so that the effect itself is a clock that runs slow on average. A
+    diagnosis sees them in the tracks, by steps of the ball that are twice as long as their neighbours.
+    """
+
+    name = "counted_frames"
+    sentence = (
+        "Stamps count the frames that were kept although frames were dropped between them: on average the same as a "
+        "time scale, but steps of the ball are of one, two or three frames' length."
+    )
+    decide = "Write down the camera's own frame numbers, or the times of its exposures, beside the stamps."
+    coefficients = (Coefficient("missing", 0.0, 0.1, "1", 0.0, 9.0),)
+    rank = 100
+
+    @classmethod
+    def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
+        """None: residuals show its mean only, which is a time scale."""
+        return ()
+
+    def true_stamps(self, stamps: Tensor) -> Tensor:
+        """(...) s of true time, on average."""
+        return stamps * (1.0 + self.missing)
+
+    def stamps(self, times: Tensor) -> Tensor:
+        """(...) s as written, on average."""
+        return times / (1.0 + self.missing)
 
 
 class VelocityLag(MeasurementEffect):
@@ -145,6 +176,36 @@ class RadialBias(MeasurementEffect):
         away = position - vector(self.x, self.y, self.z)
         distance = (away.square().sum(-1, keepdim=True) + SOFT_DISTANCE**2).sqrt()
         return position + self.offset * away / distance
+
+
+class Distortion(MeasurementEffect):
+    """Positions stretched from a centre c, the more the farther away: c + d (1 + k |d|^2) with d = p - c."""
+
+    name = "distortion"
+    sentence = (
+        "Positions are stretched or compressed smoothly by place, as with a lens or cameras that were calibrated in "
+        "the middle of the room only; near the middle nothing of it shows."
+    )
+    decide = "Measure rods of known length, or a ball at rest in known places, in the room's middle and at its edges."
+    coefficients = (
+        Coefficient("k", 0.0, 0.005, "1/m^2", -0.5, 0.5),
+        Coefficient("x", 0.0, 0.5, "m", -100.0, 100.0, absent=None),
+        Coefficient("y", 0.0, 0.5, "m", -100.0, 100.0, absent=None),
+        Coefficient("z", 0.0, 0.5, "m", -100.0, 100.0, absent=None),
+    )
+    rank = 13
+
+    @classmethod
+    def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
+        """About the middle of the space that the data fill."""
+        middle = (0.5 * (low + high) for low, high in zip(scene.low, scene.high, strict=True))
+        return (dict(zip("xyz", middle, strict=True)),)
+
+    def positions(self, states: Tensor, later: Later) -> Tensor:
+        """(..., 3) m, stretched about the centre."""
+        center = vector(self.x, self.y, self.z)
+        away = states[..., POSITION] - center
+        return center + away * (1.0 + self.k * away.square().sum(-1, keepdim=True))
 
 
 class SpinLabelFrame(MeasurementEffect):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ballfg.diagnosis.fit.problem import declared_free
+from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.result import Errors, Outcome
 from ballfg.diagnosis.search.hypothesis import has_effect, without_effect
 from ballfg.diagnosis.search.loop import SearchLoop
@@ -20,7 +21,7 @@ CATALOGUE = [EFFECTS[name] for name in ("gravity", "wind", "table_tilt", "spin_d
 
 def holdout(search, held_out):
     """The part of a holdout that the search asks for."""
-    return SimpleNamespace(search=search, held_out=held_out, settings=Settings(spin_label_noise=4.0))
+    return SimpleNamespace(search=search, held_out=held_out, settings=Settings(spin_label_noise=4.0), stamps=Stamps())
 
 
 def shots(make_ball, make_launches, make_shots, seed, **truth):
@@ -126,13 +127,14 @@ def test_what_balls_usually_have_is_found_though_no_score_calls(make_ball, make_
 
 
 def test_what_would_have_to_be_implausibly_strong_is_not_added(make_ball, make_launches, make_shots):
-    """The tilt found is 1.1 degrees, 4 prior sigmas: beyond what counts as plausible here."""
-    data = (shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.02, "y": 0.0}) for seed in (71, 72))
-    loop = SearchLoop(holdout(*data), [EFFECTS["table_tilt"]], predicts_well, judges_alike, unwatched, plausible=3.0)
+    """A table that leans by 3.4 degrees: a ball would roll off, so that something else must be the reason."""
+    data = (shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.06, "y": 0.0}) for seed in (71, 72))
+    loop = SearchLoop(holdout(*data), [EFFECTS["table_tilt"]], predicts_well, judges_alike, unwatched)
     search = loop.run(make_ball())
     assert search.findings == ()
     (row,) = search.rounds[0]
     assert row.outcome is Outcome.IMPLAUSIBLE
+    assert "outside of -0.03 to 0.03 rad" in search.refused["table_tilt"].reason
 
 
 def judged(rmse):

@@ -17,6 +17,8 @@ POSITION, VELOCITY, SPIN = STATE[0, :3].numpy(), STATE[0, 3:6].numpy(), STATE[0,
 DOWN = np.array([0.0, 0.0, -9.81])
 ALL = {
     "spin_label_offset": {"x": 20.0, "z": -5.0},
+    "distortion": {"k": 0.008, "x": 1.0, "y": 0.2, "z": 1.0},
+    "counted_frames": {"missing": 0.3},
     "radial_bias": {"offset": 0.02, "x": -1.0, "y": 0.5, "z": 2.0},
     "scale": {"x": 0.01, "y": -0.02, "z": 0.03},
     "time_scale": {"s": 0.01},
@@ -61,6 +63,18 @@ def test_radial_bias_points_away_from_its_centre():
     moved = seen(measuring(radial_bias=ALL["radial_bias"])) - POSITION
     np.testing.assert_allclose(moved, 0.02 * away / np.sqrt(away @ away + SOFT_DISTANCE**2), atol=1e-15)
     assert np.linalg.norm(moved) == pytest.approx(0.02, rel=3e-4)
+
+
+def test_distortion_grows_with_the_square_of_the_distance():
+    away = POSITION - [1.0, 0.2, 1.0]
+    moved = seen(measuring(distortion=ALL["distortion"])) - POSITION
+    np.testing.assert_allclose(moved, 0.008 * (away @ away) * away, atol=1e-15)
+
+
+def test_counted_frames_are_a_slow_clock_on_average():
+    model, times = measuring(counted_frames={"missing": 0.25}), torch.linspace(0.0, 2.0, 50, dtype=torch.float64)
+    torch.testing.assert_close(model.stamps(times), times / 1.25, rtol=1e-15, atol=0)
+    torch.testing.assert_close(model.true_stamps(model.stamps(times)), times, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("lag", [0.005, -0.005])
@@ -158,6 +172,8 @@ def test_effects_act_in_one_order_whatever_the_files():
         "frame_tilt",
         "scale",
         "radial_bias",
+        "distortion",
+        "counted_frames",
         "time_scale",
         "spin_label_frame",
         "spin_label_scale",
@@ -170,7 +186,9 @@ def test_effects_act_in_one_order_whatever_the_files():
     p = POSITION + delays * VELOCITY + delays**2 / 2 * DOWN - 0.003 * VELOCITY
     p = Rotation.from_rotvec([0.1, -0.2, 0.0]).apply(p) * [1.01, 0.98, 1.03]
     away = p - [-1.0, 0.5, 2.0]
-    np.testing.assert_allclose(seen(forward), p + 0.02 * away / np.sqrt(away @ away + SOFT_DISTANCE**2), atol=1e-13)
+    p = p + 0.02 * away / np.sqrt(away @ away + SOFT_DISTANCE**2)
+    away = p - [1.0, 0.2, 1.0]
+    np.testing.assert_allclose(seen(forward), p + 0.008 * (away @ away) * away, atol=1e-13)
 
 
 def test_in_a_model_file_and_among_the_coefficients():

@@ -1,0 +1,218 @@
+"""What stamps are wrong by, seen in the tracks alone: frames that were counted though some were dropped; a far clock.
+
+Both must be known before a track is cut into flights. With a clock that is wrong by tens of percent, or with a step of
+the ball that is twice as long as the one before, free flight looks like a chain of hits.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Final
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from scipy import stats
+
+from ballfg.arrays import Array, Index
+from ballfg.tracks import Track
+
+REGULAR: Final = 0.02
+"""Relative. Stamps that count frames have intervals that differ by no more."""
+NEAR: Final = 9
+"""Steps about one that tell the length of a step of one frame."""
+SHORT: Final = 25.0
+"""Percentile of these lengths that is one frame's to begin with."""
+MOST_MISSING: Final = 6
+"""Frames between two samples, at most."""
+WINDOW: Final = 16
+"""Samples of a piece of flight whose polynomial is looked at."""
+ROUNDS: Final = 100
+"""Times that frames are counted again beside a motion that became smoother."""
+CLEAR: Final = 0.7
+"""A further missing frame must lower the variance of a piece to this share."""
+LEAST_SHARE: Final = 0.02
+"""Share of missing frames that is thought possible to begin with."""
+TINY: Final = 1e-9
+"""m. Shorter steps are divided by it."""
+QUIET: Final = 3.0
+"""Pieces whose scatter is larger than so many times the lower quartile's hold a bounce or a hit."""
+SMOOTHER: Final = 0.5
+"""Fall of the log variance about polynomials from which counted frames are believed."""
+FAR: Final = 0.2
+"""A clock that is wrong by less is found by the fit itself; a lift may look like a clock that is."""
+CHANCE: Final = 1e-3
+"""Probability by chance, in each half of the tracks, below which wrong stamps are believed."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A number for each track of a half that is zero on average by chance: its mean, and the probability of that."""
+
+    mean: float
+    p_value: float
+    gain: float
+
+    @classmethod
+    def of(cls, values: Sequence[float]) -> "Evidence":
+        """From one number a track; gain: of a normal log likelihood, per track."""
+        spread = float(np.std(values, ddof=1)) if len(values) > 2 else np.inf
+        mean = float(np.mean(values)) if len(values) else 0.0
+        if not np.isfinite(spread) or spread == 0.0:
+            return cls(mean, 1.0, 0.0)
+        return cls(mean, float(stats.ttest_1samp(values, 0.0).pvalue), 0.5 * (mean / spread) ** 2)
+
+
+@dataclass(frozen=True)
+class Stamps:
+    """What is known of a dataset's stamps before anything is fitted.
+
+    Attributes:
+        missing: frames that are missing for each sample, on average; zero where stamps are times.
+        counted: (n,) s stamps of each track with the missing frames in their places, the mean rate as written.
+        scale: written durations over true ones less one; zero where the clock is not far off.
+        found: by effect, the evidence on the search half and on the held-out half.
+    """
+
+    missing: float = 0.0
+    counted: Mapping[str, Array] = field(default_factory=dict)
+    scale: float = 0.0
+    found: Mapping[str, tuple[Evidence, Evidence]] = field(default_factory=dict)
+
+    @property
+    def stretch(self) -> float:
+        """True durations over those of stamps with the missing frames in their places."""
+        return (1.0 + self.missing) / (1.0 + self.scale)
+
+    def repaired(self, track: Track) -> Track:
+        """The track with stamps as they should be: frames in their places, and true durations."""
+        if not self.found:
+            return track
+        times = self.counted.get(track.name, track.times)
+        return replace(track, times=times[0] + (times - times[0]) * self.stretch)
+
+
+def look_at_stamps(tracks: Sequence[Track], gravity: float, drag: float) -> Stamps:
+    """Look for counted frames and for a clock that is far off.
+
+    Args: tracks: every second one belongs to the search half.  gravity: m/s^2.  drag: 1/m, of the declared model.
+    """
+    stamps = _with_counts(tracks)
+    repaired = [stamps.repaired(track) for track in tracks]
+    logs = np.array([_log_gravity(track, gravity, drag) for track in repaired])
+    halves = [Evidence.of(half[np.isfinite(half)].tolist()) for half in (logs[::2], logs[1::2])]
+    scale = float(np.exp(-0.5 * halves[0].mean)) - 1.0
+    if abs(scale) < FAR or max(h.p_value for h in halves) > CHANCE:
+        return stamps
+    return replace(stamps, scale=scale, found={**stamps.found, "time_scale": (halves[0], halves[1])})
+
+
+def _with_counts(tracks: Sequence[Track]) -> Stamps:
+    """The frames that are missing between samples, if stamps count frames and some are missing."""
+    counts = [frame_counts(track) for track in tracks]
+    falls = []
+    for track, count in zip(tracks, counts, strict=True):
+        before, after = (_roughness(times, track.positions) for times in (track.times, count.astype(np.float64)))
+        falls.append(float(np.log(before / after)) if before > 0.0 and after > 0.0 else np.nan)
+    halves = [Evidence.of([f for f in falls[first::2] if np.isfinite(f)]) for first in (0, 1)]
+    missing = sum(int(c[-1]) for c in counts) / max(1, sum(len(c) - 1 for c in counts)) - 1.0
+    if missing < LEAST_SHARE or min(h.mean for h in halves) < SMOOTHER or max(h.p_value for h in halves) > CHANCE:
+        return Stamps()
+    counted = {}
+    for track, count in zip(tracks, counts, strict=True):
+        period = float(np.median(np.diff(track.times)))
+        counted[track.name] = track.times[0] + count * period / (1.0 + missing)
+    return Stamps(missing, counted, 0.0, {"counted_frames": (halves[0], halves[1])})
+
+
+def frame_counts(track: Track) -> Index:
+    """(n,) number of the frame of each sample, from the lengths of the ball's steps; 0, 1, 2 ... where none is missing.
+
+    A step of the ball over a missing frame is twice as long as its neighbours.
+    """
+    plain = np.arange(len(track.times))
+    gaps = np.diff(track.times)
+    if len(gaps) <= WINDOW or np.ptp(gaps) > 2.0 * REGULAR * float(np.median(gaps)):
+        return plain
+    steps = np.linalg.norm(np.diff(track.positions, axis=0), axis=-1)
+    near = sliding_window_view(np.pad(steps, NEAR // 2, mode="reflect"), NEAR)
+    one = np.percentile(near, SHORT, axis=-1)
+    frames = np.clip(np.round(steps / np.maximum(one, TINY)), 1, MOST_MISSING + 1)
+    numbers, quiet = np.concatenate(([0], np.cumsum(frames.astype(np.int64)))), _across(track)
+    for _ in range(ROUNDS):
+        changes = _changes(numbers, track.positions, quiet)
+        if not changes.any():
+            break
+        numbers = numbers + np.concatenate(([0], np.cumsum(changes)))
+    return numbers
+
+
+def _changes(numbers: Index, positions: Array, quiet: float) -> Index:
+    """(n - 1,) by how many frames each step is longer if the motion about it shall be as smooth as possible.
+
+    Of steps that are near each other only the one changes with which most is gained.
+
+    Args: numbers: (n,) frames so far.  positions: (n, 3) m.  quiet: m^2, variance of a coordinate's noise.
+    """
+    steps, gaps = np.arange(len(numbers) - 1), np.diff(numbers)
+    tried = (0, -1, 1)
+    costs = np.full((len(tried), len(steps)), np.inf)
+    for behind in (WINDOW // 4, WINDOW // 2, 3 * WINDOW // 4):  # a bounce is in some of the windows about a step
+        first = np.clip(steps - behind + 1, 0, len(numbers) - WINDOW)
+        inside = first[:, None] + np.arange(WINDOW)
+        for row, change in zip(costs, tried, strict=True):
+            moved = numbers[inside] + change * (inside > steps[:, None])
+            np.minimum(row, _quadratics(moved.astype(np.float64), positions[inside])[1], out=row)
+    freedom = 3.0 * (WINDOW - 3)
+    share = np.clip(1.0 - len(steps) / numbers[-1], LEAST_SHARE, 0.9)
+    unclear = costs[2] > CLEAR * costs[0]  # a bounce stays a kink whatever is counted
+    costs = freedom * costs / quiet - 2.0 * np.log(share) * np.array(tried)[:, None]
+    costs[1, gaps <= 1], costs[2, unclear | (gaps > MOST_MISSING)] = np.inf, np.inf
+    best = np.argmin(costs, axis=0)
+    gain = costs[0] - costs[best, steps]
+    most = sliding_window_view(np.pad(gain, WINDOW // 2), WINDOW + 1).max(axis=-1)
+    return np.where((gain > 0.0) & (gain == most), np.array(tried)[best], 0)
+
+
+def _quadratics(times: Array, positions: Array) -> tuple[Array, Array]:
+    """(w, 3, 3) coefficients of quadratics, highest power first, and (w,) m^2 variances about them.
+
+    Args: times: (w, m) s, counted from the middle of each window.  positions: (w, m, 3) m.
+    """
+    basis = np.stack([(times - times.mean(axis=1, keepdims=True)) ** power for power in (2, 1, 0)], axis=-1)
+    basis /= (scale := np.abs(basis).max(axis=1, keepdims=True))
+    found = np.linalg.solve(basis.swapaxes(-1, -2) @ basis, basis.swapaxes(-1, -2) @ positions)
+    left = positions - basis @ found
+    return found / scale.swapaxes(-1, -2), (left**2).sum(axis=(1, 2)) / (3.0 * (times.shape[1] - 3))
+
+
+def _pieces(times: Array, positions: Array) -> tuple[Array, Array]:
+    """Quadratics through windows of samples, as `_quadratics` gives them; none for a track that is too short."""
+    if len(times) < WINDOW:
+        return np.zeros((0, 3, 3)), np.zeros(0)
+    windows = sliding_window_view(times, WINDOW)[:: WINDOW // 4]
+    return _quadratics(windows, sliding_window_view(positions, WINDOW, axis=0)[:: WINDOW // 4].swapaxes(-1, -2))
+
+
+def _across(track: Track) -> float:
+    """m^2, variance of a coordinate across the motion, which wrong stamps do not change: about planar parabolas."""
+    windows = sliding_window_view(track.positions, WINDOW, axis=0)[:: WINDOW // 4].swapaxes(-1, -2)
+    ways = windows - windows.mean(axis=1, keepdims=True)
+    spread = np.linalg.eigvalsh(ways.swapaxes(-1, -2) @ ways)  # smallest: out of the plane of the motion
+    return float(np.median(spread[:, 0])) / (WINDOW - 3)
+
+
+def _roughness(times: Array, positions: Array) -> float:
+    """m^2, lower quartile of the variances about quadratics; zero for a track that is too short."""
+    _, variances = _pieces(times, positions)
+    return float(np.percentile(variances, 25.0)) if len(variances) else 0.0
+
+
+def _log_gravity(track: Track, gravity: float, drag: float) -> float:
+    """Log of the downward acceleration over g once drag is taken off; drag along a path has no clock."""
+    found, variances = _pieces(track.times, track.positions)
+    if not len(variances):
+        return float("nan")
+    quiet = variances <= QUIET**2 * np.percentile(variances, 25.0)
+    velocity = found[quiet, 1]
+    upward = 2.0 * found[quiet, 0, 2] + drag * np.linalg.norm(velocity, axis=-1) * velocity[:, 2]
+    down = -float(np.median(upward))
+    return float(np.log(down / gravity)) if down > 0.0 else float("nan")
