@@ -41,6 +41,8 @@ a wrong name for a lacking effect bends the motion to the samples, and predictio
 PLAUSIBLE = 10.0
 """Prior standard deviations from its usual value within which a coefficient is plausible. An effect that must be
 stronger than that (air that moves at 20 m/s through a part of the room) stands for something else."""
+POORER = 0.3
+"""Share of an effect's gain that is there without the effect too, from which the fit before was in a poor minimum."""
 ALIKE = 6.0
 """BIC difference below which two effects cannot be told apart: odds of 20 to 1."""
 
@@ -124,7 +126,10 @@ class SearchLoop:
     def _round(self, search: Search) -> tuple[Search, bool]:
         """The search after one more round, and whether the round added an effect."""
         number = len(search.rounds) + 1
-        scored, refits = _tried(search.fit, self.catalogue, lambda line: self.watch(f"round {number}: {line}"))
+        scored, refits = self._tried(search, number)
+        if refits and (better := self._better_minimum(search, refits[0])) is not None:
+            search = better
+            scored, refits = self._tried(search, number)
         outcomes: dict[str, Outcome] = {}
         winner, refused = self._confirmed(search, refits, outcomes)
         if winner is None:
@@ -149,6 +154,31 @@ class SearchLoop:
         )
         return after, True
 
+    def _tried(self, search: Search, number: int) -> tuple[list[Scored], list[Refit]]:
+        return _tried(search.fit, self.catalogue, lambda line: self.watch(f"round {number}: {line}"))
+
+    def _better_minimum(self, search: Search, best: Refit) -> Search | None:
+        """The search from a better minimum of the same model, to which a refit has led; None if there is none.
+
+        Spins without labels leave several minima. An effect that leads out of a poor one has not explained anything:
+        without it the fit stays as good.
+        """
+        if best.delta_bic >= 0.0:
+            return None
+        fit = _without(best.fit, best.scored.hypothesis, search.first)
+        if not search.fit.cost - fit.cost > POORER * (search.fit.cost - best.fit.cost):
+            return None
+        self.watch("a better minimum of the fit was found")
+        settled = fit_problem(fit.problem, fit.unknowns, fit.noise)
+        predictive = self.predictive(settled)
+        if predictive.errors.prediction_rmse_mm > WORSE * search.predictive.errors.prediction_rmse_mm:
+            return None
+        judged = self.judge(predictive.model)
+        moved = replace(search, fit=settled, predictive=predictive, judged=judged)
+        if search.named:
+            return moved
+        return replace(moved, first=settled, declared=predictive, before=judged)
+
     def _confirmed(
         self, search: Search, refits: Sequence[Refit], outcomes: dict[str, Outcome]
     ) -> tuple[_Confirmed | None, dict[str, Refusal]]:
@@ -160,39 +190,39 @@ class SearchLoop:
             examined = self._examined(search, candidate)
             if isinstance(examined, _Confirmed):
                 return examined, refused
-            outcomes[candidate.name] = examined
-            if examined in NO_NAME:
-                refused[candidate.name] = self._refusal(candidate, examined)
+            outcomes[candidate.name], settled = examined
+            if outcomes[candidate.name] in NO_NAME:
+                refused[candidate.name] = self._refusal(candidate.scored.hypothesis, settled, outcomes[candidate.name])
         return None, refused
 
-    def _examined(self, search: Search, candidate: Refit) -> _Confirmed | Outcome:
-        """A refit with all that confirms it, or the reason for which it is no name; cheap questions come first."""
+    def _examined(self, search: Search, candidate: Refit) -> _Confirmed | tuple[Outcome, Fit]:
+        """A refit with all that confirms it, or why it is no name and its fit then; cheap questions come first."""
         hypothesis = candidate.scored.hypothesis
         evidence = held_out_gain(search.fit, candidate.fit, self.holdout.held_out)
         if evidence.p_value >= CONFIRMED:
-            return Outcome.NOT_HELPFUL
+            return Outcome.NOT_HELPFUL, candidate.fit
         settled = fit_problem(candidate.fit.problem, candidate.fit.unknowns, candidate.fit.noise)
         if self._implausible(hypothesis, settled):
-            return Outcome.IMPLAUSIBLE
+            return Outcome.IMPLAUSIBLE, settled
         idle = insignificant(settled, [*search.named, hypothesis])
         if hypothesis in idle:
-            return Outcome.INSIGNIFICANT
+            return Outcome.INSIGNIFICANT, settled
         kept = tuple(h for h in search.named if h not in idle)
         if idle:
             alone = candidate.fit
             for other in idle:
                 alone = _without(alone, other, search.first)
             if delta_bic(search.fit, alone) >= 0.0:
-                return Outcome.SAME_PATTERN
+                return Outcome.SAME_PATTERN, settled
             settled = fit_problem(alone.problem, alone.unknowns, alone.noise)
         if halves_differ(settled, hypothesis, self.holdout.held_out):
-            return Outcome.CONTRADICTORY
+            return Outcome.CONTRADICTORY, settled
         predictive = self.predictive(settled)
         if predictive.errors.prediction_rmse_mm > WORSE * search.predictive.errors.prediction_rmse_mm:
-            return Outcome.MISLEADING
+            return Outcome.MISLEADING, settled
         judged = self.judge(predictive.model)
         if judged.prediction_rmse_mm > search.judged.prediction_rmse_mm:
-            return Outcome.MISLEADING
+            return Outcome.MISLEADING, settled
         return _Confirmed(candidate, evidence, kept, settled, predictive, judged)
 
     def _implausible(self, hypothesis: Hypothesis, fit: Fit) -> str:
@@ -207,46 +237,56 @@ class SearchLoop:
             return f"more than {self.plausible:g} times its typical distance from the usual value"
         return ""
 
-    def _refusal(self, candidate: Refit, outcome: Outcome) -> Refusal:
-        """An effect that fits better and is no name."""
-        hypothesis = candidate.scored.hypothesis
-        reason = self._implausible(hypothesis, candidate.fit) if outcome is Outcome.IMPLAUSIBLE else ""
-        values = fitted_values(candidate.fit, hypothesis)
-        return Refusal(candidate.name, values, outcome, reason, hypothesis.effect.decide)
+    def _refusal(self, hypothesis: Hypothesis, fit: Fit, outcome: Outcome) -> Refusal:
+        """An effect that fits better and is no name; fit: with it."""
+        reason = self._implausible(hypothesis, fit) if outcome is Outcome.IMPLAUSIBLE else ""
+        return Refusal(hypothesis.name, fitted_values(fit, hypothesis), outcome, reason, hypothesis.effect.decide)
 
-    def _pruned(self, search: Search) -> Search:
-        """The search without effects that make predictions of the judging half worse; the last added goes first.
+    def _pruned(self, search: Search, *, examined: int = 1) -> Search:
+        """The search without effects that are no names beside those that came after them; the last added goes first.
 
-        The last one was judged when it was added. The others are judged again, beside those that came after them.
+        Effects are asked again whether they are plausible, differ from zero, and make predictions of the judging half
+        better; not so the last ones that were `examined` beside all others when they were added.
         """
-        for hypothesis in reversed(search.named[:-1]):
+        idle = insignificant(search.fit, search.named)
+        for hypothesis in reversed(search.named[: len(search.named) - examined]):
             if hypothesis.name in self.holdout.stamps.found:
                 continue
             fit = _without(search.fit, hypothesis, search.first)
             fit = fit_problem(fit.problem, fit.unknowns, fit.noise)
             predictive = self.predictive(fit)
             judged = self.judge(predictive.model)
-            if judged.prediction_rmse_mm >= search.judged.prediction_rmse_mm:
-                continue
-            self.watch(f"{hypothesis.name} taken out again")
-            reason = (
-                f"{search.judged.prediction_rmse_mm:.1f} mm off on the judging half with it, "
-                f"{judged.prediction_rmse_mm:.1f} mm without it"
-            )
-            values, decide = fitted_values(search.fit, hypothesis), hypothesis.effect.decide
-            refusal = Refusal(hypothesis.name, values, Outcome.MISLEADING, reason, decide)
-            kept = [h for h in search.named if h is not hypothesis and has_effect(fit.problem.model, h.name)]
-            pruned = replace(
-                search,
-                fit=fit,
-                predictive=predictive,
-                judged=judged,
-                named=tuple(kept),
-                findings=tuple(f for f in search.findings if f.name in {h.name for h in kept}),
-                refused=search.refused | {hypothesis.name: refusal},
-            )
-            return self._pruned(pruned)
+            refusal = None
+            if self._implausible(hypothesis, search.fit):
+                refusal = self._refusal(hypothesis, search.fit, Outcome.IMPLAUSIBLE)
+            elif hypothesis in idle:
+                refusal = self._refusal(hypothesis, search.fit, Outcome.INSIGNIFICANT)
+            elif judged.prediction_rmse_mm < search.judged.prediction_rmse_mm:
+                reason = (
+                    f"{search.judged.prediction_rmse_mm:.1f} mm off on the judging half with it, "
+                    f"{judged.prediction_rmse_mm:.1f} mm without it"
+                )
+                refusal = replace(self._refusal(hypothesis, search.fit, Outcome.MISLEADING), reason=reason)
+            if refusal is not None:
+                self.watch(f"{hypothesis.name} taken out again")
+                return self._pruned(_left(search, hypothesis, fit, predictive, judged, refusal), examined=0)
         return search
+
+
+def _left(
+    search: Search, hypothesis: Hypothesis, fit: Fit, predictive: PredictiveModel, judged: Errors, refusal: Refusal
+) -> Search:
+    """The search after one of its effects was taken out; the fit and errors are those without it."""
+    kept = [h for h in search.named if h is not hypothesis and has_effect(fit.problem.model, h.name)]
+    return replace(
+        search,
+        fit=fit,
+        predictive=predictive,
+        judged=judged,
+        named=tuple(kept),
+        findings=tuple(f for f in search.findings if f.name in {h.name for h in kept}),
+        refused=search.refused | {hypothesis.name: refusal},
+    )
 
 
 def _without(fit: Fit, hypothesis: Hypothesis, first: Fit) -> Fit:

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from scipy import stats
 
-from ballfg.diagnosis.fit.fit import fit_problem, reachable
+from ballfg.diagnosis.fit.fit import fit_problem, reachable, values_of
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import by_track
@@ -55,10 +55,23 @@ def _own_score(fit: Fit, hypothesis: Hypothesis, gram: np.ndarray) -> Score | No
 
 
 def insignificant(fit: Fit, named: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Those effects of a model whose coefficients do not differ from absent by themselves."""
+    """Those effects of a model that do not differ from absent by themselves: none of their strengths, or not together.
+
+    Standard deviations are those of the noise or of the scatter of tracks, the larger of the two.
+    """
     testable = [hypothesis for hypothesis in named if hypothesis.strengths]
     scores = own_scores(fit, testable) if testable else []
-    return [h for h, score in zip(testable, scores, strict=True) if score is None or score.p_value > CHANCE]
+    return [h for h, score in zip(testable, scores, strict=True) if score is None or not _differs(fit, h, score)]
+
+
+def _differs(fit: Fit, hypothesis: Hypothesis, score: Score) -> bool:
+    values = values_of(fit, hypothesis.columns, {}).values()
+    absent = [hypothesis.coefficients[n].absent for n in hypothesis.strengths]
+    far = [
+        abs(value.value - (zero or 0.0)) > SIGMAS * max(value.sigma, sigma)
+        for value, zero, sigma in zip(values, absent, score.sigma.tolist(), strict=True)
+    ]
+    return any(far) and score.p_value <= CHANCE
 
 
 def halves_differ(fit: Fit, hypothesis: Hypothesis, held_out: Stretches) -> bool:
