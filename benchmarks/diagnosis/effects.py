@@ -77,6 +77,7 @@ PLANTS: Final[dict[str, Plant]] = {
         Plant("table_tilt", (("y", 0.0087),)),
         Plant("scale", (("x", 0.01),)),
         Plant("radial_bias", (("offset", 0.01),)),
+        Plant("distortion", (("k", 0.008),)),
         Plant("spin_label_offset", (("y", 15.0),)),
         Plant("spin_label_frame", (("yy", -1.0),), sized=False),
         Plant("gravity", (("g", 0.1),), base=9.81, hidden=True),

@@ -5,6 +5,7 @@ from collections.abc import Iterable
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.record import Found, Record
 from ballfg.diagnosis.result import Outcome, Verdict
+from ballfg.diagnosis.search.hypothesis import TWINS
 
 LARGEST_GROUP = 3
 """Effects that a diagnosis may name together and still be right."""
@@ -25,7 +26,8 @@ def honest(record: Record, name: str) -> bool:
     """The same for an effect that hides: its group is named, however large, or it is said to be invisible."""
     if record.found:
         return name in (record.found[0].name, *record.found[0].alike)
-    standings = [ranked.standing for ranked in record.rounds[-1] if ranked.name == name] if record.rounds else []
+    entries = {name, *(listed for listed, twins in TWINS.items() if name in twins)}  # exact twins are one entry
+    standings = [ranked.standing for ranked in record.rounds[-1] if ranked.name in entries] if record.rounds else []
     return standings == [Outcome.INVISIBLE.value]
 
 

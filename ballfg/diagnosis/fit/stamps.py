@@ -110,8 +110,8 @@ def _with_counts(tracks: Sequence[Track]) -> Stamps:
     counts = [frame_counts(track) for track in tracks]
     falls = []
     for track, count in zip(tracks, counts, strict=True):
-        before, after = (_roughness(times, track.positions) for times in (track.times, count.astype(np.float64)))
-        falls.append(float(np.log(before / after)) if before > 0.0 and after > 0.0 else np.nan)
+        before, after = (_pieces(times, track.positions)[1] for times in (track.times, count.astype(np.float64)))
+        falls.append(float(np.log(before / after).mean()) if len(before) else np.nan)
     halves = [Evidence.of([f for f in falls[first::2] if np.isfinite(f)]) for first in (0, 1)]
     missing = sum(int(c[-1]) for c in counts) / max(1, sum(len(c) - 1 for c in counts)) - 1.0
     if missing < LEAST_SHARE or min(h.mean for h in halves) < SMOOTHER or max(h.p_value for h in halves) > CHANCE:
@@ -198,12 +198,6 @@ def _across(track: Track) -> float:
     ways = windows - windows.mean(axis=1, keepdims=True)
     spread = np.linalg.eigvalsh(ways.swapaxes(-1, -2) @ ways)  # smallest: out of the plane of the motion
     return float(np.median(spread[:, 0])) / (WINDOW - 3)
-
-
-def _roughness(times: Array, positions: Array) -> float:
-    """m^2, lower quartile of the variances about quadratics; zero for a track that is too short."""
-    _, variances = _pieces(times, positions)
-    return float(np.percentile(variances, 25.0)) if len(variances) else 0.0
 
 
 def _log_gravity(track: Track, gravity: float, drag: float) -> float:

@@ -1,40 +1,28 @@
 """The search loop: fit, test, add the effect that is lacking, and repeat until nothing more helps."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.result import Candidate, Errors, Finding, Outcome, Refusal
-from ballfg.diagnosis.search.candidates import (
-    ALARM,
-    Refit,
-    Scored,
-    delta_bic,
-    refit,
-    refit_driven,
-    refit_usual,
-    score_all,
-    shortlist,
-)
-from ballfg.diagnosis.search.evaluation import HeldOutGain, held_out_gain
-from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect, hypotheses, scene_of, without_effect
-from ballfg.diagnosis.search.label_frames import frame_hypotheses
+from ballfg.diagnosis.result import Errors, Outcome, Refusal
+from ballfg.diagnosis.search.candidates import Refit, Scored, delta_bic
+from ballfg.diagnosis.search.evaluation import held_out_gain
+from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.diagnosis.search.parsimony import halves_differ, insignificant
 from ballfg.diagnosis.search.plausible import implausible, in_table
 from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.diagnosis.search.ranking import NO_NAME, as_left, finding_of, fitted_values, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
+from ballfg.diagnosis.search.state import Confirmed, Search, left_out, without_named
+from ballfg.diagnosis.search.trial import try_hypotheses
 from ballfg.dynamics import AnalyticModel, BallModel, Effect
-from ballfg.dynamics.effects.measurement import SpinLabelFrame
 
 MOST_EFFECTS = 4
 """Effects that are added before the search ends; further ones would be found in what earlier wrong ones left."""
 CONFIRMED = 0.05
 """An effect stays only if its gain on the held-out half would arise by chance less often than this."""
-LABELLED = 0.5
-"""Share of flights whose spin must be labelled for an effect that multiplies spins to show in a score test."""
 WORSE = 1.1
 """Ratio of prediction errors beyond which an effect is not added, however much better whole tracks are fitted with it:
 a wrong name for a lacking effect bends the motion to the samples, and predictions get worse."""
@@ -45,51 +33,6 @@ POORER = 0.3
 """Share of an effect's gain that is there without the effect too, from which the fit before was in a poor minimum."""
 ALIKE = 6.0
 """BIC difference below which two effects cannot be told apart: odds of 20 to 1."""
-
-
-@dataclass(frozen=True)
-class Search:
-    """State of the search after some rounds.
-
-    Attributes:
-        first, declared: fit of the declared model, and that model as it predicts.
-        fit, predictive: the same of the model with the effects added so far.
-        before, judged: prediction errors of both on the judging half.
-        named: the effects added so far, in order.
-        findings, rounds: as in `Diagnosis`.
-        refused: by name, effects that fit better and are no names.
-    """
-
-    first: Fit
-    declared: PredictiveModel
-    fit: Fit
-    predictive: PredictiveModel
-    before: Errors
-    judged: Errors
-    named: tuple[Hypothesis, ...] = ()
-    findings: tuple[Finding, ...] = ()
-    rounds: tuple[tuple[Candidate, ...], ...] = ()
-    refused: dict[str, Refusal] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class _Confirmed:
-    """A refit that deserves a name.
-
-    Attributes:
-        refit: with the effect.
-        evidence: its gain on the held-out half.
-        kept: effects named before that stay.
-        settled, predictive: the fit with its noise settled, and as it predicts.
-        judged: errors of its predictions on the judging half.
-    """
-
-    refit: Refit
-    evidence: HeldOutGain
-    kept: tuple[Hypothesis, ...]
-    settled: Fit
-    predictive: PredictiveModel
-    judged: Errors
 
 
 @dataclass(frozen=True)
@@ -155,7 +98,7 @@ class SearchLoop:
         return after, True
 
     def _tried(self, search: Search, number: int) -> tuple[list[Scored], list[Refit]]:
-        return _tried(search.fit, self.catalogue, lambda line: self.watch(f"round {number}: {line}"))
+        return try_hypotheses(search.fit, self.catalogue, lambda line: self.watch(f"round {number}: {line}"))
 
     def _better_minimum(self, search: Search, best: Refit) -> Search | None:
         """The search from a better minimum of the same model, to which a refit has led; None if there is none.
@@ -165,7 +108,7 @@ class SearchLoop:
         """
         if best.delta_bic >= 0.0:
             return None
-        fit = _without(best.fit, best.scored.hypothesis, search.first)
+        fit = without_named(best.fit, best.scored.hypothesis, search.first)
         if not search.fit.cost - fit.cost > POORER * (search.fit.cost - best.fit.cost):
             return None
         self.watch("a better minimum of the fit was found")
@@ -181,21 +124,21 @@ class SearchLoop:
 
     def _confirmed(
         self, search: Search, refits: Sequence[Refit], outcomes: dict[str, Outcome]
-    ) -> tuple[_Confirmed | None, dict[str, Refusal]]:
+    ) -> tuple[Confirmed | None, dict[str, Refusal]]:
         """The best refit that deserves a name, and better ones that do not; fills in their outcomes."""
         refused: dict[str, Refusal] = {}
         for candidate in refits:
             if candidate.delta_bic >= 0.0:
                 break
             examined = self._examined(search, candidate)
-            if isinstance(examined, _Confirmed):
+            if isinstance(examined, Confirmed):
                 return examined, refused
             outcomes[candidate.name], settled = examined
             if outcomes[candidate.name] in NO_NAME:
                 refused[candidate.name] = self._refusal(candidate.scored.hypothesis, settled, outcomes[candidate.name])
         return None, refused
 
-    def _examined(self, search: Search, candidate: Refit) -> _Confirmed | tuple[Outcome, Fit]:
+    def _examined(self, search: Search, candidate: Refit) -> Confirmed | tuple[Outcome, Fit]:
         """A refit with all that confirms it, or why it is no name and its fit then; cheap questions come first."""
         hypothesis = candidate.scored.hypothesis
         evidence = held_out_gain(search.fit, candidate.fit, self.holdout.held_out)
@@ -211,7 +154,7 @@ class SearchLoop:
         if idle:
             alone = candidate.fit
             for other in idle:
-                alone = _without(alone, other, search.first)
+                alone = without_named(alone, other, search.first)
             if delta_bic(search.fit, alone) >= 0.0:
                 return Outcome.SAME_PATTERN, settled
             settled = fit_problem(alone.problem, alone.unknowns, alone.noise)
@@ -223,7 +166,7 @@ class SearchLoop:
         judged = self.judge(predictive.model)
         if judged.prediction_rmse_mm > search.judged.prediction_rmse_mm:
             return Outcome.MISLEADING, settled
-        return _Confirmed(candidate, evidence, kept, settled, predictive, judged)
+        return Confirmed(candidate, evidence, kept, settled, predictive, judged)
 
     def _implausible(self, hypothesis: Hypothesis, fit: Fit) -> str:
         """Why the fitted strengths of an effect are not plausible; empty if they are."""
@@ -252,7 +195,7 @@ class SearchLoop:
         for hypothesis in reversed(search.named[: len(search.named) - examined]):
             if hypothesis.name in self.holdout.stamps.found:
                 continue
-            fit = _without(search.fit, hypothesis, search.first)
+            fit = without_named(search.fit, hypothesis, search.first)
             fit = fit_problem(fit.problem, fit.unknowns, fit.noise)
             predictive = self.predictive(fit)
             judged = self.judge(predictive.model)
@@ -269,69 +212,5 @@ class SearchLoop:
                 refusal = replace(self._refusal(hypothesis, search.fit, Outcome.MISLEADING), reason=reason)
             if refusal is not None:
                 self.watch(f"{hypothesis.name} taken out again")
-                return self._pruned(_left(search, hypothesis, fit, predictive, judged, refusal), examined=0)
+                return self._pruned(left_out(search, hypothesis, fit, predictive, judged, refusal), examined=0)
         return search
-
-
-def _left(
-    search: Search, hypothesis: Hypothesis, fit: Fit, predictive: PredictiveModel, judged: Errors, refusal: Refusal
-) -> Search:
-    """The search after one of its effects was taken out; the fit and errors are those without it."""
-    kept = [h for h in search.named if h is not hypothesis and has_effect(fit.problem.model, h.name)]
-    return replace(
-        search,
-        fit=fit,
-        predictive=predictive,
-        judged=judged,
-        named=tuple(kept),
-        findings=tuple(f for f in search.findings if f.name in {h.name for h in kept}),
-        refused=search.refused | {hypothesis.name: refusal},
-    )
-
-
-def _without(fit: Fit, hypothesis: Hypothesis, first: Fit) -> Fit:
-    """The fit without one of the effects that were added to the first one's model, at the same noise."""
-    problem, name = fit.problem, hypothesis.name
-    model = problem.model if has_effect(first.problem.model, name) else without_effect(problem.model, name)
-    left = dict(model.named_parameters())
-    free = {n: c for n, c in problem.free.items() if n in left and n not in hypothesis.columns}
-    values = {n: fit.unknowns.values[n] for n in free}
-    unknowns = replace(fit.unknowns, values=values)
-    return fit_problem(replace(problem, model=model, free=free), unknowns, fit.noise, settle_noise=False)
-
-
-def _tried(
-    before: Fit, catalogue: Sequence[type[Effect]], tell: Callable[[str], None]
-) -> tuple[list[Scored], list[Refit]]:
-    """Every hypothesis, the one that explains most first; and the refits, the best first."""
-    model = before.problem.model
-    listed = hypotheses(model, scene_of(before), catalogue)
-    candidates = [h for h in listed if not set(h.columns) & set(before.problem.free)]
-    tell(f"testing {len(candidates)} hypotheses")
-    unlabelled = before.problem.stretches.labelled.mean() < LABELLED
-    driven = [h for h in candidates if h.effect.multiplies_spin and unlabelled]
-    scored = score_all(before, [h for h in candidates if h not in driven])
-    leading, refits = shortlist(scored), []
-    for candidate in leading:
-        tell(f"fitting with {candidate.hypothesis.name}")
-        shaped = [candidate]
-        if candidate.hypothesis.effect is SpinLabelFrame:
-            frames = frame_hypotheses(before, candidate.hypothesis)
-            shaped = [Scored(frame, None, candidate.p_value) for frame in frames]
-        refits += [refit(before, one) for one in shaped]
-    called = {candidate.hypothesis.name for candidate in leading}
-    for place, hypothesis in enumerate([s.hypothesis for s in scored]):
-        if hypothesis.name in called or not hypothesis.usual or has_effect(model, hypothesis.name):
-            continue
-        tell(f"fitting with {hypothesis.name}, which balls usually have")
-        fitted = refit_usual(before, hypothesis)
-        if fitted.scored.p_value < ALARM:
-            scored[place] = fitted.scored
-            refits.append(fitted)
-    for hypothesis in driven:
-        tell(f"fitting with {hypothesis.name} and spins that nobody labelled")
-        fitted = refit_driven(before, hypothesis)
-        scored.append(fitted.scored)
-        refits += [fitted] if fitted.scored.p_value < ALARM else []
-    ranked = sorted(scored, key=lambda s: s.explained, reverse=True)
-    return ranked, sorted(refits, key=lambda r: r.delta_bic)

@@ -1,0 +1,83 @@
+"""The state of a search: the model so far, its fit and its errors, and the effects that were named or refused."""
+
+from dataclasses import dataclass, field, replace
+
+from ballfg.diagnosis.fit.fit import fit_problem
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.result import Candidate, Errors, Finding, Refusal
+from ballfg.diagnosis.search.candidates import Refit
+from ballfg.diagnosis.search.evaluation import HeldOutGain
+from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect, without_effect
+from ballfg.diagnosis.search.process_noise import PredictiveModel
+
+
+@dataclass(frozen=True)
+class Search:
+    """State of the search after some rounds.
+
+    Attributes:
+        first, declared: fit of the declared model, and that model as it predicts.
+        fit, predictive: the same of the model with the effects added so far.
+        before, judged: prediction errors of both on the judging half.
+        named: the effects added so far, in order.
+        findings, rounds: as in `Diagnosis`.
+        refused: by name, effects that fit better and are no names.
+    """
+
+    first: Fit
+    declared: PredictiveModel
+    fit: Fit
+    predictive: PredictiveModel
+    before: Errors
+    judged: Errors
+    named: tuple[Hypothesis, ...] = ()
+    findings: tuple[Finding, ...] = ()
+    rounds: tuple[tuple[Candidate, ...], ...] = ()
+    refused: dict[str, Refusal] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Confirmed:
+    """A refit that deserves a name.
+
+    Attributes:
+        refit: with the effect.
+        evidence: its gain on the held-out half.
+        kept: effects named before that stay.
+        settled, predictive: the fit with its noise settled, and as it predicts.
+        judged: errors of its predictions on the judging half.
+    """
+
+    refit: Refit
+    evidence: HeldOutGain
+    kept: tuple[Hypothesis, ...]
+    settled: Fit
+    predictive: PredictiveModel
+    judged: Errors
+
+
+def left_out(
+    search: Search, hypothesis: Hypothesis, fit: Fit, predictive: PredictiveModel, judged: Errors, refusal: Refusal
+) -> Search:
+    """The search after one of its effects was taken out; the fit and errors are those without it."""
+    kept = [h for h in search.named if h is not hypothesis and has_effect(fit.problem.model, h.name)]
+    return replace(
+        search,
+        fit=fit,
+        predictive=predictive,
+        judged=judged,
+        named=tuple(kept),
+        findings=tuple(f for f in search.findings if f.name in {h.name for h in kept}),
+        refused=search.refused | {hypothesis.name: refusal},
+    )
+
+
+def without_named(fit: Fit, hypothesis: Hypothesis, first: Fit) -> Fit:
+    """The fit without one of the effects that were added to the first one's model, at the same noise."""
+    problem, name = fit.problem, hypothesis.name
+    model = problem.model if has_effect(first.problem.model, name) else without_effect(problem.model, name)
+    left = dict(model.named_parameters())
+    free = {n: c for n, c in problem.free.items() if n in left and n not in hypothesis.columns}
+    values = {n: fit.unknowns.values[n] for n in free}
+    unknowns = replace(fit.unknowns, values=values)
+    return fit_problem(replace(problem, model=model, free=free), unknowns, fit.noise, settle_noise=False)
