@@ -64,7 +64,7 @@ class SearchLoop:
             search, helped = self._round(search)
         search = self._pruned(search)
         refused = {n: r for n, r in search.refused.items() if n not in {f.name for f in search.findings}}
-        return replace(search, findings=as_left(search.findings, search.named, search.fit), refused=refused)
+        return replace(search, findings=as_left(search.findings, search.named, search.fit, first), refused=refused)
 
     def _round(self, search: Search) -> tuple[Search, bool]:
         """The search after one more round, and whether the round added an effect."""
@@ -147,7 +147,7 @@ class SearchLoop:
         settled = fit_problem(candidate.fit.problem, candidate.fit.unknowns, candidate.fit.noise)
         if self._implausible(hypothesis, settled):
             return Outcome.IMPLAUSIBLE, settled
-        idle = insignificant(settled, [*search.named, hypothesis])
+        idle = insignificant(settled, [*search.named, hypothesis], search.first)
         if hypothesis in idle:
             return Outcome.INSIGNIFICANT, settled
         kept = tuple(h for h in search.named if h not in idle)
@@ -191,7 +191,7 @@ class SearchLoop:
         Effects are asked again whether they are plausible, differ from zero, and make predictions of the judging half
         better; not so the last ones that were `examined` beside all others when they were added.
         """
-        idle = insignificant(search.fit, search.named)
+        idle = insignificant(search.fit, search.named, search.first)
         for hypothesis in reversed(search.named[: len(search.named) - examined]):
             if hypothesis.name in self.holdout.stamps.found:
                 continue

@@ -6,12 +6,13 @@ beside it. Standard deviations here come from the scatter of tracks, not from th
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from scipy import stats
 
+from ballfg.arrays import Array
 from ballfg.diagnosis.fit.fit import fit_problem, reachable, values_of
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stretches import Stretches
@@ -19,6 +20,7 @@ from ballfg.diagnosis.fit.system import by_track
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.diagnosis.search.score import Score, score_tests
 from ballfg.diagnosis.search.signatures import Signatures
+from ballfg.diagnosis.search.state import without_named
 
 SIGMAS: Final = 3.0
 """Coefficients must differ from absent by so many standard deviations, and the halves by no more than so many."""
@@ -38,7 +40,7 @@ def own_scores(fit: Fit, named: Sequence[Hypothesis]) -> list[Score | None]:
     return [_own_score(fit, hypothesis, gram) for hypothesis in named]
 
 
-def _own_score(fit: Fit, hypothesis: Hypothesis, gram: np.ndarray) -> Score | None:
+def _own_score(fit: Fit, hypothesis: Hypothesis, gram: Array) -> Score | None:
     """Args: gram: (t, q + 1, q + 1) inner products of the common columns of a fit, the residual last."""
     listed, precision = list(fit.problem.free), fit.problem.common_precision
     own = [listed.index(name) for name in hypothesis.columns]
@@ -54,24 +56,43 @@ def _own_score(fit: Fit, hypothesis: Hypothesis, gram: np.ndarray) -> Score | No
     return score_tests(Signatures(turned, precision[others], len(others)), [range(len(own))])[0]
 
 
-def insignificant(fit: Fit, named: Sequence[Hypothesis]) -> list[Hypothesis]:
-    """Those effects of a model that do not differ from absent by themselves: none of their strengths, or not together.
+@dataclass(frozen=True)
+class Significance:
+    """Whether an effect differs from absent by itself, and the standard deviation (p,) of each of its strengths."""
 
-    Standard deviations are those of the noise or of the scatter of tracks, the larger of the two.
+    differs: bool
+    sigmas: Array
+
+
+def significance(fit: Fit, hypothesis: Hypothesis, first: Fit) -> Significance:
+    """Whether an effect of a model differs from absent: its strengths together, and one of them alone.
+
+    Standard deviations are those of the noise or of the scatter of tracks, the larger of the two. A strength that acts
+    far from linearly (a saturation) may be badly known and yet far from zero. For a single strength the likelihood
+    ratio against the fit without it therefore counts too, divided by the excess of the scatter over the noise.
+
+    Args: fit: with the effect, which has strengths.  first: of the declared model, without the named effects.
     """
-    testable = [hypothesis for hypothesis in named if hypothesis.strengths]
-    scores = own_scores(fit, testable) if testable else []
-    return [h for h, score in zip(testable, scores, strict=True) if score is None or not _differs(fit, h, score)]
+    values = list(values_of(fit, hypothesis.columns, {}).values())
+    noise = np.array([value.sigma for value in values])
+    (score,) = own_scores(fit, [hypothesis])
+    if score is None:
+        return Significance(False, np.full(len(values), np.inf))
+    absent = np.array([hypothesis.coefficients[n].absent for n in hypothesis.strengths], dtype=np.float64)
+    size, sigmas = np.abs(np.array([value.value for value in values]) - absent), np.maximum(noise, score.sigma)
+    if score.p_value <= CHANCE and (size > SIGMAS * sigmas).any():
+        return Significance(True, sigmas)
+    if len(values) > 1:
+        return Significance(False, sigmas)
+    gain = 2.0 * (without_named(fit, hypothesis, first).cost - fit.cost) * float((noise / sigmas)[0]) ** 2
+    if gain < SIGMAS**2:
+        return Significance(False, sigmas)
+    return Significance(True, np.clip(size / np.sqrt(gain), noise, sigmas))
 
 
-def _differs(fit: Fit, hypothesis: Hypothesis, score: Score) -> bool:
-    values = values_of(fit, hypothesis.columns, {}).values()
-    absent = [hypothesis.coefficients[n].absent for n in hypothesis.strengths]
-    far = [
-        abs(value.value - (zero or 0.0)) > SIGMAS * max(value.sigma, sigma)
-        for value, zero, sigma in zip(values, absent, score.sigma.tolist(), strict=True)
-    ]
-    return any(far) and score.p_value <= CHANCE
+def insignificant(fit: Fit, named: Sequence[Hypothesis], first: Fit) -> list[Hypothesis]:
+    """Those effects of a model that do not differ from absent by themselves."""
+    return [h for h in named if h.strengths and not significance(fit, h, first).differs]
 
 
 def halves_differ(fit: Fit, hypothesis: Hypothesis, held_out: Stretches) -> bool:

@@ -4,13 +4,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final
 
+import numpy as np
+
 from ballfg.diagnosis.fit.fit import values_of
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Candidate, Finding, Outcome, Value
 from ballfg.diagnosis.search.candidates import Refit, Scored
 from ballfg.diagnosis.search.evaluation import HeldOutGain
 from ballfg.diagnosis.search.hypothesis import TWINS, Hypothesis
-from ballfg.diagnosis.search.parsimony import own_scores
+from ballfg.diagnosis.search.parsimony import significance
 
 NO_NAME: Final = (
     Outcome.IMPLAUSIBLE,
@@ -47,17 +49,18 @@ def fitted_values(fit: Fit, hypothesis: Hypothesis) -> dict[str, Value]:
     return values | {c: Value(v, 0.0, hypothesis.coefficients[c].unit) for c, v in shape.items()}
 
 
-def as_left(findings: Sequence[Finding], named: Sequence[Hypothesis], fit: Fit) -> tuple[Finding, ...]:
+def as_left(findings: Sequence[Finding], named: Sequence[Hypothesis], fit: Fit, first: Fit) -> tuple[Finding, ...]:
     """Findings with the coefficients of the last fit, beside all the others.
 
-    The standard deviation of a strength is that of the noise or that of the scatter of tracks, the larger of the two.
+    The standard deviation of a strength is that of its significance; first: the fit without any of the findings.
     """
     refreshed = []
     for finding, hypothesis in zip(findings, named, strict=True):
         values = fitted_values(fit, hypothesis)
-        (score,) = own_scores(fit, [hypothesis]) if hypothesis.strengths else [None]
-        for name, sigma in zip(hypothesis.strengths, () if score is None else score.sigma.tolist(), strict=False):
-            values[name] = replace(values[name], sigma=max(values[name].sigma, sigma))
+        sigmas = significance(fit, hypothesis, first).sigmas.tolist() if hypothesis.strengths else []
+        for name, sigma in zip(hypothesis.strengths, sigmas, strict=True):
+            if np.isfinite(sigma):
+                values[name] = replace(values[name], sigma=sigma)
         refreshed.append(replace(finding, parameters=values))
     return tuple(refreshed)
 
