@@ -80,7 +80,8 @@ def significance(fit: Fit, hypothesis: Hypothesis, first: Fit) -> Significance:
         return Significance(False, np.full(len(values), np.inf))
     absent = np.array([hypothesis.coefficients[n].absent for n in hypothesis.strengths], dtype=np.float64)
     size, sigmas = np.abs(np.array([value.value for value in values]) - absent), np.maximum(noise, score.sigma)
-    if score.p_value <= CHANCE and (size > SIGMAS * sigmas).any():
+    # the score leaves out directions that change nothing, such as the same time offset of all axes
+    if score.p_value <= CHANCE and (np.abs(score.estimate) > SIGMAS * score.sigma).any():
         return Significance(True, sigmas)
     if len(values) > 1:
         return Significance(False, sigmas)

@@ -99,3 +99,11 @@ def test_gravity_and_buoyancy_are_one_entry(calm_fit, make_ball):
     assert [h.name for h in listed] == ["gravity"]
     alone = hypotheses(make_ball(), scene_of(calm_fit), catalogue[1:])
     assert [h.name for h in alone] == ["buoyancy"]
+
+
+def test_directions_that_change_nothing_do_not_count(make_ball, make_launches, make_shots, make_fit):
+    """The same time offset on all axes is a shift of the clock: no track shows it, the others differ from zero."""
+    offset = Hypothesis(EFFECTS["time_offset"], {}, ("x", "y", "z"))
+    data = make_shots(make_ball(time_offset={"x": 0.003}), make_launches(16, 7), 7).stretches
+    before = make_fit(make_ball(), data)
+    assert insignificant(fit_with(before, offset), [offset], before) == []
