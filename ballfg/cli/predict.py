@@ -40,7 +40,7 @@ def predict(
     with TableWriter(out) as table:
         inputs.check_out(out, dataset)
         check_observe(observe)
-        opened = inputs.open_inputs(dataset, model, effects_file)
+        opened = inputs.open_inputs(dataset, model, effects_file, observe)
         count = len(opened.dataset)
         predictions = predict_tracks(opened.estimator(method), opened.dataset, count, observe, jobs=jobs)
         for result in progress(predictions, count, "tracks predicted"):
