@@ -17,6 +17,7 @@ from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.estimation.settings import MEASURED, Settings
 from ballfg.estimation.table_extent import TableExtent, find_table_extent
 from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
+from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Dataset, DatasetInfo
 
 TRACKS_FOR_NOISE = 50
@@ -64,7 +65,9 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
     return settings
 
 
-def fitted_settings(dataset: Dataset | SightedDataset, model: BallModel, observed: float = np.inf) -> Settings:
+def fitted_settings(
+    dataset: Dataset | SightedDataset, model: BallModel, observed: float = np.inf, watch: Watch = unwatched
+) -> Settings:
     """`dataset_settings`, and where neither dataset nor model states the noise, the noise that the tracks show.
 
     Args:
@@ -72,18 +75,19 @@ def fitted_settings(dataset: Dataset | SightedDataset, model: BallModel, observe
             where cameras saw the ball, or with a trained model, the settings are those of `dataset_settings`.
         model: the ball.
         observed: s from the start of each track that may be looked at.
+        watch: told of each track, and of each step of the search.
     """
     settings = dataset_settings(dataset, model)
     stated = dataset.info.noise is not None or model.noise is not None or model.trained is not None
     if stated or dataset.rough or len(dataset) < LEAST_TRACKS or not model.measures_plainly:
         return settings
     values = tuple(float(p.detach()) for p in model.parameters() if p.numel() == 1)
-    return _fitted(dataset, model, values, observed) or settings
+    return _fitted(dataset, model, values, observed, watch) or settings
 
 
 @lru_cache(maxsize=8)
 def _fitted(
-    dataset: Dataset | SightedDataset, model: BallModel, values: tuple[float, ...], observed: float
+    dataset: Dataset | SightedDataset, model: BallModel, values: tuple[float, ...], observed: float, watch: Watch
 ) -> Settings | None:
     """The settings with the noise that the tracks show. Args: values: of the model's parameters, for the cache."""
     tracks = spread_over(dataset, min(len(dataset), TRACKS_FOR_NOISE), QUICK_TRACKS)
@@ -95,6 +99,7 @@ def _fitted(
         parts,
         position_known=dataset.info.position_noise is not None,
         errors=False,
+        watch=watch,
     )
     return None if found is None else found.settings
 

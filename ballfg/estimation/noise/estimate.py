@@ -16,7 +16,14 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.noise.forecasts import EARLIEST_START, START_EVERY, Forecaster
 from ballfg.estimation.noise.linear_tracks import LEAST_SAMPLES, LinearTracks, linearise
-from ballfg.estimation.noise.parameters import Parameter, parameters_of, tensors_of, track_noise, with_noise
+from ballfg.estimation.noise.parameters import (
+    COEFFICIENTS,
+    Parameter,
+    parameters_of,
+    tensors_of,
+    track_noise,
+    with_noise,
+)
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.progress import Watch, unwatched
@@ -43,6 +50,7 @@ class NoiseEstimate:
         noise: standard deviations.
         relative_errors: standard deviation of each number's logarithm, by name, with `.x`, `.y`, `.z` where there is
             one per axis. From the curvature of the score; each start of a forecast counts as one observation.
+        coefficient_factor: spread of coefficients from track to track, as a multiple of the settings'.
         settings: with that noise.
         held_before: share of forecast coordinates inside their 90 % intervals with the settings given.
         held: the same with this noise.
@@ -52,6 +60,7 @@ class NoiseEstimate:
 
     noise: TrackNoise
     relative_errors: dict[str, float]
+    coefficient_factor: float
     settings: Settings
     held_before: float
     held: float
@@ -102,6 +111,9 @@ def estimate_noise(
     return NoiseEstimate(
         noise=found,
         relative_errors=search.errors(logs) if errors else {},
+        coefficient_factor=next(
+            (float(np.exp(x)) for p, x in zip(parameters, logs, strict=True) if p.name == COEFFICIENTS), 1.0
+        ),
         settings=with_noise(settings, found),
         held_before=search.held(search.start),
         held=search.held(logs),

@@ -61,6 +61,7 @@ def parameters_of(settings: Settings, tracks: LinearTracks, position_known: bool
     for axis in range(3):
         if not position_known:
             found.append(Parameter("position", axis, white[axis], FACTOR_FOUR, 1e-5, 0.1))
+    for axis in range(3):
         memory = settings.memory[axis] or MEMORY_SHARE * white[axis]
         found.append(Parameter("memory", axis, memory, FACTOR_FOUR, 1e-5, 0.1))
     found.append(Parameter("memory_time", None, settings.memory_time, FACTOR_FOUR, 0.002, 0.5))
