@@ -111,9 +111,7 @@ def estimate_noise(
     return NoiseEstimate(
         noise=found,
         relative_errors=search.errors(logs) if errors else {},
-        coefficient_factor=next(
-            (float(np.exp(x)) for p, x in zip(parameters, logs, strict=True) if p.name == COEFFICIENTS), 1.0
-        ),
+        coefficient_factor=float(np.exp(logs[-1])) if parameters[-1].name == COEFFICIENTS else 1.0,
         settings=with_noise(settings, found),
         held_before=search.held(search.start),
         held=search.held(logs),
