@@ -73,7 +73,8 @@ def parameters_of(settings: Settings, tracks: LinearTracks, position_known: bool
         found.append(Parameter("contact_tangential", None, tangential, FACTOR_FOUR, 1e-3, 3.0))
         found.append(Parameter("contact_spin", None, process.contact_spin, FACTOR_FOUR, 0.5, 300.0))
     if bool(tracks.labelled.any()):
-        found.append(Parameter("spin_label", None, settings.spin_label_noise, FACTOR_FOUR, 1.0, 300.0))
+        label = settings.spin_label_noise if settings.launcher is None else settings.launcher.sigma
+        found.append(Parameter("spin_label", None, label, FACTOR_FOUR, 1.0, 300.0))
     if not bool(tracks.labelled.all()):
         found.append(Parameter("spin_prior", None, settings.spin_prior, FACTOR_FOUR, 3.0, 500.0))
     if settings.coefficients:
@@ -119,7 +120,8 @@ def track_noise(parameters: list[Parameter], logs: Array, settings: Settings) ->
 def with_noise(settings: Settings, noise: TrackNoise) -> Settings:
     """Settings with all that is known of the noise.
 
-    Spreads of coefficients replace those of the settings for coefficients that are estimated with each track.
+    Spreads of coefficients replace those of the settings for coefficients that are estimated with each track; where the
+    settings estimate none, all that the noise names are.
     """
     own = {
         "position_noise": noise.position,
@@ -131,9 +133,14 @@ def with_noise(settings: Settings, noise: TrackNoise) -> Settings:
     }
     process = {name: value for name in PROCESS_NOISE if (value := getattr(noise, name, None)) is not None}
     coefficients = {name: noise.coefficients.get(name, sigma) for name, sigma in settings.coefficients.items()}
+    launcher = settings.launcher
+    if launcher is not None and noise.spin_label is not None:
+        launcher = replace(launcher, sigma=noise.spin_label)
     return replace(
         settings,
         **{name: value for name, value in own.items() if value is not None},
+        position_scale=settings.position_scale if noise.position is None else 1.0,
+        launcher=launcher,
         process=replace(settings.process, **process),
-        coefficients=coefficients,
+        coefficients=coefficients or dict(noise.coefficients),
     )
