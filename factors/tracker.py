@@ -5,6 +5,7 @@ and the way that the ball makes at velocity v during the error s of the stamp. T
 per state, so that the graph stays banded; b_{i+1} = a_i b_i + noise with a_i = exp(-dt_i / memory time).
 """
 
+from collections.abc import Hashable
 from typing import ClassVar
 
 import numpy as np
@@ -18,6 +19,18 @@ from ballfg.state import POSITION, STATE_DIM
 
 BIAS_DIM = 3
 _BIAS = slice(STATE_DIM, STATE_DIM + BIAS_DIM)
+
+
+def bias_step(dt: Array, sigma: Array, memory_time: float) -> tuple[Array, Array]:
+    """How a bias fades over dt: b' = a b + noise, with a = exp(-dt / memory time).
+
+    Args:
+        dt: (m,) s.
+        sigma: (3,) m, standard deviation s of the bias per axis.
+        memory_time: s, over which the bias falls to 1 / e.
+    Returns: a (m,), dimensionless; the noise's standard deviations s sqrt(1 - a^2), (m, 3) m.
+    """
+    return np.exp(-dt / memory_time), sigma * np.sqrt(-np.expm1(-2.0 * dt / memory_time))[:, None]
 
 
 class BiasedPositionFactors(FactorBatch):
@@ -49,6 +62,11 @@ class BiasedPositionFactors(FactorBatch):
         self.measured = measured
         self.information_root = np.linalg.inv(np.linalg.cholesky(covariance))
         self.sees_biases = biased  # type: ignore[misc]  # the class's is that of factors that know states alone
+
+    @property
+    def group(self) -> Hashable:
+        """Besides the usual: whether the graph has biases."""
+        return (*super().group, self.sees_biases)  # type: ignore[misc]
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, 3) and Jacobians (k, 3, 9) or, with biases, (k, 3, 12)."""
@@ -97,8 +115,8 @@ class BiasFactors(FactorBatch):
         super().__init__(np.stack((states, states + 1), axis=-1), BIAS_DIM)
         if not ((dt > 0).all() and (sigma > 0).all() and memory_time > 0.0):
             raise ValueError("dt, sigma and memory_time must be positive; sort the times and drop repeats")
-        self.decay = np.exp(-dt / memory_time)
-        self.information_root = 1.0 / (sigma * np.sqrt(-np.expm1(-2.0 * dt / memory_time))[:, None])
+        self.decay, spread = bias_step(dt, sigma, memory_time)
+        self.information_root = 1.0 / spread
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, 3) and Jacobians (k, 3, 12) twice."""
@@ -114,6 +132,10 @@ class BiasFactors(FactorBatch):
         """(m, 3) whitened residuals in torch."""
         before, after = (state[:, _BIAS] for state in inputs)
         return torch.from_numpy(self.information_root) * (after - torch.from_numpy(self.decay)[:, None] * before)
+
+    def log_spread(self) -> float:
+        """Sum of the logarithms of all standard deviations."""
+        return -float(np.log(self.information_root).sum())
 
 
 class BiasStartFactors(FactorBatch):
@@ -142,3 +164,7 @@ class BiasStartFactors(FactorBatch):
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, 3) whitened residuals in torch."""
         return torch.from_numpy(self.information_root.copy()) * inputs[0][:, _BIAS]
+
+    def log_spread(self) -> float:
+        """Sum of the logarithms of all standard deviations."""
+        return -float(np.log(self.information_root).sum())

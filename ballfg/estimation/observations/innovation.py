@@ -18,7 +18,7 @@ def whiten_innovation(innovation: Array, covariance: Array) -> Array:
     return np.asarray(np.linalg.solve(root, innovation[..., None])[..., 0])
 
 
-def leave_position_out(states: Array, covariances: Array, measured: Array, sigma: Array, samples: Rows) -> Array:
+def leave_position_out(states: Array, covariances: Array, measured: Array, noise: Array, samples: Rows) -> Array:
     """(n, 3) whitened innovations of positions.
 
     With the sample's share M taken out of the posterior information, the others know the position to C = (P^-1 - M)^-1;
@@ -26,8 +26,10 @@ def leave_position_out(states: Array, covariances: Array, measured: Array, sigma
     z lies z - x - C g from there, with covariance R + C.
 
     Args:
-        states: (n, 9).  covariances: (n, 9, 9).
-        measured: (n, 3) m.  sigma: (n, 3) m.
+        states: (n, 3) m, the positions x that measurements should show, or (n, 9), beginning with them.
+        covariances: (n, 3, 3) or (n, 9, 9) of the states.
+        measured: (n, 3) m.
+        noise: (n, 3, 3) m^2, covariances R of the measurements.
         samples: the position factors, linearised at the states.
     """
     residual, (jacobian,) = weighted(samples)
@@ -40,7 +42,7 @@ def leave_position_out(states: Array, covariances: Array, measured: Array, sigma
     others[:, axes, axes] += LEAST_INFORMATION * information[:, axes, axes]
     covariance = np.linalg.inv(others)
     distance = measured - states[:, POSITION] - (covariance @ pull[..., None])[..., 0]
-    covariance[:, axes, axes] += sigma**2
+    covariance += noise
     return whiten_innovation(distance, np.asarray(covariance, dtype=np.float64))
 
 
