@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
+from ballfg.estimation.filters.sliding_window import SlidingWindow
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.result import Status
@@ -194,3 +195,31 @@ def test_online_after_a_repair(lag) -> None:
     np.testing.assert_allclose(
         online.window.newest_covariance, undisturbed.window.newest_covariance, rtol=1e-6, atol=1e-9
     )
+
+
+def test_gates_know_the_whole_error() -> None:
+    """30 mm of memory and 2 ms of jitter beside 2 mm of noise: no sample is an outlier, no hit is seen."""
+    settings = replace(FALLING, memory=(0.03,) * 3, stamp_jitter=0.002, find_events=True)
+    for seed in range(5):
+        track = falling_track(settings, seed=seed)
+        estimate = ExtendedKalmanFilter(gravity_model(), NOWHERE, settings).estimate(track)
+        assert estimate.quality.max() == 0
+        assert len(estimate.hits) == 0
+        told_white = replace(settings, memory=(0.0,) * 3, stamp_jitter=0.0)
+        assert ExtendedKalmanFilter(gravity_model(), NOWHERE, told_white).estimate(track).quality.max() > 0
+
+
+def test_sliding_window_states_the_whole_error() -> None:
+    track = falling_track(JITTER)
+    estimate = SlidingWindow(gravity_model(), NOWHERE, JITTER).estimate(track)
+    along = JITTER.stamp_jitter * window_velocities(track.times, track.positions)
+    expected = np.sqrt(np.square(JITTER.position_noise) + np.square(JITTER.memory) + along**2)
+    np.testing.assert_allclose(estimate.sigmas[:, :3], expected, rtol=1e-12)
+
+
+def test_a_track_made_from_sightings_has_no_tracker() -> None:
+    """Its positions are not measured: settings with memory change nothing."""
+    track = replace(falling_track(FALLING), rough=True)
+    assert not JITTER.for_track(track).has_memory
+    assert JITTER.for_track(track).stamp_jitter == 0.0
+    assert JITTER.for_track(falling_track(FALLING)) is JITTER
