@@ -15,6 +15,7 @@ from torch import Tensor
 from ballfg.arrays import Array, Index
 from ballfg.factors.batch import FactorBatch, Noise
 from ballfg.factors.loss import Loss
+from ballfg.factors.noise import whitening_tensor
 from ballfg.state import POSITION, STATE_DIM
 
 BIAS_DIM = 3
@@ -39,27 +40,35 @@ class BiasedPositionFactors(FactorBatch):
     Args:
         states: (m,) indices of the observed states.
         measured: (m, 3) m.
-        covariance: (m, 3, 3) m^2, of the part of the noise that is white.
+        sigma: (m, 3) m, standard deviation per axis of the white error.
+        stamps: (m, 3, 3) m^2, covariance of what errors of the stamps move the ball; None where stamps are exact.
         loss: a robust one where tracks have outliers.
         biased: whether the graph has biases; without them b is zero.
 
     Raises: ValueError: a wrong shape, or a position that is not finite.
     """
 
-    row_arrays: ClassVar[tuple[str, ...]] = ("variables", "measured", "information_root")
+    row_arrays: ClassVar[tuple[str, ...]] = ("variables", "measured", "sigma", "stamps", "information_root")
 
     def __init__(
-        self, states: Index, measured: Array, covariance: Array, loss: Loss | None = None, biased: bool = True
+        self,
+        states: Index,
+        measured: Array,
+        sigma: Array,
+        stamps: Array | None = None,
+        loss: Loss | None = None,
+        biased: bool = True,
     ) -> None:
         super().__init__(np.asarray(states)[:, None], 3, loss)
-        if measured.shape != (len(self), 3) or covariance.shape != (len(self), 3, 3):
+        if measured.shape != (len(self), 3) or sigma.shape != (len(self), 3):
             raise ValueError(
-                f"measured and covariance must have shapes ({len(self)}, 3) and ({len(self)}, 3, 3); got "
-                f"{measured.shape} and {covariance.shape}"
+                f"measured and sigma must have shape ({len(self)}, 3); got {measured.shape} and {sigma.shape}"
             )
-        if not np.isfinite(measured).all():
-            raise ValueError("measured must be finite; remove the samples that are not")
-        self.measured = measured
+        if not (np.isfinite(measured).all() and (sigma > 0).all()):
+            raise ValueError("measured must be finite and sigma positive; remove the samples that are not")
+        self.measured, self.sigma = measured, sigma
+        self.stamps = np.zeros((len(self), 3, 3)) if stamps is None else stamps
+        covariance = sigma[:, :, None] ** 2 * np.eye(3) + self.stamps
         self.information_root = np.linalg.inv(np.linalg.cholesky(covariance))
         self.sees_biases = biased  # type: ignore[misc]  # the class's is that of factors that know states alone
 
@@ -87,8 +96,13 @@ class BiasedPositionFactors(FactorBatch):
         return (torch.from_numpy(self.information_root) @ error.unsqueeze(-1)).squeeze(-1)
 
     def rewhitening(self, noise: Noise) -> Tensor | None:
-        """One factor for all axes of all samples; the jitter of stamps is scaled with it."""
-        return None if noise.position is None else 1.0 / noise.position
+        """(m, 3, 3) from the present noise to one whose white part is scaled; errors of stamps stay as they are."""
+        if noise.position is None:
+            return None
+        white = (noise.position * torch.from_numpy(self.sigma)).square().diag_embed()
+        return whitening_tensor(white + torch.from_numpy(self.stamps)) @ torch.linalg.inv(
+            torch.from_numpy(self.information_root)
+        )
 
     def log_spread(self) -> float:
         """Half the log determinants of all covariances."""

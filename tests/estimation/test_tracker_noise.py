@@ -215,11 +215,3 @@ def test_sliding_window_states_the_whole_error() -> None:
     along = JITTER.stamp_jitter * window_velocities(track.times, track.positions)
     expected = np.sqrt(np.square(JITTER.position_noise) + np.square(JITTER.memory) + along**2)
     np.testing.assert_allclose(estimate.sigmas[:, :3], expected, rtol=1e-12)
-
-
-def test_a_track_made_from_sightings_has_no_tracker() -> None:
-    """Its positions are not measured: settings with memory change nothing."""
-    track = replace(falling_track(FALLING), rough=True)
-    assert not JITTER.for_track(track).has_memory
-    assert JITTER.for_track(track).stamp_jitter == 0.0
-    assert JITTER.for_track(falling_track(FALLING)) is JITTER

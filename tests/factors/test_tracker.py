@@ -32,10 +32,10 @@ def values(coefficients: int = 0) -> Values:
 def batches() -> list[FactorBatch]:
     rng = np.random.default_rng(1)
     where = np.array([0, 1, 3])
-    measured, noise = rng.standard_normal((3, 3)), covariances(3, rng)
+    measured, sigma, stamps = rng.standard_normal((3, 3)), rng.uniform(1e-3, 3e-3, (3, 3)), covariances(3, rng)
     return [
-        BiasedPositionFactors(where, measured, noise, Loss("huber")),
-        BiasedPositionFactors(where, measured, noise, biased=False),
+        BiasedPositionFactors(where, measured, sigma, stamps, Loss("huber")),
+        BiasedPositionFactors(where, measured, sigma, biased=False),
         BiasFactors(np.arange(3), DT, SIGMA, MEMORY_TIME),
         BiasStartFactors(np.array([0, 2]), SIGMA),
     ]
@@ -80,6 +80,18 @@ def test_rows_of_a_batch_are_rows_by_themselves(kind) -> None:
     np.testing.assert_array_equal(both.linearize(values()).residual, whole.residual[:2])
 
 
+def parts() -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations of the white errors, and the covariances of those of stamps."""
+    rng = np.random.default_rng(5)
+    return rng.uniform(1e-3, 3e-3, (3, 3)), covariances(3, rng)
+
+
+def whole_noise() -> np.ndarray:
+    """(2, 3, 3, 3) both covariances of the three samples."""
+    sigma, stamps = parts()
+    return np.stack((sigma[:, :, None] ** 2 * np.eye(3), stamps))
+
+
 def test_whitened_residuals_have_the_declared_covariance() -> None:
     """A stationary process stays stationary: variance a^2 s^2 + (1 - a^2) s^2 after any interval."""
     decay, spread = bias_step(DT, SIGMA, MEMORY_TIME)
@@ -87,24 +99,32 @@ def test_whitened_residuals_have_the_declared_covariance() -> None:
     np.testing.assert_allclose(decay[:, None] ** 2 * SIGMA**2 + spread**2, np.tile(SIGMA**2, (3, 1)), rtol=1e-12)
     kind = BiasFactors(np.arange(3), DT, SIGMA, MEMORY_TIME)
     np.testing.assert_allclose(kind.information_root * spread, 1.0, rtol=1e-12)
-    noise = covariances(3, np.random.default_rng(5))
-    root = BiasedPositionFactors(np.arange(3), np.zeros((3, 3)), noise).information_root
+    noise, root = whole_noise().sum(0), BiasedPositionFactors(np.arange(3), np.zeros((3, 3)), *parts()).information_root
     np.testing.assert_allclose(root @ noise @ root.swapaxes(-1, -2), np.tile(np.eye(3), (3, 1, 1)), atol=1e-9)
 
 
 def test_spreads_are_half_the_log_determinants() -> None:
-    noise = covariances(3, np.random.default_rng(5))
-    kind = BiasedPositionFactors(np.arange(3), np.zeros((3, 3)), noise)
-    assert kind.log_spread() == pytest.approx(0.5 * np.linalg.slogdet(noise)[1].sum(), rel=1e-12)
+    kind = BiasedPositionFactors(np.arange(3), np.zeros((3, 3)), *parts())
+    assert kind.log_spread() == pytest.approx(0.5 * np.linalg.slogdet(whole_noise().sum(0))[1].sum(), rel=1e-12)
     _, spread = bias_step(DT, SIGMA, MEMORY_TIME)
     assert BiasFactors(np.arange(3), DT, SIGMA, MEMORY_TIME).log_spread() == pytest.approx(np.log(spread).sum())
     assert BiasStartFactors(np.array([0, 2]), SIGMA).log_spread() == pytest.approx(2.0 * np.log(SIGMA).sum())
 
 
-def test_learned_position_noise_scales_what_is_new_in_a_sample() -> None:
+def test_learned_position_noise_scales_the_white_part() -> None:
+    """As factors built anew with it; errors of stamps stay as they are, and no other kind has this noise."""
     scale = Noise(position=torch.tensor(2.5, dtype=torch.float64))
-    known = [kind.rewhitening(scale) for kind in batches()]
-    assert [None if change is None else float(change) for change in known] == [0.4, 0.4, None, None]
+    sigma, stamps = parts()
+    where, measured = np.arange(3), np.random.default_rng(2).standard_normal((3, 3))
+    old = BiasedPositionFactors(where, measured, sigma, stamps)
+    new = BiasedPositionFactors(where, measured, 2.5 * sigma, stamps)
+    change, inputs = old.rewhitening(scale), tuple(torch.from_numpy(np.array(x)) for x in old.inputs(values()))
+    found = (change @ old.residual(inputs)[..., None])[..., 0]
+    torch.testing.assert_close(found, new.residual(inputs), rtol=1e-9, atol=1e-9)
+    grown = -float(change.diagonal(dim1=-2, dim2=-1).log().sum())
+    assert new.log_spread() - old.log_spread() == pytest.approx(grown, rel=1e-9)
+    assert [kind.rewhitening(scale) for kind in batches()[2:]] == [None, None]
+    assert old.rewhitening(Noise()) is None
 
 
 def test_gtsam_finds_the_same_minimum_with_biases_behind_its_states() -> None:
@@ -131,7 +151,9 @@ def test_a_row_asked_by_itself_sees_the_state_alone() -> None:
 def test_a_bad_argument_is_named() -> None:
     with pytest.raises(ValueError, match="dt, sigma and memory_time must be positive"):
         BiasFactors(np.array([0]), np.zeros(1), SIGMA, MEMORY_TIME)
-    with pytest.raises(ValueError, match="measured and covariance must have shapes"):
-        BiasedPositionFactors(np.array([0]), np.zeros((1, 3)), np.ones((1, 3)))
+    with pytest.raises(ValueError, match="measured and sigma must have shape"):
+        BiasedPositionFactors(np.array([0]), np.zeros((1, 3)), np.ones(3))
     with pytest.raises(ValueError, match="measured must be finite"):
-        BiasedPositionFactors(np.array([0]), np.full((1, 3), np.nan), np.eye(3)[None])
+        BiasedPositionFactors(np.array([0]), np.full((1, 3), np.nan), np.ones((1, 3)))
+    with pytest.raises(ValueError, match="sigma positive"):
+        BiasedPositionFactors(np.array([0]), np.zeros((1, 3)), np.zeros((1, 3)))

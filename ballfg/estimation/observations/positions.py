@@ -37,10 +37,10 @@ class Positions(Observation):
         settings = context.settings
         if not settings.has_memory and context.velocities is None:
             return PositionFactors(self.state, self.positions, context.sigma, settings.loss)
-        covariance = context.sigma[:, :, None] ** 2 * np.eye(3)
-        if context.velocities is not None:
-            covariance += stamp_covariance(settings, context.velocities)
-        return BiasedPositionFactors(self.state, self.positions, covariance, settings.loss, settings.has_memory)
+        stamps = None if context.velocities is None else stamp_covariance(settings, context.velocities)
+        return BiasedPositionFactors(
+            self.state, self.positions, context.sigma, stamps, settings.loss, settings.has_memory
+        )
 
     def taken(self, samples: NDArray[np.bool_]) -> Positions:
         """The positions of some samples."""

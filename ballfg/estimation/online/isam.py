@@ -349,8 +349,8 @@ class IncrementalWindow:
         batch: PositionFactors | BiasedPositionFactors
         where, position, loss = np.array([state]), sample.position[None], self.settings.loss
         if self.biased or self.settings.stamp_jitter > 0.0:
-            noise = self._measurement_noise(sample)[None]
-            batch = BiasedPositionFactors(where, position, noise, loss, self.biased)
+            stamps = stamp_covariance(self.settings, sample.velocity)[None]
+            batch = BiasedPositionFactors(where, position, sample.sigma[None], stamps, loss, self.biased)
         else:
             batch = PositionFactors(where, position, sample.sigma[None], loss)
         return self._linear(batch) if loss.name == "squared" else Bridge(batch, "row").factor(0)

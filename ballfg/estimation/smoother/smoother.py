@@ -127,8 +127,9 @@ class Smoother(Estimator):
 
     def segment(self, track: Track) -> Segmentation:
         """The events in a track."""
-        white = sample_sigmas(self.settings, len(track), track.sigmas)
-        sigma = total_sigmas(self.settings, white, window_velocities(track.times, track.positions))
+        settings = self.settings.for_track(track)
+        white = sample_sigmas(settings, len(track), track.sigmas)
+        sigma = total_sigmas(settings, white, window_velocities(track.times, track.positions))
         physics = physics_of(self.model)
         found = segment(track.times, track.positions, sigma, surfaces=self.surfaces, physics=physics)
         return found if self.settings.find_events else found.only_contacts()
