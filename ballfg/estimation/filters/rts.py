@@ -83,7 +83,8 @@ class FilterRecord:
         """
         n, expected = len(mean), mean @ H.T
         used = self.used & (np.arange(n) >= self.start)
-        whitening = used[:, None, None] * np.linalg.inv(np.linalg.cholesky(self.measurement_noise))
+        root = np.linalg.inv(np.linalg.cholesky(self.measurement_noise))
+        whitening = np.where(used[:, None, None], root, 0.0)
         residual = (whitening @ (expected - measured)[..., None])[..., 0]
         samples = Rows(np.arange(n)[:, None], residual, (whitening,), Loss())
         return leave_position_out(expected, H @ covariance @ H.T, measured, self.measurement_noise, samples)

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
 from ballfg.estimation.online.events import SIGMA_FACTOR
-from ballfg.estimation.online.isam import Sample, without_bias
+from ballfg.estimation.online.isam import Sample
+from ballfg.estimation.online.tracker import without_bias
 from ballfg.estimation.online.window import Window
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation import Contact, Segmentation

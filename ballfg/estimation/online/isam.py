@@ -16,6 +16,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.online.interval import Interval, IntervalMaker, evaluate, store
 from ballfg.estimation.online.measurement import Measurement, prepare
+from ballfg.estimation.online.tracker import bias_link, bias_start, carried_with_bias, linear_factor, without_bias
 from ballfg.estimation.settings import Settings, stamp_covariance
 from ballfg.estimation.smoother.motion import FLIGHT, Motion
 from ballfg.estimation.smoother.problem import coefficient_means, start_priors
@@ -24,7 +25,7 @@ from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
 from ballfg.factors.dynamics import model_width
 from ballfg.factors.position import PositionFactors
 from ballfg.factors.prior import coefficient_prior
-from ballfg.factors.tracker import BIAS_DIM, BiasedPositionFactors, BiasFactors, BiasStartFactors, bias_step
+from ballfg.factors.tracker import BIAS_DIM, BiasedPositionFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 VELOCITY_THRESHOLD = 0.3
@@ -40,7 +41,6 @@ COEFFICIENT_THRESHOLD = 0.5
 """Prior standard deviations. The coefficients touch every factor: moving them relinearises the whole window."""
 WIDE_VELOCITY = 1.0
 """m/s. A predicted velocity that is less well known does not tell along which way a stamp's error moved the ball."""
-_UNIT3 = gtsam.noiseModel.Unit.Create(3)
 WILDFIRE = 1e-7
 """m, m/s, rad/s. Back-substitution stops where the solution changes by less."""
 
@@ -190,7 +190,9 @@ class IncrementalWindow:
         estimate = self.points[-1], self.coefficients
         piece, count, calls = self._relinearize(interval)
         away = np.concatenate((estimate[0] - self.theta[-1], estimate[1] - self.coefficient_theta))
-        carried, noise = self._carried(piece, interval.covariance, dt)
+        carried, noise = piece, interval.covariance
+        if self.biased:
+            carried, noise = carried_with_bias(piece, noise, self.theta[-1, STATE_DIM:], dt, self.settings)
         predicted = carried[:, 0] + carried[:, 1:] @ away
         covariance = carried[:, 1:] @ self.newest_covariance @ carried[:, 1:].T + noise
         if np.trace(covariance[VELOCITY, VELOCITY]) < WIDE_VELOCITY**2:
@@ -209,28 +211,6 @@ class IncrementalWindow:
         priors = start_priors(0, sample.position, sample.label, self.settings)
         _, count, calls = self._relinearize(None)
         return Update(np.full(3, np.nan), count, calls, self._insert(sample, state, None, priors))
-
-    def _carried(self, piece: Array, covariance: Array, dt: float) -> tuple[Array, Array]:
-        """What leads from the newest state, its bias and the coefficients to the next state with its bias.
-
-        Args:
-            piece: (9, 1 + 9 + p) the propagated state and its Jacobian.
-            covariance: (9, 9) of the process noise.
-            dt: s.
-        Returns: where it leads and the Jacobian side by side, (w, 1 + w + p), from the linearisation point on; the
-            covariance of the noise (w, w).
-        """
-        if not self.biased:
-            return piece, covariance
-        decay, spread = bias_step(np.array([dt]), self.settings.bias_sigmas, self.settings.memory_time)
-        carried, noise = np.zeros((self.width, 1 + self.width + self.p)), np.zeros((self.width, self.width))
-        carried[:STATE_DIM, : 1 + STATE_DIM], carried[:STATE_DIM, 1 + self.width :] = np.split(
-            piece, [1 + STATE_DIM], 1
-        )
-        carried[STATE_DIM:, 0] = decay * self.theta[-1, STATE_DIM:]
-        carried[STATE_DIM:, 1 + STATE_DIM : 1 + self.width] = decay * np.eye(BIAS_DIM)
-        noise[:STATE_DIM, :STATE_DIM], noise[STATE_DIM:, STATE_DIM:] = covariance, np.diag(spread[0] ** 2)
-        return carried, noise
 
     def _corrected(self, predicted: Array, covariance: Array, sample: Sample) -> tuple[Array, Array]:
         """The predicted state moved by the measurement as a Kalman filter would, and the whitened innovation.
@@ -317,11 +297,11 @@ class IncrementalWindow:
         for prior in priors:
             graph.push_back(Bridge(prior, "row").factor(0, [key - STATE_KEY]))
         if self.biased and priors and not self.samples:
-            graph.push_back(self._bias_start(key))
+            graph.push_back(bias_start(key, self.settings))
         values.insert(key, state)
         own = graph.size()
         if self.biased and self.samples:
-            graph.push_back(self._bias_link(key, sample.time - self.samples[-1].time))
+            graph.push_back(bias_link(key, sample.time - self.samples[-1].time, self.settings))
         if len(self.theta) == 0:
             for factor in self.shared:
                 graph.push_back(factor)
@@ -345,35 +325,20 @@ class IncrementalWindow:
         return position + [measurement.factor(state) for measurement in sample.measurements]
 
     def _position_factor(self, sample: Sample, state: int) -> gtsam.NonlinearFactor:
-        """The observation's factor; without a robust loss it is linear, and GTSAM never has to ask for it."""
-        batch: PositionFactors | BiasedPositionFactors
+        """The observation's factor; without a robust loss it is linear."""
         where, position, loss = np.array([state]), sample.position[None], self.settings.loss
         if self.biased or self.settings.stamp_jitter > 0.0:
             stamps = stamp_covariance(self.settings, sample.velocity)[None]
             batch = BiasedPositionFactors(where, position, sample.sigma[None], stamps, loss, self.biased)
-        else:
-            batch = PositionFactors(where, position, sample.sigma[None], loss)
-        return self._linear(batch) if loss.name == "squared" else Bridge(batch, "row").factor(0)
-
-    def _bias_start(self, key: int) -> gtsam.NonlinearFactor:
-        """Before anything is known of it, the bias of a state lies about zero."""
-        return self._linear(BiasStartFactors(np.array([key - STATE_KEY]), self.settings.bias_sigmas))
-
-    def _bias_link(self, key: int, dt: float) -> gtsam.NonlinearFactor:
-        """The bias of a state is that of the state before, dt s earlier, faded and renewed."""
-        before, settings = np.array([key - STATE_KEY - 1]), self.settings
-        return self._linear(BiasFactors(before, np.array([dt]), settings.bias_sigmas, settings.memory_time))
-
-    def _linear(self, batch: FactorBatch) -> gtsam.NonlinearFactor:
-        """A factor that is linear, from a batch of one: GTSAM never has to ask for it."""
-        origin, keys = np.zeros((1, self.width)), [STATE_KEY + int(i) for i in batch.variables[0]]
-        (residual,), blocks = batch.compute(slice(None), (origin,) * len(keys))
-        terms = [term for key, block in zip(keys, blocks, strict=True) for term in (key, block[0])]
-        factor = gtsam.JacobianFactor(*terms, -residual, _UNIT3)
-        values = gtsam.Values()
-        for key in keys:
-            values.insert(key, origin[0])
-        return gtsam.LinearContainerFactor(factor, values)
+            if loss.name == "squared":
+                (residual,), (block,) = batch.compute(slice(None), (np.zeros((1, self.width)),))
+                return linear_factor([STATE_KEY + state], [block[0]], -residual)
+            return Bridge(batch, "row").factor(0)
+        if loss.name == "squared":
+            root = np.zeros((3, STATE_DIM))
+            root[:, POSITION] = np.diag(1.0 / sample.sigma)
+            return linear_factor([STATE_KEY + state], [root], sample.position / sample.sigma)
+        return Bridge(PositionFactors(where, position, sample.sigma[None], loss), "row").factor(0)
 
     def _update(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int], last: dict[int, int]
@@ -402,14 +367,6 @@ class IncrementalWindow:
             self.newest_covariance = self.isam.jointMarginalCovariance([newest, COEFFICIENT_KEY]).fullMatrix()
         else:
             self.newest_covariance = self.isam.marginalCovariance(newest)
-
-
-def without_bias(joint: Array, width: int) -> Array:
-    """(9 + p, 9 + p) covariance of a state and the coefficients, from (w + p, w + p) with the bias between them."""
-    if width == STATE_DIM:
-        return joint
-    kept = np.delete(np.arange(len(joint)), np.s_[STATE_DIM:width])
-    return joint[np.ix_(kept, kept)]
 
 
 def _parameters(threshold: Array, coefficient_threshold: Array) -> gtsam.ISAM2Params:

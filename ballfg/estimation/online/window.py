@@ -5,6 +5,7 @@ import numpy as np
 
 from ballfg.estimation.online.isam import IncrementalWindow, Sample, Update
 from ballfg.estimation.online.measurement import Measurement, prepare
+from ballfg.estimation.online.tracker import bias_start
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
 
 
@@ -126,7 +127,7 @@ class Window(IncrementalWindow):
             graph.push_back(factor)
         self.samples[0].bias_slot = None
         if self.biased and not linked:
-            graph.push_back(self._bias_start(STATE_KEY + self.first))
+            graph.push_back(bias_start(STATE_KEY + self.first, self.settings))
         for factor in self.shared:
             graph.push_back(factor)
         self.isam = self._new_isam()
