@@ -117,7 +117,7 @@ class Bridge:
         found = self._answers[row]
         assert found is not None
         residual, blocks = found
-        return residual, tuple([widened(block, len(v)) for block, v in zip(blocks, vectors, strict=True)])
+        return residual, tuple([_widened(block, len(v)) for block, v in zip(blocks, vectors, strict=True)])
 
     def _seen(self, key: int, vector: Array) -> Array:
         """What the batch sees of one of GTSAM's vectors."""
@@ -140,11 +140,8 @@ class Bridge:
         self.prepare(np.array(rows), tuple(np.stack(column) for column in zip(*columns, strict=True)))
 
 
-def widened(block: Array, width: int) -> Array:
-    """A Jacobian (r, d) with columns of zeros behind it.
-
-    Args: block: per unit of a variable.  width: number of columns in the end, d or more.
-    """
+def _widened(block: Array, width: int) -> Array:
+    """A Jacobian (r, d) with columns of zeros behind it, so that it has `width` of them."""
     return block if block.shape[1] == width else np.pad(block, ((0, 0), (0, width - block.shape[1])))
 
 

@@ -67,12 +67,12 @@ def _train(config: TrainConfig, folder: Path, resume: bool) -> None:
     from ballfg.learning.run.ranks import started_by_launcher
     from ballfg.learning.run.run_folder import check
 
-    workers = config.workers or usable_cores()
-    if workers == 1 or started_by_launcher():
+    jobs = config.jobs or usable_cores()
+    if jobs == 1 or started_by_launcher():
         _train_here(config, folder, resume)
         return
     check(folder, config, resume=resume)  # refuse a bad folder before the processes start
-    status = launch(workers, _train_guarded, config, folder, resume)
+    status = launch(jobs, _train_guarded, config, folder, resume)
     if status:
         raise SystemExit(status)  # the first process has printed the reason
 

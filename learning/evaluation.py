@@ -54,20 +54,23 @@ class Summary(BaseModel):
 
 
 def judge_tracks(
-    estimator: Estimator, tracks: Iterable[Track], observe: float, horizon: float, jobs: int, count: int
+    estimator: Estimator, tracks: Iterable[Track], observed_share: float, horizon: float, jobs: int, count: int
 ) -> Iterator[TrackScore | None]:
     """Scores of a stream of `count` tracks, in their order, as `judge_track`."""
-    return map_tracks(partial(judge_track, estimator, observe=observe, horizon=horizon), tracks, count, jobs)
+    judge = partial(judge_track, estimator, observed_share=observed_share, horizon=horizon)
+    return map_tracks(judge, tracks, count, jobs)
 
 
-def judge_track(estimator: Estimator, track: Track, observe: float, horizon: float) -> TrackScore | None:
+def judge_track(estimator: Estimator, track: Track, observed_share: float, horizon: float) -> TrackScore | None:
     """The score of one track; None where nothing is left to predict, or the estimate failed.
 
-    Args: observe: share of the duration that is observed.  horizon: s that are predicted, `inf` for the whole rest.
+    Args:
+        observed_share: share of the duration that is observed, above 0 and below 1.
+        horizon: s that are predicted, `inf` for the whole rest.
     """
     if len(track) < 2:
         return None
-    prediction = next(predict_tracks(estimator, [track], 1, observe * track.duration, horizon=horizon))
+    prediction = next(predict_tracks(estimator, [track], 1, observed_share * track.duration, horizon=horizon))
     nis = prediction.estimate.nis[np.isfinite(prediction.estimate.nis)]
     if prediction.status is not Status.OK or not len(prediction.times) or not len(nis):
         return None

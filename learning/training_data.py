@@ -9,7 +9,7 @@ import torch
 
 from ballfg.dynamics import AnalyticModel, load_model, nominal_model
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
-from ballfg.estimation import Settings, dataset_settings, dataset_surfaces, with_readings
+from ballfg.estimation import Settings, dataset_settings, dataset_surfaces, table_note, with_readings
 from ballfg.estimation.launcher import Launcher
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.shots import Shot, shots_of
@@ -64,12 +64,12 @@ def read_training_data(config: TrainConfig) -> TrainingData:
 
 
 def open_dataset(folder: str) -> Dataset:
-    """The dataset of a folder with all readings beside its positions; notes on repairs go to stderr.
+    """The dataset of a folder with all readings beside its positions; notes on repairs and on the table go to stderr.
 
     Raises: ValueError, FileNotFoundError: as in reading.
     """
     dataset = with_readings(read_dataset(folder))
-    for note in dataset.notes:
+    for note in (*dataset.notes, *filter(None, [table_note(dataset)])):
         print(f"note: {note}", file=sys.stderr)
     return dataset
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import CORES, DatasetFolder, Jobs, OwnEffects, open_inputs
+from ballfg.cli.inputs import CORES, DatasetFolder, EffectsFiles, Jobs, open_inputs
 
 if TYPE_CHECKING:
     from ballfg.diagnosis.result import Diagnosis
@@ -19,7 +19,7 @@ def diagnose(
     dataset: DatasetFolder,
     out: Annotated[Path, typer.Option(help="Folder of the report: new, empty or with an earlier report.")],
     model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal model of the ball.")] = None,
-    effects: OwnEffects = None,
+    effects_file: EffectsFiles = None,
     jobs: Jobs = CORES,
 ) -> None:
     """Find effects that the model lacks, with their evidence, their alternatives and the gain in prediction.
@@ -40,7 +40,7 @@ def diagnose(
     check_report_folder(out)
     if model is not None and model.resolve() == out.resolve() / MODEL:
         raise ValueError(f"out must not hold the model itself; {model} would be replaced. Choose another folder.")
-    inputs = open_inputs(dataset, model, effects)
+    inputs = open_inputs(dataset, model, effects_file)
     if not isinstance(inputs.model, AnalyticModel):
         raise ValueError(
             f"--model must be analytic: a diagnosis adds physical effects to it; {model} is a learned one. "

@@ -35,7 +35,7 @@ def estimate(
             show_default="positions where there is a table of tracks",
         ),
     ] = None,
-    effects: inputs.OwnEffects = None,
+    effects_file: inputs.EffectsFiles = None,
     jobs: inputs.Jobs = inputs.CORES,
 ) -> None:
     """Position, velocity and spin with standard deviations, one row per stamp.
@@ -58,7 +58,7 @@ def estimate(
         inputs.check_out(out, dataset)
         positions = has_positions(dataset) if source is None else source is inputs.Source.POSITIONS
         open_dataset = inputs.open_inputs if positions else inputs.open_sighted
-        opened = open_dataset(dataset, model, effects)
+        opened = open_dataset(dataset, model, effects_file)
         count = len(opened.dataset)
         estimates = estimate_tracks(opened.estimator(method), opened.dataset, count, jobs)
         for result in progress(estimates, count, "tracks estimated"):

@@ -15,10 +15,14 @@ from ballfg.cli.diagnose import diagnose
 from ballfg.cli.errors import guarded
 from ballfg.cli.estimate import estimate
 from ballfg.cli.info import info
+from ballfg.cli.noise import noise
 from ballfg.cli.predict import predict
 from ballfg.cli.render import render
 from ballfg.cli.simulate import simulate
 from ballfg.cli.track import track
+
+EARLIER_OPTIONS = {"effects": "effects-file"}
+"""Options, without their dashes, that scripts may still write under an earlier name; `--help` shows today's alone."""
 
 app = typer.Typer(
     name="ballfg",
@@ -26,11 +30,13 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode="rich",
+    context_settings={"token_normalize_func": lambda name: EARLIER_OPTIONS.get(name, name)},
 )
 
 app.command()(estimate)
 app.command()(predict)
 app.command()(diagnose)
+app.command()(noise)
 app.command()(simulate)
 app.command()(render)
 app.command()(track)

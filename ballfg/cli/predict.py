@@ -22,7 +22,7 @@ def predict(
     out: inputs.OutTable,
     method: inputs.MethodName = "smoother",
     model: inputs.ModelFile = None,
-    effects: inputs.OwnEffects = None,
+    effects_file: inputs.EffectsFiles = None,
     jobs: inputs.Jobs = inputs.CORES,
 ) -> None:
     """Positions at every stamp after the observed part, with the standard deviation of a measurement there.
@@ -40,7 +40,7 @@ def predict(
     with TableWriter(out) as table:
         inputs.check_out(out, dataset)
         check_observe(observe)
-        opened = inputs.open_inputs(dataset, model, effects)
+        opened = inputs.open_inputs(dataset, model, effects_file, observe)
         count = len(opened.dataset)
         predictions = predict_tracks(opened.estimator(method), opened.dataset, count, observe, jobs=jobs)
         for result in progress(predictions, count, "tracks predicted"):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ballfg.cli.inputs import OwnEffects, Seed, know_effects
+from ballfg.cli.inputs import EffectsFiles, Seed, know_effects
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ def render(
         list[str] | None,
         _balls(help="Undeclared effect on the balls, as wind.x=0.3; may be repeated."),
     ] = None,
-    effects: OwnEffects = None,
+    effects_file: EffectsFiles = None,
     rate: Annotated[float, _cameras(help="Frames per second, Hz.")] = 120.0,
     exposure: Annotated[float, _cameras(help="Exposure time, s.")] = 0.002,
     unsynchronised: Annotated[
@@ -59,7 +59,7 @@ def render(
     from ballfg.simulation import SceneConfig, parse_effects, parse_settings, record, table_rig, write_scene
     from ballfg.simulation.scene.writing import check_scene_folder
 
-    know_effects(effects)
+    know_effects(effects_file)
     check_scene_folder(out, force=force)
     cameras = table_rig(_size(size), distance)
     names = [camera.name for camera in cameras]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import OwnEffects, Seed, know_effects
+from ballfg.cli.inputs import EffectsFiles, Seed, know_effects
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
@@ -31,6 +31,8 @@ def simulate(
     outlier_size: Annotated[float, _noise(help="Typical distance of an outlier, m.")] = 0.1,
     spin_noise: Annotated[float, _noise(help="Standard deviation of each component of the spin labels, rad/s.")] = 4.0,
     spin_labels: Annotated[bool, _noise(help="Spin labels in labels.csv; launcher settings are always there.")] = True,
+    memory: Annotated[float, _noise(help="Standard deviation of an error that lasts from frame to frame, m.")] = 0.0,
+    memory_time: Annotated[float, _noise(help="Time over which that error lasts, s.")] = 0.015,
     process_noise: Annotated[float, _noise(help="Density of a white acceleration in flight, m/s^1.5.")] = 0.0,
     spin_process_noise: Annotated[float, _noise(help="Density of a white angular acceleration, rad/s^1.5.")] = 0.0,
     contact_noise: Annotated[float, _noise(help="Random kick to the velocity after each bounce, m/s.")] = 0.0,
@@ -42,7 +44,7 @@ def simulate(
         list[str] | None,
         _ball_option(help="Undeclared effect, in no dataset or model file, as wind.x=0.3; may be repeated."),
     ] = None,
-    effects: OwnEffects = None,
+    effects_file: EffectsFiles = None,
     format: Annotated[str, _files(help="Format of the tables: csv or parquet.")] = "csv",
     force: Annotated[bool, _files("--force", help="Replace a simulated dataset.")] = False,
 ) -> None:
@@ -57,14 +59,16 @@ def simulate(
     from ballfg.simulation.writing import check_format
 
     file_format = check_format(format)
-    know_effects(effects)
+    know_effects(effects_file)
     config = simulation.SimulationConfig(
         tracks=tracks,
         rate=rate,
         seed=seed,
         ball=_ball(ball, model),
         settings=simulation.parse_settings(settings) if settings else {},
-        noise=simulation.MeasurementNoise(noise, dropout, jitter, outliers, outlier_size, spin_noise),
+        noise=simulation.MeasurementNoise(
+            noise, dropout, jitter, outliers, outlier_size, spin_noise, memory, memory_time
+        ),
         process=simulation.MotionNoise(process_noise, spin_process_noise, contact_noise, contact_spin_noise),
         undeclared=simulation.parse_effects(effect or ()),
         spin_labels=spin_labels,

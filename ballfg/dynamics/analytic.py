@@ -23,27 +23,27 @@ class AnalyticModel(BallModel):
     effects act in the order of their ranks.
 
     Attributes:
-        flight: `nn.ModuleDict` of flight effects by name.  contact: `nn.ModuleDict` of bounce effects by name.
+        flight: `nn.ModuleDict` of flight effects by name.  bounce: `nn.ModuleDict` of bounce effects by name.
         measurement: `nn.ModuleDict` of measurement effects by name.
     """
 
     def __init__(self, effects: Iterable[Effect], *, radius: float = 0.02, inertia_factor: float = THIN_SHELL) -> None:
         super().__init__(radius, inertia_factor)
         self.flight = nn.ModuleDict()
-        self.contact = nn.ModuleDict()
+        self.bounce = nn.ModuleDict()
         self.measurement = nn.ModuleDict()
-        groups = {"flight": self.flight, "bounce": self.contact, "measurement": self.measurement}
+        groups = {"flight": self.flight, "bounce": self.bounce, "measurement": self.measurement}
         for effect in sorted(after_needs(effects), key=_rank):
             groups[effect.kind][effect.name] = effect
         # names, not effects: `substitute` puts others in their places
         self._moving_air = _overriding(self.flight, FlightEffect, "air_velocity")
         self._adjusting = _overriding(self.flight, FlightEffect, "adjust")
         self._turning = _overriding(self.flight, FlightEffect, "spin_rate")
-        self._sloping = _overriding(self.contact, BounceEffect, "surface_slope")
+        self._sloping = _overriding(self.bounce, BounceEffect, "surface_slope")
 
     def declared_coefficients(self) -> dict[str, Coefficient]:
         """The coefficients of all effects, for instance under `flight.drag.k`."""
-        groups = {"flight": self.flight, "contact": self.contact, "measurement": self.measurement}
+        groups = {"flight": self.flight, "bounce": self.bounce, "measurement": self.measurement}
         return {
             f"{section}.{name}.{c.name}": c
             for section, group in groups.items()
@@ -68,14 +68,14 @@ class AnalyticModel(BallModel):
             acceleration = acceleration.expand_as(flight.velocity)
         return acceleration, spin_rate
 
-    def bounce(self, state: Tensor) -> Tensor:
+    def after_bounce(self, state: Tensor) -> Tensor:
         """(..., 9) state just after an impact on a surface, from the state (..., 9) before it."""
         velocity, spin = state[..., VELOCITY], state[..., SPIN]
         slope = self.surface_slope(state)
         if slope is not None:
             velocity, spin = to_plane(velocity, slope), to_plane(spin, slope)
         impact = Impact(velocity, spin, _ONE, _ZERO, _ZERO)
-        for module in self.contact.values():
+        for module in self.bounce.values():
             impact = cast(BounceEffect, module).adjust(impact)
         velocity, spin = apply_impulse(impact, self.radius, self.inertia_factor)
         if slope is not None:
@@ -88,7 +88,7 @@ class AnalyticModel(BallModel):
         A ball that touches a slope does so beside its lowest point: its centre is R sqrt(1 + slope^2) above the slope.
         """
         position = state[..., POSITION]
-        total = _sum(cast(BounceEffect, effect).surface_offset(position) for effect in self.contact.values())
+        total = _sum(cast(BounceEffect, effect).surface_offset(position) for effect in self.bounce.values())
         if total is None:
             return 0.0
         slope = self.surface_slope(state)
@@ -99,7 +99,7 @@ class AnalyticModel(BallModel):
     def surface_slope(self, state: Tensor) -> Tensor | None:
         """(2,) or (..., 2) dimensionless slope of the surfaces along x and y under the ball; None: horizontal."""
         position = state[..., POSITION]
-        return _sum(cast(BounceEffect, self.contact[name]).surface_slope(position) for name in self._sloping)
+        return _sum(cast(BounceEffect, self.bounce[name]).surface_slope(position) for name in self._sloping)
 
     @property
     def measures_plainly(self) -> bool:

@@ -57,9 +57,9 @@ class AugmentedModel(BallModel):
         """Acceleration and angular acceleration in free flight."""
         return self.bound(state).rates(state[..., :STATE_DIM])
 
-    def bounce(self, state: Tensor) -> Tensor:
+    def after_bounce(self, state: Tensor) -> Tensor:
         """State and coefficients just after an impact."""
-        after = self.bound(state).bounce(state[..., :STATE_DIM])
+        after = self.bound(state).after_bounce(state[..., :STATE_DIM])
         return torch.cat((after, state[..., STATE_DIM:]), dim=-1)
 
     def surface_offset(self, state: Tensor) -> Tensor | float:

@@ -101,7 +101,7 @@ def _guessed_model(ball: Ball) -> AnalyticModel:
 
 def _set_spread(model: AnalyticModel, shares: Mapping[str, float]) -> None:
     """Give the one coefficient of some effects a prior standard deviation that is a share of its value."""
-    effects = {name: effect for group in (model.flight, model.contact) for name, effect in group.items()}
+    effects = {name: effect for group in (model.flight, model.bounce) for name, effect in group.items()}
     for name, share in shares.items():
         effect = cast(Effect, effects[name])
         (coefficient,) = effect.coefficients

@@ -13,6 +13,10 @@ from ballfg.state import Z
 
 TABLE_ABOVE_FLOOR: Final = 0.76
 """m, height of a table-tennis table (ITTF Laws 2.1.1)."""
+TABLE_LENGTH: Final = 2.74
+"""m (ITTF Laws 2.1.1)."""
+TABLE_WIDTH: Final = 1.525
+"""m (ITTF Laws 2.1.1)."""
 
 
 @dataclass(frozen=True)
@@ -22,15 +26,17 @@ class Surfaces:
     Attributes:
         table_height: m, z of the table's surface.
         floor_height: m, z of the floor; None where there is no floor below (a court is its own floor).
-        extent: (x_low, x_high, y_low, y_high) m of the table; None where it is not known: then the table is taken to
-            lie under every ball whose centre is above its surface.
+        extent: (x_low, x_high, y_low, y_high) m of the table; infinite where an end is not known, None where none is:
+            the table is taken to lie under every ball whose centre is above its surface and within the known ends.
+        edge_sigmas: (x_low, x_high, y_low, y_high) m, standard deviations of those ends, for predictions near them.
 
-    Raises: ValueError: if a height is not finite, the floor not below the table, or the extent not in order.
+    Raises: ValueError: a height that is not finite, a floor above the table, an extent out of order, a negative sigma.
     """
 
     table_height: float = 0.0
     floor_height: float | None = None
     extent: tuple[float, float, float, float] | None = None
+    edge_sigmas: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
         if not math.isfinite(self.table_height):
@@ -41,11 +47,18 @@ class Surfaces:
             )
         if self.extent is not None and not (self.extent[0] < self.extent[1] and self.extent[2] < self.extent[3]):
             raise ValueError(f"extent must be (x_low, x_high, y_low, y_high); got {self.extent}")
+        if not all(0.0 <= sigma < math.inf for sigma in self.edge_sigmas):
+            raise ValueError(f"edge_sigmas must be finite and not negative, in m; got {self.edge_sigmas}")
 
     @classmethod
     def table_tennis(cls, table_height: float) -> Surfaces:
         """A table of unknown place in the room, with the floor 0.76 m below its surface."""
         return cls(table_height, table_height - TABLE_ABOVE_FLOOR)
+
+    def __str__(self) -> str:
+        names = ("x >= {:.2f} m", "x <= {:.2f} m", "y >= {:.2f} m", "y <= {:.2f} m")
+        ends = [name.format(end) for name, end in zip(names, self.extent or (), strict=False) if math.isfinite(end)]
+        return f"table at {self.table_height:g} m" + (f" within {', '.join(ends)}" if ends else "")
 
     def heights(self) -> tuple[float, ...]:
         """All surface heights, the table's first."""

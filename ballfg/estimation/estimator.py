@@ -37,7 +37,7 @@ class Estimator(ABC):
     def __init__(self, model: BallModel | Ball, surfaces: Surfaces | float, settings: Settings | None = None) -> None:
         model = nominal_model(model) if isinstance(model, Ball) else model
         surfaces = Surfaces.table_tennis(surfaces) if isinstance(surfaces, int | float) else surfaces
-        settings = Settings.for_measured(model) if settings is None else settings
+        settings = Settings.for_measured(model) if settings is None else settings.renamed(model)
         if not (model.measures_plainly or self.undoes_measurement):
             raise ValueError(
                 f"model must have no measurement effects for the estimator '{self.name}' by itself. "
@@ -51,7 +51,7 @@ class Estimator(ABC):
     def __repr__(self) -> str:
         effects = type(self.model).__name__
         noise = " / ".join(f"{1e3 * s:g}" for s in self.settings.position_noise)
-        return f"{type(self).__name__}({effects}, table at {self.surfaces.table_height:g} m, noise {noise} mm)"
+        return f"{type(self).__name__}({effects}, {self.surfaces}, noise {noise} mm)"
 
     @abstractmethod
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:

@@ -22,9 +22,12 @@ for _own in (Smoother, Online, ExtendedKalmanFilter, SlidingWindow):
     register_estimator(_own)
 
 
-def make_estimator(name: str, model: BallModel, surfaces: Surfaces, settings: Settings) -> Estimator:
+def make_estimator(name: str, model: BallModel, surfaces: Surfaces | float, settings: Settings) -> Estimator:
     """The estimator of a name; one that undoes the model's measurement effects, where there are any.
 
+    Args:
+        name: of a registered estimator.
+        model, surfaces, settings: as for every `Estimator`.
     Raises: ValueError: if there is none of that name; the message lists those there are.
     """
     if name not in ESTIMATORS:

@@ -48,6 +48,8 @@ class Estimate:
         times: (n,) s, the track's stamps.
         states: (n, 9) position m, velocity m/s, spin rad/s.
         covariances: (n, 9, 9) in the products of those units.
+        other_sides: (n, 9, 9) in the same units, their parts for the chance that a ball is on the other side of a near
+            contact.
         status: how the estimation ended.
         innovations: whitened innovations by name of the observation, (m, dim) each. For a filter: measured minus
             predicted; for a smoother: measured minus its prediction from all other measurements. Each divided by its
@@ -89,6 +91,7 @@ class Estimate:
     iterations: int = 0
     world: World | None = None
     notes: tuple[str, ...] = ()
+    other_sides: Array = field(default_factory=lambda: np.zeros((0, 9, 9)))
 
     def __len__(self) -> int:
         return len(self.times)
@@ -112,7 +115,10 @@ class Estimate:
             joint[STATE_DIM:, :STATE_DIM] = self.cross_covariances[sample].T
             joint[STATE_DIM:, STATE_DIM:] = self.coefficient_covariance
         mean = np.concatenate((self.states[sample], self.coefficients))
-        return BallState(float(self.times[sample]), mean, joint, self.coefficient_names, self.world, self.name)
+        other_side = self.other_sides[sample] if len(self.other_sides) else None
+        return BallState(
+            float(self.times[sample]), mean, joint, self.coefficient_names, self.world, self.name, other_side
+        )
 
     @property
     def last(self) -> BallState:

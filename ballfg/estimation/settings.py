@@ -10,6 +10,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.earlier_names import todays_name
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.launcher import Launcher, SpinLabel
 from ballfg.factors.loss import Loss
@@ -126,6 +127,14 @@ class Settings:
     def for_track(self, track: Track) -> Settings:
         """The settings of a track: positions that were made from other observations have no tracker's errors."""
         return replace(self, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0) if track.rough else self
+
+    def renamed(self, model: BallModel) -> Settings:
+        """These settings with coefficients under the names that the model has today."""
+        earlier = [name for name in self.coefficients if todays_name(name) != name]
+        if not earlier:
+            return self
+        known = {name for name, _ in model.named_parameters()}
+        return replace(self, coefficients={todays_name(name, known): s for name, s in self.coefficients.items()})
 
     def spin_label(self, track: Track) -> SpinLabel | None:
         """The spin label of a track: its own, else that of its launcher settings, else None."""

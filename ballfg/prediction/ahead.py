@@ -26,6 +26,10 @@ AXES = ("x", "y", "z")
 class Ahead:
     """Where a ball will be.
 
+    Near a contact of uncertain time some of the possible balls have bounced at a stamp and others have not. The state
+    there is the mean of all of them, and the covariance is that of all of them about it: an average of a falling and a
+    rising velocity, with a sigma of up to half of the jump. `next_contact` has the velocity of the bounce itself.
+
     Attributes:
         start: the state that the path begins with.
         horizon: s, how far ahead events are looked for.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -76,6 +76,28 @@ class Belief:
     def __len__(self) -> int:
         return len(self.time)
 
+    @staticmethod
+    def joined(beliefs: Sequence[Belief]) -> Belief:
+        """All balls of some beliefs.
+
+        Args:
+            beliefs: one or more, of the same model.
+        """
+        return Belief(
+            beliefs[0].model,
+            torch.cat([belief.time for belief in beliefs]),
+            torch.cat([belief.mean for belief in beliefs]),
+            torch.cat([belief.covariance for belief in beliefs]),
+        )
+
+    def take(self, rows: Tensor | slice) -> Belief:
+        """Some of the balls.
+
+        Args:
+            rows: their (m,) indices, a (n,) mask or a slice.
+        """
+        return replace(self, time=self.time[rows], mean=self.mean[rows], covariance=self.covariance[rows])
+
 
 def _joint(state: BallState, names: tuple[str, ...], prior_mean: Array, prior_sigma: Array) -> tuple[Array, Array]:
     """Mean (9 + p,) and covariance (9 + p, 9 + p) of a state and of all coefficients."""
@@ -84,6 +106,8 @@ def _joint(state: BallState, names: tuple[str, ...], prior_mean: Array, prior_si
     own = np.array([*range(STATE_DIM), *(STATE_DIM + names.index(name) for name in state.coefficient_names)])
     mean[own] = state.mean
     covariance[np.ix_(own, own)] = state.joint
+    if state.other_side is not None:
+        covariance[:STATE_DIM, :STATE_DIM] -= state.other_side
     return mean, (covariance + covariance.T) / 2
 
 

@@ -1,13 +1,13 @@
 """Propagation of a belief: mean and covariance through flight, contacts and rest, with process noise.
 
-The mean is the rollout of the mean. The covariance goes through the derivative of that rollout, contact times included
+The mean is the rollout of the mean. The covariance goes through the derivative of that rollout, contact times included.
+Near a contact of uncertain time the reported mean and covariance are those of the balls on both sides of it
 (docs/derivations/prediction.md).
 """
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
@@ -20,12 +20,14 @@ from ballfg.dynamics.motion.rollout import LONGEST_MOTION, is_resting
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.belief import Belief
+from ballfg.prediction.edges import edge_doubt
+from ballfg.prediction.near_contact import Unbounced, spread_over_contacts
 from ballfg.state import STATE_DIM, VZ
 
 
 @dataclass(frozen=True)
 class Prediction:
-    """Future states.
+    """Future states. Near a contact, means and covariances of the balls that have bounced and of those that have not.
 
     Attributes:
         times: (n, k) s, on each track's clock.
@@ -61,65 +63,93 @@ class Propagator:
         stamps = torch.as_tensor(times, dtype=torch.float64)
         if stamps.dim() == 1:
             stamps = stamps.expand(len(belief), -1)
-        states, covariances = [], []
-        for later in self.walk(belief, stamps):
-            states.append(later.mean[:, :STATE_DIM].detach().numpy())
-            covariances.append(later.covariance[:, :STATE_DIM, :STATE_DIM].detach().numpy())
-        return Prediction(stamps.numpy().copy(), np.stack(states, axis=1), np.stack(covariances, axis=1))
+        carried, unbounced = zip(*self._carried(belief, stamps), strict=True)
+        # one batch over all stamps: what a call costs hardly depends on its number of balls
+        late = [replace(u, rows=u.rows + len(belief) * k) for k, u in enumerate(unbounced)]
+        spread = spread_over_contacts(Belief.joined(carried), Unbounced.joined(late), self.surfaces, self.noise)
+        shape = (stamps.shape[1], len(belief))
+        states = spread.mean[:, :STATE_DIM].unflatten(0, shape).transpose(0, 1)
+        covariances = spread.covariance[:, :STATE_DIM, :STATE_DIM].unflatten(0, shape).transpose(0, 1)
+        return Prediction(stamps.numpy().copy(), states.detach().numpy().copy(), covariances.detach().numpy().copy())
 
     def walk(self, belief: Belief, times: Tensor) -> Iterator[Belief]:
         """The beliefs at given times (n, k) s, one after the other.
 
+        Near a contact of uncertain time a belief is the mean and covariance of the balls on both sides of it. Start a
+        later prediction from `forward` instead: it keeps to the mean's side, as the propagation needs it.
+
         Raises: ValueError: as `rollout`.
         """
+        for carried, unbounced in self._carried(belief, times):
+            yield spread_over_contacts(carried, unbounced, self.surfaces, self.noise)
+
+    def _carried(self, belief: Belief, times: Tensor) -> Iterator[tuple[Belief, Unbounced]]:
+        """Linear beliefs at given times (n, k) s, and the balls of which some may not have bounced by then."""
         if times.dim() != 2 or len(times) != len(belief) or times.shape[1] == 0:
             raise ValueError(f"times must have shape ({len(belief)}, k) with k >= 1; got {tuple(times.shape)}")
         steps = torch.diff(times, dim=-1, prepend=belief.time[:, None])
         if not bool((steps >= 0).all()):
             raise ValueError("times must not decrease and must not lie before the belief's time. Sort them.")
+        unbounced = _no_ball_of(belief)
         for dt in steps.unbind(-1):
-            belief = self.forward(belief, dt)
-            yield belief
+            belief, unbounced = self._forward(belief, dt, unbounced)
+            yield belief, unbounced
 
     def forward(self, belief: Belief, dt: Tensor) -> Belief:
-        """The belief after dt (n,) s.
+        """The belief after dt (n,) s, on the mean's side of every contact.
 
         Raises: ValueError: if a dt is negative, infinite or not a number.
         """
+        return self._forward(belief, dt, _no_ball_of(belief))[0]
+
+    def _forward(self, belief: Belief, dt: Tensor, unbounced: Unbounced) -> tuple[Belief, Unbounced]:
+        """The belief after dt (n,) s, and the balls of which some may not have bounced by then."""
         if not bool(((dt >= 0) & dt.isfinite()).all()):
             raise ValueError(f"dt must be finite and not negative; got {float(dt.min()):g} to {float(dt.max()):g} s")
         moving = dt.clamp_max(LONGEST_MOTION)
         count = step_count(moving)
         for _ in range(count):
-            belief = self._step(belief, moving / count)
+            belief, unbounced = self._step(belief, moving / count, unbounced)
         staying = dt - moving
         if not bool((staying > 0).any()):
-            return belief
+            return belief, unbounced
         noise = torch.from_numpy(self.noise.flight(staying.numpy()))
-        return _moved(belief, staying, belief.mean, torch.eye(belief.mean.shape[-1], dtype=dt.dtype), noise)
+        eye = torch.eye(belief.mean.shape[-1], dtype=dt.dtype)
+        return _moved(belief, staying, belief.mean, eye, noise), _no_ball_of(belief)
 
     def in_flight(self, belief: Belief, dt: Tensor) -> Belief:
         """The belief after dt (n,) s of free flight; surfaces are not there."""
         after, jacobian = fly_jacobian(belief.model, belief.mean, dt)
         return _moved(belief, dt, after, jacobian, torch.from_numpy(self.noise.flight(dt.numpy())))
 
-    def _step(self, belief: Belief, h: Tensor) -> Belief:
-        """One step of at most `MAX_STEP`."""
-        model, mean = belief.model, belief.mean
+    def _step(self, belief: Belief, h: Tensor, unbounced: Unbounced) -> tuple[Belief, Unbounced]:
+        """One step of at most `MAX_STEP`; the unbounced balls fly on along with it."""
+        model, mean, n = belief.model, belief.mean, len(belief)
         level = self.surfaces.level_below(mean)
-        after, jacobian = fly_jacobian(model, mean, h)
-        noise = torch.from_numpy(self.noise.flight(h.numpy()))
+        everyone = Belief.joined([belief, unbounced.belief]) if len(unbounced.rows) else belief
+        flown = self.in_flight(everyone, torch.cat((h, h[unbounced.rows])))
+        after, unbounced = flown.take(slice(n)), replace(unbounced, belief=flown.take(slice(n, None))).recent()
         with torch.no_grad():
-            touching = is_resting(model, mean, level) | ((model.gap(after, level) < 0) & (after[:, VZ] < 0))
+            falls_below = (model.gap(after.mean, level) < 0) & (after.mean[:, VZ] < 0)
+            touching = is_resting(model, mean, level) | falls_below
         rows = touching.nonzero()[:, 0]
-        if len(rows):
-            after[rows], jacobian[rows], noise[rows] = self._touch(model, mean[rows], h[rows])
-        return _moved(belief, h, after, jacobian, noise)
+        if not len(rows):
+            return after, unbounced
+        touched, heights = self._touch(belief.take(rows), h[rows])
+        bounced = heights.isfinite()
+        unbounced = unbounced.followed_by(Unbounced.just_now(after, rows[bounced], heights[bounced]))
+        mean, covariance = after.mean.clone(), after.covariance.clone()
+        mean[rows], covariance[rows] = touched.mean, touched.covariance
+        return replace(after, mean=mean, covariance=covariance), unbounced
 
-    def _touch(self, model: BallModel, mean: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Mean, Jacobian and noise of balls that reach a surface's level, or rest, within a step."""
+    def _touch(self, belief: Belief, h: Tensor) -> tuple[Belief, Tensor]:
+        """Balls that reach a surface's level, or rest, within a step; and (n,) m the surface that a ball bounced on.
+
+        NaN for a ball that did not bounce, or more than once.
+        """
+        model, mean = belief.model, belief.mean
         after, jacobian = torch.empty_like(mean), mean.new_empty((*mean.shape, mean.shape[-1]))
-        noise = torch.from_numpy(self.noise.flight(h.numpy()))
+        noise, heights = torch.from_numpy(self.noise.flight(h.numpy())), torch.full_like(h, torch.nan)
         for i in range(len(mean)):
             row = slice(i, i + 1)
             motion = advance_jacobian(model, mean[row], float(h[i]), self.surfaces)
@@ -127,7 +157,10 @@ class Propagator:
             if motion.contacts:
                 times = mean.new_tensor([[time for time, _ in motion.contacts]])
                 noise[row] = self._bounce_noise(model, mean[row], h[row], times, jacobian[row])
-        return after, jacobian, noise
+            noise[row] += edge_doubt(model, mean[row], belief.covariance[row], h[row], self.surfaces)
+            if len(motion.contacts) == 1:
+                heights[row] = motion.contacts[0][1]
+        return _moved(belief, h, after, jacobian, noise), heights
 
     def _bounce_noise(self, model: BallModel, mean: Tensor, h: Tensor, times: Tensor, jacobian: Tensor) -> Tensor:
         """(n, 9, 9) covariance gathered in a step with impacts at times (n, k).
@@ -142,6 +175,11 @@ class Propagator:
         for time in times.unbind(-1):
             noise += torch.from_numpy(self.noise.contact(h.numpy(), time.numpy()))
         return noise
+
+
+def _no_ball_of(belief: Belief) -> Unbounced:
+    nothing = torch.zeros(0, dtype=torch.long)
+    return Unbounced.just_now(belief, nothing, belief.time[nothing])
 
 
 def _moved(belief: Belief, h: Tensor, after: Tensor, jacobian: Tensor, noise: Tensor) -> Belief:

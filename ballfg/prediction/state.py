@@ -43,6 +43,8 @@ class BallState:
         coefficient_names: of the p model parameters.
         world: carries the state forward; None where nobody named a model.
         name: of the track.
+        other_side: (9, 9) part of the covariance for the chance that the ball is on the other side of a near contact;
+            None: there is none. A prediction leaves it out, since it follows both sides itself.
     """
 
     time: float
@@ -51,6 +53,7 @@ class BallState:
     coefficient_names: tuple[str, ...] = ()
     world: World | None = None
     name: str = ""
+    other_side: Array | None = None
 
     def __repr__(self) -> str:
         rows = (("position", POSITION, 3, "m", 1e3, "mm"), ("velocity", VELOCITY, 2, "m/s", 1e2, "cm/s"))

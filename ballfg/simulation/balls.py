@@ -8,9 +8,9 @@ from typing import Any, Final
 from ballfg.checks import check_number
 from ballfg.dynamics import AnalyticModel, Surfaces, model_from_dict, nominal_model
 from ballfg.dynamics.model import THIN_SHELL
-from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR
+from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH
 from ballfg.files.strict_yaml import read_yaml
-from ballfg.simulation.launcher import TABLE_LAUNCHER, TABLE_LENGTH, TABLE_WIDTH, TENNIS_LAUNCHER, SimulatedLauncher
+from ballfg.simulation.launcher import TABLE_LAUNCHER, TENNIS_LAUNCHER, SimulatedLauncher
 from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball
 
 TABLE: Final = Surfaces(TABLE_ABOVE_FLOOR, 0.0, (0.0, TABLE_LENGTH, -TABLE_WIDTH / 2, TABLE_WIDTH / 2))

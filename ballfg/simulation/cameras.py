@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR
-from ballfg.simulation.launcher import TABLE_LENGTH
+from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH
 from ballfg.vision.camera import Camera
 
 FOCAL_BY_WIDTH: Final = 0.78125

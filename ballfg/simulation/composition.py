@@ -22,7 +22,7 @@ def true_model(declared: AnalyticModel, undeclared: Iterable[Effect]) -> Analyti
 
     Raises: ValueError: if an effect is given twice, or changes one that the model does not have.
     """
-    groups = (declared.flight, declared.contact, declared.measurement)
+    groups = (declared.flight, declared.bounce, declared.measurement)
     effects = {name: cast(Effect, effect) for group in groups for name, effect in group.items()}
     seen: set[str] = set()
     for effect in undeclared:
@@ -59,9 +59,9 @@ class KickedModel(BallModel):
         """That of the undisturbed model."""
         return self.model.surface_slope(state)
 
-    def bounce(self, state: Tensor) -> Tensor:
+    def after_bounce(self, state: Tensor) -> Tensor:
         """(..., 9) after the impact and its kick. A bounce that ends in rest gets none: it would start again."""
-        after = self.model.bounce(state)
+        after = self.model.after_bounce(state)
         kicked = after + self._sigma * torch.from_numpy(self._rng.standard_normal(tuple(after.shape)))
         kicked[..., VZ] = kicked[..., VZ].abs()
         rests = after[..., VZ : VZ + 1] < REST_SPEED

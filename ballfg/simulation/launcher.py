@@ -20,10 +20,6 @@ from ballfg.simulation.bounded import bounded, check_bounds
 from ballfg.simulation.settings import SETTING_LEVELS, Settings
 from ballfg.state import STATE_DIM
 
-TABLE_LENGTH: Final = 2.74
-TABLE_WIDTH: Final = 1.525
-"""m, ITTF Laws of Table Tennis 2.1.1."""
-
 _SPEED_LEVELS: Final = SETTING_LEVELS["speed"]
 
 

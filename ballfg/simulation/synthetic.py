@@ -59,4 +59,5 @@ def dataset_info(config: SimulationConfig) -> DatasetInfo:
         position_noise=noise.position or None,
         spin_noise=(noise.spin or None) if config.spin_labels else None,
         source="ballfg simulate",
+        table_extent=config.ball.surfaces.extent,
     )

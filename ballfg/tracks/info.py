@@ -10,17 +10,20 @@ import yaml
 
 from ballfg.checks import check_number, check_text, did_you_mean, nearest, type_name
 from ballfg.files.strict_yaml import YamlError, read_yaml
+from ballfg.tracks.noise import TrackNoise
 
 INFO_FILE = "dataset.yaml"
 _REQUIRED = ("name", "frame", "ball")
 _OPTIONAL = ("rate", "position_noise", "spin_noise", "source", "licence")
-_KNOWN = (*_REQUIRED, *_OPTIONAL, "labels")
+_KNOWN = (*_REQUIRED, *_OPTIONAL, "noise", "labels")
 
 # The largest values that can be meant in SI units; above them the unit is almost surely another one.
 _MAX_RADIUS = 0.5  # m
 _MAX_MASS = 2.0  # kg
 MAX_HEIGHT = 50.0  # m
 _MAX_POSITION_NOISE = 1.0  # m
+_MAX_TABLE_PLACE = 1000.0  # m from the origin, as for positions
+_TABLE_SIZES = (0.1, 50.0)  # m, least and most from one end to the other; a tennis court is 24 m long
 
 
 @dataclass(frozen=True)
@@ -81,9 +84,17 @@ class DatasetInfo:
     licence: str | None = None
     """What one may do with them."""
 
+    table_extent: tuple[float, float, float, float] | None = None
+    """(x_low, x_high, y_low, y_high) m, the table's ends; None where they are not stated."""
+
+    noise: TrackNoise | None = None
+    """All noise that is known of the tracks, as `ballfg noise` finds it; it comes before the two numbers above."""
+
     def __post_init__(self) -> None:
         for key in ("name", "source", "licence"):
             check_text(key, getattr(self, key), optional=key != "name")
+        if not isinstance(self.noise, TrackNoise | None):
+            raise TypeError(f"noise must be a TrackNoise or None; got {type(self.noise).__name__}.")
         if not isinstance(self.ball, Ball):
             raise TypeError(f"ball must be a Ball; got {type(self.ball).__name__}. Pass Ball(radius, mass).")
         height = check_number("frame.table_height", self.table_height, "m", limit=MAX_HEIGHT, instead="mm")
@@ -96,18 +107,20 @@ class DatasetInfo:
             value = getattr(self, key)
             if value is not None:
                 object.__setattr__(self, key, check_number(key, value, unit, above=0.0, limit=limit, instead=instead))
+        if self.table_extent is not None:
+            object.__setattr__(self, "table_extent", _checked_extent(self.table_extent))
 
     @classmethod
     def from_mapping(cls, content: Mapping[str, Any]) -> "DatasetInfo":
         """The info that a parsed `dataset.yaml` states.
 
         Args:
-            content: the file's content: `name`, `frame: {up, table_height}`, `ball: {radius, mass}` and the
-                optional fields; keys that are not known are left aside.
+            content: the file's content: `name`, `frame: {up, table_height}` with an optional `table: {x, y}`,
+                `ball: {radius, mass}` and the optional fields; keys that are not known are left aside.
         Raises: ValueError: a missing field, a wrong type or range, an up axis other than z.
         """
-        frame = _section(content, "frame", ("up", "table_height"))
-        ball = _section(content, "ball", ("radius", "mass"))
+        frame = _section(content, "frame", {"up": "...", "table_height": "..."})
+        ball = _section(content, "ball", {"radius": "...", "mass": "..."})
         if frame["up"] != "z":
             raise ValueError(
                 f"frame.up must be 'z', the only up axis that is supported; got {frame['up']!r}. "
@@ -118,18 +131,24 @@ class DatasetInfo:
             name=content["name"],
             table_height=frame["table_height"],
             ball=Ball(radius=ball["radius"], mass=ball["mass"]),
+            table_extent=_stated_extent(frame),
+            noise=None if content.get("noise") is None else TrackNoise.from_mapping(content["noise"]),
             **{key: content.get(key) for key in _OPTIONAL},
         )
 
     def to_mapping(self) -> dict[str, Any]:
         """The content of the `dataset.yaml` that states this; fields that are None are left out."""
+        frame: dict[str, Any] = {"up": "z", "table_height": self.table_height}
+        if self.table_extent is not None:
+            frame["table"] = {"x": list(self.table_extent[:2]), "y": list(self.table_extent[2:])}
         content: dict[str, Any] = {
             "name": self.name,
-            "frame": {"up": "z", "table_height": self.table_height},
+            "frame": frame,
             "ball": {field.name: getattr(self.ball, field.name) for field in fields(Ball)},
         }
         optional = {key: getattr(self, key) for key in _OPTIONAL}
-        return content | {key: value for key, value in optional.items() if value is not None}
+        content |= {key: value for key, value in optional.items() if value is not None}
+        return content if self.noise is None else content | {"noise": self.noise.to_mapping()}
 
 
 def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:
@@ -164,17 +183,50 @@ def write_info(path: Path, info: DatasetInfo) -> None:
     path.write_text(text, encoding="utf-8")
 
 
-def _section(content: Mapping[str, Any], key: str, names: tuple[str, ...]) -> dict[str, Any]:
-    _need(content, key, "")
+def _section(content: Mapping[str, Any], key: str, fields: Mapping[str, str], prefix: str = "") -> dict[str, Any]:
+    """A section with all its fields; `fields` shows how each is written."""
+    _need(content, key, prefix)
     section = content[key]
     if not isinstance(section, dict):
         raise ValueError(
-            f"{key} must be a mapping with {' and '.join(names)}; got {section!r}. "
-            f"Write {key}: {{{', '.join(name + ': ...' for name in names)}}}."
+            f"{prefix}{key} must be a mapping with {' and '.join(fields)}; got {section!r}. "
+            f"Write {key}: {{{', '.join(f'{name}: {text}' for name, text in fields.items())}}}."
         )
-    for name in names:
-        _need(section, name, f"{key}.")
+    for name in fields:
+        _need(section, name, f"{prefix}{key}.")
     return section
+
+
+def _stated_extent(frame: Mapping[str, Any]) -> tuple[Any, ...] | None:
+    """The table's ends as `frame` states them, not yet checked but for their number."""
+    if frame.get("table") is None:
+        return None
+    table = _section(frame, "table", {"x": "[0.0, 2.74]", "y": "[-0.76, 0.76]"}, "frame.")
+    for axis in "xy":
+        if not isinstance(table[axis], list) or len(table[axis]) != 2:
+            raise ValueError(
+                f"frame.table.{axis} must be two numbers in m, the table's ends along {axis}; got {table[axis]!r}. "
+                f"Write {axis}: [low, high]."
+            )
+    return (*table["x"], *table["y"])
+
+
+def _checked_extent(extent: Any) -> tuple[float, ...]:
+    if not isinstance(extent, tuple | list) or len(extent) != 4:
+        raise TypeError(f"table_extent must be (x_low, x_high, y_low, y_high) in m; got {extent!r}. Give four numbers.")
+    ends: list[float] = []
+    for axis, pair in (("x", extent[:2]), ("y", extent[2:])):
+        label = f"frame.table.{axis}"
+        low, high = (check_number(label, end, "m", limit=_MAX_TABLE_PLACE, instead="mm") for end in pair)
+        if not low < high:
+            raise ValueError(f"{label} must increase; got [{low:g}, {high:g}]. Give the lower end first.")
+        if not _TABLE_SIZES[0] <= high - low <= _TABLE_SIZES[1]:
+            raise ValueError(
+                f"{label} must be in m, its ends {_TABLE_SIZES[0]:g} to {_TABLE_SIZES[1]:g} m apart; got "
+                f"[{low:g}, {high:g}]. Convert it to m."
+            )
+        ends += [low, high]
+    return tuple(ends)
 
 
 def _need(content: Mapping[str, Any], key: str, prefix: str) -> None:

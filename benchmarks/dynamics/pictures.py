@@ -16,8 +16,8 @@ from ballfg.benchmarks.dynamics.task import APEXES, Task
 from ballfg.benchmarks.estimators.measured import HORIZON
 from ballfg.benchmarks.pictures import BLUE, GREY, ORANGE, curve, save
 from ballfg.benchmarks.results import Row
+from ballfg.dynamics.surfaces import TABLE_LENGTH, TABLE_WIDTH
 from ballfg.simulation import SETTING_LEVELS
-from ballfg.simulation.launcher import TABLE_LENGTH, TABLE_WIDTH
 
 COLOURS: Final = {
     "truth": "#bdbdbd",

@@ -55,7 +55,7 @@ def kind_of(method: str) -> str:
 def content_of(method: str, quick: bool, measured: bool) -> dict[str, Any]:
     """The config of a method. Those of one family differ in `kind` and in the augmentation that it implies."""
     kind = kind_of(method)
-    common: dict[str, Any] = {"kind": kind, "split": {"by": "label"}, "workers": 1}
+    common: dict[str, Any] = {"kind": kind, "split": {"by": "label"}, "jobs": 1}
     epochs = {"epochs": QUICK_EPOCHS} if quick else {}
     if kind in SEQUENCES:
         cold = {"warm_start_epochs": 0} if quick else {}

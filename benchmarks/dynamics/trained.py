@@ -55,7 +55,8 @@ def trained_contender(job: Job, task: Task) -> Contender:
 
 def recipe(job: Job) -> str:
     """How a job's method is trained, in words that change whenever that does."""
-    return repr(content_of(job.method, job.quick, job.measured))
+    words = repr(content_of(job.method, job.quick, job.measured))
+    return words.replace("'jobs'", "'workers'")  # its earlier name: folders of finished trainings are marked with it
 
 
 def _written(job: Job) -> list[Path]:

@@ -56,9 +56,9 @@ class NetworkFlight(BallModel):
             x = torch.tanh(nn.functional.linear(x, weight, bias))
         return nn.functional.linear(x, *self._last), None
 
-    def bounce(self, state: Tensor) -> Tensor:
+    def after_bounce(self, state: Tensor) -> Tensor:
         """That of the other model."""
-        return self.bounces.bounce(state)
+        return self.bounces.after_bounce(state)
 
 
 def features(state: Tensor) -> Tensor:

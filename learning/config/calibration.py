@@ -1,10 +1,18 @@
 """The config of a calibration; each field with its meaning."""
 
+from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import Field
+from pydantic import AfterValidator, Field
 
+from ballfg.dynamics.earlier_names import todays_name
 from ballfg.learning.config.training import Count, Positive, Section, Share
+
+Coefficients = Annotated[
+    tuple[str, ...],
+    Field(min_length=1, strict=False),
+    AfterValidator(lambda names: tuple(todays_name(name) for name in names)),
+]
 
 
 class CalibrationConfig(Section):
@@ -15,6 +23,8 @@ class CalibrationConfig(Section):
 
     FREE_TO_CHANGE: ClassVar[tuple[str, ...]] = ("out", "data", "model", "max_iterations", "tolerance", "jobs")
     """Fields that a resumed run may change: without effect on the result, or compared by content (data, model)."""
+
+    EARLIER: ClassVar[Mapping[str, str]] = {"observe": "observed_share"}
 
     kind: Literal["calibrate"] = "calibrate"
     """Distinguishes this config from that of a training."""
@@ -28,12 +38,12 @@ class CalibrationConfig(Section):
     out: str = "calibration"
     """Folder that is written. `--out` replaces it."""
 
-    coefficients: Annotated[tuple[str, ...], Field(min_length=1, strict=False)] = (
+    coefficients: Coefficients = (
         "flight.drag.k",
-        "contact.restitution.e",
-        "contact.table_height.offset",
+        "bounce.restitution.e",
+        "bounce.table_height.offset",
     )
-    """Calibrated parameters by name: `flight.` or `contact.`, the effect, its coefficient."""
+    """Calibrated parameters by name: `flight.` or `bounce.`, the effect, its coefficient."""
 
     split: Literal["random", "label"] = "random"
     """random: half of the tracks are fitted and half judge, by the seed. label: by the label `split` of the dataset,
@@ -42,7 +52,7 @@ class CalibrationConfig(Section):
     seed: Annotated[int, Field(ge=0)] = 0
     """Seed of the random split."""
 
-    observe: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.4
+    observed_share: Annotated[float, Field(gt=0.0, lt=1.0)] = 0.4
     """Share of a judged track's duration that is observed; the rest is predicted."""
 
     horizon: Positive | None = None

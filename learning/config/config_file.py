@@ -31,20 +31,29 @@ def read_config(path: str | Path, overrides: Iterable[str] = (), options: Mappin
     """
     path = Path(path)
     content = _load(path)
-    where = str(path)
-    for override in overrides:
-        _override(content, override)
-        where = f"{path} with overrides"
-    return checked_config(content | dict(options or {}), where)
+    replacing = [_override(text) for text in overrides]
+    kind = next((value for keys, value in reversed(replacing) if keys == ["kind"]), content.get("kind"))
+    config = _class_of(kind)
+    try:
+        content = config.renamed(content)  # before the overrides: `jobs=1` replaces the `workers` of an older file
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+    for (first, *others), value in replacing:
+        _put(content, [config.EARLIER.get(first, first), *others], value)
+    return checked_config(content | dict(options or {}), f"{path} with overrides" if replacing else str(path))
 
 
 def checked_config(content: Mapping[str, Any], where: str) -> Config:
     """A config from plain values. Raises: ValueError: a wrong key or value; the message begins with `where`."""
-    kind: type[Config] = CalibrationConfig if content.get("kind") == CALIBRATE else TrainConfig
+    config = _class_of(content.get("kind"))
     try:
-        return kind.model_validate(dict(content))
+        return config.model_validate(dict(content))
     except ValidationError as error:
-        raise ValueError(f"{where}: {_explained(error, kind)}") from None
+        raise ValueError(f"{where}: {_explained(error, config)}") from None
+
+
+def _class_of(kind: Any) -> type[Config]:
+    return CalibrationConfig if kind == CALIBRATE else TrainConfig
 
 
 def _load(path: Path) -> dict[str, Any]:
@@ -63,18 +72,22 @@ def _load(path: Path) -> dict[str, Any]:
     return {str(key): value for key, value in content.items()}
 
 
-def _override(content: dict[str, Any], override: str) -> None:
-    """Put the value of `key=value` in its place; sections on the way are made."""
+def _override(override: str) -> tuple[list[str], Any]:
+    """The keys, those of sections first, and the value of `key=value`."""
     key, separator, text = override.partition("=")
     parts = [part.strip() for part in key.split(".")]
     if not separator or not all(parts):
         raise ValueError(f"overrides must be key=value; got '{override}'. Write for instance seed=3.")
-    place = content
-    for part in parts[:-1]:
-        below = place.get(part)
-        place[part] = dict(below) if isinstance(below, dict) else {}
-        place = place[part]
-    place[parts[-1]] = _parse(override, text)
+    return parts, _parse(override, text)
+
+
+def _put(content: dict[str, Any], keys: list[str], value: Any) -> None:
+    """Put a value in its place; sections on the way are made."""
+    for key in keys[:-1]:
+        below = content.get(key)
+        content[key] = dict(below) if isinstance(below, dict) else {}
+        content = content[key]
+    content[keys[-1]] = value
 
 
 def _parse(override: str, text: str) -> Any:

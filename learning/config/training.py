@@ -1,5 +1,6 @@
 """The config of a training; each field with its meaning."""
 
+from collections.abc import Mapping
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
@@ -17,6 +18,26 @@ class Section(BaseModel):
     """A part of a config: strict types, no unknown keys, immutable."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
+
+    EARLIER: ClassVar[Mapping[str, str]] = {}
+    """Earlier names of fields, which files may still use, and the names of today."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _renamed(cls, content: Any) -> Any:
+        return cls.renamed(content) if isinstance(content, dict) else content
+
+    @classmethod
+    def renamed(cls, content: Mapping[str, Any]) -> dict[str, Any]:
+        """The content under the names of today.
+
+        Args: content: fields by name.
+        Raises: ValueError: if it has a field under both names.
+        """
+        for earlier, name in cls.EARLIER.items():
+            if earlier in content and name in content:
+                raise ValueError(f"'{earlier}' is the earlier name of '{name}'; got both. Delete '{earlier}'.")
+        return {cls.EARLIER.get(key, key): value for key, value in content.items()}
 
 
 class ArchitectureConfig(Section):
@@ -54,7 +75,7 @@ class SplitConfig(Section):
 
 
 class ObserveConfig(Section):
-    """The observed part of a track; the rest is predicted. Exactly one of the two."""
+    """The observed part of a track; the rest is predicted. Exactly one of the two; a number alone is seconds."""
 
     samples: Count | None = 80
     """Number of observed samples."""
@@ -65,7 +86,11 @@ class ObserveConfig(Section):
     @model_validator(mode="before")
     @classmethod
     def _seconds_alone(cls, content: Any) -> Any:
-        """Seconds without samples replace the default number of samples."""
+        """Seconds, in the section or as a number in its place, replace the default number of samples."""
+        if isinstance(content, int | float) and not isinstance(content, bool):
+            return {"samples": None, "seconds": content}
+        if not isinstance(content, dict | cls):
+            raise ValueError(f"must be seconds, or a section with samples or seconds; got {content!r}. Write 0.25.")
         if isinstance(content, dict) and content.get("seconds") is not None and "samples" not in content:
             return content | {"samples": None}
         return content
@@ -198,10 +223,12 @@ class TrainConfig(Section):
         "optimizer.epochs",
         "failure_limit",
         "diverged_limit",
-        "workers",
+        "jobs",
         "checkpoint_every",
     )
     """Fields that a resumed run may change."""
+
+    EARLIER: ClassVar[Mapping[str, str]] = {"workers": "jobs"}
 
     kind: Annotated[str, BeforeValidator(_known)] = "mnn+gs"
     """What is trained. a-tune: coefficients of the analytic model. mlp, mlp+gs, skip+gs, mnn+gs: networks for the
@@ -249,7 +276,7 @@ class TrainConfig(Section):
     diverged_limit: Count = 10
     """Steps in a row that may be skipped because loss or gradient is not finite. One more stops the run."""
 
-    workers: Count | None = None
+    jobs: Count | None = None
     """Processes on this machine; null: one per core. The count of torchrun replaces it. The results depend on it by
     rounding only."""
 

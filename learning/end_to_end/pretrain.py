@@ -42,7 +42,7 @@ def pretrain(model: LearnedModel, teacher: BallModel, seed: int, iterations: int
     """
     flying, bouncing = random_states(seed, samples)
     with torch.no_grad():
-        rates, after = teacher.rates(flying), teacher.bounce(bouncing)
+        rates, after = teacher.rates(flying), teacher.after_bounce(bouncing)
     parameters = [*model.flight.parameters(), *model.contact.parameters()]
     optimizer = torch.optim.LBFGS(parameters, max_iter=iterations, history_size=50, line_search_fn="strong_wolfe")
 
@@ -64,7 +64,7 @@ class Anchor:
         self.flying, self.bouncing = random_states(seed, ANCHORS)
         fixed = copy.deepcopy(start)
         with torch.no_grad():
-            self.rates, self.after = fixed.rates(self.flying), fixed.bounce(self.bouncing)
+            self.rates, self.after = fixed.rates(self.flying), fixed.after_bounce(self.bouncing)
 
     def __call__(self) -> Tensor:
         """() mean square; one means 1 m/s^2, 0.1 m/s or 10 rad/s."""
@@ -80,7 +80,7 @@ def difference(model: BallModel, flying: Tensor, bouncing: Tensor, rates: Rates,
         bouncing: (n, 9) states before a bounce.  after: (n, 9), the given states after it.
     """
     acceleration, spin_rate = model.rates(flying)
-    bounced = model.bounce(bouncing)
+    bounced = model.after_bounce(bouncing)
     value = ((acceleration - rates[0]) / ACCELERATION_UNIT).square().mean()
     value = value + ((bounced - after)[:, VELOCITY] / VELOCITY_UNIT).square().mean()
     value = value + ((bounced - after)[:, SPIN] / SPIN_UNIT).square().mean()

@@ -1,8 +1,9 @@
 """The checkpoint of a training, from which it continues to the same numbers: a folder of tensors and YAML."""
 
-from dataclasses import dataclass, field
+from collections.abc import Container, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
@@ -10,6 +11,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from ballfg.dynamics.earlier_names import todays_name
 from ballfg.files.strict_yaml import YamlError, read_yaml
 from ballfg.files.whole_folder import recover, replaced_folder
 
@@ -53,6 +55,15 @@ class Checkpoint:
     best: dict[str, Tensor]
     optimizer: dict[str, Tensor] = field(default_factory=dict)
     memory: dict[str, Tensor] = field(default_factory=dict)
+
+    def renamed(self, known: Container[str]) -> Self:
+        """This checkpoint with tensors under the names of today; known: those of the module."""
+
+        def today(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            split = ((name.partition("/"), tensor) for name, tensor in tensors.items())
+            return {todays_name(name, known) + slash + moment: tensor for (name, slash, moment), tensor in split}
+
+        return replace(self, weights=today(self.weights), best=today(self.best), optimizer=today(self.optimizer))
 
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:

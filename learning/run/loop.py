@@ -234,6 +234,7 @@ class Training:
 
     def _restore(self, checkpoint: Checkpoint) -> None:
         """Restore a checkpoint. Raises: ValueError: if it is of another model or other tracks."""
+        checkpoint = checkpoint.renamed(self.module.state_dict())
         progress, task = checkpoint.progress, self.task
         there, here = (progress.train, progress.validation), (len(task.train), len(task.validation))
         if there != here:

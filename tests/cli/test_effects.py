@@ -1,4 +1,4 @@
-"""`--effects FILE.py` as a user meets it: an effect of one's own in simulations, model files and searches."""
+"""`--effects-file FILE.py` as a user meets it: an effect of one's own in simulations, model files and searches."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_the_guides_commands(monkeypatch: pytest.MonkeyPatch, capsys: pytest.Cap
         raise ValueError("enough")
 
     monkeypatch.setattr(ballfg.diagnosis, "diagnose", diagnose)
-    commands = re.findall(r"^ballfg (.*--effects.*)$", GUIDE.read_text(encoding="utf-8"), re.MULTILINE)
+    commands = re.findall(r"^ballfg (.*--effects-file .*)$", GUIDE.read_text(encoding="utf-8"), re.MULTILINE)
     simulate, search, predict = (command.replace("--tracks 50", "--tracks 2").split() for command in commands)
     with EFFECTS.restored():
         assert status(*simulate) == 0
@@ -70,9 +70,9 @@ def test_a_model_file_that_names_an_unknown_effect_is_refused(capsys: pytest.Cap
     said = capsys.readouterr()
     assert said.out == ""
     assert said.err.startswith("ballfg: error: model.yaml: there is no flight effect 'static_charge'; known ones: ")
-    assert said.err.endswith("must be registered first: --effects FILE.py, or ballfg.dynamics.register.\n")
+    assert said.err.endswith("must be registered first: --effects-file FILE.py, or ballfg.dynamics.register.\n")
     assert not Path("states.csv").exists()
-    assert status(*arguments, "--effects", "static_charge.py", "--effects", "static_charge.py") == 0
+    assert status(*arguments, "--effects-file", "static_charge.py", "--effects-file", "static_charge.py") == 0
 
 
 @pytest.mark.parametrize(
@@ -88,9 +88,23 @@ def test_bad_files_are_one_line_and_status_2(
 ) -> None:
     if text is not None:
         Path("broken.py").write_text(text, encoding="utf-8")
-    assert status("simulate", "--out", "d", "--effects", "broken.py") == 2
+    assert status("simulate", "--out", "d", "--effects-file", "broken.py") == 2
     said = capsys.readouterr()
     assert (said.out, said.err.count("\n")) == ("", 1)
     assert said.err.startswith("ballfg: error: ")
     assert said.err.endswith(f"{message}\n")
     assert not Path("d").exists()
+
+
+@pytest.mark.parametrize("words", [("--effects", "static_charge.py"), ("--effects=static_charge.py",)])
+def test_the_earlier_name_of_the_option_works(capsys: pytest.CaptureFixture[str], words: tuple[str, ...]) -> None:
+    """Also beside the name of today and beside `--effect`, which names an effect. Help shows only the name of today."""
+    simulated = ("simulate", "--tracks", 2, "--effect", "static_charge.strength=2")
+    assert status(*simulated, "--out", "earlier", *words) == 0
+    assert status(*simulated, "--out", "both", *words, "--effects-file", "static_charge.py") == 0
+    assert capsys.readouterr().out.count("undeclared effects: static_charge") == 2
+    for command in ("estimate", "predict", "diagnose", "simulate", "render"):
+        assert status(command, "--help") == 0
+        said = capsys.readouterr().out
+        assert "--effects-file" in said
+        assert not re.search(r"--effects(?!-file)", said)

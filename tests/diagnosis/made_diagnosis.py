@@ -159,7 +159,7 @@ def found() -> Diagnosis:
         calibrated={
             "flight.drag.k": Value(0.1213, 0.0011, "1/m", 0.12),
             "flight.magnus.k": Value(0.00284, 0.00003, "1", 0.0028),
-            "contact.restitution.e": Value(0.9312, 0.0021, "1", 0.93),
+            "bounce.restitution.e": Value(0.9312, 0.0021, "1", 0.93),
         },
         noise={axis: Value(0.0031, 0.00002, "m", 0.003) for axis in "xyz"},
         unexplained=Unexplained("", 0.02, left, None),

@@ -55,7 +55,7 @@ class NetworkModel(BallModel):
         out = self.air(scaled)
         return out[..., :3] - 9.8 * torch.tensor((0.0, 0.0, 1.0), dtype=torch.float64), 10 * out[..., 3:]
 
-    def bounce(self, state: Tensor) -> Tensor:
+    def after_bounce(self, state: Tensor) -> Tensor:
         velocity = state[..., 3:6] * torch.tensor((0.7, 0.7, -0.9), dtype=torch.float64)
         change = self.surface(state[..., 3:9] / 100)
         spin = state[..., 6:9] + 20 * change[..., 3:]

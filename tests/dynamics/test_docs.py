@@ -103,10 +103,10 @@ def test_nominal_values_in_the_physics_page():
         ("gravity", f"{model.flight['gravity'].g.item():g} m/s²"),
         ("drag", f"{model.flight['drag'].k.item():g} 1/m"),
         ("Magnus", f"{model.flight['magnus'].k.item():g}"),
-        ("restitution", f"{model.contact['restitution'].e.item():g}"),
-        ("friction", f"{model.contact['friction'].mu.item():g}"),
-        ("tangential restitution", f"{model.contact['tangential_restitution'].e_t.item():g}"),
-        ("table height", f"{1000 * model.contact['table_height'].offset.item():g} mm"),
+        ("restitution", f"{model.bounce['restitution'].e.item():g}"),
+        ("friction", f"{model.bounce['friction'].mu.item():g}"),
+        ("tangential restitution", f"{model.bounce['tangential_restitution'].e_t.item():g}"),
+        ("table height", f"{1000 * model.bounce['table_height'].offset.item():g} mm"),
         ("radius", f"{model.radius:.3f} m"),
     ):
         shown = next(v for k, v in nominal.items() if k.startswith(start))

@@ -29,10 +29,10 @@ def test_values_and_defaults(write):
     model = load_model(write(GOOD), radius=0.033, inertia_factor=0.5)
     assert (model.radius, model.inertia_factor) == (0.033, 0.5)
     assert list(model.flight) == ["gravity", "drag", "magnus"]
-    assert list(model.contact) == ["restitution", "friction"]
+    assert list(model.bounce) == ["restitution", "friction"]
     assert model.flight["gravity"].g.item() == 9.80
     assert model.flight["magnus"].k.item() == EFFECTS["magnus"].coefficients[0].default
-    assert model.contact["friction"].mu.item() == EFFECTS["friction"].coefficients[0].default
+    assert model.bounce["friction"].mu.item() == EFFECTS["friction"].coefficients[0].default
 
 
 def test_round_trip(model, tmp_path):

@@ -32,7 +32,7 @@ def test_the_table_tennis_ball() -> None:
         "measurement": {},
         "learned": None,
     }
-    sigmas = {"flight.drag.k": 0.035, "contact.restitution.e": 0.02, "contact.table_height.offset": 0.004}
+    sigmas = {"flight.drag.k": 0.035, "bounce.restitution.e": 0.02, "bounce.table_height.offset": 0.004}
     for model in (nominal_model(), nominal_model(TABLE_TENNIS), nominal_model(0.02)):
         assert model_to_dict(model) == expected
         assert coefficient_sigmas(model) == sigmas
@@ -70,8 +70,8 @@ def test_an_unknown_ball_gets_physics_wide_priors_and_a_note() -> None:
     assert drag(model) == pytest.approx(1.2 * 0.5 * math.pi * GOLF.radius**2 / (2 * GOLF.mass))
     sigmas = coefficient_sigmas(model)
     assert sigmas["flight.drag.k"] == pytest.approx(0.5 * drag(model))
-    assert sigmas["contact.restitution.e"] == pytest.approx(0.15)
-    assert coefficient_sigmas(nominal_model())["contact.restitution.e"] == 0.02  # other models keep theirs
+    assert sigmas["bounce.restitution.e"] == pytest.approx(0.15)
+    assert coefficient_sigmas(nominal_model())["bounce.restitution.e"] == 0.02  # other models keep theirs
     note = nominal_note(GOLF)
     assert note is not None
     assert note.startswith(

@@ -13,9 +13,9 @@ from ballfg.dynamics.motion.integrate import batch_jacobian
 NAMES = (
     "flight.drag.k",
     "flight.magnus.k",
-    "contact.restitution.e",
-    "contact.friction.mu",
-    "contact.table_height.offset",
+    "bounce.restitution.e",
+    "bounce.friction.mu",
+    "bounce.table_height.offset",
 )
 
 
@@ -57,7 +57,7 @@ def test_per_row_values_are_what_each_row_has_alone(model, states):
 
 def test_gradient_reaches_the_given_tensors(model, states):
     k = torch.full((3, 1), 0.1, dtype=torch.float64, requires_grad=True)
-    ball = substitute(model, {"flight.drag.k": k, "contact.restitution.e": torch.tensor(0.9, dtype=torch.float64)})
+    ball = substitute(model, {"flight.drag.k": k, "bounce.restitution.e": torch.tensor(0.9, dtype=torch.float64)})
     after = advance(ball, states(3), torch.full((3,), 0.4, dtype=torch.float64), Surfaces(0.0))
     (gradient,) = torch.autograd.grad(after[1, :3].sum(), k)
     assert gradient[1].abs().item() > 0

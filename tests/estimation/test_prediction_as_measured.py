@@ -15,13 +15,13 @@ from ballfg.simulation import MeasurementNoise, SimulationConfig, parse_effects,
 CONFIG = SimulationConfig(tracks=3, rate=60.0, seed=5, noise=MeasurementNoise(position=0.002, spin=4.0))
 BALL, SURFACES = CONFIG.ball.model, CONFIG.ball.surfaces
 EXACT = Settings(position_noise=(0.002,) * 3, process=ProcessNoise(acceleration=0.02, spin=0.5), spin_label_noise=4.0)
-UNSURE = replace(EXACT, coefficients={"flight.drag.k": 0.01, "contact.restitution.e": 0.005})
+UNSURE = replace(EXACT, coefficients={"flight.drag.k": 0.01, "bounce.restitution.e": 0.005})
 OBSERVE = 0.292
 """s, between two frames, whatever the clock of the cases below makes of them."""
 
 
 def declared(effects: tuple[Effect, ...]) -> AnalyticModel:
-    own = [*BALL.flight.values(), *BALL.contact.values(), *effects]
+    own = [*BALL.flight.values(), *BALL.bounce.values(), *effects]
     return AnalyticModel(own, radius=BALL.radius, inertia_factor=BALL.inertia_factor)
 
 

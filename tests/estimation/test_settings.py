@@ -40,8 +40,8 @@ def test_uncertain_takes_the_coefficients_that_vary() -> None:
     settings = Settings.for_measured(nominal_model(), spin_prior=50.0)
     assert settings.coefficients == {
         "flight.drag.k": 0.035,
-        "contact.restitution.e": 0.02,
-        "contact.table_height.offset": 0.004,
+        "bounce.restitution.e": 0.02,
+        "bounce.table_height.offset": 0.004,
     }
     assert settings.process == MEASURED
     assert settings.spin_prior == 50.0

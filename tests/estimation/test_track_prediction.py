@@ -121,7 +121,7 @@ def test_wrong_arguments_are_refused_at_once(tracks):
 
 # --- beliefs -----------------------------------------------------------------------------------------------------
 
-COEFFICIENTS = {"flight.drag.k": 0.03, "contact.restitution.e": 0.02}
+COEFFICIENTS = {"flight.drag.k": 0.03, "bounce.restitution.e": 0.02}
 
 
 def test_coefficients_come_with_their_correlations(tracks):

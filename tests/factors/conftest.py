@@ -12,9 +12,9 @@ from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Rows, Values
 NAMES = (
     "flight.drag.k",
     "flight.magnus.k",
-    "contact.restitution.e",
-    "contact.friction.mu",
-    "contact.table_height.offset",
+    "bounce.restitution.e",
+    "bounce.friction.mu",
+    "bounce.table_height.offset",
 )
 
 

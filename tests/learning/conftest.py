@@ -7,7 +7,7 @@ import pytest
 from ballfg.dynamics import model_from_dict
 from ballfg.simulation import MeasurementNoise, SimulationConfig, table_tennis, with_model, write_simulation
 
-PLANTED = {"flight.drag.k": 0.155, "contact.restitution.e": 0.88, "contact.table_height.offset": 0.006}
+PLANTED = {"flight.drag.k": 0.155, "bounce.restitution.e": 0.88, "bounce.table_height.offset": 0.006}
 
 
 def simulated(folder: Path, tracks: int, *, spin_labels: bool = True) -> Path:
@@ -15,10 +15,10 @@ def simulated(folder: Path, tracks: int, *, spin_labels: bool = True) -> Path:
     content = {
         "flight": {"gravity": {}, "drag": {"k": PLANTED["flight.drag.k"]}, "magnus": {"k": 0.0028}},
         "bounce": {
-            "restitution": {"e": PLANTED["contact.restitution.e"]},
+            "restitution": {"e": PLANTED["bounce.restitution.e"]},
             "friction": {"mu": 0.25},
             "tangential_restitution": {"e_t": 0.15},
-            "table_height": {"offset": PLANTED["contact.table_height.offset"]},
+            "table_height": {"offset": PLANTED["bounce.table_height.offset"]},
         },
     }
     ball = with_model(table_tennis(), model_from_dict(content))

@@ -13,7 +13,7 @@ from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import Belief, Propagator
 
 NEARLY_EXACT = ProcessNoise(acceleration=1e-9, spin=1e-9, contact_velocity=1e-9, contact_spin=1e-9)
-UNCERTAIN = {"flight.drag.k": 0.005, "contact.restitution.e": 0.004, "contact.table_height.offset": 0.002}
+UNCERTAIN = {"flight.drag.k": 0.005, "bounce.restitution.e": 0.004, "bounce.table_height.offset": 0.002}
 SIGMAS = torch.tensor((0.002, 0.003, 0.002, 0.02, 0.03, 0.02, 2.0, 3.0, 2.0), dtype=torch.float64)
 
 

@@ -109,12 +109,14 @@ def test_impact_noise_comes_with_impacts_only(model, beliefs, name):
 
 
 @pytest.mark.parametrize("name", PATHS)
-def test_covariance_goes_through_the_derivative_of_the_rollout(uncertain, beliefs, table, name):
+def test_covariance_goes_through_the_derivative_of_the_rollout(uncertain, beliefs, table, name, monkeypatch):
     """One belief for each column j, with covariance e_j e_j': after the rollout it is the outer product of J's column.
 
     Differences: fourth order with steps of 1e-6 to 1e-3, a thousandth of what the dynamics change over: truncation is
     below 1e-9, rounding near 1e-10 of a step, and three bounces multiply it by less than a thousand.
     """
+    # a belief as wide as a column reaches across every edge: test_edges.py tests what that adds
+    monkeypatch.setattr("ballfg.prediction.propagate.edge_doubt", lambda *_: 0.0)
     state, surfaces, end, _ = PATHS[name]
     surfaces = surfaces or table.surfaces
     belief = beliefs(uncertain, state)
@@ -185,8 +187,8 @@ def test_batch_is_the_same_as_one_by_one(uncertain, beliefs):
     for i, name in enumerate(names):
         one = Belief(uncertain, batch.time[i : i + 1], batch.mean[i : i + 1], batch.covariance[i : i + 1])
         alone = propagator.rollout(one, times[i : i + 1])
-        np.testing.assert_allclose(together.states[i], alone.states[0], rtol=1e-6, atol=1e-6)
         scale = np.sqrt(np.diagonal(alone.covariances[0], axis1=-2, axis2=-1) + negligible**2)
+        assert np.abs((together.states[i] - alone.states[0]) / scale).max() < 1e-4, name
         error = (together.covariances[i] - alone.covariances[0]) / (scale[:, :, None] * scale[:, None])
         assert np.abs(error).max() < 0.02, name
 

@@ -105,7 +105,11 @@ def test_contact_kicks() -> None:
     noise = MotionNoise(contact_velocity=0.05, contact_spin=4.0)
     model = nominal_model()
     before = torch.tensor([[0.0, 0.0, 0.0, 3.0, 0.2, -3.0, 20.0, 100.0, 30.0]], dtype=torch.float64).expand(20_000, 9)
-    kick = (KickedModel(model, noise, np.random.default_rng(0)).bounce(before) - model.bounce(before)).detach().numpy()
+    kick = (
+        (KickedModel(model, noise, np.random.default_rng(0)).after_bounce(before) - model.after_bounce(before))
+        .detach()
+        .numpy()
+    )
     assert np.all(kick[:, :3] == 0)
     assert_sigma(kick[:, 3:6], 0.05)
     assert_sigma(kick[:, 6:], 4.0)

@@ -145,7 +145,7 @@ def test_own_effects_do_nothing_at_their_defaults(name: str) -> None:
     model = nominal_model()
     changed = true_model(model, [UNDECLARED[name]()])
     np.testing.assert_array_equal(acceleration(changed), acceleration(model))
-    np.testing.assert_array_equal(changed.bounce(STATE).detach(), model.bounce(STATE).detach())
+    np.testing.assert_array_equal(changed.after_bounce(STATE).detach(), model.after_bounce(STATE).detach())
 
 
 def test_formulas_of_own_effects() -> None:

@@ -1,6 +1,7 @@
 import pytest
 
 from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball, DatasetInfo, read_dataset
+from ballfg.tracks.info import read_info, write_info
 
 GOOD = {
     "name": "name: small",
@@ -11,6 +12,10 @@ GOOD = {
 
 def _yaml(**changes: str) -> str:
     return "\n".join(line for line in (GOOD | changes).values() if line) + "\n"
+
+
+def _table(ends: str) -> str:
+    return _yaml(frame=f"frame: {{up: z, table_height: 0.76, table: {ends}}}")
 
 
 def test_presets_are_si():
@@ -29,6 +34,15 @@ def test_all_fields_are_read(make_folder):
     dataset = read_dataset(make_folder(yaml=text))
     assert dataset.info == DatasetInfo("small", 0.76, TABLE_TENNIS, 100.0, 0.002, 5.0, "lab", "MIT")
     assert dataset.notes == []
+
+
+def test_the_ends_of_the_table_are_read_and_written(make_folder, tmp_path):
+    frame = "frame: {up: z, table_height: 0.76, table: {x: [-1.37, 1.37], y: [0, 1.525]}}"
+    dataset = read_dataset(make_folder(yaml=_yaml(frame=frame)))
+    assert dataset.info.table_extent == (-1.37, 1.37, 0.0, 1.525)
+    assert dataset.notes == []
+    write_info(tmp_path / "dataset.yaml", dataset.info)
+    assert read_info(tmp_path / "dataset.yaml") == (dataset.info, [])
 
 
 def test_unknown_fields_are_noted_with_the_nearest_name(make_folder):
@@ -62,6 +76,24 @@ def test_unknown_fields_are_noted_with_the_nearest_name(make_folder):
             _yaml(frame="frame: {up: z, table_height: high}"),
             "frame.table_height must be a number in m; got str 'high'.",
         ),
+        (
+            _table("[0, 2.74]"),
+            "frame.table must be a mapping with x and y; got [0, 2.74]. Write table: {x: [0.0, 2.74]",
+        ),
+        (_table("{x: [0, 2.74]}"), "frame.table.y is required; got x. Add it."),
+        (_table("{x: 2.74, y: [0, 1]}"), "frame.table.x must be two numbers in m, the table's ends along x; got 2.74."),
+        (_table("{x: [0, 1, 2], y: [0, 1]}"), "got [0, 1, 2]. Write x: [low, high]."),
+        (_table("{x: [2.74, 0], y: [0, 1]}"), "frame.table.x must increase; got [2.74, 0]. Give the lower end first."),
+        (_table("{x: [0, 1], y: [1, 1]}"), "frame.table.y must increase; got [1, 1]."),
+        (_table("{x: [0, .inf], y: [0, 1]}"), "frame.table.x must be finite; got inf. Correct it (unit: m)."),
+        (_table("{x: [0, .nan], y: [0, 1]}"), "frame.table.x must be finite; got nan."),
+        (_table("{x: [0, long], y: [0, 1]}"), "frame.table.x must be a number in m; got str 'long'."),
+        (
+            _table("{x: [0, 2740], y: [0, 1525]}"),
+            "frame.table.x must be in m, at most 1000; got 2740. It is probably in mm",
+        ),
+        (_table("{x: [0, 274], y: [0, 153]}"), "frame.table.x must be in m, its ends 0.1 to 50 m apart; got [0, 274]."),
+        (_table("{x: [0, 0.01], y: [0, 1]}"), "its ends 0.1 to 50 m apart; got [0, 0.01]. Convert it to m."),
         (
             _yaml(ball="ball: {radius: 20, mass: 0.0027}"),
             "ball.radius must be in m, at most 0.5; got 20. It is probably",
@@ -104,3 +136,5 @@ def test_info_is_checked_without_a_file_too():
         DatasetInfo(None, 0.0, TABLE_TENNIS)
     with pytest.raises(ValueError, match=r"ball\.radius must be finite and above 0; got -1"):
         Ball(-1, 0.1)
+    with pytest.raises(TypeError, match=r"table_extent must be \(x_low, x_high, y_low, y_high\) in m; got \(0, 1\)"):
+        DatasetInfo("a", 0.0, TABLE_TENNIS, table_extent=(0, 1))

@@ -99,7 +99,7 @@ def shoot(model: BallModel, start: Tensor, heights: Tensor, guesses: Tensor, end
         rows, near = rows[meets], arc.nodes[-1][meets]
         tau = contact_time(own, near, height[rows])
         lost = tau.isnan()
-        start = own.bounce(fly(own, near, tau.masked_fill(lost, 0.0)))
+        start = own.after_bounce(fly(own, near, tau.masked_fill(lost, 0.0)))
         start = torch.where(lost.unsqueeze(-1), torch.nan, start)
         begun = begun[meets] + count * arc.step[meets, 0] + tau.masked_fill(lost, 0.0)
         contacts[rows, len(arcs) - 1] = begun.detach().masked_fill(lost, torch.nan)

@@ -12,8 +12,6 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.dynamics import AnalyticModel, Coefficient, Effect
 from ballfg.dynamics.effect import Scene, Vector
 
-SECTION = {"flight": "flight", "bounce": "contact", "measurement": "measurement"}
-"""Attribute of the model that holds the effects of a kind."""
 LOOSE = 10.0
 """Factor by which the prior of a hypothesis' coefficient is wider than the effect declares: the data are to decide."""
 INEXACT = 0.02
@@ -48,7 +46,7 @@ class Hypothesis:
 
     def parameter(self, coefficient: str) -> str:
         """Its name among the model's parameters."""
-        return f"{SECTION[self.effect.kind]}.{self.name}.{coefficient}"
+        return f"{self.effect.kind}.{self.name}.{coefficient}"
 
     @property
     def columns(self) -> tuple[str, ...]:
@@ -87,7 +85,7 @@ def _spread(coefficient: Coefficient) -> float:
 
 def effects_of(model: AnalyticModel) -> list[Effect]:
     """All effects of a model, in order."""
-    groups = (model.flight, model.contact, model.measurement)
+    groups = (model.flight, model.bounce, model.measurement)
     return [cast(Effect, effect) for group in groups for effect in group.values()]
 
 

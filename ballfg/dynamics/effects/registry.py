@@ -71,7 +71,7 @@ def effect_class(name: str, kind: Kind) -> type[Effect]:
     effect = EFFECTS.get(name) or GENERIC.get(name)
     if effect is None or effect.kind != kind:
         known = ", ".join(n for n, e in EFFECTS.items() if e.kind == kind) or "none"
-        own = "One of your own must be registered first: --effects FILE.py, or ballfg.dynamics.register"
+        own = "One of your own must be registered first: --effects-file FILE.py, or ballfg.dynamics.register"
         raise ValueError(f"there is no {kind} effect '{name}'; known ones: {known}. {own}.")
     return effect
 

@@ -138,7 +138,7 @@ def fly_through(
         tau = contact_time(model, state, height, dt.abs() + BEYOND)
         lost = lost | tau.isnan()
         tau = tau.masked_fill(lost, 0.0)
-        state = model.bounce(fly(model, state, tau))
+        state = model.after_bounce(fly(model, state, tau))
         elapsed = elapsed + tau
         times.append(elapsed.masked_fill(lost, torch.nan))
     after = fly(model, state, dt - elapsed)
@@ -171,7 +171,7 @@ def fly_through_jacobian(
         tau_by_state = -(_gap_gradient(model, before, height).unsqueeze(-2) @ jacobian)
         tau_by_state = tau_by_state / speed[..., None, None]
         jacobian = jacobian + rate.unsqueeze(-1) * tau_by_state
-        state, impact = batch_jacobian(model.bounce, before, outputs=state.shape[-1])
+        state, impact = batch_jacobian(model.after_bounce, before, outputs=state.shape[-1])
         jacobian = impact @ jacobian
         elapsed = elapsed + tau
         elapsed_by_state = elapsed_by_state + tau_by_state

@@ -152,7 +152,7 @@ def _land(model: BallModel, arc: _Arc, start: Tensor) -> tuple[Tensor, Tensor, T
     within = contact_time(own, before, arc.height[rows])
     lost = within.isnan()
     within = within.masked_fill(lost, 0.0)
-    after = own.bounce(fly(own, before, within))
+    after = own.after_bounce(fly(own, before, within))
     stops = lost | (after[:, VZ].detach() < REST_SPEED)
     return (
         bounced.index_put((rows,), after),

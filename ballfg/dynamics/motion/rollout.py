@@ -135,7 +135,7 @@ def _land(model: BallModel, state: Tensor, remaining: Tensor, height: Tensor, *,
     tau = contact_time(model, state, height)
     lost = tau.isnan()  # below the surface and never up again
     tau = torch.where(lost, torch.zeros_like(tau), tau)
-    bounced = model.bounce(fly(model, state, tau))
+    bounced = model.after_bounce(fly(model, state, tau))
     rest = (lost | (bounced[..., VZ] < REST_SPEED) | last).unsqueeze(-1)
     return torch.where(rest, place_on(model, bounced, height), bounced), remaining - tau
 

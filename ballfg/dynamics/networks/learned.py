@@ -98,13 +98,13 @@ class LearnedModel(BallModel):
             spin_rate = base_spin_rate + spin_rate
         return base_acceleration + acceleration, base_spin_rate if spin_rate is None else spin_rate
 
-    def bounce(self, state: Tensor) -> Tensor:
+    def after_bounce(self, state: Tensor) -> Tensor:
         """(..., 9) state just after an impact on a horizontal plane, from the state (..., 9) before it."""
         if self.base is None:
             up = -START_RESTITUTION * state[..., VZ : VZ + 1]
             guess = torch.cat((state[..., :VZ], up, state[..., SPIN]), dim=-1)
         else:
-            guess = self.base.bounce(state)
+            guess = self.base.after_bounce(state)
         after: Tensor = self.contact(state, guess)
         return after
 

@@ -145,13 +145,14 @@ def _empty_model(config: _Config, analytic: AnalyticModel, folder: Path) -> Ball
     model: BallModel = analytic
     architecture = config.architecture
     if architecture is not None:
-        if not architecture.residual and (analytic.flight or analytic.contact):
+        if not architecture.residual and (analytic.flight or analytic.bounce):
             raise ValueError(
                 f"{folder / CONFIG}: a model that is not residual must stand alone; the model file declares "
-                f"{', '.join((*analytic.flight, *analytic.contact))}. Leave its sections flight and bounce empty."
+                f"{', '.join((*analytic.flight, *analytic.bounce))}. Leave its sections flight and bounce empty."
             )
         base = analytic if architecture.residual else None
         model = build(architecture, radius=analytic.radius, inertia_factor=analytic.inertia_factor, base=base)
+    model.noise = analytic.noise
     if config.trained is not None:
         model.trained = _trained(config.trained, folder)
     return model

@@ -23,11 +23,12 @@ from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.rts import FilterRecord, fly_back, rts_smooth
 from ballfg.estimation.filters.sliding_window import SlidingWindow, first_pair
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
+from ballfg.estimation.observations.innovation import FilterInnovation
 from ballfg.estimation.observations.observation import Context, refuse_unknowns
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact, Quality
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, stamp_covariance, total_sigmas
-from ballfg.estimation.smoother.near_contact import widen_near_contacts
+from ballfg.estimation.smoother.near_contact import other_sides
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.dynamics import model_width
@@ -113,23 +114,15 @@ class _BallFilter(FilterpyEKF):
         """The update of filterpy with a measured position."""
         self.update(measured, lambda _: self.H, lambda x: self.H @ x)
 
-    def correct_by(self, factors: FactorBatch, gated: bool) -> Array:
+    def correct_by(self, factor: FactorBatch, gated: bool) -> Array:
         """(dim,) whitened innovation of a factor on the present state; the update of filterpy with its residual.
 
         The factor's loss gives the noise its weight; with a gate, a measurement beyond it is not used.
         """
-        inputs = (self.x[None, :STATE_DIM], self.x[None, STATE_DIM : self.width])[: factors.variables.shape[1]]
-        (residual,), blocks = factors.compute(slice(None), inputs)
-        H = np.zeros((factors.dim, len(self.x)))
-        H[:, :STATE_DIM] = blocks[0][0]
-        if len(blocks) > 1:
-            H[:, STATE_DIM : self.width] = blocks[1][0]
-        unit = np.eye(factors.dim)
-        whitened = np.linalg.solve(np.linalg.cholesky(H @ self.P @ H.T + unit), -residual)
-        if not gated or whitened @ whitened <= chi2.isf(GATE_CHANCE, factors.dim):
-            (weight,) = factors.loss.weight(np.array([np.linalg.norm(whitened)]))
-            self.update(np.zeros(factors.dim), lambda _: H, lambda _: residual, R=unit / weight)
-        return np.asarray(whitened)
+        found = FilterInnovation.of(factor, self.x, self.P, biases=len(self.x) - self.width)
+        if not gated or found.whitened @ found.whitened <= chi2.isf(GATE_CHANCE, factor.dim):
+            self.update(np.zeros(factor.dim), lambda _: found.H, lambda _: found.residual, R=found.R)
+        return found.whitened
 
 
 class ExtendedKalmanFilter(Estimator):
@@ -190,14 +183,14 @@ class ExtendedKalmanFilter(Estimator):
     def _result(self, track: Track, run: _Run, mean: Array, covariance: Array, whitened: Array) -> Estimate:
         states, own = mean[:, :STATE_DIM], slice(STATE_DIM, STATE_DIM + len(run.means))
         contacts = tuple(contact for i in sorted(run.record.contacts) for contact in run.record.contacts[i])
-        honest = widen_near_contacts(
-            track.times, states, covariance[:, :STATE_DIM, :STATE_DIM], contacts, self.model, self.surfaces
-        )
+        of_states = covariance[:, :STATE_DIM, :STATE_DIM]
+        others = other_sides(track.times, states, of_states, contacts, self.model, self.surfaces)
         return Estimate(
             name=track.name,
             times=track.times,
             states=states,
-            covariances=honest,
+            covariances=of_states + others,
+            other_sides=others,
             status=_status(run.record.used),
             innovations={"position": whitened, **run.innovations},
             world=self.world,

@@ -77,13 +77,13 @@ class InvertMeasurement(Estimator):
     name = "invert-measurement"
     undoes_measurement = True
 
-    def __init__(self, kind: type[Estimator], model: BallModel, surfaces: Surfaces, settings: Settings) -> None:
+    def __init__(self, kind: type[Estimator], model: BallModel, surfaces: Surfaces | float, settings: Settings) -> None:
         super().__init__(model, surfaces, settings)
         self.labels = LabelMap.of(model)
         own = replace(settings, spin_label_noise=settings.spin_label_noise / self.labels.gain)
         plain = plainly_measured(model)
-        self.smoother = Smoother(plain, surfaces, own)
-        self.inner = self.smoother if kind is Smoother else kind(plain, surfaces, own)
+        self.smoother = Smoother(plain, self.surfaces, own)
+        self.inner = self.smoother if kind is Smoother else kind(plain, self.surfaces, own)
 
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
         """The true states at the written stamps; `NOT_CONVERGED` where the shifts did not settle."""

@@ -1,15 +1,59 @@
-"""Whitened innovations of a smoother: each measurement against its prediction from all others."""
+"""Whitened innovations: of a filter against its prediction, of a smoother against the prediction from all others."""
+
+from dataclasses import dataclass
 
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.factors.batch import Rows
+from ballfg.factors.batch import FactorBatch, Rows
 from ballfg.factors.covariance import Covariances
 from ballfg.factors.linear import weighted
-from ballfg.state import POSITION
+from ballfg.state import POSITION, STATE_DIM
 
 LEAST_INFORMATION = 1e-6
 """Share of the posterior's information that the other measurements are given at least."""
+
+
+@dataclass(frozen=True)
+class FilterInnovation:
+    """One factor on the state that a filter predicts, linearised there: the input of its update.
+
+    Attributes:
+        residual: (r,) whitened.
+        H: (r, d) whitened, per unit of the filter's state.
+        R: (r, r) noise of the whitened residual: one, divided by the weight that a robust loss gives the innovation.
+        spread: (r, r) H P H^T, the covariance that the prediction adds to it.
+        whitened: (r,) the innovation divided by the root of its covariance before the loss, H P H^T + 1.
+    """
+
+    residual: Array
+    H: Array
+    R: Array
+    spread: Array
+    whitened: Array
+
+    @classmethod
+    def of(cls, factor: FactorBatch, mean: Array, covariance: Array, biases: int = 0) -> "FilterInnovation":
+        """The innovation of a batch of one factor.
+
+        Args:
+            factor: on the state, and perhaps on the coefficients behind it in the filter's state.
+            mean: (d,) m, m/s, rad/s, then the coefficients in their own units, then the tracker's biases in m.
+            covariance: (d, d) in the squares of these units.
+            biases: how many numbers at the end of the mean are biases, which the factor does not look at.
+        """
+        own = slice(STATE_DIM, len(mean) - biases)
+        inputs = (mean[None, :STATE_DIM], mean[None, own])[: factor.variables.shape[1]]
+        (residual,), blocks = factor.compute(slice(None), inputs)
+        H = np.zeros((factor.dim, len(mean)))
+        H[:, :STATE_DIM] = blocks[0][0]
+        if len(blocks) > 1:
+            H[:, own] = blocks[1][0]
+        unit = np.eye(factor.dim)
+        spread = H @ covariance @ H.T
+        whitened = np.linalg.solve(np.linalg.cholesky(spread + unit), -residual)
+        (weight,) = factor.loss.weight(np.array([np.linalg.norm(whitened)]))
+        return cls(residual, H, unit / weight, spread, np.asarray(whitened))
 
 
 def whiten_innovation(innovation: Array, covariance: Array) -> Array:

@@ -106,6 +106,7 @@ def final_estimate(
         times=track.times,
         states=np.concatenate((np.array([f.state for f in frozen]), late.states)),
         covariances=np.concatenate((joints[:, :STATE_DIM, :STATE_DIM], late.covariances)),
+        other_sides=np.concatenate((np.zeros((len(frozen), STATE_DIM, STATE_DIM)), late.other_sides)),
         cross_covariances=np.concatenate((joints[:, :STATE_DIM, STATE_DIM:], late.cross_covariances)),
         contacts=(*contacts, *(replace(c, interval=c.interval + first) for c in late.contacts)),
         hits=np.concatenate((hits, late.hits + first)),

@@ -7,8 +7,9 @@ import gtsam
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.estimation.observations.innovation import FilterInnovation
 from ballfg.factors.batch import FactorBatch, merge
-from ballfg.factors.bridge import Bridge, checked, widened
+from ballfg.factors.bridge import Bridge, checked
 from ballfg.state import STATE_DIM
 
 
@@ -36,15 +37,11 @@ class Measurement:
         A tracker's bias may stand behind the state; the measurement does not look at it.
         A robust loss gets the weight that the innovation gives it. The innovation is kept the first time.
         """
-        (residual,), (rows,) = self.batch.compute(slice(None), (state[None, :STATE_DIM],))
-        slope, unit = widened(rows[0], len(state)), np.eye(self.batch.dim)
-        spread = slope @ covariance @ slope.T
-        whitened = np.linalg.solve(np.linalg.cholesky(spread + unit), -residual)
+        found = FilterInnovation.of(self.batch, state, covariance, biases=len(state) - STATE_DIM)
         if np.isnan(self.innovation).any():
-            self.innovation = whitened
-        (weight,) = self.batch.loss.weight(np.array([np.linalg.norm(whitened)]))
-        gain = np.linalg.solve(spread + unit / weight, slope @ covariance).T
-        return state - gain @ residual, covariance - gain @ slope @ covariance
+            self.innovation = found.whitened
+        gain = np.linalg.solve(found.spread + found.R, found.H @ covariance).T
+        return state - gain @ found.residual, covariance - gain @ found.H @ covariance
 
 
 def prepare(measurements: Sequence[Measurement], states: Array) -> None:

@@ -100,6 +100,6 @@ def _bounce_coefficients(model: BallModel, still: Tensor) -> tuple[float, float]
     falling = still.repeat(len(falls), 1)
     falling[:, VZ] = -falls
     falling[:, VELOCITY.start] = PROBE_SLIDE
-    after = model.bounce(falling)
+    after = model.after_bounce(falling)
     normal = after[:, VZ] + falls
     return float((after[:, VZ] / falls).mean()), float(((PROBE_SLIDE - after[:, VELOCITY.start]) / normal).mean())

@@ -60,7 +60,7 @@ def _start_contact(states: Array, contact: Contact, model: BallModel) -> None:
         if gap < 0.0:
             states[contact.interval, Z] -= gap
         states[contact.interval, VZ] = before[VZ] = min(float(before[VZ]), -LEAST_FALL)
-        states[contact.interval + 1 :, SPIN] = model.bounce(before)[SPIN].numpy()
+        states[contact.interval + 1 :, SPIN] = model.after_bounce(before)[SPIN].numpy()
 
 
 def _start_rest(states: Array, height: float, model: BallModel) -> None:

@@ -17,7 +17,7 @@ LEAST_SPEED = 1e-3
 """m/s, least vertical speed in the uncertainty of a contact's time."""
 
 
-def widen_near_contacts(
+def other_sides(
     times: Array,
     states: Array,
     covariances: Array,
@@ -25,7 +25,7 @@ def widen_near_contacts(
     model: BallModel,
     surfaces: Surfaces,
 ) -> Array:
-    """Covariances that own up to the two sides of a contact.
+    """What the covariances lack for the chance that a ball is on the other side of a near contact.
 
     A state within the uncertainty of a contact's time is on the side that the estimate took with probability p and
     on the other with 1 - p. With the jump d between the sides, the covariance about the estimate is larger by p (1 - p)
@@ -39,16 +39,16 @@ def widen_near_contacts(
         contacts: with the times that the estimate gives them.
         model: the ball.
         surfaces: what it may bounce on.
-    Returns: (n, 9, 9).
+    Returns: (n, 9, 9), to be added; zero far from contacts.
     """
-    widened = covariances.copy()
+    lacking = np.zeros_like(covariances)
     for contact in contacts:
         for k, beyond in ((contact.interval, contact.interval + 1), (contact.interval + 1, contact.interval)):
             sigma = float(np.sqrt(covariances[k, Z, Z])) / max(abs(float(states[k, VZ])), LEAST_SPEED)
             margin = (contact.time - times[k]) * np.sign(beyond - k) / sigma
             if margin < FAR:
                 jump = _carried(model, states[beyond], times[k] - times[beyond]) - states[k]
-                widened[k] += _mixture(margin, jump)
+                lacking[k] += _mixture(margin, jump)
     last = torch.from_numpy(states[-1])
     height = float(surfaces.height_below(last))
     margin = (
@@ -58,8 +58,8 @@ def widen_near_contacts(
     )
     if margin < FAR and last[VZ] < 0.0:
         with torch.no_grad():
-            widened[-1] += _mixture(margin, model.bounce(last).numpy() - states[-1])
-    return widened
+            lacking[-1] += _mixture(margin, model.after_bounce(last).numpy() - states[-1])
+    return lacking
 
 
 def _mixture(margin: float, jump: Array) -> Array:

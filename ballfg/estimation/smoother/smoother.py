@@ -16,7 +16,7 @@ from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Segmentation, physics_of, segment
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
 from ballfg.estimation.smoother.initial import initial_states, move_contacts
-from ballfg.estimation.smoother.near_contact import widen_near_contacts
+from ballfg.estimation.smoother.near_contact import other_sides
 from ballfg.estimation.smoother.problem import Events, TrackProblem
 from ballfg.estimation.smoother.restart import label_let_go, minimise_with_restart
 from ballfg.estimation.smoother.solution import (
@@ -213,13 +213,13 @@ class Smoother(Estimator):
             known = covariances = marginal_covariances(minimum.step.bayes_net, n, p)
         own, rest = slice(0, problem.width), slice(problem.width, p)
         own_covariances = covariances.states[:, :STATE_DIM, :STATE_DIM]
+        others = other_sides(track.times, values.states, own_covariances, contacts, self.model, self.surfaces)
         return Estimate(
             name=track.name,
             times=track.times,
             states=values.states,
-            covariances=widen_near_contacts(
-                track.times, values.states, own_covariances, contacts, self.model, self.surfaces
-            ),
+            covariances=own_covariances + others,
+            other_sides=others,
             status=_status(minimum, n),
             innovations=problem.innovations(values, known),
             coefficient_names=tuple(self.settings.coefficients),

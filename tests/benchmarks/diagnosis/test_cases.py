@@ -43,7 +43,7 @@ def doings(model: AnalyticModel) -> torch.Tensor:
         parts = [
             acceleration,
             torch.zeros_like(acceleration) if spin_rate is None else spin_rate,
-            model.bounce(falling),
+            model.after_bounce(falling),
             offset,
             model.measured(STATES, lambda delay: STATES + 0.01 * delay.reshape(-1, 1)),
             model.true_stamps(torch.tensor([[0.3], [0.7]], dtype=torch.float64)),
@@ -90,7 +90,7 @@ def test_gravity_is_planted_beside_the_declared_one() -> None:
 def test_a_left_out_effect_takes_along_those_that_need_it() -> None:
     bare = declared_model(Case("measured", "x", 1.0, 0, left_out=BARE), 0.02)
     assert set(bare.flight) == {"gravity", "drag"}
-    assert set(bare.contact) == {"restitution", "friction"}
+    assert set(bare.bounce) == {"restitution", "friction"}
     assert set(nominal_model().flight) == {"gravity", "drag", "magnus"}
 
 

@@ -13,7 +13,7 @@ from ballfg.benchmarks.dynamics.measured import Measured, measured_task, measure
 from ballfg.benchmarks.dynamics.record import job_digest, task_digest
 from ballfg.benchmarks.dynamics.suite import Plan, run_dynamics
 from ballfg.benchmarks.dynamics.task import Shot, Task
-from ballfg.benchmarks.dynamics.trained import config_of, trained_contender
+from ballfg.benchmarks.dynamics.trained import config_of, recipe, trained_contender
 from ballfg.benchmarks.estimators.measured import run_measured
 from ballfg.benchmarks.results import Results
 from ballfg.simulation import SimulationConfig, write_simulation
@@ -166,6 +166,12 @@ def test_all_graph_models_have_one_recipe(data: Measured) -> None:
     assert not configs["mnn+gs"].architecture.residual
     assert configs["mnn+gs"].data == ("a", "b")
     assert configs["mnn+gs"].launcher.labels == ("group",)
+
+
+def test_finished_trainings_keep_their_mark(data: Measured) -> None:
+    job = Job(tuple(measured_tasks(data, 1, None)), "mnn+gs", 0, Path(), False)
+    assert recipe(job).startswith("{'kind': 'mnn+gs', 'split': {'by': 'label'}, 'workers': 1, 'optimizer': ")
+    assert config_of(job, [Path("a")]).jobs == 1
 
 
 def test_bad_combinations_are_named(data: Measured) -> None:

@@ -25,7 +25,7 @@ from ballfg.dynamics.motion.paths import paths
 
 FREE = {
     "flight.drag.k": Coefficient("k", 0.12, 0.02, "1/m", 0.0, 2.0),
-    "contact.restitution.e": Coefficient("e", 0.93, 0.01, "1", 0.0, 1.0),
+    "bounce.restitution.e": Coefficient("e", 0.93, 0.01, "1", 0.0, 1.0),
 }
 NOISE = Noise(np.array([1.0, 1.2, 0.9]), 5.0, 40.0)
 

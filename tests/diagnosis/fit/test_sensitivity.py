@@ -23,8 +23,7 @@ def stretches(make_ball, make_launches, make_shots):
 
 
 def parameters(name, own):
-    section = {"flight": "flight", "bounce": "contact", "measurement": "measurement"}[EFFECTS[name].kind]
-    return {f"{section}.{name}.{c}": v for c, v in own.items()}
+    return {f"{EFFECTS[name].kind}.{name}.{c}": v for c, v in own.items()}
 
 
 def differences(model, stretches, values, step):
@@ -112,7 +111,7 @@ def test_prediction_is_the_motion_as_measured(make_ball, stretches, surfaces):
 
 
 def test_directions_in_parts_are_the_same(make_ball, stretches):
-    values = {"flight.drag.k": 0.1, "contact.restitution.e": 0.9}
+    values = {"flight.drag.k": 0.1, "bounce.restitution.e": 0.9}
     starts = stretches.starts.numpy()
     whole = sensitivity(make_ball(), stretches, starts, values, tuple(values))
     parts = sensitivity(make_ball(), stretches, starts, values, tuple(values), most_rows=12)

@@ -81,7 +81,7 @@ def test_at_a_contact_the_ball_touches_and_turns(model, states, stretches):
     before, after = motion.states(first - 1e-9)[0], motion.states(first)[0]
     assert float(model.gap(after, stretches.heights[:, 0]).abs().max()) < 1e-9
     assert bool((model.gap_rate(before) < -0.5).all())
-    torch.testing.assert_close(after[:, 3:], model.bounce(before)[:, 3:], rtol=0, atol=1e-6)
+    torch.testing.assert_close(after[:, 3:], model.after_bounce(before)[:, 3:], rtol=0, atol=1e-6)
 
 
 def test_each_row_has_its_own_coefficients(model, states, stretches):

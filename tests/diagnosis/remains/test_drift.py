@@ -32,7 +32,7 @@ def recording_test(fit):
 def test_another_table_is_found_and_said(two_sessions):
     found = recording_test(two_sessions)
     assert found.p_value < ALARM
-    assert "contact.restitution.e changes from 0.9" in found.where
+    assert "bounce.restitution.e changes from 0.9" in found.where
     assert " to 0.8" in found.where
 
 

@@ -81,7 +81,7 @@ def test_friction_is_found_though_its_absence_is_a_minimum(make_ball, make_launc
     shots = make_shots(make_ball(), make_launches(12, 21), 21, rate=50.0).stretches
     before = make_fit(without_effect(make_ball(), "friction"), shots)
     after = refit(before, Scored(hypothesis("friction"), None, 0.0))
-    found = values_of(after.fit, ["contact.friction.mu"], {})["contact.friction.mu"]
+    found = values_of(after.fit, ["bounce.friction.mu"], {})["bounce.friction.mu"]
     assert after.delta_bic < -100.0
     assert abs(found.value - 0.25) < 4 * found.sigma
 

@@ -114,7 +114,7 @@ def test_declared_coefficients_that_are_estimated(make_ball):
     free = declared_free(make_ball(drag_speed={}))
     assert "flight.gravity.g" not in free  # exact
     assert "flight.drag_speed.reference" not in free  # a shape
-    assert {"flight.drag.k", "flight.magnus.k", "contact.restitution.e", "flight.drag_speed.slope"} <= set(free)
+    assert {"flight.drag.k", "flight.magnus.k", "bounce.restitution.e", "flight.drag_speed.slope"} <= set(free)
 
 
 def test_strain_is_the_distance_from_the_usual_value_in_prior_sigmas():
@@ -122,7 +122,7 @@ def test_strain_is_the_distance_from_the_usual_value_in_prior_sigmas():
     values = {"flight.gust_region.x": 20.0, "flight.gust_region.y": -0.5, "flight.gust_region.z": 0.0}
     assert gust.strain(values) == pytest.approx(40.0)  # sigma 0.5 m/s
     friction = Hypothesis(EFFECTS["friction"], {}, ("mu",))
-    assert friction.strain({"contact.friction.mu": 0.25}) == 0.0
+    assert friction.strain({"bounce.friction.mu": 0.25}) == 0.0
     assert Hypothesis(EFFECTS["spin_label_frame"], {"yy": -1.0}, ()).strain({}) == 0.0
 
 

@@ -70,7 +70,7 @@ def test_the_model_holds_what_was_found(tilted):
     assert has_effect(search.fit.problem.model, "table_tilt")
     assert not has_effect(first.problem.model, "table_tilt")
     assert set(first.problem.free) == set(declared_free(first.problem.model))
-    assert set(search.fit.problem.free) - set(first.problem.free) == {"contact.table_tilt.x", "contact.table_tilt.y"}
+    assert set(search.fit.problem.free) - set(first.problem.free) == {"bounce.table_tilt.x", "bounce.table_tilt.y"}
     assert float(np.prod(search.fit.noise.position)) < float(np.prod(first.noise.position))
 
 

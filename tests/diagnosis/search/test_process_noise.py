@@ -64,7 +64,7 @@ def test_standard_deviations_are_those_of_the_whole_problem(calm_fit):
     np.testing.assert_allclose([v.sigma for v in found.values()], sigma, rtol=1e-6)
     assert found["flight.drag.k"].declared == 0.12
     assert found["flight.drag.k"].unit == "1/m"
-    assert found["contact.restitution.e"].declared is None
+    assert found["bounce.restitution.e"].declared is None
 
 
 def test_the_model_goes_through_a_file(unlabelled, tmp_path):

@@ -18,7 +18,7 @@ BASE = {
     "friction": {"mu": 0.25},
     "tangential_restitution": {"e_t": 0.15},
 }
-SECTION = {"flight": "flight", "bounce": "contact", "measurement": "measurement"}
+KINDS = ("flight", "bounce", "measurement")
 V, W, P = np.array([5.0, -1.0, -2.0]), np.array([40.0, -150.0, 60.0]), np.array([1.2, 0.3, 1.1])
 STATE = torch.from_numpy(np.concatenate((P, V, W)))[None]
 GRIPS = torch.tensor([[1.2, 0.3, 1.1, 0.5, 0.2, -4.0, 5.0, 3.0, 60.0]], dtype=torch.float64)
@@ -55,18 +55,18 @@ def said(model, state, kind):
         return torch.cat((acceleration, torch.zeros_like(acceleration) if spin_rate is None else spin_rate), dim=-1)
     if kind == "bounce":
         gaps = (model.gap(state, 0.0), model.gap_rate(state), model.gap_acceleration(state))
-        return torch.cat((model.bounce(state)[..., 3:], torch.stack(gaps, dim=-1)), dim=-1)
+        return torch.cat((model.after_bounce(state)[..., 3:], torch.stack(gaps, dim=-1)), dim=-1)
     stamps = model.true_stamps(TIMES.expand(len(state), 1))
     return torch.cat((model.measured(state, ballistic(state)), stamps, model.labelled(state[..., 6:])), dim=-1)
 
 
 def everything(model, state):
     """All that a model says of a state."""
-    return torch.cat([said(model, state, kind) for kind in SECTION], dim=-1)
+    return torch.cat([said(model, state, kind) for kind in KINDS], dim=-1)
 
 
 def parameters(name):
-    return [f"{SECTION[EFFECTS[name].kind]}.{name}.{c.name}" for c in EFFECTS[name].coefficients]
+    return [f"{EFFECTS[name].kind}.{name}.{c.name}" for c in EFFECTS[name].coefficients]
 
 
 @pytest.mark.parametrize("name", EFFECTS)
@@ -216,8 +216,8 @@ def test_restitution_falls_with_speed_whatever_the_order():
     effects = [EFFECTS["restitution_speed"](slope=0.02, reference=1.0), EFFECTS["restitution"](e=0.9)]
     for given in (effects, effects[::-1]):
         model = AnalyticModel(given)
-        assert list(model.contact) == ["restitution", "restitution_speed"]
-        assert model.bounce(STATE)[0, 5].item() == pytest.approx((0.9 - 0.02) * 2.0, abs=1e-14)
+        assert list(model.bounce) == ["restitution", "restitution_speed"]
+        assert model.after_bounce(STATE)[0, 5].item() == pytest.approx((0.9 - 0.02) * 2.0, abs=1e-14)
 
 
 class Chained(FlightEffect):

@@ -104,7 +104,7 @@ def test_effects_add_up(build, states):
 
 
 def test_order_of_effects_does_not_matter(model, states):
-    effects = [*model.flight.values(), *model.contact.values()]
+    effects = [*model.flight.values(), *model.bounce.values()]
     torch.testing.assert_close(moved(AnalyticModel(reversed(effects)), states(20)), moved(model, states(20)))
 
 
@@ -192,6 +192,7 @@ def test_printing_a_model_shows_ball_and_effects(model):
     [
         ({"table_height": math.nan}, "table_height must be finite; got nan"),
         ({"floor_height": 0.0}, "floor_height must lie below table_height 0 m; got 0 m"),
+        ({"edge_sigmas": (0, -1, 0, 0)}, r"edge_sigmas must be finite and not negative, in m; got \(0, -1, 0, 0\)"),
         ({"extent": (1, 0, 0, 1)}, r"extent must be \(x_low, x_high, y_low, y_high\); got \(1, 0, 0, 1\)"),
     ],
 )

@@ -209,5 +209,5 @@ def test_a_measurement_effect_and_a_decorator() -> None:
 
 
 def test_an_unknown_effect_says_how_to_make_it_known() -> None:
-    with pytest.raises(ValueError, match=r"One of your own must be registered first: --effects FILE\.py, or ballfg"):
+    with pytest.raises(ValueError, match=r"of your own must be registered first: --effects-file FILE\.py, or ballfg"):
         model_from_dict({"flight": {"own_lift": {}}, "bounce": {}})

@@ -75,7 +75,9 @@ def test_gap_is_that_of_the_turned_scene(starts):
 
 
 def test_a_bounce_is_the_turned_bounce(starts):
-    torch.testing.assert_close(TILTED.bounce(turned(starts)), turned(LEVEL.bounce(starts)), rtol=0, atol=1e-12)
+    torch.testing.assert_close(
+        TILTED.after_bounce(turned(starts)), turned(LEVEL.after_bounce(starts)), rtol=0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize("heights", [(HEIGHT,), (HEIGHT, HEIGHT)])
@@ -112,7 +114,7 @@ def test_jacobian_by_two_routes(starts):
 
 
 def test_contact_time_by_the_tilt_against_differences(starts):
-    names = ("contact.table_tilt.x", "contact.table_tilt.y")
+    names = ("bounce.table_tilt.x", "bounce.table_tilt.y")
 
     def time(x, y):
         return contact_time(substitute(LEVEL_WITH_TILT, dict(zip(names, (x, y), strict=True))), starts, HEIGHT)
@@ -147,7 +149,7 @@ def test_the_slope_rises_where_the_rotation_says():
 
 
 def test_a_tilt_that_travels_with_the_state(starts):
-    names = ("contact.table_tilt.x", "contact.table_tilt.y")
+    names = ("bounce.table_tilt.x", "bounce.table_tilt.y")
     augmented = AugmentedModel(TILTED, names)
     state = augmented.append(turned(starts), torch.tensor(TILT, dtype=torch.float64))
     torch.testing.assert_close(augmented.gap_rate(state), TILTED.gap_rate(turned(starts)), rtol=0, atol=1e-14)

@@ -168,7 +168,7 @@ def test_saltation_formula(model, states):
     with torch.no_grad():
         tau = contact_time(model, state, 0.0)
         before = fly(model, state, tau)
-    after, impact = batch_jacobian(model.bounce, before)
+    after, impact = batch_jacobian(model.after_bounce, before)
     f_before, f_after = (derivative(model.rates, x).detach().unsqueeze(-1) for x in (before, after))
     row = torch.zeros((1, 9), dtype=torch.float64)
     row[0, 2] = 1.0
@@ -223,7 +223,7 @@ def test_heights_that_differ_and_contacts_outside_the_interval(model, states):
         torch.testing.assert_close(after, reference, rtol=0, atol=1e-7)
         torch.testing.assert_close(times[:, 0], torch.full((5,), -0.004, dtype=torch.float64), rtol=0, atol=1e-8)
         early, _ = fly_through(model, state, tau - 0.003, (0.0,))
-        bounced = model.bounce(fly(model, state, tau))
+        bounced = model.after_bounce(fly(model, state, tau))
         backwards = fly(model, bounced, torch.full((5,), -0.003, dtype=torch.float64))
         torch.testing.assert_close(early, backwards, rtol=0, atol=1e-12)
         floor = torch.full((5,), -0.5, dtype=torch.float64)
@@ -237,7 +237,7 @@ def loss_through(model, state, steps):
         tau = contact_time(model, state, 0.0)
     for _ in range(steps):
         tau = tau + _newton_step(model, state, 0.0, tau)
-    after = fly(model, model.bounce(fly(model, state, tau)), 0.25 - tau)
+    after = fly(model, model.after_bounce(fly(model, state, tau)), 0.25 - tau)
     weights = torch.tensor((1, 2, 3, 0.4, 0.5, 0.6, 0.01, 0.02, 0.03), dtype=torch.float64)
     return (after * weights).sum() + (after[..., :3].square()).sum()
 

@@ -136,15 +136,15 @@ def test_slip_never_reverses_without_tangential_restitution(random_impacts):
 
 def test_a_ball_that_moves_away_gets_no_friction(model):
     state = torch.tensor([[0, 0, 0.02, 5, 0, 1, 0, 0, 0]], dtype=torch.float64)
-    assert model.bounce(state)[0, 3].item() == 5.0
-    assert energy(model.bounce(state)[:, 3:6], state[:, 6:], SHELL) <= energy(state[:, 3:6], state[:, 6:], SHELL)
+    assert model.after_bounce(state)[0, 3].item() == 5.0
+    assert energy(model.after_bounce(state)[:, 3:6], state[:, 6:], SHELL) <= energy(state[:, 3:6], state[:, 6:], SHELL)
 
 
 @pytest.mark.parametrize("vz", [0.0, -1.0])
 def test_first_and_second_derivatives_are_finite_without_slip(model, vz):
     state = torch.tensor([0, 0, 0.02, 0, 0, vz, 0, 0, 0], dtype=torch.float64)
-    jacobian = torch.autograd.functional.jacobian(model.bounce, state)
-    hessian = torch.autograd.functional.hessian(lambda s: model.bounce(s).square().sum(), state)
+    jacobian = torch.autograd.functional.jacobian(model.after_bounce, state)
+    hessian = torch.autograd.functional.hessian(lambda s: model.after_bounce(s).square().sum(), state)
     assert bool(jacobian.isfinite().all())
     assert bool(hessian.isfinite().all())
 
@@ -153,13 +153,13 @@ def test_first_and_second_derivatives_are_finite_without_slip(model, vz):
 def test_gradcheck(model, speed):
     state = torch.tensor([[0.1, 0.2, 0.02, speed, 0.3, -2.0, 10.0, 20.0, 30.0]], dtype=torch.float64)
     state.requires_grad_(True)
-    assert torch.autograd.gradcheck(model.bounce, (state,))
-    assert torch.autograd.gradgradcheck(model.bounce, (state,))
+    assert torch.autograd.gradcheck(model.after_bounce, (state,))
+    assert torch.autograd.gradgradcheck(model.after_bounce, (state,))
 
 
 def test_without_effects_a_bounce_only_turns_the_normal_speed(build, states):
     before = states(20)
-    after = build().bounce(before)
+    after = build().after_bounce(before)
     expected = before.clone()
     expected[:, 5] *= -1
     assert torch.equal(after, expected)

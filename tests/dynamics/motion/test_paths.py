@@ -142,7 +142,7 @@ def test_the_edge_of_the_table(build) -> None:
 
 def test_coefficients_of_each_ball(model, states, table) -> None:
     """An augmented model: each row with its own coefficients, as a model that has them."""
-    names = ("flight.drag.k", "contact.restitution.e")
+    names = ("flight.drag.k", "bounce.restitution.e")
     augmented, state = AugmentedModel(model, names), states(3)
     own = torch.tensor([[0.10, 0.93], [0.15, 0.80], [0.13, 0.88]], dtype=torch.float64)
     with torch.no_grad():

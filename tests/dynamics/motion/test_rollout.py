@@ -142,9 +142,9 @@ def test_own_parameters_for_each_row(model, states):
     values = {
         "flight.drag.k": torch.linspace(0.0, 0.3, 5, dtype=torch.float64)[:, None],
         "flight.gravity.g": torch.linspace(9, 11, 5, dtype=torch.float64)[:, None],
-        "contact.restitution.e": torch.linspace(0.5, 0.9, 5, dtype=torch.float64)[:, None],
-        "contact.friction.mu": torch.linspace(0.1, 0.4, 5, dtype=torch.float64)[:, None],
-        "contact.table_height.offset": torch.linspace(-0.01, 0.01, 5, dtype=torch.float64)[:, None],
+        "bounce.restitution.e": torch.linspace(0.5, 0.9, 5, dtype=torch.float64)[:, None],
+        "bounce.friction.mu": torch.linspace(0.1, 0.4, 5, dtype=torch.float64)[:, None],
+        "bounce.table_height.offset": torch.linspace(-0.01, 0.01, 5, dtype=torch.float64)[:, None],
     }
     with torch.no_grad():
         together = advance(substitute(model, values), state, dt, TABLE_ONLY)

@@ -69,7 +69,7 @@ def test_untrained_it_falls_in_vacuum_and_bounces_up(kind, spin_rate, states):
     assert angular is None if not spin_rate else bool((angular == 0).all())
     after = state.clone()
     after[:, 5] *= -START_RESTITUTION
-    assert torch.allclose(model.bounce(state), after, rtol=1e-15)
+    assert torch.allclose(model.after_bounce(state), after, rtol=1e-15)
     assert physics_of(model).restitution == pytest.approx(START_RESTITUTION)
     assert physics_of(model).gravity == pytest.approx(9.81)
     assert physics_of(model).surface_offset == -0.003
@@ -81,7 +81,7 @@ def test_untrained_corrections_correct_nothing(kind, every_effect, states):
     model = build(Architecture.of(kind, residual=True, spin_rate=True), radius=0.02, base=every_effect)
     for ours, its in zip(model.rates(state), every_effect.rates(state), strict=True):
         assert torch.equal(ours, its)
-    assert torch.equal(model.bounce(state), every_effect.bounce(state))
+    assert torch.equal(model.after_bounce(state), every_effect.after_bounce(state))
     assert physics_of(model) == physics_of(every_effect)
 
 
@@ -103,7 +103,9 @@ def test_symmetric_about_z(kind, mirror, every_effect, states):
     surfaces = Surfaces(0.0)
     for base in (None, every_effect):
         model = model_of(kind, base=base, spin_rate=True)
-        assert torch.allclose(model.bounce(turned(state, matrix)), turned(model.bounce(state), matrix), atol=1e-11)
+        assert torch.allclose(
+            model.after_bounce(turned(state, matrix)), turned(model.after_bounce(state), matrix), atol=1e-11
+        )
         there = rollout(model, turned(state, matrix), times, surfaces)
         assert torch.allclose(there, turned(rollout(model, state, times, surfaces), matrix), rtol=0, atol=1e-10)
 
@@ -129,7 +131,7 @@ def test_a_falling_ball_always_leaves_upwards(kind, states):
     state = states(200, seed=4)
     state[:, 5] = -state[:, 5].abs()
     for size in (0.1, 1.0, 10.0):
-        up = model_of(kind, size=size).bounce(state)[:, 5]
+        up = model_of(kind, size=size).after_bounce(state)[:, 5]
         assert bool((up >= 0).all())
         assert bool((up <= (HIGHEST_RESTITUTION + 1e-12) * -state[:, 5]).all())
 
@@ -158,8 +160,8 @@ def test_jacobians(kind, spin_rate, states, differences):
     heavy, light = (rate_jacobian(model.rates, state, heavy=h) for h in (True, False))
     assert torch.allclose(heavy, light, rtol=0, atol=1e-12)
     before = fly(model, state, contact_time(model, state, 0.0)).detach()
-    _, impact = batch_jacobian(model.bounce, before)
-    assert torch.allclose(impact, differences(model.bounce, before), rtol=1e-6, atol=1e-7)
+    _, impact = batch_jacobian(model.after_bounce, before)
+    assert torch.allclose(impact, differences(model.after_bounce, before), rtol=1e-6, atol=1e-7)
     dt = contact_time(model, state, 0.0).detach() + 0.005
     _, _, through = fly_through_jacobian(model, state, dt, (0.0,))
     expected = differences(lambda s: fly_through(model, s, dt, (0.0,))[0], state)
@@ -176,7 +178,7 @@ def test_a_gradient_reaches_every_parameter(kind, states):
 
 def test_coefficients_of_the_base_travel_with_the_state(every_effect, states, differences):
     model, state = model_of("mnn+gs", base=every_effect), states(5)
-    names = ("base.flight.drag.k", "base.contact.restitution.e", "base.contact.table_height.offset")
+    names = ("base.flight.drag.k", "base.bounce.restitution.e", "base.bounce.table_height.offset")
     assert set(names) <= set(model.declared_coefficients())
     ball = AugmentedModel(model, names)
     values = torch.tensor((0.11, 0.88, -0.002), dtype=torch.float64) * torch.linspace(0.9, 1.1, 5).double()[:, None]

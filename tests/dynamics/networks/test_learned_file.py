@@ -140,7 +140,7 @@ def test_only_models_that_a_file_can_hold(tmp_path):
         def rates(self, state):
             return torch.zeros_like(state[..., 3:6]), None
 
-        def bounce(self, state):
+        def after_bounce(self, state):
             return state
 
     for model in (Still(0.02), small("mlp", Still(0.02))):

@@ -186,7 +186,7 @@ def test_rts_pass_is_the_dense_batch_solution(linear):
 def test_motion_is_the_rollout_and_its_jacobian(start, dt):
     model = nominal_model()
     surfaces = Surfaces(table_height=0.003, floor_height=-0.76, extent=(-1.0, 1.0, -1.0, 1.0))
-    trackwise = AugmentedModel(model, ("flight.drag.k", "contact.restitution.e"))
+    trackwise = AugmentedModel(model, ("flight.drag.k", "bounce.restitution.e"))
     state = trackwise.append(tensor(start), torch.tensor([0.12, 0.93], dtype=torch.float64))
     motion = advance_jacobian(trackwise, state, dt, surfaces)
 
@@ -391,16 +391,16 @@ def test_coefficients_are_learnt_on_the_way(rng):
     settings = Settings(
         process=ProcessNoise(0.05, 1.0, 0.005, 1.0),
         position_noise=(0.002,) * 3,
-        coefficients={"contact.restitution.e": 0.05},
+        coefficients={"bounce.restitution.e": 0.05},
     )
     parameters = dict(model.named_parameters())
     with torch.no_grad():
-        parameters["contact.restitution.e"].fill_(0.85)
+        parameters["bounce.restitution.e"].fill_(0.85)
     _, track = simulate(model, settings, SERVE, np.arange(60) * 0.01, rng, label=False)
     with torch.no_grad():
-        parameters["contact.restitution.e"].fill_(0.93)
+        parameters["bounce.restitution.e"].fill_(0.93)
     result = ExtendedKalmanFilter(model, TABLE, settings, smooth=True).estimate(track)
-    assert result.coefficient_names == ("contact.restitution.e",)
+    assert result.coefficient_names == ("bounce.restitution.e",)
     assert result.cross_covariances.shape == (60, STATE_DIM, 1)
     sigma = float(np.sqrt(result.coefficient_covariance[0, 0]))
     assert sigma < 0.02

@@ -29,7 +29,7 @@ STATES = torch.tensor(
 def measuring(**effects: dict[str, float]) -> AnalyticModel:
     nominal = nominal_model()
     extra = [EFFECTS[name](**values) for name, values in effects.items()]
-    return AnalyticModel([*nominal.flight.values(), *nominal.contact.values(), *extra])
+    return AnalyticModel([*nominal.flight.values(), *nominal.bounce.values(), *extra])
 
 
 def frame(matrix: np.ndarray) -> dict[str, float]:

@@ -43,7 +43,7 @@ class Bulge(MeasurementEffect):
 
 
 def declared(*effects: Effect) -> AnalyticModel:
-    own = [*BALL.flight.values(), *BALL.contact.values(), *effects]
+    own = [*BALL.flight.values(), *BALL.bounce.values(), *effects]
     return AnalyticModel(own, radius=BALL.radius, inertia_factor=BALL.inertia_factor)
 
 
@@ -134,7 +134,7 @@ def test_an_effect_that_no_catalogue_holds(plain, reference) -> None:
 
 
 def test_coefficients_of_the_track_are_estimated_as_usual(plain) -> None:
-    settings = replace(SETTINGS, coefficients={"flight.drag.k": 0.02, "contact.table_height.offset": 0.003})
+    settings = replace(SETTINGS, coefficients={"flight.drag.k": 0.02, "bounce.table_height.offset": 0.003})
     effects = parse_effects(["velocity_lag.lag=0.005"])
     (expected,) = [Smoother(BALL, SURFACES, settings).estimate(s.track) for s in plain[:1]]
     found = make_estimator("smoother", declared(*effects), SURFACES, settings).estimate(simulated(effects)[0].track)

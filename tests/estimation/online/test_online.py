@@ -51,8 +51,8 @@ class NetworkModel(BallModel):
         features = torch.cat((velocity / 5, spin / 100, torch.linalg.cross(spin, velocity) / 500), dim=-1)
         return self.ball.rates(state)[0] + 0.5 * self.net(features), None
 
-    def bounce(self, state):
-        return self.ball.bounce(state)
+    def after_bounce(self, state):
+        return self.ball.after_bounce(state)
 
 
 def make_track(start, n=50, *, model=None, surfaces=TABLE, seed=0, dt=0.01, labels=None):

@@ -30,7 +30,7 @@ class Useless(BallModel):
     def rates(self, state):
         return torch.ones_like(state[..., :3]), None
 
-    def bounce(self, state):
+    def after_bounce(self, state):
         return -3.0 * state
 
 
@@ -51,9 +51,9 @@ def test_learned_contacts_are_asked_what_they_may_know():
         def rates(self, state):
             return torch.zeros_like(state[..., :3]), None
 
-        def bounce(self, state):
+        def after_bounce(self, state):
             inside = state[..., 3:4].abs() < 15.0
-            after = inner.bounce(state)
+            after = inner.after_bounce(state)
             return torch.where(inside, after, 2.0 * state)
 
     inner = model_from_dict({"flight": {}, "bounce": {"restitution": {"e": 0.9}, "friction": {"mu": 0.2}}})

@@ -94,7 +94,7 @@ def test_spin_coefficients_need_spin_labels(no_spin_labels: Path, few_tracks: Pa
 @pytest.mark.parametrize(
     ("names", "message"),
     [
-        (["contact.restitution.k"], r"'contact.restitution.k' is not\. Did you mean 'contact.restitution.e'"),
+        (["bounce.restitution.k"], r"'bounce.restitution.k' is not\. Did you mean 'bounce.restitution.e'"),
         (["flight.wind.x"], "'flight.wind.x' is not"),
         (["flight.drag.k", "flight.drag.k"], "'flight.drag.k' stands twice"),
         (["flight.gravity.g"], "'flight.gravity.g' is taken as known"),

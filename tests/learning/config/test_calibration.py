@@ -25,6 +25,15 @@ def test_defaults_overrides_and_options(tmp_path: Path) -> None:
     assert (found.horizon, found.split, found.data) == (None, "label", "b")
 
 
+def test_the_earlier_name_of_the_observed_share_is_read(tmp_path: Path) -> None:
+    found = read_config(written(tmp_path, "kind: calibrate\nobserve: 0.3"))
+    assert found == CalibrationConfig(observed_share=0.3)
+    assert "observe" not in found.model_dump()
+    path = written(tmp_path, "observe: 0.3")
+    assert read_config(path, ["observed_share=0.5", "kind=calibrate"]) == CalibrationConfig(observed_share=0.5)
+    assert read_config(path, ["kind=calibrate", "observe=0.5"]) == CalibrationConfig(observed_share=0.5)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -39,7 +48,10 @@ def test_defaults_overrides_and_options(tmp_path: Path) -> None:
         ("coefficients: [1]", "'coefficients.0' must be a valid string; got 1"),
         ("coefficients: []", "'coefficients' must hold at least one"),
         ("split: half", "'split' must be 'random' or 'label'; got 'half'"),
-        ("observe: 1.0", "'observe' must be less than 1; got 1.0"),
+        ("observed_share: 1.0", "'observed_share' must be less than 1; got 1.0"),
+        ("observe: 1.0", "'observed_share' must be less than 1; got 1.0"),
+        ("observe: 0.3\nobserved_share: 0.3", "'observe' is the earlier name of 'observed_share'; got both. Delete"),
+        ("workers: 3", "unknown key 'workers'"),
         ("seed: 1\nseed: 2", "'seed' stands twice"),
         ("[1, 2]", "a config maps keys to values; got [1, 2]"),
         ("seed: [", "not readable as YAML"),

@@ -75,6 +75,11 @@ def test_overrides_reach_into_sections(tmp_path: Path) -> None:
         ("data: []", "'data' must hold at least one; got []"),
         ("data: 3", "'data' must be a list; got 3"),
         ("observe: {samples: 20, seconds: 0.3}", "'observe' must have exactly one of samples and seconds"),
+        ("observe: -0.3", "'observe.seconds' must be greater than 0; got -0.3"),
+        ("observe: true", "'observe' must be seconds, or a section with samples or seconds; got True. Write 0.25."),
+        ("observe: soon", "'observe' must be seconds, or a section with samples or seconds; got 'soon'. Write 0.25."),
+        ("{jobs: 2, workers: 2}", "'workers' is the earlier name of 'jobs'; got both. Delete 'workers'."),
+        ("workers: 0", "'jobs' must be greater than or equal to 1; got 0"),
         ("observe: {samples: null}", "'observe' must have exactly one of samples and seconds"),
         ("{kind: lstm, model: a.yaml}", "'model' plays no part in kind 'lstm'. Leave it out."),
         ("{kind: lstm, gradient: unrolled}", "'gradient' plays no part in kind 'lstm'. Leave it out."),
@@ -88,6 +93,32 @@ def test_what_is_wrong_is_said(tmp_path: Path, text: str, message: str) -> None:
         read_config(path)
     assert message in str(error.value)
     assert str(error.value).startswith(f"{path}: ")
+
+
+def test_a_number_to_observe_is_seconds(tmp_path: Path) -> None:
+    for text, words in (
+        ("observe: 0.3", ()),
+        ("observe: {samples: 40}", ("observe=0.3",)),
+        ("observe: 2", ("observe=0.3",)),
+    ):
+        found = read_config(written(tmp_path, text), words)
+        assert isinstance(found, TrainConfig)
+        assert found == TrainConfig.model_validate({"observe": {"seconds": 0.3}})
+        assert read_config(written(tmp_path, yaml.safe_dump(found.model_dump(mode="json")))) == found
+    found = read_config(written(tmp_path, "observe: 0.3"), ["observe.samples=40"])
+    assert isinstance(found, TrainConfig)
+    assert (found.observe.samples, found.observe.seconds) == (40, None)
+
+
+def test_the_earlier_name_of_jobs_is_read(tmp_path: Path) -> None:
+    path = written(tmp_path, "workers: 3")
+    assert read_config(path) == checked_config({"workers": 3}, "here") == TrainConfig(jobs=3)
+    assert "workers" not in read_config(path).model_dump()
+    for name in ("jobs", "workers"):
+        for text in ("workers: 3", "jobs: 3", ""):
+            assert read_config(written(tmp_path, text), [f"{name}=2"]) == TrainConfig(jobs=2)
+    with pytest.raises(ValueError, match=r"^here: 'workers' is the earlier name of 'jobs'; got both"):
+        checked_config({"workers": 3, "jobs": 3}, "here")
 
 
 def test_bad_overrides_name_the_nested_key(tmp_path: Path) -> None:

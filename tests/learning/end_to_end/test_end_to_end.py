@@ -68,8 +68,8 @@ def check(learner: EndToEnd, steps: dict[str, float], tolerance: float) -> None:
 
 STEPS = {
     "model.flight.drag.k": 5e-4,
-    "model.contact.restitution.e": 5e-4,
-    "model.contact.table_height.offset": 2e-6,
+    "model.bounce.restitution.e": 5e-4,
+    "model.bounce.table_height.offset": 2e-6,
     "embedding.weight": 5e-4,
     "noise.process": 5e-4,
     "noise.position": 2e-4,
@@ -400,11 +400,11 @@ def test_groups_and_bounds() -> None:
     assert len(coefficients) == 8
     assert groups == {"noise.": (10.0, 3), "embedding.": (3.0, 1)} | coefficients
     with torch.no_grad():
-        model.contact.restitution.e.fill_(5.0)
+        model.bounce.restitution.e.fill_(5.0)
         learner.learnables.noise.spin.fill_(99.0)
     learner.after_step()
-    high = model.declared_coefficients()["contact.restitution.e"].high
-    assert float(model.contact.restitution.e.detach()) == high
+    high = model.declared_coefficients()["bounce.restitution.e"].high
+    assert float(model.bounce.restitution.e.detach()) == high
     assert float(learner.learnables.noise.spin.detach()) == 12.0
     assert {g["name"] for g in trainee(noise=False).groups()} == {"embedding.", *coefficients}
     corrected = {name.replace("model.", "model.base.") for name in coefficients}

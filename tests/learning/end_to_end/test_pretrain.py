@@ -28,7 +28,7 @@ def misfit(model: LearnedModel, teacher, seed: int, *, spin_rate: bool = False) 
     falling[:, 5] = -0.3 - falling[:, 5].abs()
     with torch.no_grad():
         (a, w), (b, u) = model.rates(state), teacher.rates(state)
-        after = model.bounce(falling) - teacher.bounce(falling)
+        after = model.after_bounce(falling) - teacher.after_bounce(falling)
     squares = (
         (a - b).square().mean() + (after[:, VELOCITY] / 0.1).square().mean() + (after[:, SPIN] / 10).square().mean()
     )

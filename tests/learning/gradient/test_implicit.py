@@ -183,7 +183,7 @@ def test_scaling_all_noise_moves_nothing() -> None:
 def test_priors_of_coefficients() -> None:
     """Coefficients of each track about the model's own: those values act through the prior's mean, others as ever."""
     model = usual_ball()
-    settings = replace(SETTINGS, coefficients={"flight.drag.k": 0.03, "contact.restitution.e": 0.02})
+    settings = replace(SETTINGS, coefficients={"flight.drag.k": 0.03, "bounce.restitution.e": 0.02})
     estimates = Estimates(model, measured(TRUTH), settings)
     assert len(estimates.starts[0].coefficients) == 2
     leaves = {n: p for n, p in model.named_parameters() if n.split(".")[1] in ("drag", "restitution", "magnus")}

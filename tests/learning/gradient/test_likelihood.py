@@ -167,7 +167,7 @@ def test_contacts_and_coefficients_of_a_ball_that_bounces() -> None:
     The value itself, solved anew at each noise, gives the differences: a few per cent are seen.
     """
     noise = NoiseScales(NOISE, learned=True)
-    settings = replace(PLAIN, coefficients={"flight.drag.k": 0.03, "contact.restitution.e": 0.02})
+    settings = replace(PLAIN, coefficients={"flight.drag.k": 0.03, "bounce.restitution.e": 0.02})
     estimates = Estimates(usual_ball(), measured(usual_ball())[1:2], settings, noise)
     assert all(len(s.events.contacts) == 1 for s in estimates.solve())
     check_gradient(estimates, lambda: likelihood(estimates).sum(), 0.06)

@@ -24,7 +24,7 @@ from tests.learning.estimates import (
     usual_ball,
 )
 
-COEFFICIENTS = {"flight.drag.k": 0.03, "contact.restitution.e": 0.02}
+COEFFICIENTS = {"flight.drag.k": 0.03, "bounce.restitution.e": 0.02}
 
 
 @pytest.fixture(scope="module", params=["states", "coefficients"])

@@ -38,7 +38,7 @@ def outer(point: torch.Tensor) -> torch.Tensor:
     return along + 0.01 * along.square()
 
 
-@pytest.mark.parametrize("name", ["flight.gravity.g", "flight.drag.k", "flight.magnus.k", "contact.restitution.e"])
+@pytest.mark.parametrize("name", ["flight.gravity.g", "flight.drag.k", "flight.magnus.k", "bounce.restitution.e"])
 def test_gradient_by_a_parameter_is_that_of_differences(estimates: Estimates, name: str) -> None:
     leaf = dict(estimates.model.named_parameters())[name]
     (found,) = torch.autograd.grad(outer(estimates.attached(ImplicitGradient(), [leaf])), [leaf])

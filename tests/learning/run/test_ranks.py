@@ -65,7 +65,7 @@ def check_same(a: Path, b: Path) -> None:
 
 
 def test_two_processes_give_what_one_gives(folder: Path, one: Path) -> None:
-    done = trained(folder, "--data", "plain", "--out", "two", "workers=2")
+    done = trained(folder, "--data", "plain", "--out", "two", "jobs=2")
     assert (done.returncode, done.stderr) == (0, "note: read\n")
     assert done.stdout.count("epoch 3/3") == 1
     check_same(one, folder / "two")
@@ -78,8 +78,8 @@ def test_torchrun_and_another_number_of_processes_on_resume_give_it_too(folder: 
     assert done.stdout.count("epoch 3/3") == 1
     check_same(one, folder / "torchrun")
     shutil.copytree(one, folder / "more")
-    for name, workers in (("torchrun", "workers=1"), ("more", "workers=2")):
-        done = trained(folder, "--data", "plain", "--resume", name, workers, "optimizer.epochs=5")
+    for name, jobs in (("torchrun", "jobs=1"), ("more", "jobs=2")):
+        done = trained(folder, "--data", "plain", "--resume", name, jobs, "optimizer.epochs=5")
         assert (done.returncode, done.stderr) == (0, "note: read\n")
     check_same(folder / "torchrun", folder / "more")
     assert len(read_metrics(folder / "more" / "metrics.csv")) == 6
@@ -88,7 +88,7 @@ def test_torchrun_and_another_number_of_processes_on_resume_give_it_too(folder: 
 @pytest.mark.slow
 def test_a_stop_is_said_once(folder: Path) -> None:
     failing = ("--data", "failing-1", "--data", "failing-4", "--data", "failing-7")
-    done = trained(folder, *failing, "--out", "stopped", "workers=2")
+    done = trained(folder, *failing, "--out", "stopped", "jobs=2")
     assert done.returncode == 2
     assert done.stderr.count("ballfg: error: more than 20 % of the 10 training tracks failed in one epoch") == 1
     assert done.stderr.count("\n") == 2  # with the note
@@ -111,10 +111,10 @@ def _wait_for(lines: Iterator[str], beginning: str) -> None:
         pass
 
 
-@pytest.mark.parametrize("workers", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_ctrl_c_keeps_the_last_epoch(folder: Path, workers: int) -> None:
-    out = folder / f"interrupted-{workers}"
-    status, said = interrupted(folder, f"workers={workers}", "--out", str(out))
+@pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
+def test_ctrl_c_keeps_the_last_epoch(folder: Path, jobs: int) -> None:
+    out = folder / f"interrupted-{jobs}"
+    status, said = interrupted(folder, f"jobs={jobs}", "--out", str(out))
     assert status == 130
     assert said.splitlines()[1:] == [
         f"epochs up to 2 are kept; continue with --resume {out}",

@@ -73,7 +73,10 @@ def test_a_resumed_run_is_the_uninterrupted_one(finished: Path, tmp_path: Path, 
     # rows that no checkpoint knows of are taken again
     rows = read_metrics(folder / "metrics.csv")
     write_metrics(folder / "metrics.csv", [*rows, replace(rows[-1], epoch=3)])
-    run(config(epochs=4, workers=2, checkpoint_every=2), folder, resume=True)
+    written = folder / "config.yaml"
+    assert "jobs: " in written.read_text()
+    written.write_text(written.read_text().replace("jobs: ", "workers: "))  # as an older version wrote it
+    run(config(epochs=4, jobs=2, checkpoint_every=2), folder, resume=True)
     assert "epoch 1/" not in capsys.readouterr().out
     for name in ("weights", "optimizer", "memory", "best"):
         file = f"checkpoint/{name}.safetensors"

@@ -1,0 +1,1 @@
+"""Noise that the tracks of a dataset show: of the tracker, of the motion, of bounces, labels and spins."""

@@ -1,0 +1,181 @@
+"""Tracks linearised about their estimates: what another noise would have made of them, without estimating again.
+
+Near an estimate the motion is linear: a deviation d_k of state and coefficients moves on as F_k d_k + o_k, where o_k is
+by how much the estimate itself departs from the model. F and o come from the dynamics factors of the solved graph,
+contacts with their saltation included. A Kalman filter over deviations then gives forecasts for any noise.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ballfg.arrays import Array
+from ballfg.estimation.segmentation import Quality
+from ballfg.estimation.settings import sample_sigmas, spin_start
+from ballfg.estimation.smoother.problem import START_POSITION_SIGMA, TrackProblem, coefficient_means
+from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.estimation.smoother.solution import Solution
+from ballfg.factors.dynamics import DynamicsFactors
+from ballfg.factors.graph import run
+from ballfg.factors.noise import PROCESS_NOISE, Kicks
+from ballfg.progress import Watch, unwatched
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+from ballfg.tracks import Track
+
+LEAST_SAMPLES = 6
+"""A track of fewer samples says nothing about its noise that its own fit does not take away."""
+
+
+@dataclass(frozen=True)
+class LinearTracks:
+    """Linearised tracks side by side; shorter ones end in samples that are not used.
+
+    With t tracks of up to n samples, and d = 9 + p numbers for state and coefficients:
+
+    Attributes:
+        times: (t, n) s since the first stamp.
+        errors: (t, n, 3) m, measured minus estimated positions.
+        white: (t, n, 3) m, standard deviations of the samples' white errors.
+        velocities: (t, n, 3) m/s.
+        used: (t, n) bool, good samples.
+        transitions: (t, n - 1, d, d) F, in the units of state and coefficients.
+        departures: (t, n - 1, d) o, in the units of state and coefficients.
+        kicks: (t, n - 1, 7, 9, 9) covariance that a unit of each number of `PROCESS_NOISE` gathers.
+        starts: (t, d) mean of the prior at the first sample, as a deviation from the estimate.
+        labelled: (t,) bool, whether a label tells the spin at the first sample.
+        coefficient_sigmas: (p,) prior standard deviations, in the coefficients' own units.
+    """
+
+    times: Tensor
+    errors: Tensor
+    white: Tensor
+    velocities: Tensor
+    used: Tensor
+    transitions: Tensor
+    departures: Tensor
+    kicks: Tensor
+    starts: Tensor
+    labelled: Tensor
+    coefficient_sigmas: Tensor
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def prior_variances(self, spin: Tensor, label: Tensor, coefficients: Tensor, velocity: float) -> Tensor:
+        """(t, d) of the first state and the coefficients.
+
+        Args:
+            spin: () rad/s, standard deviation per axis of spins without a label.
+            label: () rad/s, of a label.
+            coefficients: () multiple of `coefficient_sigmas`.
+            velocity: m/s, standard deviation per axis.
+        """
+        count = len(self)
+        spins = torch.where(self.labelled, label, spin).square()[:, None].expand(count, 3)
+        fixed = torch.tensor([START_POSITION_SIGMA**2] * 3 + [velocity**2] * 3, dtype=torch.float64)
+        own = (coefficients * self.coefficient_sigmas).square()
+        return torch.cat((fixed.expand(count, 6), spins, own.expand(count, -1)), dim=1)
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """One linearised track: the fields of `LinearTracks` without the first dimension."""
+
+    times: Array
+    errors: Array
+    white: Array
+    velocities: Array
+    used: Array
+    transitions: Array
+    departures: Array
+    kicks: Array
+    start: Array
+    labelled: bool
+
+
+def linearise(smoother: Smoother, tracks: Sequence[Track], watch: Watch = unwatched) -> LinearTracks | None:
+    """The tracks about what a smoother makes of them, each up to its first hit; None where no track is long enough.
+
+    Args: smoother: model, surfaces and the noise to linearise with.  tracks: measured.  watch: told of each track.
+    """
+    pieces = []
+    for track in watch(tracks, len(tracks), "linearising tracks"):
+        problem = smoother.problem(track)
+        solution = run(smoother.search(problem))
+        piece = _linearised(problem, solution)
+        if len(piece.times) >= LEAST_SAMPLES and np.isfinite(piece.errors).all():
+            pieces.append(piece)
+    if not pieces:
+        return None
+    sigmas = np.array(list(smoother.settings.coefficients.values()))
+    return _side_by_side(pieces, torch.from_numpy(sigmas))
+
+
+def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
+    track, values, width = problem.track, solution.minimum.values, problem.width
+    intervals = len(track) - 1
+    transitions = np.tile(np.eye(STATE_DIM + width), (intervals, 1, 1))
+    departures = np.zeros((intervals, STATE_DIM + width))
+    kicks = np.zeros((intervals, len(PROCESS_NOISE), STATE_DIM, STATE_DIM))
+    linked = np.zeros(intervals, dtype=bool)
+    for batch in solution.graph.batches:
+        if isinstance(batch, DynamicsFactors):
+            rows, where = batch.linearize(values), batch.variables[:, 0]
+            spread = -np.linalg.inv(batch.whitening)
+            transitions[where, :STATE_DIM, :STATE_DIM] = (spread @ rows.jacobians[0])[..., :STATE_DIM]
+            if width:
+                transitions[where, :STATE_DIM, STATE_DIM:] = (spread @ rows.jacobians[2])[..., :width]
+            departures[where, :STATE_DIM] = (spread @ rows.residual[..., None])[..., 0]
+            kicks[where] = Kicks(batch.kick_times, batch.hit).basis(batch.dt)
+            linked[where] = True
+    breaks = np.union1d(np.flatnonzero(~linked), solution.events.segmentation.hits)
+    end = int(breaks[0]) + 1 if len(breaks) else len(track)
+    label = problem.settings.spin_label(track)
+    start = np.zeros(STATE_DIM + width)
+    start[POSITION] = track.positions[0] - values.states[0, POSITION]
+    start[VELOCITY] = -values.states[0, VELOCITY]
+    start[SPIN] = spin_start(label, problem.settings)[0] - values.states[0, SPIN]
+    start[STATE_DIM:] = coefficient_means(problem.model, problem.settings) - values.coefficients[:width]
+    return _Piece(
+        track.times[:end] - track.times[0],
+        (track.positions - values.states[:, POSITION])[:end],
+        sample_sigmas(problem.settings, len(track), track.sigmas)[:end],
+        values.states[:end, VELOCITY],
+        solution.events.segmentation.quality[:end] == Quality.GOOD,
+        transitions[: end - 1],
+        departures[: end - 1],
+        kicks[: end - 1],
+        start,
+        label is not None,
+    )
+
+
+def _side_by_side(pieces: Sequence[_Piece], coefficient_sigmas: Tensor) -> LinearTracks:
+    longest = max(len(piece.times) for piece in pieces)
+
+    def stacked(arrays: Iterable[Array], length: int, mode: str) -> Tensor:
+        rows = []
+        for array in arrays:
+            missing = length - len(array)
+            filling = array[-1:] if mode == "edge" else np.zeros((1, *array.shape[1:]), dtype=array.dtype)
+            rows.append(np.concatenate((array, np.repeat(filling, missing, axis=0))))
+        return torch.from_numpy(np.stack(rows))
+
+    return LinearTracks(
+        times=stacked((p.times for p in pieces), longest, "edge"),
+        errors=stacked((p.errors for p in pieces), longest, "zero"),
+        white=stacked((p.white for p in pieces), longest, "edge"),
+        velocities=stacked((p.velocities for p in pieces), longest, "edge"),
+        used=stacked((p.used for p in pieces), longest, "zero"),
+        transitions=stacked((p.transitions for p in pieces), longest - 1, "edge"),
+        departures=stacked((p.departures for p in pieces), longest - 1, "zero"),
+        kicks=stacked((p.kicks for p in pieces), longest - 1, "zero"),
+        starts=torch.from_numpy(np.stack([p.start for p in pieces])),
+        labelled=torch.tensor([p.labelled for p in pieces]),
+        coefficient_sigmas=coefficient_sigmas,
+    )

@@ -1,0 +1,128 @@
+"""The noise of a set of tracks: that of its tracker, its labels, its bounces and its flights, as files state it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Final
+
+from ballfg.checks import check_number, did_you_mean, type_name
+
+LARGEST: Final[Mapping[str, float]] = {
+    "position": 1.0,
+    "memory": 1.0,
+    "memory_time": 10.0,
+    "stamp_jitter": 1.0,
+    "spin_label": 5000.0,
+    "spin_prior": 5000.0,
+    "acceleration": 100.0,
+    "contact_velocity": 50.0,
+    "contact_tangential": 50.0,
+    "contact_spin": 5000.0,
+}
+"""What a number may be at most; more is in another unit."""
+UNITS: Final[Mapping[str, str]] = {
+    "position": "m",
+    "memory": "m",
+    "memory_time": "s",
+    "stamp_jitter": "s",
+    "spin_label": "rad/s",
+    "spin_prior": "rad/s",
+    "acceleration": "m/s^2/sqrt(Hz)",
+    "contact_velocity": "m/s",
+    "contact_tangential": "m/s",
+    "contact_spin": "rad/s",
+}
+PER_AXIS: Final = ("position", "memory")
+MAY_BE_ZERO: Final = ("memory", "stamp_jitter", "contact_tangential")
+
+
+@dataclass(frozen=True)
+class TrackNoise:
+    """Standard deviations; None where they are not known.
+
+    Raises: ValueError: a number that is negative, not finite, or cannot be in SI units; the message names it.
+    """
+
+    position: tuple[float, float, float] | None = None
+    """m, of the error of a measured x, y, z that is new in each sample."""
+
+    memory: tuple[float, float, float] | None = None
+    """m, of the tracker's error along x, y, z that lasts from sample to sample."""
+
+    memory_time: float | None = None
+    """s, over which the correlation of that error falls to 1 / e."""
+
+    stamp_jitter: float | None = None
+    """s, of the error of a stamp."""
+
+    spin_label: float | None = None
+    """rad/s, of one component of a spin label."""
+
+    spin_prior: float | None = None
+    """rad/s, of one component of the spin of a ball without a label, about zero."""
+
+    acceleration: float | None = None
+    """m/s^2/sqrt(Hz), density of the acceleration that the model lacks."""
+
+    contact_velocity: float | None = None
+    """m/s, of each component of the velocity after a bounce."""
+
+    contact_tangential: float | None = None
+    """m/s, in addition, of its two components along the surface."""
+
+    contact_spin: float | None = None
+    """rad/s, of each component of the spin after a bounce."""
+
+    coefficients: Mapping[str, float] = field(default_factory=dict)
+    """By how much coefficients differ from track to track, by the name of the parameter, in its own unit."""
+
+    def __post_init__(self) -> None:
+        for name in LARGEST:
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, _checked(name, value))
+        for name, value in self.coefficients.items():
+            check_number(f"noise.coefficients.{name}", value, "its own unit", above=0.0)
+
+    @classmethod
+    def from_mapping(cls, content: Any) -> TrackNoise:
+        """The noise that a file states.
+
+        Args: content: the parsed section; its keys are the fields of this class.
+        Raises: ValueError: a key that is not known, or a number out of its range.
+        """
+        if not isinstance(content, Mapping):
+            raise ValueError(f"noise must be a mapping such as {{memory_time: 0.02}}; got {type_name(content)}.")
+        known = [f.name for f in fields(cls)]
+        for key in content:
+            if key not in known:
+                hint = did_you_mean(str(key), known) or f"Known ones: {', '.join(known)}."
+                raise ValueError(f"noise.{key} is not known. {hint}")
+        values = dict(content)
+        coefficients = values.pop("coefficients", None) or {}
+        if not isinstance(coefficients, Mapping):
+            raise ValueError(f"noise.coefficients must map parameters to numbers; got {type_name(coefficients)}.")
+        return cls(**values, coefficients={str(name): value for name, value in coefficients.items()})
+
+    def to_mapping(self) -> dict[str, Any]:
+        """What a file says of this noise; what is not known is left out."""
+        content: dict[str, Any] = {}
+        for name in LARGEST:
+            value = getattr(self, name)
+            if value is not None:
+                content[name] = list(value) if name in PER_AXIS else value
+        return content | ({"coefficients": dict(self.coefficients)} if self.coefficients else {})
+
+
+def _checked(name: str, value: Any) -> Any:
+    above = -1e-300 if name in MAY_BE_ZERO else 0.0
+
+    def number(what: str, one: Any) -> float:
+        return check_number(what, one, UNITS[name], above=above, limit=LARGEST[name], instead=f"m{UNITS[name]}")
+
+    if name not in PER_AXIS:
+        return number(f"noise.{name}", value)
+    if not isinstance(value, list | tuple) or len(value) != 3:
+        raise ValueError(f"noise.{name} must be three numbers in m, along x, y and z; got {value!r}.")
+    return tuple(number(f"noise.{name}[{axis}]", one) for axis, one in enumerate(value))

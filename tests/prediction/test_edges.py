@@ -1,0 +1,60 @@
+"""Predictions of balls that come down near the edge of the table."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import norm
+
+from ballfg.dynamics import Surfaces, rollout
+from ballfg.prediction import Propagator
+from tests.prediction.conftest import NEARLY_EXACT
+
+START = [0.0, 0.0, 0.25, 4.0, 0.3, -1.0, 10.0, 30.0, 5.0]
+LANDS = 0.54
+"""m, x at which it comes down."""
+TIMES = torch.tensor([0.1, 0.16, 0.25, 0.35], dtype=torch.float64)  # it comes down at 0.14 s
+
+
+def with_end(x: float, sigma: float = 0.0) -> Surfaces:
+    return Surfaces(0.0, -5.0, (-np.inf, x, -np.inf, np.inf), (0.0, sigma, 0.0, 0.0))
+
+
+def second_moments(drawn: torch.Tensor, about: np.ndarray) -> np.ndarray:
+    difference = drawn[:, :, :9].numpy() - about
+    return np.einsum("nki,nkj->kij", difference, difference) / len(difference)
+
+
+@pytest.mark.parametrize("beyond", [-0.015, -0.003, 0.003, 0.015])
+@pytest.mark.parametrize("sigma", [0.0, 0.02])
+def test_the_spread_is_that_of_both_ways(model, beliefs, samples, beyond, sigma):
+    """Against balls drawn from the belief and ends drawn from theirs, all about the predicted mean."""
+    belief = beliefs(model, START)
+    predicted = Propagator(with_end(LANDS + beyond, sigma), NEARLY_EXACT).rollout(belief, TIMES)
+    drawn = samples(belief, 2000)
+    ends = LANDS + beyond + sigma * norm.ppf((np.arange(20) + 0.5) / 20)
+    with torch.no_grad():
+        flown = torch.cat([rollout(model, drawn[k::20], TIMES, with_end(float(ends[k]))) for k in range(20)])
+    expected = second_moments(flown, predicted.states[0])
+    for k in (0, 2, 3):  # at 0.16 s some have not come down yet
+        ratio = np.sqrt(np.diagonal(predicted.covariances[0, k]) / np.diagonal(expected[k]))
+        assert np.abs(ratio - 1.0)[[0, 1, 2, 3, 4, 5]].max() < 0.2
+
+
+def test_far_from_an_edge_nothing_changes(model, beliefs):
+    belief = beliefs(model, START)
+    plain = Propagator(Surfaces(0.0, -5.0), NEARLY_EXACT).rollout(belief, TIMES)
+    far = Propagator(with_end(LANDS + 0.5, 0.02), NEARLY_EXACT).rollout(belief, TIMES)
+    np.testing.assert_array_equal(far.covariances, plain.covariances)
+    beside = Propagator(with_end(LANDS - 0.5, 0.02), NEARLY_EXACT).rollout(belief, TIMES)
+    falling = Propagator(Surfaces(-5.0), NEARLY_EXACT).rollout(belief, TIMES)
+    np.testing.assert_allclose(beside.covariances, falling.covariances, rtol=1e-9, atol=1e-15)
+
+
+def test_known_places_at_a_known_edge_have_no_doubt(model, beliefs):
+    belief = beliefs(model, START)
+    belief = replace(belief, covariance=torch.zeros_like(belief.covariance))
+    for beyond in (-0.01, 0.01):
+        predicted = Propagator(with_end(LANDS + beyond), NEARLY_EXACT).rollout(belief, TIMES)
+        assert np.abs(predicted.covariances).max() < 1e-12
