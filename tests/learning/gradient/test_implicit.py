@@ -122,7 +122,8 @@ def test_a_tracker_with_memory_and_jitter() -> None:
     tracker = {"memory": (0.002, 0.003, 0.002), "memory_time": 0.03, "stamp_jitter": 0.0005}
     noise = NoiseScales(NOISE, learned=True)
     estimates = Estimates(usual_ball(), measured(TRUTH), replace(SETTINGS, launcher=launcher(), **tracker), noise)
-    leaves = [estimates.model.flight.drag.k, estimates.model.contact.restitution.e, noise.position, noise.process]
+    own = dict(estimates.model.named_parameters())
+    leaves = [own["flight.drag.k"], own["bounce.restitution.e"], noise.position, noise.process]
 
     def value(point: Tensor) -> Tensor:
         return outer(point.view(-1, 12)[:, :9].reshape(-1))
