@@ -2,6 +2,9 @@ from .batch import estimate_tracks as estimate_tracks
 from .configure import dataset_settings as dataset_settings
 from .configure import dataset_surfaces as dataset_surfaces
 from .configure import table_note as table_note
+from .conformal import ConformalScales as ConformalScales
+from .conformal import check_calibration_tracks as check_calibration_tracks
+from .conformal import load_conformal as load_conformal
 from .estimator import Estimator as Estimator
 from .filters.ekf import ExtendedKalmanFilter as ExtendedKalmanFilter
 from .filters.sliding_window import SlidingWindow as SlidingWindow
