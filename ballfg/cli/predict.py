@@ -107,15 +107,15 @@ def _print_conformal(scales: ConformalScales, outcome: _Outcome) -> None:
     from ballfg.estimation import Status
     from ballfg.estimation.conformal import BIN, FEWEST
 
-    what = "the model's own hold {:.0%}, the conformal ones {:.0%}"
+    what = "the model's own hold {:.0f} %, the conformal ones {:.0f} %"
     if (scales.tracks > FEWEST).any():
-        count, own, held = sum(scales.statuses.values()), scales.own_coverage, scales.coverage
+        count, own, held = sum(scales.statuses.values()), 100 * scales.own_coverage, 100 * scales.coverage
         print(f"  90 % intervals on the {count} calibration tracks of {scales.source!r}: {what.format(own, held)}")
     for text, number in scales.statuses.items():
         if text != Status.OK.value:
             print(f"  {number} calibration track{'s' if number > 1 else ''}: {text}")
     if outcome.finite:
-        own, held = outcome.held_by_own / outcome.finite, outcome.held / outcome.finite
+        own, held = 100 * outcome.held_by_own / outcome.finite, 100 * outcome.held / outcome.finite
         print(f"  90 % intervals on the {outcome.statuses.total()} predicted tracks: {what.format(own, held)}")
     infinite = 3 * outcome.rows - outcome.finite
     if infinite:

@@ -98,8 +98,8 @@ class ConformalScales:
         most = max((one.count for one in found), default=0)
         if most < FEWEST:
             raise ValueError(
-                f"conformal must hold at least {FEWEST} tracks with samples after their first {observe:g} s: fewer give "
-                f"no finite {LEVEL:.0%} interval; got {most} in {source!r}. Give a larger dataset."
+                f"conformal must hold at least {FEWEST} tracks with samples after their first {observe:g} s: a finite "
+                f"{100 * LEVEL:.0f} % interval needs as many; got {most} in {source!r}. Give a larger dataset."
             )
         while found[-1].count < FEWEST:
             found.pop()
@@ -245,33 +245,38 @@ class _Bin:
 
     def quantile(self) -> Array:
         """(3,) conformal quantile along each axis."""
-        return np.array([_quantile(column, self.weights, self.count) for column in self.scores.T])
+        orders = np.argsort(self.scores, axis=0).T
+        columns = zip(self.scores.T, orders, strict=True)
+        return np.array([_quantile(column[order], self.weights[order], self.count) for column, order in columns])
 
     def share(self, limit: float) -> Array:
         """(3,) share of the scores within a limit, each track with the same weight; NaN without any."""
-        return np.average(self.scores <= limit, axis=0, weights=self.weights) if self.count else np.full(3, np.nan)
+        samples = np.bincount(self.track)
+        held = [np.bincount(self.track, column <= limit) for column in self.scores.T]
+        return np.mean(held / samples, axis=1) if self.count else np.full(3, np.nan)
 
     def left_out_share(self) -> Array:
         """(3,) share of the scores within the quantile of the other tracks; NaN where those are too few for one."""
         if self.count <= FEWEST:
             return np.full(3, np.nan)
-        weights, held = self.weights, np.zeros(3)
-        for number in range(self.count):
-            own = self.track == number
-            for axis, column in enumerate(self.scores.T):
-                limit = _quantile(column[~own], weights[~own], self.count - 1)
-                held[axis] += (column[own] <= limit).mean()
+        held = np.zeros(3)
+        for axis, column in enumerate(self.scores.T):
+            order = np.argsort(column)
+            scores, weights, track = column[order], self.weights[order], self.track[order]
+            for number in range(self.count):
+                own = track == number
+                limit = _quantile(scores, np.where(own, 0.0, weights), self.count - 1)
+                held[axis] += (scores[own] <= limit).mean()
         return held / self.count
 
 
 def _quantile(scores: Array, weights: Array, count: int) -> float:
-    """The smallest score up to which the weights of (m,) scores reach LEVEL (count + 1).
+    """The smallest of (m,) sorted scores up to which their weights reach LEVEL (count + 1).
 
     The weights of a track sum to 1. The new track's own weight, also 1, lies at infinity: it may be the worst of all.
     """
-    order = np.argsort(scores)
-    reached = np.cumsum(weights[order]) >= LEVEL * (count + 1) - ROUNDING
-    return float(scores[order][reached.argmax()]) if reached.any() else np.inf
+    reached = np.cumsum(weights) >= LEVEL * (count + 1) - ROUNDING
+    return float(scores[reached.argmax()]) if reached.any() else np.inf
 
 
 def _by_bin(tracks: list[tuple[Index, Array]]) -> Iterator[_Bin]:
