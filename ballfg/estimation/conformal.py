@@ -1,6 +1,7 @@
 """Split-conformal intervals: factors on predicted sigmas, from the errors on calibration tracks.
 
-Source: Lee, Barber, Willett, "Distribution-free inference with hierarchical data", 2023, section 3; docs/predict.md.
+Source: Lee, Barber, Willett, "Distribution-free inference with hierarchical data", 2023, arXiv:2306.06342;
+docs/predict.md.
 """
 
 from __future__ import annotations
@@ -49,8 +50,8 @@ class ConformalScales:
 
     Bin i of the horizon ends 0.05 (i + 1) s after the last observed stamp. Take a new track that is exchangeable with
     the calibration tracks and one of its samples in a bin at random. Along each axis the interval holds the measured
-    coordinate with a probability of at least 90 %, and at most 90 % + 2 / (n + 1) for n calibration tracks. Samples of
-    a track may depend on each other in any way.
+    coordinate with a probability of at least 90 %, and for n calibration tracks at most 90 % + 2 / (n + 1) if no two
+    scores are equal. Samples of a track may depend on each other in any way.
 
     Attributes:
         source: name of the calibration dataset.
