@@ -18,9 +18,9 @@ from ballfg.estimation import (
     SightedDataset,
     TrackPrediction,
     check_calibration_tracks,
-    dataset_settings,
     dataset_surfaces,
     estimate_tracks,
+    fitted_settings,
     load_conformal,
     make_estimator,
     predict_tracks,
@@ -134,10 +134,10 @@ def predict(
         _refuse(conformal)
         return known.predict(horizon)
     data = _opened(known)
-    estimator = estimator_for(data, method, model, surfaces, settings)
     if isinstance(data, Track):
         _refuse(conformal)
-        return estimator.estimate(data).predict(horizon)
+        return estimator_for(data, method, model, surfaces, settings).estimate(data).predict(horizon)
+    estimator = estimator_for(data, method, model, surfaces, settings, observe)
     scales = _scales(conformal, data, estimator, method, observe, horizon, jobs)
     found = predict_tracks(estimator, data, len(data), observe, horizon=horizon, jobs=jobs)
     return {one.name: one if scales is None else scales.scaled(one) for one in found}
@@ -194,14 +194,18 @@ def estimator_for(
     model: Model = None,
     surfaces: Surfaces | float | None = None,
     settings: Settings | None = None,
+    observed: float = np.inf,
 ) -> Estimator:
-    """The estimator that `estimate` uses; arguments and errors as there."""
+    """The estimator that `estimate` uses; arguments and errors as there.
+
+    Args: observed: s from the start of each track from which noise and table may be learned, where nobody states them.
+    """
     source = data.dataset if isinstance(data, Track) else data
     ball = _model(model, source)
     if surfaces is None:
-        surfaces = 0.0 if source is None else dataset_surfaces(source)
+        surfaces = 0.0 if source is None else dataset_surfaces(source, observed)
     if settings is None:
-        settings = Settings.for_measured(ball) if source is None else dataset_settings(source, ball)
+        settings = Settings.for_measured(ball) if source is None else fitted_settings(source, ball, observed)
     return make_estimator(method, ball, surfaces, settings)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 import sys
 from collections import Counter
 from collections.abc import Iterable
@@ -13,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
 import typer
 
 from ballfg.machine import usable_cores
+from ballfg.progress import progress
 
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel
@@ -96,13 +98,18 @@ def know_effects(files: Iterable[Path] | None) -> None:
         load_effects(file)
 
 
-def open_inputs(dataset: Path, model: Path | None, effects_files: Iterable[Path] | None = None) -> Inputs[Dataset]:
-    """Open and check everything before any work starts; what was repaired is said on stderr."""
+def open_inputs(
+    dataset: Path, model: Path | None, effects_files: Iterable[Path] | None = None, observed: float = math.inf
+) -> Inputs[Dataset]:
+    """Open and check everything before any work starts; what was repaired is said on stderr.
+
+    Args: observed: s from the start of each track from which noise and table may be learned, where nobody states them.
+    """
     from ballfg.estimation import with_readings
     from ballfg.tracks import read_dataset
 
     know_effects(effects_files)
-    return _inputs(with_readings(read_dataset(dataset)), model)
+    return _inputs(with_readings(read_dataset(dataset)), model, observed)
 
 
 def open_sighted(
@@ -115,19 +122,29 @@ def open_sighted(
     return _inputs(read_sighted(dataset), model)
 
 
-def _inputs(data: Opened, model: Path | None) -> Inputs[Opened]:
+def _inputs(data: Opened, model: Path | None, observed: float = math.inf) -> Inputs[Opened]:
+    from ballfg.estimation import dataset_surfaces, fitted_settings
+
+    ball = open_model(data, model, observed)
+    return Inputs(data, ball, dataset_surfaces(data, observed), fitted_settings(data, ball, observed, progress))
+
+
+def open_model(data: Dataset | SightedDataset, model: Path | None, observed: float = math.inf) -> BallModel:
+    """The model of a file, or the nominal one; what the user should know of data and model is said on stderr.
+
+    Args: observed: s from the start of each track from which the table may be learned, where nobody states it.
+    """
     import torch
 
     from ballfg.dynamics import load_model, nominal_model, nominal_note
-    from ballfg.estimation import dataset_settings, dataset_surfaces, table_note, unused_model
+    from ballfg.estimation import table_note, unused_model
 
     torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
-    notes = [*data.notes, *filter(None, [table_note(data)])]
+    notes = [*data.notes, *filter(None, [table_note(data, observed)])]
     if model is None:
         notes += [note for note in (nominal_note(data.ball), *unused_model(data.path, data.ball)) if note]
     print_notes(notes)
-    ball = nominal_model(data.ball) if model is None else load_model(model, radius=data.ball.radius)
-    return Inputs(data, ball, dataset_surfaces(data), dataset_settings(data, ball))
+    return nominal_model(data.ball) if model is None else load_model(model, radius=data.ball.radius)
 
 
 def check_out(out: Path, dataset: Path) -> None:

@@ -56,7 +56,7 @@ def predict(
             check_file(save_conformal, "save_conformal")
             if conformal is None:
                 raise ValueError("save_conformal must come with --conformal, whose scales it keeps. Add --conformal.")
-        opened = inputs.open_inputs(dataset, model, effects_file)
+        opened = inputs.open_inputs(dataset, model, effects_file, observe)
         count = len(opened.dataset)
         estimator = opened.estimator(method)
         scales = None

@@ -1,6 +1,7 @@
 from .batch import estimate_tracks as estimate_tracks
 from .configure import dataset_settings as dataset_settings
 from .configure import dataset_surfaces as dataset_surfaces
+from .configure import fitted_settings as fitted_settings
 from .configure import table_note as table_note
 from .conformal import ConformalScales as ConformalScales
 from .conformal import check_calibration_tracks as check_calibration_tracks
@@ -9,6 +10,9 @@ from .estimator import Estimator as Estimator
 from .filters.ekf import ExtendedKalmanFilter as ExtendedKalmanFilter
 from .filters.sliding_window import SlidingWindow as SlidingWindow
 from .launcher import Launcher as Launcher
+from .noise.estimate import NoiseEstimate as NoiseEstimate
+from .noise.estimate import estimate_noise as estimate_noise
+from .noise.estimate import spread_over as spread_over
 from .observations.files import write_readings as write_readings
 from .observations.observation import Context as Context
 from .observations.observation import Observation as Observation

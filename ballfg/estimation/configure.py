@@ -4,19 +4,28 @@ from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
 
+import numpy as np
+
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.dynamics.trained import Trained
 from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
+from ballfg.estimation.noise.estimate import estimate_noise, spread_over
+from ballfg.estimation.noise.parameters import with_noise
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.estimation.settings import MEASURED, Settings
 from ballfg.estimation.table_extent import TableExtent, find_table_extent
 from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
+from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Dataset, DatasetInfo
 
 TRACKS_FOR_NOISE = 50
 """How many tracks the measurement noise is estimated from, when a dataset does not state it."""
+QUICK_TRACKS = 12
+"""How many of them tell all other noise: enough for its size, and done in seconds."""
+LEAST_TRACKS = 5
+"""Fewer tracks do not tell how much tracks differ."""
 STATED_EDGE_SIGMA = 0.01
 """m, of the ends of a table that a dataset states: a ball touches an edge up to its radius beside it."""
 TRACKS_FOR_TABLE = 200
@@ -28,7 +37,8 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
 
     The position noise is the dataset's; where it states none, it is estimated from the scatter of the first tracks
     about short polynomials. The coefficients of an analytic model are estimated with each track, within their priors; a
-    trained model is taken as it is, with the noise and the launcher that were learned together with it.
+    trained model is taken as it is, with the noise and the launcher that were learned together with it. Where the
+    dataset or the model states more of the noise, that holds, the model's before the dataset's.
     """
     info, trained = dataset.info, model.trained
     if info.position_noise is not None:
@@ -48,7 +58,50 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
         )
         if trained.launcher is None and trained.spin_noise is not None:
             settings = replace(settings, spin_label_noise=trained.spin_noise)
-    return settings if info.spin_noise is None else replace(settings, spin_label_noise=info.spin_noise)
+    if info.spin_noise is not None:
+        settings = replace(settings, spin_label_noise=info.spin_noise)
+    for stated in (info.noise, model.noise):
+        settings = settings if stated is None else with_noise(settings, stated)
+    return settings
+
+
+def fitted_settings(
+    dataset: Dataset | SightedDataset, model: BallModel, observed: float = np.inf, watch: Watch = unwatched
+) -> Settings:
+    """`dataset_settings`, and where neither dataset nor model states the noise, the noise that the tracks show.
+
+    Args:
+        dataset: a few of its tracks are estimated once (`estimate_noise`); with fewer than `LEAST_TRACKS` of them, or
+            where cameras saw the ball, or with a trained model, the settings are those of `dataset_settings`.
+        model: the ball.
+        observed: s from the start of each track that may be looked at.
+        watch: told of each track, and of each step of the search.
+    """
+    settings = dataset_settings(dataset, model)
+    stated = dataset.info.noise is not None or model.noise is not None or model.trained is not None
+    if stated or dataset.rough or len(dataset) < LEAST_TRACKS or not model.measures_plainly:
+        return settings
+    values = tuple(float(p.detach()) for p in model.parameters() if p.numel() == 1)
+    return _fitted(dataset, model, values, observed, watch) or settings
+
+
+@lru_cache(maxsize=8)
+def _fitted(
+    dataset: Dataset | SightedDataset, model: BallModel, values: tuple[float, ...], observed: float, watch: Watch
+) -> Settings | None:
+    """The settings with the noise that the tracks show. Args: values: of the model's parameters, for the cache."""
+    tracks = spread_over(dataset, min(len(dataset), TRACKS_FOR_NOISE), QUICK_TRACKS)
+    parts = [track.until(float(track.times[0]) + observed) for track in tracks] if np.isfinite(observed) else tracks
+    found = estimate_noise(
+        model,
+        dataset_surfaces(dataset, observed),
+        dataset_settings(dataset, model),
+        parts,
+        position_known=dataset.info.position_noise is not None,
+        errors=False,
+        watch=watch,
+    )
+    return None if found is None else found.settings
 
 
 @lru_cache(maxsize=8)
@@ -77,27 +130,34 @@ def launcher_of(info: DatasetInfo, model: BallModel) -> Launcher | None:
     return Launcher(trained.launcher, trained.spin_noise, {"group": info.name})
 
 
-def dataset_surfaces(dataset: Dataset | SightedDataset) -> Surfaces:
+def dataset_surfaces(dataset: Dataset | SightedDataset, observed: float = np.inf) -> Surfaces:
     """The dataset's table and the floor below it.
 
     The table ends where `dataset.yaml` says; where it does not, beside the sides past which balls fell.
+
+    Args: dataset: with its tracks.  observed: s from the start of each track that may be looked at.
     """
     info = dataset.info
     surfaces = Surfaces.table_tennis(info.table_height)
     if info.table_extent is not None:
         return replace(surfaces, extent=info.table_extent, edge_sigmas=(STATED_EDGE_SIGMA,) * 4)
-    found = found_table(dataset)
+    found = found_table(dataset, observed)
     return surfaces if found is None else replace(surfaces, extent=found.sides, edge_sigmas=found.sigmas)
 
 
 @lru_cache(maxsize=8)
-def found_table(dataset: Dataset | SightedDataset) -> TableExtent | None:
+def found_table(dataset: Dataset | SightedDataset, observed: float = np.inf) -> TableExtent | None:
     """The table's ends as the first tracks show them, whatever `dataset.yaml` says; None where they do not."""
     tracks = islice(iter(dataset), TRACKS_FOR_TABLE)
+    if np.isfinite(observed):
+        tracks = (track.until(float(track.times[0]) + observed) for track in tracks)  # type: ignore[assignment]
     return find_table_extent(tracks, dataset.info.table_height, dataset.ball.radius)
 
 
-def table_note(dataset: Dataset | SightedDataset) -> str | None:
-    """A sentence on ends of the table that were found from the tracks; None if there are none."""
-    found = found_table(dataset) if dataset.info.table_extent is None else None
+def table_note(dataset: Dataset | SightedDataset, observed: float = np.inf) -> str | None:
+    """A sentence on ends of the table that were found from the tracks; None if there are none.
+
+    Args: dataset: with its tracks.  observed: s from the start of each track that may be looked at.
+    """
+    found = found_table(dataset, observed) if dataset.info.table_extent is None else None
     return None if found is None else str(found)

@@ -79,7 +79,6 @@ class Forecaster:
 
     Args:
         tracks: linearised.
-        white: (t, n, 3) m, white standard deviations of the samples.
         velocity_prior: m/s, standard deviation per axis at the start of a track.
         earliest: s after the first sample, of the first start of a forecast.
         every: s between starts.
@@ -91,12 +90,11 @@ class Forecaster:
     def __init__(
         self,
         tracks: LinearTracks,
-        white: Tensor,
         velocity_prior: float,
         earliest: float = EARLIEST_START,
         every: float = START_EVERY,
     ) -> None:
-        self.tracks, self.white, self.velocity_prior = tracks, white, velocity_prior
+        self.tracks, self.velocity_prior = tracks, velocity_prior
         self.count, self.samples = tracks.times.shape
         self.own = tracks.transitions.shape[-1]
         self.width = self.own + BIAS_DIM
@@ -157,7 +155,7 @@ class Forecaster:
     def _measurement(self, noise: Noise) -> Tensor:
         """(t, n, 3, 3) m^2, of the part of a measured position that is new in each sample."""
         way = noise.stamp_jitter * self.tracks.velocities
-        white = torch.diag_embed((noise.position * self.white).square())
+        white = torch.diag_embed((noise.position * self.tracks.white).square())
         return white + way[..., :, None] * way[..., None, :]
 
     def _filter(
@@ -173,12 +171,13 @@ class Forecaster:
         departures = torch.nn.functional.pad(tracks.departures, (0, BIAS_DIM))
         total, nexts = torch.zeros((), dtype=torch.float64), 0
         means, covariances = [], []
+        # taken apart once: the derivative of an index would fill a tensor of the whole size at every step
+        steps, added, news = transitions.unbind(1), gathered.unbind(1), measured.unbind(1)
         for k in range(self.samples):
             if k:
-                step = transitions[:, k - 1]
-                mean = (step @ mean[..., None])[..., 0] + departures[:, k - 1]
-                covariance = step @ covariance @ step.mT + gathered[:, k - 1]
-            spread = observe @ covariance @ observe.mT + measured[:, k]
+                mean = (steps[k - 1] @ mean[..., None])[..., 0] + departures[:, k - 1]
+                covariance = steps[k - 1] @ covariance @ steps[k - 1].mT + added[k - 1]
+            spread = observe @ covariance @ observe.mT + news[k]
             root = torch.linalg.cholesky(spread)
             missed = tracks.errors[:, k] - mean @ observe.mT
             whitened = torch.linalg.solve_triangular(root, missed[..., None], upper=False)[..., 0]
@@ -192,7 +191,7 @@ class Forecaster:
             gain = gain * (tracks.used[:, k] & (square < GATE))[:, None, None]
             mean = mean + (gain @ missed[..., None])[..., 0]
             rest = unit - gain @ observe
-            covariance = rest @ covariance @ rest.mT + gain @ measured[:, k] @ gain.mT
+            covariance = rest @ covariance @ rest.mT + gain @ news[k] @ gain.mT
             means.append(mean)
             covariances.append(covariance)
         return torch.stack(means, dim=1), torch.stack(covariances, dim=1), total, nexts
@@ -204,12 +203,13 @@ class Forecaster:
         track, start = self.starts.T
         mean, covariance = means[track, start], covariances[track, start]
         departures = torch.nn.functional.pad(self.tracks.departures, (0, BIAS_DIM))
+        intervals = (start[:, None] + torch.arange(len(self._plan))).clamp(max=self.samples - 2)
+        steps, added = (x[track[:, None], intervals].unbind(1) for x in (transitions, gathered))
         total, inside, count = torch.zeros((), dtype=torch.float64), 0.0, 0
         for ahead, scored in enumerate(self._plan, start=1):
-            before = (start + ahead - 1).clamp(max=self.samples - 2)
-            step = transitions[track, before]
-            mean = (step @ mean[..., None])[..., 0] + departures[track, before]
-            covariance = step @ covariance @ step.mT + gathered[track, before]
+            step = steps[ahead - 1]
+            mean = (step @ mean[..., None])[..., 0] + departures[track, intervals[:, ahead - 1]]
+            covariance = step @ covariance @ step.mT + added[ahead - 1]
             if not len(scored):
                 continue
             at = track[scored], start[scored] + ahead

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.estimation.segmentation import Quality
-from ballfg.estimation.settings import spin_start
+from ballfg.estimation.settings import sample_sigmas, spin_start
 from ballfg.estimation.smoother.problem import START_POSITION_SIGMA, TrackProblem, coefficient_means
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.estimation.smoother.solution import Solution
@@ -40,6 +40,7 @@ class LinearTracks:
     Attributes:
         times: (t, n) s since the first stamp.
         errors: (t, n, 3) m, measured minus estimated positions.
+        white: (t, n, 3) m, standard deviations of the samples' white errors.
         velocities: (t, n, 3) m/s.
         used: (t, n) bool, good samples.
         transitions: (t, n - 1, d, d) F, in the units of state and coefficients.
@@ -52,6 +53,7 @@ class LinearTracks:
 
     times: Tensor
     errors: Tensor
+    white: Tensor
     velocities: Tensor
     used: Tensor
     transitions: Tensor
@@ -86,6 +88,7 @@ class _Piece:
 
     times: Array
     errors: Array
+    white: Array
     velocities: Array
     used: Array
     transitions: Array
@@ -141,6 +144,7 @@ def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
     return _Piece(
         track.times[:end] - track.times[0],
         (track.positions - values.states[:, POSITION])[:end],
+        sample_sigmas(problem.settings, len(track), track.sigmas)[:end],
         values.states[:end, VELOCITY],
         solution.events.segmentation.quality[:end] == Quality.GOOD,
         transitions[: end - 1],
@@ -165,6 +169,7 @@ def _side_by_side(pieces: Sequence[_Piece], coefficient_sigmas: Tensor) -> Linea
     return LinearTracks(
         times=stacked((p.times for p in pieces), longest, "edge"),
         errors=stacked((p.errors for p in pieces), longest, "zero"),
+        white=stacked((p.white for p in pieces), longest, "edge"),
         velocities=stacked((p.velocities for p in pieces), longest, "edge"),
         used=stacked((p.used for p in pieces), longest, "zero"),
         transitions=stacked((p.transitions for p in pieces), longest - 1, "edge"),
