@@ -3,6 +3,9 @@ from .configure import dataset_settings as dataset_settings
 from .configure import dataset_surfaces as dataset_surfaces
 from .configure import fitted_settings as fitted_settings
 from .configure import table_note as table_note
+from .conformal import ConformalScales as ConformalScales
+from .conformal import check_calibration_tracks as check_calibration_tracks
+from .conformal import load_conformal as load_conformal
 from .estimator import Estimator as Estimator
 from .filters.ekf import ExtendedKalmanFilter as ExtendedKalmanFilter
 from .filters.sliding_window import SlidingWindow as SlidingWindow
