@@ -22,8 +22,8 @@ from ballfg.tracks import Dataset, DatasetInfo
 
 TRACKS_FOR_NOISE = 50
 """How many tracks the measurement noise is estimated from, when a dataset does not state it."""
-QUICK_TRACKS = 12
-"""How many of them tell all other noise: enough for its size, and done in seconds."""
+QUICK_TRACKS = 20
+"""How many tracks tell all other noise, evenly over the first `TRACKS_FOR_TABLE`, which may be of several groups."""
 LEAST_TRACKS = 5
 """Fewer tracks do not tell how much tracks differ."""
 STATED_EDGE_SIGMA = 0.01
@@ -90,7 +90,7 @@ def _fitted(
     dataset: Dataset | SightedDataset, model: BallModel, values: tuple[float, ...], observed: float, watch: Watch
 ) -> Settings | None:
     """The settings with the noise that the tracks show. Args: values: of the model's parameters, for the cache."""
-    tracks = spread_over(dataset, min(len(dataset), TRACKS_FOR_NOISE), QUICK_TRACKS)
+    tracks = spread_over(dataset, min(len(dataset), TRACKS_FOR_TABLE), QUICK_TRACKS)
     parts = [track.until(float(track.times[0]) + observed) for track in tracks] if np.isfinite(observed) else tracks
     found = estimate_noise(
         model,

@@ -40,6 +40,8 @@ from ballfg.factors.tracker import BIAS_DIM, BiasFactors, BiasStartFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 
+LEAST_SPIN_PRIOR = 60.0
+"""rad/s, of a ball after a hit, however well a launcher repeats its spin."""
 START_POSITION_SIGMA = 5.0
 """m, prior of the first position about its measurement: wide enough to say nothing."""
 QUALITY_SIGMA = {Quality.WIDE: 4.0, Quality.SHIFTED: 20.0, Quality.OUTLIER: 200.0}
@@ -224,8 +226,9 @@ def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> lis
         batches.append(_wide_prior(0, track.positions[0], settings))
     else:
         batches += start_priors(0, track.positions[0], settings.spin_label(track), settings)
+    anew = replace(settings, spin_prior=max(settings.spin_prior, LEAST_SPIN_PRIOR))
     for interval in segmentation.restarts:
-        batches += start_priors(int(interval) + 1, track.positions[int(interval) + 1], None, settings)
+        batches += start_priors(int(interval) + 1, track.positions[int(interval) + 1], None, anew)
     return batches
 
 
