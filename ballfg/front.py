@@ -198,12 +198,12 @@ def estimator_for(
 ) -> Estimator:
     """The estimator that `estimate` uses; arguments and errors as there.
 
-    Args: observed: s from the start of each track from which noise and table may be learned, where nobody states them.
+    Args: observed: s from the start of each track from which the noise may be learned, where nobody states it.
     """
     source = data.dataset if isinstance(data, Track) else data
     ball = _model(model, source)
     if surfaces is None:
-        surfaces = 0.0 if source is None else dataset_surfaces(source, observed)
+        surfaces = 0.0 if source is None else dataset_surfaces(source)
     if settings is None:
         settings = Settings.for_measured(ball) if source is None else fitted_settings(source, ball, observed)
     return make_estimator(method, ball, surfaces, settings)

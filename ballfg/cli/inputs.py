@@ -19,7 +19,7 @@ from ballfg.progress import progress
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel
     from ballfg.dynamics.surfaces import Surfaces
-    from ballfg.estimation import Estimator, Settings
+    from ballfg.estimation import Estimator
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.tracks import Dataset
 
@@ -81,13 +81,15 @@ class Inputs(Generic[D]):
     dataset: D
     model: BallModel
     surfaces: Surfaces
-    settings: Settings
+    observed: float
+    """s from the start of each track from which the noise may be learned, where nobody states it."""
 
     def estimator(self, method: str) -> Estimator:
-        """The estimator of a name. Raises: ValueError: if there is none of that name."""
-        from ballfg.estimation import make_estimator
+        """The estimator of a name, with the noise of the dataset. Raises: ValueError: if there is none of that name."""
+        from ballfg.estimation import fitted_settings, make_estimator
 
-        return make_estimator(method, self.model, self.surfaces, self.settings)
+        settings = fitted_settings(self.dataset, self.model, self.observed, progress)
+        return make_estimator(method, self.model, self.surfaces, settings)
 
 
 def know_effects(files: Iterable[Path] | None) -> None:
@@ -103,7 +105,7 @@ def open_inputs(
 ) -> Inputs[Dataset]:
     """Open and check everything before any work starts; what was repaired is said on stderr.
 
-    Args: observed: s from the start of each track from which noise and table may be learned, where nobody states them.
+    Args: observed: s from the start of each track from which the noise may be learned, where nobody states it.
     """
     from ballfg.estimation import with_readings
     from ballfg.tracks import read_dataset
@@ -123,24 +125,20 @@ def open_sighted(
 
 
 def _inputs(data: Opened, model: Path | None, observed: float = math.inf) -> Inputs[Opened]:
-    from ballfg.estimation import dataset_surfaces, fitted_settings
+    from ballfg.estimation import dataset_surfaces
 
-    ball = open_model(data, model, observed)
-    return Inputs(data, ball, dataset_surfaces(data, observed), fitted_settings(data, ball, observed, progress))
+    return Inputs(data, open_model(data, model), dataset_surfaces(data), observed)
 
 
-def open_model(data: Dataset | SightedDataset, model: Path | None, observed: float = math.inf) -> BallModel:
-    """The model of a file, or the nominal one; what the user should know of data and model is said on stderr.
-
-    Args: observed: s from the start of each track from which the table may be learned, where nobody states it.
-    """
+def open_model(data: Dataset | SightedDataset, model: Path | None) -> BallModel:
+    """The model of a file, or the nominal one; what the user should know of data and model is said on stderr."""
     import torch
 
     from ballfg.dynamics import load_model, nominal_model, nominal_note
     from ballfg.estimation import table_note, unused_model
 
     torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
-    notes = [*data.notes, *filter(None, [table_note(data, observed)])]
+    notes = [*data.notes, *filter(None, [table_note(data)])]
     if model is None:
         notes += [note for note in (nominal_note(data.ball), *unused_model(data.path, data.ball)) if note]
     print_notes(notes)

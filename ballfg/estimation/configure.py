@@ -94,7 +94,7 @@ def _fitted(
     parts = [track.until(float(track.times[0]) + observed) for track in tracks] if np.isfinite(observed) else tracks
     found = estimate_noise(
         model,
-        dataset_surfaces(dataset, observed),
+        dataset_surfaces(dataset),
         dataset_settings(dataset, model),
         parts,
         position_known=dataset.info.position_noise is not None,
@@ -130,34 +130,27 @@ def launcher_of(info: DatasetInfo, model: BallModel) -> Launcher | None:
     return Launcher(trained.launcher, trained.spin_noise, {"group": info.name})
 
 
-def dataset_surfaces(dataset: Dataset | SightedDataset, observed: float = np.inf) -> Surfaces:
+def dataset_surfaces(dataset: Dataset | SightedDataset) -> Surfaces:
     """The dataset's table and the floor below it.
 
     The table ends where `dataset.yaml` says; where it does not, beside the sides past which balls fell.
-
-    Args: dataset: with its tracks.  observed: s from the start of each track that may be looked at.
     """
     info = dataset.info
     surfaces = Surfaces.table_tennis(info.table_height)
     if info.table_extent is not None:
         return replace(surfaces, extent=info.table_extent, edge_sigmas=(STATED_EDGE_SIGMA,) * 4)
-    found = found_table(dataset, observed)
+    found = found_table(dataset)
     return surfaces if found is None else replace(surfaces, extent=found.sides, edge_sigmas=found.sigmas)
 
 
 @lru_cache(maxsize=8)
-def found_table(dataset: Dataset | SightedDataset, observed: float = np.inf) -> TableExtent | None:
+def found_table(dataset: Dataset | SightedDataset) -> TableExtent | None:
     """The table's ends as the first tracks show them, whatever `dataset.yaml` says; None where they do not."""
     tracks = islice(iter(dataset), TRACKS_FOR_TABLE)
-    if np.isfinite(observed):
-        tracks = (track.until(float(track.times[0]) + observed) for track in tracks)  # type: ignore[assignment]
     return find_table_extent(tracks, dataset.info.table_height, dataset.ball.radius)
 
 
-def table_note(dataset: Dataset | SightedDataset, observed: float = np.inf) -> str | None:
-    """A sentence on ends of the table that were found from the tracks; None if there are none.
-
-    Args: dataset: with its tracks.  observed: s from the start of each track that may be looked at.
-    """
-    found = found_table(dataset, observed) if dataset.info.table_extent is None else None
+def table_note(dataset: Dataset | SightedDataset) -> str | None:
+    """A sentence on ends of the table that were found from the tracks; None if there are none."""
+    found = found_table(dataset) if dataset.info.table_extent is None else None
     return None if found is None else str(found)
