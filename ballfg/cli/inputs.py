@@ -70,7 +70,7 @@ class Source(enum.StrEnum):
     DETECTIONS = "detections"
 
 
-D = TypeVar("D")
+D = TypeVar("D", bound="Dataset | SightedDataset")
 Opened = TypeVar("Opened", "Dataset", "SightedDataset")
 
 

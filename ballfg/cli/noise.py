@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -82,11 +82,12 @@ def noise(
 
 def _table(found: NoiseEstimate) -> list[str]:
     """A line for each number: meaning, value, error bar."""
-    content, lines = found.noise.to_mapping(), []
+    content: dict[str, Any] = found.noise.to_mapping() | {"coefficients": found.coefficient_factor}
+    lines = []
     for name, error in found.relative_errors.items():
         field, _, axis = name.partition(".")
         meaning, factor, unit = MEANINGS[field]
-        value = found.coefficient_factor if field == "coefficients" else content[field]
+        value = content[field]
         number = factor * (value["xyz".index(axis)] if axis else value)
         doubt = "  (hardly known)" if error >= UNKNOWN else ""
         lines.append(f"  {meaning.format(axis):52} {number:8.3g} x/: {_ratio(error)}  {unit}{doubt}")

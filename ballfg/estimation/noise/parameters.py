@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -123,7 +123,7 @@ def with_noise(settings: Settings, noise: TrackNoise) -> Settings:
     Spreads of coefficients replace those of the settings for coefficients that are estimated with each track; where the
     settings estimate none, all that the noise names are.
     """
-    own = {
+    own: dict[str, Any] = {
         "position_noise": noise.position,
         "memory": noise.memory,
         "memory_time": noise.memory_time,
