@@ -8,13 +8,17 @@ import numpy as np
 
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.dynamics.trained import Trained
+from ballfg.estimation.launcher import Launcher
+from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.estimation.noise.estimate import estimate_noise, spread_over
 from ballfg.estimation.noise.parameters import with_noise
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
-from ballfg.estimation.settings import Settings
+from ballfg.estimation.settings import MEASURED, Settings
 from ballfg.estimation.table_extent import TableExtent, find_table_extent
+from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
 from ballfg.progress import Watch, unwatched
-from ballfg.tracks import Dataset
+from ballfg.tracks import Dataset, DatasetInfo
 
 TRACKS_FOR_NOISE = 50
 """How many tracks the measurement noise is estimated from, when a dataset does not state it."""
@@ -105,6 +109,32 @@ def _fitted(dataset: Dataset | SightedDataset, model: BallModel, observed: float
         watch=watch,
     )
     return None if found is None else found.settings
+
+
+@lru_cache(maxsize=8)
+def _noise_of(dataset: Dataset | SightedDataset) -> tuple[float, float, float]:
+    """m, along x, y, z, from the first tracks; once for a dataset, whose tracks may be estimated one by one."""
+    x, y, z = estimate_position_noise(islice(iter(dataset), TRACKS_FOR_NOISE)).tolist()
+    return x, y, z
+
+
+def learned_process(trained: Trained) -> ProcessNoise:
+    """The process noise that was learned; what was not is as usual. Raises: ValueError: a number of another name."""
+    unknown = sorted(set(trained.process_noise) - set(PROCESS_NOISE))
+    if unknown:
+        known = ", ".join(PROCESS_NOISE)
+        raise ValueError(
+            f"process_noise must name numbers of the process noise, {known}; got '{unknown[0]}'. Rename it."
+        )
+    return replace(MEASURED, **trained.process_noise)
+
+
+def launcher_of(info: DatasetInfo, model: BallModel) -> Launcher | None:
+    """What a trained model knows of a dataset's launcher; a track without the label `group` is of the dataset's own."""
+    trained = model.trained
+    if trained is None or trained.launcher is None or trained.spin_noise is None:
+        return None
+    return Launcher(trained.launcher, trained.spin_noise, {"group": info.name})
 
 
 def dataset_surfaces(dataset: Dataset | SightedDataset) -> Surfaces:
