@@ -49,7 +49,7 @@ class NoiseEstimate:
     Attributes:
         noise: standard deviations.
         relative_errors: standard deviation of each number's logarithm, by name, with `.x`, `.y`, `.z` where there is
-            one per axis. From the curvature of the score; each start of a forecast counts as one observation.
+            one per axis, from the scatter of the score from track to track.
         coefficient_factor: spread of coefficients from track to track, as a multiple of the settings'.
         settings: with that noise.
         held_before: share of forecast coordinates inside their 90 % intervals with the settings given.
@@ -180,7 +180,11 @@ class _Search:
         return np.asarray(found.x)
 
     def errors(self, logs: Array) -> dict[str, float]:
-        """Standard deviations of the logarithms: the inverse Hessian, where it is one of a minimum."""
+        """Standard deviations of the logarithms: tracks are independent, forecasts within a track are not.
+
+        With H the Hessian of the objective, G the sum over tracks of the squares of their gradients and P the precision
+        of the prior, the covariance is H^-1 (G + P) H^-1 (P. J. Huber 1967; clusters: K.-Y. Liang, S. L. Zeger 1986).
+        """
         size = len(logs)
         hessian = np.empty((size, size))
         for k in range(size):
@@ -189,9 +193,20 @@ class _Search:
             hessian[k] = (self.value(logs + step)[1] - self.value(logs - step)[1]) / (2.0 * DIFFERENCE)
         values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
         least = 1.0 / self.spread.max() ** 2  # where the score bends downwards the prior alone is what is known
-        covariance = (vectors / np.maximum(values, least)) @ vectors.T
+        inverse = (vectors / np.maximum(values, least)) @ vectors.T
+        covariance = inverse @ (self._scatter(logs) + np.diag(self.spread**-2)) @ inverse
         names = [p.name if p.axis is None else f"{p.name}.{'xyz'[p.axis]}" for p in self.parameters]
         return dict(zip(names, np.sqrt(np.diagonal(covariance)).tolist(), strict=True))
+
+    def _scatter(self, logs: Array) -> Array:
+        """(k, k) sum over tracks of the squares of their gradients about the mean."""
+        leaf = torch.tensor(logs, dtype=torch.float64, requires_grad=True)
+        by_track = self.weight * self.forecaster.score(tensors_of(self.parameters, leaf, self.settings)).by_track
+        gradients = np.stack(
+            [torch.autograd.grad(one, leaf, retain_graph=True)[0].numpy() for one in by_track.unbind()]
+        )
+        count, away = len(gradients), gradients - gradients.mean(axis=0)
+        return np.asarray(away.T @ away * count / max(count - 1, 1))
 
     def held(self, logs: Array) -> float:
         """Share of forecast coordinates inside their 90 % intervals."""

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ballfg.estimation import Smoother, predict_tracks
-from ballfg.estimation.noise.forecasts import HORIZONS, Forecaster
+from ballfg.estimation.noise.forecasts import HORIZONS, ROUNDING, Forecaster
 from ballfg.estimation.noise.linear_tracks import linearise
 from ballfg.estimation.noise.parameters import parameters_of, tensors_of
 from ballfg.simulation import MeasurementNoise
@@ -61,9 +61,9 @@ def test_score_is_that_of_the_joint_gaussian(case):
         for start in forecaster.starts[forecaster.starts[:, 0] == track, 1].tolist():
             seen = np.flatnonzero(np.repeat(used[: start + 1], 3))
             ahead = {
-                int(np.flatnonzero(used & (times >= times[start] + h))[0])
+                int(np.flatnonzero(used & (times >= times[start] + h - ROUNDING))[0])
                 for h in horizons
-                if (used & (times >= times[start] + h)).any()
+                if (used & (times >= times[start] + h - ROUNDING)).any()
             } - {start}
             gain = np.linalg.solve(cov[np.ix_(seen, seen)], cov[seen]).T
             known = mean + gain @ (errors.reshape(-1)[seen] - mean[seen])
@@ -78,7 +78,7 @@ def test_score_is_that_of_the_joint_gaussian(case):
     means, covariances, _, _ = forecaster._filter(noise, transitions, gathered, measured)
     own, _, scored = forecaster._forecast(means, covariances, transitions, gathered, measured)
     assert scored == count
-    np.testing.assert_allclose(float(own) / scored, total / count, rtol=1e-6)
+    np.testing.assert_allclose(float(own.sum()) / scored, total / count, rtol=1e-6)
 
 
 def test_gradient_is_that_of_differences(case):
@@ -112,8 +112,8 @@ def test_forecast_has_the_sigmas_of_a_prediction(case):
     measured = forecaster._measurement(noise)
     _, covariances, _, _ = forecaster._filter(noise, transitions, gathered, measured)
     for track in range(len(tracks)):
-        start = int(np.searchsorted(linear.times[track], 0.25))
-        end = int(np.searchsorted(linear.times[track], 0.35))
+        start = int(np.searchsorted(linear.times[track].numpy(), 0.25))
+        end = int(np.searchsorted(linear.times[track].numpy(), 0.35))
         covariance = covariances[track, start]
         for k in range(start, end):
             covariance = transitions[track, k] @ covariance @ transitions[track, k].T + gathered[track, k]
@@ -122,7 +122,7 @@ def test_forecast_has_the_sigmas_of_a_prediction(case):
         (prediction,) = predict_tracks(Smoother(model, surfaces, own), [tracks[track]], 1, seen)
         if prediction.estimate.contacts:
             continue  # the seen part moves its contact; the linear filter keeps that of the whole track
-        np.testing.assert_allclose(spread.diagonal().sqrt(), prediction.sigmas[end - start - 1], rtol=0.06)
+        np.testing.assert_allclose(spread.diagonal().sqrt().numpy(), prediction.sigmas[end - start - 1], rtol=0.06)
 
 
 def test_linear_tracks_follow_the_smoother(case):
@@ -130,4 +130,5 @@ def test_linear_tracks_follow_the_smoother(case):
     assert len(linear) == len(tracks)
     assert linear.transitions.shape[-1] == STATE_DIM + len(linear.coefficient_sigmas)
     assert float(linear.errors.abs()[linear.used].max()) < 0.02
-    assert bool((linear.transitions[:, :, POSITION, POSITION].diagonal(dim1=-2, dim2=-1) > 0.5).all())
+    steps = linear.transitions[:, :, POSITION, POSITION].diagonal(dim1=-2, dim2=-1)
+    assert float((steps[..., :2] - 1.0).abs().max()) < 0.01  # a bounce turns z alone
