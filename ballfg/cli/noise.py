@@ -57,8 +57,6 @@ def noise(
     inputs.know_effects(effects_file)
     data = with_readings(read_dataset(dataset))
     ball = inputs.open_model(data, model)
-    if not ball.measures_plainly:
-        raise ValueError("model must have no measurement effects; the noise is that of positions as they are written")
     if out is not None and out.resolve() == (dataset / "dataset.yaml").resolve():
         raise ValueError(f"out must be a model file; got {out}. Use --write for dataset.yaml.")
     found = estimate_noise(

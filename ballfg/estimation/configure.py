@@ -79,7 +79,7 @@ def fitted_settings(
     """
     settings = dataset_settings(dataset, model)
     stated = dataset.info.noise is not None or model.noise is not None or model.trained is not None
-    if stated or dataset.rough or len(dataset) < LEAST_TRACKS or not model.measures_plainly:
+    if stated or dataset.rough or len(dataset) < LEAST_TRACKS:
         return settings
     values = tuple(float(p.detach()) for p in model.parameters() if p.numel() == 1)
     key = (dataset, model, values, observed)

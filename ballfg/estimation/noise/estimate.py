@@ -14,6 +14,8 @@ from scipy.optimize import minimize
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.measurement.as_measured import plainly_measured
+from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
 from ballfg.estimation.noise.forecasts import EARLIEST_START, START_EVERY, Forecaster
 from ballfg.estimation.noise.linear_tracks import LEAST_SAMPLES, LinearTracks, linearise
 from ballfg.estimation.noise.parameters import (
@@ -84,7 +86,7 @@ def estimate_noise(
     is not changed: what it lacks counts as noise.
 
     Args:
-        model: the ball.
+        model: the ball, and how it is measured.
         surfaces: what it may bounce on.
         settings: prior medians of all numbers.
         tracks: measured positions; each contributes its first part (`LONGEST_PART`).
@@ -96,6 +98,9 @@ def estimate_noise(
     parts = [part for track in tracks if len(part := _first_part(track)) >= LEAST_SAMPLES]
     own_sigmas = any(part.sigmas is not None for part in parts)
     plain = replace(settings, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0)
+    if not model.measures_plainly:  # of measured positions as they happened
+        inverse = InvertMeasurement(Smoother, model, surfaces, plain)
+        parts, model = [inverse.undo(part).track for part in parts], plainly_measured(model)
     linear = linearise(Smoother(model, surfaces, plain), parts, watch)
     if linear is None:
         return None

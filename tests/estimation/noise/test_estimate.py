@@ -3,8 +3,17 @@
 import numpy as np
 import pytest
 
-from ballfg.estimation import Smoother, estimate_noise, predict_tracks, spread_over
-from ballfg.simulation import MeasurementNoise, MotionNoise
+from ballfg.dynamics import load_model
+from ballfg.estimation import (
+    Smoother,
+    dataset_settings,
+    dataset_surfaces,
+    estimate_noise,
+    predict_tracks,
+    spread_over,
+)
+from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, parse_effects, write_simulation
+from ballfg.tracks import read_dataset
 
 
 def held(model, surfaces, settings, tracks):
@@ -59,3 +68,18 @@ def test_nothing_to_tell(recorded):
     model, surfaces, settings, tracks = recorded(MeasurementNoise(position=0.002), tracks=2)
     short = [track.until(float(track.times[0]) + 0.03) for track in tracks]
     assert estimate_noise(model, surfaces, settings, short) is None
+
+
+def test_measurement_effects_are_undone_first(tmp_path):
+    """A tracker that lags by 5 ms is no noise to a model that says so."""
+    config = SimulationConfig(8, 100.0, seed=3, undeclared=parse_effects(["velocity_lag.lag=0.005"]))
+    write_simulation(tmp_path / "shots", config)
+    dataset = read_dataset(tmp_path / "shots")
+    text = (tmp_path / "shots" / "model.yaml").read_text()
+    text = text.replace("measurement: {}", "measurement: {velocity_lag: {lag: 0.005}}")
+    (tmp_path / "lagging.yaml").write_text(text)
+    model = load_model(tmp_path / "lagging.yaml")
+    settings = dataset_settings(dataset, model)
+    found = estimate_noise(model, dataset_surfaces(dataset), settings, dataset, position_known=True, errors=False)
+    assert found.noise.acceleration < 0.03
+    assert 0.84 < found.held < 0.96
