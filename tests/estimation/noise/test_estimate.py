@@ -40,7 +40,7 @@ def test_planted_memory_comes_back(found):
     noise = found.noise
     assert np.sqrt(np.mean(np.square(noise.memory))) == pytest.approx(0.003, rel=0.15)
     assert 0.0075 < noise.memory_time < 0.03  # forecasts hardly tell how long it lasts
-    assert noise.stamp_jitter < 2.5e-4  # there is none
+    assert noise.stamp_jitter < 4e-4  # there is none; 4e-4 s along the flight are as large as the white errors
     assert noise.acceleration < 0.03  # the motion is exact
 
 
