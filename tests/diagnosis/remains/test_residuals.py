@@ -126,7 +126,7 @@ def test_planted_kick_is_found_at_the_contact(fixed_fit):
     found = residuals_of(fitted).contact
     error = np.sqrt(np.diagonal(found.covariance, axis1=1, axis2=2)[:, :3].mean(axis=0) / len(found.times))
     # no friction in this ball: sideways all of it goes through, vertically times the restitution
-    wanted = (0.0, 0.1, -0.2 * float(fitted.problem.model.contact["restitution"].e))
+    wanted = (0.0, 0.1, -0.2 * float(fitted.problem.model.bounce["restitution"].e))
     assert error.max() < 0.05
     np.testing.assert_array_less(np.abs(found.velocity.mean(axis=0) - wanted), 4.0 * error)
     assert (found.incoming[:, 5] < -1.0).all()
