@@ -1,6 +1,6 @@
 """The diagnosis of a dataset: search for effects, evaluate them, test the rest, and say it in one sentence."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -11,10 +11,11 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.remains.fallback import fallback
 from ballfg.diagnosis.remains.generic import ALARM, generic_tests
 from ballfg.diagnosis.remains.residuals import residuals_of
-from ballfg.diagnosis.report.wording import sentence
+from ballfg.diagnosis.report.wording import refusal, sentence
 from ballfg.diagnosis.result import Diagnosis, Errors, GenericTest, Unexplained, Value, Verdict
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.loop import Search, SearchLoop
+from ballfg.diagnosis.search.plausible import implausible
 from ballfg.diagnosis.search.process_noise import PredictiveModel, calibrated_model, with_process_noise
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
 from ballfg.estimation import dataset_settings
@@ -54,12 +55,9 @@ def diagnose(
         )
     tell = watch or (lambda line: None)
     holdout = hold_out(dataset, model, jobs, tell)
-    loop = SearchLoop(holdout, tuple(catalogue or EFFECTS.values()), partial(_predictive, holdout, jobs), tell)
-    search = loop.run(model)
-    tell("predicting the judging half")
     evaluate = partial(_errors, holdout, jobs)
-    before = evaluate(search.declared.model)
-    named = evaluate(search.predictive.model) if search.findings else before
+    effects = tuple(catalogue or EFFECTS.values())
+    search = SearchLoop(holdout, effects, partial(_predictive, holdout, jobs), evaluate, tell).run(model)
     tell("looking at what is left")
     tests = generic_tests(search.fit, search.first)
     verdict = _verdict(search, tests)
@@ -67,29 +65,38 @@ def diagnose(
     if verdict is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in _alarms(tests)):
         tell("describing what is left without a name")
         tracks = [part.track for part in holdout.search_tracks]
-        helped = fallback(search.fit, holdout.launcher.embedding, dataset, tracks, named, evaluate)
+        helped = fallback(search.fit, holdout.launcher.embedding, dataset, tracks, search.judged, evaluate)
     alarms = sorted(_alarms(tests), key=lambda test: test.name == "time")  # a place says more than a correlation
     unexplained = Unexplained(alarms[0].where if alarms else "", _share(tests), tests, helped)
     residuals = residuals_of(search.first)
     declared = {name: float(value.detach()) for name, value in model.named_parameters()}
+    calibrated = values_of(search.fit, [name for name in search.fit.problem.free if name in declared], declared)
     return Diagnosis(
         dataset=dataset.info.name,
         verdict=verdict,
         sentence=sentence(verdict, search.findings, unexplained),
         findings=search.findings,
         rounds=search.rounds,
-        before=before,
-        after=named if helped is None else helped.after,
+        before=search.before,
+        after=search.judged if helped is None else helped.after,
         tracks_found_on=len(np.unique(holdout.search.track)),
-        tracks_judged_on=len(before.by_track),
-        calibrated=values_of(search.fit, [name for name in search.fit.problem.free if name in declared], declared),
+        tracks_judged_on=len(search.before.by_track),
+        calibrated=calibrated,
         noise=_noise(search.fit, holdout),
         unexplained=unexplained,
         model=search.predictive.model if helped is None else helped.model,
         residuals_before=residuals,
         residuals_after=residuals if search.fit is search.first else residuals_of(search.fit),
         excluded=holdout.excluded,
+        remarks=(*map(refusal, search.refused.values()), *_strange(calibrated, model.radius)),
     )
+
+
+def _strange(calibrated: Mapping[str, Value], radius: float) -> list[str]:
+    """Sentences on declared coefficients whose fitted values are not plausible."""
+    texts = [implausible(name.partition(".")[2], value, radius) for name, value in calibrated.items()]
+    words = "Something that the model does not describe has moved it: a clock, lengths or spin labels, say"
+    return [f"The fitted {text}. {words}." for text in texts if text]
 
 
 def _predictive(holdout: Holdout, jobs: int, fit: Fit) -> PredictiveModel:

@@ -25,6 +25,9 @@ class Outcome(enum.Enum):
     NOT_HELPFUL = "did not help on the other half"
     IMPLAUSIBLE = "would have to be stronger than is plausible"
     MISLEADING = "fits whole tracks better and predicts them worse"
+    INSIGNIFICANT = "its coefficients do not differ from zero by themselves"
+    CONTRADICTORY = "the two halves of the tracks want different values"
+    SAME_PATTERN = "explains the same pattern as an effect that was added before"
     NOT_NEEDED = "not needed"
     INVISIBLE = "cannot be seen in these data"
 
@@ -88,6 +91,25 @@ class Candidate:
     p_value: float
     delta_bic: float | None
     outcome: Outcome
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """An effect that fits better and is no name.
+
+    Attributes:
+        name: of the effect.
+        parameters: its coefficients as fitted.
+        outcome: why it is no name.
+        reason: numbers that show it, in words; empty where the outcome says it all.
+        decide: the measurement that would tell whether it is there.
+    """
+
+    name: str
+    parameters: Mapping[str, Value]
+    outcome: Outcome
+    reason: str
+    decide: str
 
 
 @dataclass(frozen=True)
@@ -255,6 +277,7 @@ class Diagnosis:
         residuals_before: of the search half with the declared model.
         residuals_after: of the search half with the corrected model.
         excluded: sentences on tracks that were not used.
+        remarks: sentences on effects that fit better and are no names, and on fitted values that are not plausible.
     """
 
     dataset: str
@@ -273,6 +296,7 @@ class Diagnosis:
     residuals_before: Residuals
     residuals_after: Residuals
     excluded: tuple[str, ...] = field(default=())
+    remarks: tuple[str, ...] = field(default=())
 
     def __repr__(self) -> str:
         effects = ", ".join(finding.name for finding in self.findings) or "none"

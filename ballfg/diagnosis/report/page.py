@@ -32,6 +32,7 @@ def page(diagnosis: Diagnosis) -> str:
         _errors(diagnosis),
         section("What was added to the model", *(_finding(f) for f in diagnosis.findings)),
         _alike(diagnosis),
+        section("What fits better and is no name", items(diagnosis.remarks) if diagnosis.remarks else ""),
         _left_over(diagnosis),
         _residuals(diagnosis),
         _rankings(diagnosis),

@@ -83,6 +83,7 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
             "noise": _values(diagnosis.noise),
             "rounds": [[_candidate(candidate) for candidate in row] for row in diagnosis.rounds],
             "excluded": diagnosis.excluded,
+            "remarks": diagnosis.remarks,
         }
     )
     return plain

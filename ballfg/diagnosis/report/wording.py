@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping, Sequence
 
-from ballfg.diagnosis.result import Finding, Unexplained, Value, Verdict
+from ballfg.diagnosis.result import Finding, Outcome, Refusal, Unexplained, Value, Verdict
 
 NONE = "–"
 """Stands for a missing number."""
@@ -11,6 +11,15 @@ MOST_DECIMALS = 6
 """A number that needs more decimals is written with a power of ten."""
 LEAST_PROBABILITY = 1e-99
 """Smaller probabilities depend on tails of distributions that nobody knows."""
+
+REFUSED = {
+    Outcome.IMPLAUSIBLE: "it would have to be stronger than is plausible",
+    Outcome.INSIGNIFICANT: "its coefficients do not differ from zero by themselves",
+    Outcome.CONTRADICTORY: "the two halves of the tracks want different values of it",
+    Outcome.SAME_PATTERN: "it explains the same pattern as an effect that was added before",
+    Outcome.MISLEADING: "predictions get worse with it",
+}
+"""Reasons for which an effect that fits better is no name."""
 
 
 def number(value: float, digits: int = 3) -> str:
@@ -58,6 +67,15 @@ def change(before: float, after: float) -> str:
 def joined(names: tuple[str, ...]) -> str:
     """For instance `wind, gust_region and drag_speed`."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}" if names else ""
+
+
+def refusal(refused: Refusal) -> str:
+    """Why an effect that fits better is no name, and the measurement that would decide."""
+    reason = f" ({refused.reason})" if refused.reason else ""
+    return (
+        f"{refused.name} ({listed(refused.parameters)}) would fit these tracks better but is not named: "
+        f"{REFUSED[refused.outcome]}{reason}. What would decide it: {refused.decide}"
+    )
 
 
 def sentence(verdict: Verdict, findings: Sequence[Finding], left: Unexplained) -> str:

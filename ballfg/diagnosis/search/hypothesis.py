@@ -16,6 +16,8 @@ LOOSE = 10.0
 """Factor by which the prior of a hypothesis' coefficient is wider than the effect declares: the data are to decide."""
 INEXACT = 0.02
 """Spread of a coefficient that is declared as exact, as a share of its value: a wrong clock or length shows so in g."""
+TWINS: Mapping[str, tuple[str, ...]] = {"gravity": ("buoyancy",)}
+"""Effects that are exactly the same as another one of a model: the other one is listed for both."""
 LEAST_GAP = 1e-4
 """s. Stamps nearer together tell no speed."""
 
@@ -119,7 +121,12 @@ def hypotheses(model: AnalyticModel, scene: Scene, catalogue: Iterable[type[Effe
     Returns: the hypotheses, in the order of the catalogue.
     """
     listed: list[Hypothesis] = []
+    catalogue = tuple(catalogue)
+    searched = {effect.name for effect in catalogue}
+    doubled = {twin for name, twins in TWINS.items() if name in searched and has_effect(model, name) for twin in twins}
     for effect in catalogue:
+        if effect.name in doubled:
+            continue
         if has_effect(model, effect.name):
             exact = tuple(c.name for c in effect.coefficients if c.sigma == 0.0 and c.absent is not None)
             listed += [Hypothesis(effect, {}, exact)] if exact else []

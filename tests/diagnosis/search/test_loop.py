@@ -40,13 +40,18 @@ def predicts_well(fitted):
     return predicting(fitted, 10.0)
 
 
+def judges_alike(model):
+    """Predictions of the judging half that are as good with every model."""
+    return Errors(10.0, 10.0, 1.0, 0.0, np.array([10.0]))
+
+
 @pytest.fixture(scope="module")
 def tilted(make_ball, make_launches, make_shots):
     """A search on shots over a table that leans by 1.1 degrees."""
     truth = {"table_tilt": {"x": 0.02, "y": 0.0}}
     data = (shots(make_ball, make_launches, make_shots, seed, **truth) for seed in (71, 72))
     said = []
-    search = SearchLoop(holdout(*data), CATALOGUE, predicts_well, said.append).run(make_ball())
+    search = SearchLoop(holdout(*data), CATALOGUE, predicts_well, judges_alike, said.append).run(make_ball())
     return search.first, search, said
 
 
@@ -89,7 +94,7 @@ def test_every_round_ranks_every_candidate(tilted):
 
 def test_nothing_is_added_where_nothing_is(make_ball, make_launches, make_shots):
     data = (shots(make_ball, make_launches, make_shots, seed) for seed in (73, 74))
-    search = SearchLoop(holdout(*data), CATALOGUE, predicts_well, unwatched).run(make_ball())
+    search = SearchLoop(holdout(*data), CATALOGUE, predicts_well, judges_alike, unwatched).run(make_ball())
     assert search.findings == ()
     assert search.fit is search.first
     assert len(search.rounds) == 1
@@ -102,7 +107,7 @@ def test_what_predicts_worse_is_not_added(make_ball, make_launches, make_shots):
     def predict(fitted):
         return predicting(fitted, 15.0 if has_effect(fitted.problem.model, "table_tilt") else 10.0)
 
-    search = SearchLoop(holdout(*data), [EFFECTS["table_tilt"]], predict, unwatched).run(make_ball())
+    search = SearchLoop(holdout(*data), [EFFECTS["table_tilt"]], predict, judges_alike, unwatched).run(make_ball())
     assert search.findings == ()
     assert search.fit is search.first
     (row,) = search.rounds[0]
@@ -114,7 +119,7 @@ def test_what_balls_usually_have_is_found_though_no_score_calls(make_ball, make_
     """Friction, left out: its score at absence says little, and its absence is a minimum of its own."""
     data = (shots(make_ball, make_launches, make_shots, seed) for seed in (75, 76))
     declared = without_effect(make_ball(), "friction")
-    search = SearchLoop(holdout(*data), [EFFECTS["friction"]], predicts_well, unwatched).run(declared)
+    search = SearchLoop(holdout(*data), [EFFECTS["friction"]], predicts_well, judges_alike, unwatched).run(declared)
     (finding,) = search.findings
     assert finding.name == "friction"
     assert abs(finding.parameters["mu"].value - 0.25) < 4 * finding.parameters["mu"].sigma
@@ -123,8 +128,47 @@ def test_what_balls_usually_have_is_found_though_no_score_calls(make_ball, make_
 def test_what_would_have_to_be_implausibly_strong_is_not_added(make_ball, make_launches, make_shots):
     """The tilt found is 1.1 degrees, 4 prior sigmas: beyond what counts as plausible here."""
     data = (shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.02, "y": 0.0}) for seed in (71, 72))
-    loop = SearchLoop(holdout(*data), [EFFECTS["table_tilt"]], predicts_well, unwatched, plausible=3.0)
+    loop = SearchLoop(holdout(*data), [EFFECTS["table_tilt"]], predicts_well, judges_alike, unwatched, plausible=3.0)
     search = loop.run(make_ball())
     assert search.findings == ()
     (row,) = search.rounds[0]
     assert row.outcome is Outcome.IMPLAUSIBLE
+
+
+def judged(rmse):
+    return Errors(rmse, rmse, 1.0, 0.0, np.array([rmse]))
+
+
+def test_what_predicts_the_judging_half_worse_is_not_added(make_ball, make_launches, make_shots):
+    data = (shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.02, "y": 0.0}) for seed in (71, 72))
+
+    def judge(model):
+        return judged(10.1 if has_effect(model, "table_tilt") else 10.0)
+
+    search = SearchLoop(holdout(*data), [EFFECTS["table_tilt"]], predicts_well, judge, unwatched).run(make_ball())
+    assert search.findings == ()
+    (row,) = search.rounds[0]
+    assert row.outcome is Outcome.MISLEADING
+    assert search.refused["table_tilt"].outcome is Outcome.MISLEADING
+
+
+def test_what_later_effects_make_superfluous_is_taken_out_again(make_ball, make_launches, make_shots):
+    """The judging half is predicted best with the wind alone, which is found beside the table's tilt."""
+    truth = {"table_tilt": {"x": 0.02, "y": 0.0}, "wind": {"x": 0.5, "y": 0.0, "z": 0.0}}
+    data = [shots(make_ball, make_launches, make_shots, seed, **truth) for seed in (81, 82)]
+    catalogue = [EFFECTS[name] for name in ("wind", "table_tilt")]
+
+    def judge(model):
+        return judged({0: 10.0, 1: 9.0, 2: 8.0}[sum(has_effect(model, e.name) for e in catalogue)])
+
+    both = SearchLoop(holdout(*data), catalogue, predicts_well, judge, unwatched).run(make_ball())
+    first, second = (finding.name for finding in both.findings)
+
+    def judge_again(model):
+        return judged(8.0 if has_effect(model, first) else 7.0)
+
+    search = SearchLoop(holdout(*data), catalogue, predicts_well, judge_again, unwatched)._pruned(both)
+    assert [finding.name for finding in search.findings] == [second]
+    assert not has_effect(search.fit.problem.model, first)
+    assert search.refused[first].outcome is Outcome.MISLEADING
+    assert "8.0 mm off on the judging half with it, 7.0 mm without it" in search.refused[first].reason

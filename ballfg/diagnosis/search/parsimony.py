@@ -1,0 +1,84 @@
+"""Whether an effect that fits better deserves a name.
+
+A flexible effect fits almost any pattern a little. It is a name only if its coefficients differ from zero by
+themselves, if both halves of the tracks want the same ones, and if the effects that were named before are still needed
+beside it. Standard deviations here come from the scatter of tracks, not from the stated noise.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from scipy import stats
+
+from ballfg.diagnosis.fit.fit import fit_problem, reachable
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.stretches import Stretches
+from ballfg.diagnosis.fit.system import by_track
+from ballfg.diagnosis.search.hypothesis import Hypothesis
+from ballfg.diagnosis.search.score import Score, score_tests
+from ballfg.diagnosis.search.signatures import Signatures
+
+SIGMAS: Final = 3.0
+"""Coefficients must differ from absent by so many standard deviations, and the halves by no more than so many."""
+CHANCE: Final = 2.0 * float(stats.norm.sf(SIGMAS))
+"""The probability that goes with it: a group of several coefficients is held to the same one."""
+
+
+def own_scores(fit: Fit, named: Sequence[Hypothesis]) -> list[Score | None]:
+    """Tests of effects that are in the model: would the fit be as good without each of them, all else being free?
+
+    Args: fit: with all of them in its model.  named: effects with strengths.
+    Returns: for each its coefficients less their absent values, their standard deviations from the scatter of tracks,
+        and the probability of so much by chance; None for an effect that the tracks do not show.
+    """
+    system, problem = fit.linearised(), fit.problem
+    gram = by_track(system.eliminated().gram, problem.stretches.track)
+    return [_own_score(fit, hypothesis, gram) for hypothesis in named]
+
+
+def _own_score(fit: Fit, hypothesis: Hypothesis, gram: np.ndarray) -> Score | None:
+    """Args: gram: (t, q + 1, q + 1) inner products of the common columns of a fit, the residual last."""
+    listed, precision = list(fit.problem.free), fit.problem.common_precision
+    own = [listed.index(name) for name in hypothesis.columns]
+    others = [number for number in range(len(precision)) if number not in own]
+    absent = np.array([hypothesis.coefficients[n].absent for n in hypothesis.strengths], dtype=np.float64)
+    strengths = np.array([fit.unknowns.values[name] for name in hypothesis.columns]) - absent
+    total = gram.sum(axis=0)
+    share = np.linalg.solve(total[np.ix_(others, others)] + np.diag(precision[others]), total[np.ix_(others, own)])
+    without = np.eye(len(precision) + 1)  # to first order the residual of the best fit without the effect
+    without[own, -1], without[others, -1] = strengths, -share @ strengths
+    order = [*others, *own, len(precision)]
+    turned = (without.T @ gram @ without)[:, order][:, :, order]
+    return score_tests(Signatures(turned, precision[others], len(others)), [range(len(own))])[0]
+
+
+def insignificant(fit: Fit, named: Sequence[Hypothesis]) -> list[Hypothesis]:
+    """Those effects of a model whose coefficients do not differ from absent by themselves."""
+    testable = [hypothesis for hypothesis in named if hypothesis.strengths]
+    scores = own_scores(fit, testable) if testable else []
+    return [h for h, score in zip(testable, scores, strict=True) if score is None or score.p_value > CHANCE]
+
+
+def halves_differ(fit: Fit, hypothesis: Hypothesis, held_out: Stretches) -> bool:
+    """Whether the held-out half wants other strengths of an effect than the search half, on which the model was fitted.
+
+    Args: fit: to the search half, with the effect.  held_out: stretches of the other half.
+    """
+    if not hypothesis.strengths:
+        return False
+    values = fit.unknowns.values
+    stretches = reachable(fit.problem.model, held_out, values)
+    unknowns = replace(fit.unknowns, starts=stretches.starts.numpy().copy())
+    other = fit_problem(replace(fit.problem, stretches=stretches), unknowns, fit.noise, settle_noise=False)
+    if not np.isfinite(other.cost):
+        return False
+    scores = [own_scores(one, [hypothesis])[0] for one in (fit, other)]
+    if None in scores:
+        return False
+    sigma = np.hypot(*(score.sigma for score in scores if score is not None))
+    difference = [other.unknowns.values[name] - values[name] for name in hypothesis.columns]
+    freedom = sum(len(np.unique(one.problem.stretches.track)) - 1 for one in (fit, other))
+    p_values = 2.0 * stats.t.sf(np.abs(difference) / sigma, freedom)
+    return bool(p_values.min() * len(p_values) < CHANCE)

@@ -1,0 +1,101 @@
+"""Names that are earned: coefficients that differ from zero, halves that agree, values that a room can have."""
+
+from __future__ import annotations
+
+import pytest
+
+from ballfg.diagnosis.fit.fit import fit_problem, values_of
+from ballfg.diagnosis.result import Value
+from ballfg.diagnosis.search.candidates import with_hypothesis
+from ballfg.diagnosis.search.hypothesis import Hypothesis, hypotheses, scene_of
+from ballfg.diagnosis.search.parsimony import halves_differ, insignificant, own_scores
+from ballfg.diagnosis.search.plausible import RANGES, implausible
+from ballfg.dynamics import EFFECTS
+
+WIND = Hypothesis(EFFECTS["wind"], {}, ("x", "y", "z"))
+TRUTH = (0.5, -0.3, 0.0)
+
+
+def fit_with(before, hypothesis):
+    problem = with_hypothesis(before.problem, hypothesis)
+    values = dict(problem.model.named_parameters())
+    free = {name: float(values[name]) for name in problem.free}
+    unknowns = type(before.unknowns)(before.unknowns.starts, free | before.unknowns.values, before.unknowns.launcher)
+    return fit_problem(problem, unknowns, before.noise, settle_noise=False)
+
+
+@pytest.fixture(scope="module")
+def with_wind(windy_fit):
+    return fit_with(windy_fit, WIND)
+
+
+def test_an_effect_that_is_there_differs_from_zero(with_wind):
+    (score,) = own_scores(with_wind, [WIND])
+    assert score.p_value < 1e-6
+    for estimate, sigma, truth, fitted in zip(
+        score.estimate, score.sigma, TRUTH, values_of(with_wind, WIND.columns, {}).values(), strict=True
+    ):
+        assert abs(estimate - truth) < 4 * sigma
+        assert abs(estimate - fitted.value) < sigma
+        assert 0.4 < sigma / fitted.sigma < 2.5
+    assert insignificant(with_wind, [WIND]) == []
+
+
+def test_an_effect_that_is_not_there_does_not(calm_fit):
+    assert insignificant(fit_with(calm_fit, WIND), [WIND]) == [WIND]
+
+
+def test_two_names_for_one_pattern_are_idle_beside_each_other(with_wind):
+    """A wind and a shear about a far reference move the same air: neither is needed beside the other."""
+    shear = Hypothesis(EFFECTS["wind_shear"], {"reference": -30.0}, ("x", "y"))
+    both = fit_with(with_wind, shear)
+    assert shear in insignificant(both, [WIND, shear])
+
+
+def test_halves_that_want_the_same_agree(with_wind, make_ball, make_launches, make_shots):
+    wind = dict(zip("xyz", TRUTH, strict=True))
+    other = make_shots(make_ball(wind=wind), make_launches(16, 5), 5).stretches
+    assert not halves_differ(with_wind, WIND, other)
+
+
+def test_halves_that_contradict_each_other_differ(with_wind, make_ball, make_launches, make_shots):
+    other = make_shots(make_ball(wind={"x": -0.5, "y": 0.0, "z": 0.0}), make_launches(16, 6), 6).stretches
+    assert halves_differ(with_wind, WIND, other)
+
+
+def test_plausible_values_of_the_catalogue():
+    for name, known in RANGES.items():
+        effect, _, coefficient = name.partition(".")
+        (found,) = (c for c in EFFECTS[effect].coefficients if c.name == coefficient)
+        assert known.low <= found.default <= known.high
+        assert known.holds(Value(found.default, found.sigma, found.unit))
+        assert known.source
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "sigma", "plausible"),
+    [
+        ("wind.x", 0.4, 0.01, True),
+        ("wind.x", 0.52, 0.01, True),
+        ("wind.x", 0.9, 0.3, False),
+        ("wind_shear.x", -2.3, 0.06, False),
+        ("tangential_restitution.e_t", -0.3, 0.01, False),
+        ("magnus.k", 0.0116, 0.0001, False),
+        ("static_charge.strength", 1e9, 1.0, True),
+    ],
+)
+def test_values_out_of_their_range_are_named_with_its_source(name, value, sigma, plausible):
+    text = implausible(name, Value(value, sigma, "1"), 0.02)
+    assert (text == "") is plausible
+    if text:
+        assert name in text
+        assert RANGES[name].source in text
+    assert implausible(name, Value(value, sigma, "1"), 0.0335) == ""
+
+
+def test_gravity_and_buoyancy_are_one_entry(calm_fit, make_ball):
+    catalogue = [EFFECTS["gravity"], EFFECTS["buoyancy"]]
+    listed = hypotheses(make_ball(), scene_of(calm_fit), catalogue)
+    assert [h.name for h in listed] == ["gravity"]
+    alone = hypotheses(make_ball(), scene_of(calm_fit), catalogue[1:])
+    assert [h.name for h in alone] == ["buoyancy"]
