@@ -24,6 +24,8 @@ TRACKS_FOR_NOISE = 50
 """How many tracks the measurement noise is estimated from, when a dataset does not state it."""
 QUICK_TRACKS = 20
 """How many tracks tell all other noise, evenly over the first `TRACKS_FOR_TABLE`, which may be of several groups."""
+KEPT = 8
+"""How many datasets' noise is remembered: their tracks may be estimated one by one."""
 LEAST_TRACKS = 5
 """Fewer tracks do not tell how much tracks differ."""
 STATED_EDGE_SIGMA = 0.01
@@ -90,8 +92,6 @@ def fitted_settings(
     return _FITTED[key] or settings
 
 
-KEPT = 8
-"""How many datasets' noise is remembered: their tracks may be estimated one by one."""
 _FITTED: dict[tuple[Dataset | SightedDataset, BallModel, tuple[float, ...], float], Settings | None] = {}
 
 
