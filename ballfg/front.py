@@ -11,14 +11,17 @@ from ballfg.diagnosis import Diagnosis
 from ballfg.diagnosis import diagnose as diagnose_dataset
 from ballfg.dynamics import BallModel, Surfaces, load_model, nominal_model
 from ballfg.estimation import (
+    ConformalScales,
     Estimate,
     Estimator,
     Settings,
     SightedDataset,
     TrackPrediction,
-    dataset_settings,
+    check_calibration_tracks,
     dataset_surfaces,
     estimate_tracks,
+    fitted_settings,
+    load_conformal,
     make_estimator,
     predict_tracks,
     read,
@@ -29,6 +32,7 @@ from ballfg.tracks import TABLE_TENNIS, Dataset, Track
 Folder: TypeAlias = str | PathLike[str]
 Tracks: TypeAlias = Dataset | SightedDataset
 Model: TypeAlias = BallModel | Folder | None
+Conformal: TypeAlias = Tracks | ConformalScales | Folder | None
 OneTrack: TypeAlias = Track | NDArray[np.float64] | tuple[ArrayLike, ArrayLike]
 """A track; or an array (n, 4) of t (s), x, y, z (m); or times (n,) s and positions (n, 3) m."""
 
@@ -47,6 +51,7 @@ class PredictOptions(Options, total=False):
     """The keyword arguments of `predict`; observe in s."""
 
     observe: float
+    conformal: Conformal
 
 
 @overload
@@ -105,6 +110,7 @@ def predict(
     model: Model = None,
     surfaces: Surfaces | float | None = None,
     settings: Settings | None = None,
+    conformal: Conformal = None,
     jobs: int = 1,
 ) -> Ahead | dict[str, TrackPrediction]:
     """The path of the ball ahead, with standard deviations.
@@ -114,20 +120,53 @@ def predict(
             `observe` seconds of each track are estimated, and the measurements after them are predicted.
         horizon: s, how far ahead.
         observe: s from the first stamp of each track of a dataset.
-        method, model, surfaces, settings, jobs: as for `estimate`.
+        conformal: for a dataset: calibration tracks of the same kind or their folder, scales that an earlier prediction
+            has, or their file. The sigmas are scaled so that mean +- 1.645 sigma are conformal 90 % intervals
+            (docs/predict.md); `conformal` of each prediction has the scales and the coverage on the calibration tracks.
+        method, model, surfaces, settings, jobs: as for `estimate`; the calibration tracks are estimated with the same.
     Returns: the path ahead; of a dataset, the predicted measurements of each track by name.
     Raises:
-        TypeError: for anything else in place of what is known.
-        ValueError: a horizon that is not positive, or what `estimate` raises.
+        TypeError: for anything else in place of what is known or of the calibration tracks.
+        ValueError: a horizon that is not positive, calibration tracks that are too few or of another kind, or what
+            `estimate` raises.
     """
     if isinstance(known, Estimate | BallState):
+        _refuse(conformal)
         return known.predict(horizon)
     data = _opened(known)
-    estimator = estimator_for(data, method, model, surfaces, settings)
     if isinstance(data, Track):
-        return estimator.estimate(data).predict(horizon)
+        _refuse(conformal)
+        return estimator_for(data, method, model, surfaces, settings).estimate(data).predict(horizon)
+    estimator = estimator_for(data, method, model, surfaces, settings, observe)
+    scales = _scales(conformal, data, estimator, method, observe, horizon, jobs)
     found = predict_tracks(estimator, data, len(data), observe, horizon=horizon, jobs=jobs)
-    return {one.name: one for one in found}
+    return {one.name: one if scales is None else scales.scaled(one) for one in found}
+
+
+def _refuse(conformal: Conformal) -> None:
+    if conformal is not None:
+        raise ValueError(
+            f"conformal must be None for a single ball; got {type(conformal).__name__}. Its scales hold at the stamps "
+            "of a dataset's tracks: predict a dataset."
+        )
+
+
+def _scales(
+    conformal: Conformal, data: Tracks, estimator: Estimator, method: str, observe: float, horizon: float, jobs: int
+) -> ConformalScales | None:
+    """The scales of predictions of `data`: those given, or from the calibration tracks that are given."""
+    if isinstance(conformal, str | PathLike) and Path(conformal).is_file():
+        conformal = load_conformal(Path(conformal))
+    if isinstance(conformal, ConformalScales):
+        conformal.check_fits(observe, method)
+    if conformal is None or isinstance(conformal, ConformalScales):
+        return conformal
+    calibration = _opened(conformal)
+    if isinstance(calibration, Track):
+        raise TypeError("conformal must be a dataset of calibration tracks or its folder; got a track. Give a dataset.")
+    check_calibration_tracks(calibration, data)
+    predictions = predict_tracks(estimator, calibration, len(calibration), observe, horizon=horizon, jobs=jobs)
+    return ConformalScales.of(predictions, calibration.info.name, observe, method)
 
 
 def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) -> Diagnosis:
@@ -155,14 +194,18 @@ def estimator_for(
     model: Model = None,
     surfaces: Surfaces | float | None = None,
     settings: Settings | None = None,
+    observed: float = np.inf,
 ) -> Estimator:
-    """The estimator that `estimate` uses; arguments and errors as there."""
+    """The estimator that `estimate` uses; arguments and errors as there.
+
+    Args: observed: s from the start of each track from which the noise may be learned, where nobody states it.
+    """
     source = data.dataset if isinstance(data, Track) else data
     ball = _model(model, source)
     if surfaces is None:
         surfaces = 0.0 if source is None else dataset_surfaces(source)
     if settings is None:
-        settings = Settings.for_measured(ball) if source is None else dataset_settings(source, ball)
+        settings = Settings.for_measured(ball) if source is None else fitted_settings(source, ball, observed)
     return make_estimator(method, ball, surfaces, settings)
 
 

@@ -151,6 +151,29 @@ def loop(
 
 
 @app.command()
+def intervals(
+    data: Datasets = None,
+    tracks: Annotated[int | None, typer.Option(min=4, help="Number of tracks of each --data, the first ones.")] = None,
+    out: Out = Path("results"),
+    quick: Quick = False,
+    seed: Seed = 0,
+    jobs: Jobs = CORES,
+) -> None:
+    """Coverage of 90 % prediction intervals, with the noise as usual and with the noise that tracks show.
+
+    Of each track 0.25 s are seen and the next 0.3 s predicted. Without --data: simulated trackers with a memory and
+    jittering stamps, and the true model. With --data: measured tracks and the nominal model.
+
+    Example: ballfg-bench intervals --data data/aimy --data data/ballgun --out results/intervals
+    """
+    from ballfg.benchmarks.intervals.suite import FULL, QUICK, run_intervals
+
+    results = _start("intervals", data or [], quick, seed, [] if tracks is None else ["--tracks", str(tracks)])
+    run_intervals(results, [_open(one) for one in data or []], QUICK if quick else FULL, jobs, tracks)
+    _finish(results, _folder(out), [])
+
+
+@app.command()
 def speed(data: Timed = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0) -> None:
     """Times of an estimate, an update and a prediction next to a control: one thread, warm, medians.
 

@@ -14,6 +14,7 @@ import numpy as np
 from ballfg.arrays import Array, Index
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Values
 from ballfg.factors.graph import BallGraph
+from ballfg.state import STATE_DIM
 
 OnMiss = Literal["changed", "row"]
 
@@ -33,6 +34,9 @@ class Bridge:
 
     A bridge never refers to the factors that it made: a factor holds its callback, the callback the bridge, the bridge
     the batch. With a reference back the chain would be a cycle through C++, which Python's collector cannot see.
+
+    Where the tracker's biases stand behind GTSAM's states, a batch that does not know of biases sees the states alone;
+    its Jacobians get columns of zeros.
 
     Args:
         batch: whitens its residuals itself; its loss goes into the factors' noise model.
@@ -105,28 +109,40 @@ class Bridge:
 
         Raises: ValueError: as `prepare`.
         """
-        asked = tuple([values.atVector(key).tobytes() for key in keys])
+        vectors = [values.atVector(key) for key in keys]
+        asked = tuple([self._seen(key, vector).tobytes() for key, vector in zip(keys, vectors, strict=True)])
         if asked != self._inputs[row]:
             self.misses += 1
             self._evaluate(row, keys, values)
         found = self._answers[row]
         assert found is not None
-        return found
+        residual, blocks = found
+        return residual, tuple([_widened(block, len(v)) for block, v in zip(blocks, vectors, strict=True)])
+
+    def _seen(self, key: int, vector: Array) -> Array:
+        """What the batch sees of one of GTSAM's vectors."""
+        return vector if self.batch.sees_biases or key == COEFFICIENT_KEY else vector[:STATE_DIM]
 
     def _evaluate(self, row: int, keys: Sequence[int], values: gtsam.Values) -> None:
         if self.on_miss == "row":
-            self.prepare(np.array([row]), tuple(values.atVector(key)[None] for key in keys))
+            self.prepare(np.array([row]), tuple(self._seen(key, values.atVector(key))[None] for key in keys))
             return
         vectors: dict[int, Array] = {}
         rows, columns = [], []
         for r, variables in enumerate(self.batch.variables.tolist()):
-            point = [_vector(values, v, vectors) for v in variables]
-            if any(p is None for p in point):
+            held = [_vector(values, v, vectors) for v in variables]
+            if any(p is None for p in held):
                 continue  # a graph of some of the rows only
-            if r == row or tuple(p.tobytes() for p in point if p is not None) != self._inputs[r]:
+            point = [self._seen(key_of(v), p) for v, p in zip(variables, held, strict=True) if p is not None]
+            if r == row or tuple(p.tobytes() for p in point) != self._inputs[r]:
                 rows.append(r)
                 columns.append(point)
         self.prepare(np.array(rows), tuple(np.stack(column) for column in zip(*columns, strict=True)))
+
+
+def _widened(block: Array, width: int) -> Array:
+    """A Jacobian (r, d) with columns of zeros behind it, so that it has `width` of them."""
+    return block if block.shape[1] == width else np.pad(block, ((0, 0), (0, width - block.shape[1])))
 
 
 def _vector(values: gtsam.Values, variable: int, known: dict[int, Array]) -> Array | None:
@@ -199,9 +215,9 @@ def nonlinear_graph(graph: BallGraph) -> tuple[gtsam.NonlinearFactorGraph, list[
 
 
 def to_gtsam(values: Values) -> gtsam.Values:
-    """States as vectors x0, x1, ...; coefficients, where there are any, as the vector c0."""
+    """States as vectors x0, x1, ..., biases behind them; coefficients, where there are any, as the vector c0."""
     result = gtsam.Values()
-    for i, state in enumerate(values.states):
+    for i, state in enumerate(values.gather(np.arange(len(values.states)), with_biases=True)):
         result.insert(STATE_KEY + i, state)
     if len(values.coefficients):
         result.insert(COEFFICIENT_KEY, values.coefficients)
@@ -211,5 +227,6 @@ def to_gtsam(values: Values) -> gtsam.Values:
 def from_gtsam(values: gtsam.Values) -> Values:
     """The way back from `to_gtsam`."""
     states = np.array(gtsam.utilities.extractVectors(values, "x"))
-    has_coefficients = values.exists(COEFFICIENT_KEY)
-    return Values(states, np.array(values.atVector(COEFFICIENT_KEY)) if has_coefficients else np.zeros(0))
+    coefficients = np.array(values.atVector(COEFFICIENT_KEY)) if values.exists(COEFFICIENT_KEY) else np.zeros(0)
+    biases = states[:, STATE_DIM:] if states.shape[1] > STATE_DIM else None
+    return Values(states[:, :STATE_DIM], coefficients, biases)

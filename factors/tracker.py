@@ -5,6 +5,7 @@ and the way that the ball makes at velocity v during the error s of the stamp. T
 per state, so that the graph stays banded; b_{i+1} = a_i b_i + noise with a_i = exp(-dt_i / memory time).
 """
 
+from collections.abc import Hashable
 from typing import ClassVar
 
 import numpy as np
@@ -14,10 +15,23 @@ from torch import Tensor
 from ballfg.arrays import Array, Index
 from ballfg.factors.batch import FactorBatch, Noise
 from ballfg.factors.loss import Loss
+from ballfg.factors.noise import whitening_tensor
 from ballfg.state import POSITION, STATE_DIM
 
 BIAS_DIM = 3
 _BIAS = slice(STATE_DIM, STATE_DIM + BIAS_DIM)
+
+
+def bias_step(dt: Array, sigma: Array, memory_time: float) -> tuple[Array, Array]:
+    """How a bias fades over dt: b' = a b + noise, with a = exp(-dt / memory time).
+
+    Args:
+        dt: (m,) s.
+        sigma: (3,) m, standard deviation s of the bias per axis.
+        memory_time: s, over which the bias falls to 1 / e.
+    Returns: a (m,), dimensionless; the noise's standard deviations s sqrt(1 - a^2), (m, 3) m.
+    """
+    return np.exp(-dt / memory_time), sigma * np.sqrt(-np.expm1(-2.0 * dt / memory_time))[:, None]
 
 
 class BiasedPositionFactors(FactorBatch):
@@ -26,29 +40,42 @@ class BiasedPositionFactors(FactorBatch):
     Args:
         states: (m,) indices of the observed states.
         measured: (m, 3) m.
-        covariance: (m, 3, 3) m^2, of the part of the noise that is white.
+        sigma: (m, 3) m, standard deviation per axis of the white error.
+        stamps: (m, 3, 3) m^2, covariance of what errors of the stamps move the ball; None where stamps are exact.
         loss: a robust one where tracks have outliers.
         biased: whether the graph has biases; without them b is zero.
 
     Raises: ValueError: a wrong shape, or a position that is not finite.
     """
 
-    row_arrays: ClassVar[tuple[str, ...]] = ("variables", "measured", "information_root")
+    row_arrays: ClassVar[tuple[str, ...]] = ("variables", "measured", "sigma", "stamps", "information_root")
 
     def __init__(
-        self, states: Index, measured: Array, covariance: Array, loss: Loss | None = None, biased: bool = True
+        self,
+        states: Index,
+        measured: Array,
+        sigma: Array,
+        stamps: Array | None = None,
+        loss: Loss | None = None,
+        biased: bool = True,
     ) -> None:
         super().__init__(np.asarray(states)[:, None], 3, loss)
-        if measured.shape != (len(self), 3) or covariance.shape != (len(self), 3, 3):
+        if measured.shape != (len(self), 3) or sigma.shape != (len(self), 3):
             raise ValueError(
-                f"measured and covariance must have shapes ({len(self)}, 3) and ({len(self)}, 3, 3); got "
-                f"{measured.shape} and {covariance.shape}"
+                f"measured and sigma must have shape ({len(self)}, 3); got {measured.shape} and {sigma.shape}"
             )
-        if not np.isfinite(measured).all():
-            raise ValueError("measured must be finite; remove the samples that are not")
-        self.measured = measured
+        if not (np.isfinite(measured).all() and (sigma > 0).all()):
+            raise ValueError("measured must be finite and sigma positive; remove the samples that are not")
+        self.measured, self.sigma = measured, sigma
+        self.stamps = np.zeros((len(self), 3, 3)) if stamps is None else stamps
+        covariance = sigma[:, :, None] ** 2 * np.eye(3) + self.stamps
         self.information_root = np.linalg.inv(np.linalg.cholesky(covariance))
         self.sees_biases = biased  # type: ignore[misc]  # the class's is that of factors that know states alone
+
+    @property
+    def group(self) -> Hashable:
+        """Besides the usual: whether the graph has biases."""
+        return (*super().group, self.sees_biases)  # type: ignore[misc]
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, 3) and Jacobians (k, 3, 9) or, with biases, (k, 3, 12)."""
@@ -69,8 +96,13 @@ class BiasedPositionFactors(FactorBatch):
         return (torch.from_numpy(self.information_root) @ error.unsqueeze(-1)).squeeze(-1)
 
     def rewhitening(self, noise: Noise) -> Tensor | None:
-        """One factor for all axes of all samples; the jitter of stamps is scaled with it."""
-        return None if noise.position is None else 1.0 / noise.position
+        """(m, 3, 3) from the present noise to one whose white part is scaled; errors of stamps stay as they are."""
+        if noise.position is None:
+            return None
+        white = (noise.position * torch.from_numpy(self.sigma)).square().diag_embed()
+        return whitening_tensor(white + torch.from_numpy(self.stamps)) @ torch.linalg.inv(
+            torch.from_numpy(self.information_root)
+        )
 
     def log_spread(self) -> float:
         """Half the log determinants of all covariances."""
@@ -97,8 +129,8 @@ class BiasFactors(FactorBatch):
         super().__init__(np.stack((states, states + 1), axis=-1), BIAS_DIM)
         if not ((dt > 0).all() and (sigma > 0).all() and memory_time > 0.0):
             raise ValueError("dt, sigma and memory_time must be positive; sort the times and drop repeats")
-        self.decay = np.exp(-dt / memory_time)
-        self.information_root = 1.0 / (sigma * np.sqrt(-np.expm1(-2.0 * dt / memory_time))[:, None])
+        self.decay, spread = bias_step(dt, sigma, memory_time)
+        self.information_root = 1.0 / spread
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, 3) and Jacobians (k, 3, 12) twice."""
@@ -114,6 +146,10 @@ class BiasFactors(FactorBatch):
         """(m, 3) whitened residuals in torch."""
         before, after = (state[:, _BIAS] for state in inputs)
         return torch.from_numpy(self.information_root) * (after - torch.from_numpy(self.decay)[:, None] * before)
+
+    def log_spread(self) -> float:
+        """Sum of the logarithms of all standard deviations."""
+        return -float(np.log(self.information_root).sum())
 
 
 class BiasStartFactors(FactorBatch):
@@ -142,3 +178,7 @@ class BiasStartFactors(FactorBatch):
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, 3) whitened residuals in torch."""
         return torch.from_numpy(self.information_root.copy()) * inputs[0][:, _BIAS]
+
+    def log_spread(self) -> float:
+        """Sum of the logarithms of all standard deviations."""
+        return -float(np.log(self.information_root).sum())

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 import ballfg as bf
 from ballfg.cli.main import run
 from ballfg.dynamics import save_model
-from ballfg.estimation import TrackPrediction, dataset_settings
+from ballfg.estimation import ConformalScales, TrackPrediction, dataset_settings
 from ballfg.factors.loss import Loss
 from ballfg.prediction import Belief, Propagator, apex, next_contact, plane_crossing
 from ballfg.simulation import MeasurementNoise, SimulationConfig, tennis, write_simulation
@@ -134,6 +134,35 @@ def gaussian(shots: bf.Dataset) -> bf.Settings:
     usual = dataset_settings(shots, bf.nominal_model())
     plain = Loss("squared")
     return replace(usual, loss=plain, spin_loss=plain, label_loss=plain, find_events=False)
+
+
+def test_conformal_intervals_of_a_dataset(shots: bf.Dataset, track: bf.Track, tmp_path: Path) -> None:
+    """From calibration tracks, from the scales that a prediction has, and from their file."""
+    calibration = written(tmp_path / "calibration", tracks=12)
+    options = {"observe": 0.35, "method": "ekf"}
+    plain = bf.predict(shots, 0.2, **options)
+    found = bf.predict(shots, 0.2, **options, conformal=calibration)
+    scales = found["000"].conformal
+    assert isinstance(scales, ConformalScales)
+    assert scales.tracks.tolist() == [12] * 4
+    assert 0.5 < scales.own_coverage <= 1.0
+    assert 0.85 < scales.coverage <= 1.0
+    factors = found["000"].sigmas / plain["000"].sigmas
+    np.testing.assert_allclose(factors[[0, -1]], scales.scales[[0, -1]])
+    np.testing.assert_array_equal(found["000"].positions, plain["000"].positions)
+    scales.save(tmp_path / "scales.yaml")
+    for again in (scales, tmp_path / "scales.yaml", bf.read(calibration)):
+        same_sigmas = bf.predict(shots, 0.2, **options, conformal=again)["000"].sigmas
+        np.testing.assert_array_equal(same_sigmas, found["000"].sigmas)
+    with pytest.raises(ValueError, match="conformal must hold other tracks than those that are predicted"):
+        bf.predict(shots, 0.2, conformal=shots)
+    with pytest.raises(ValueError, match=r"with 0.25 s observed, by ekf; the scales from .* have 0.35 s by ekf"):
+        bf.predict(shots, 0.2, method="ekf", conformal=scales)
+    with pytest.raises(TypeError, match="conformal must be a dataset of calibration tracks"):
+        bf.predict(shots, 0.2, conformal=track)
+    for single in (track, bf.estimate(track)):
+        with pytest.raises(ValueError, match="conformal must be None for a single ball; got ConformalScales"):
+            bf.predict(single, 0.2, conformal=scales)
 
 
 def test_states_of_all_estimators_predict_the_same(shots: bf.Dataset) -> None:

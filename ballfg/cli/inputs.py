@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import math
 import sys
 from collections import Counter
 from collections.abc import Iterable
@@ -13,11 +14,12 @@ from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
 import typer
 
 from ballfg.machine import usable_cores
+from ballfg.progress import progress
 
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel
     from ballfg.dynamics.surfaces import Surfaces
-    from ballfg.estimation import Estimator, Settings
+    from ballfg.estimation import Estimator
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.tracks import Dataset
 
@@ -68,7 +70,7 @@ class Source(enum.StrEnum):
     DETECTIONS = "detections"
 
 
-D = TypeVar("D")
+D = TypeVar("D", bound="Dataset | SightedDataset")
 Opened = TypeVar("Opened", "Dataset", "SightedDataset")
 
 
@@ -79,13 +81,15 @@ class Inputs(Generic[D]):
     dataset: D
     model: BallModel
     surfaces: Surfaces
-    settings: Settings
+    observed: float
+    """s from the start of each track from which the noise may be learned, where nobody states it."""
 
     def estimator(self, method: str) -> Estimator:
-        """The estimator of a name. Raises: ValueError: if there is none of that name."""
-        from ballfg.estimation import make_estimator
+        """The estimator of a name, with the noise of the dataset. Raises: ValueError: if there is none of that name."""
+        from ballfg.estimation import fitted_settings, make_estimator
 
-        return make_estimator(method, self.model, self.surfaces, self.settings)
+        settings = fitted_settings(self.dataset, self.model, self.observed, progress)
+        return make_estimator(method, self.model, self.surfaces, settings)
 
 
 def know_effects(files: Iterable[Path] | None) -> None:
@@ -96,13 +100,18 @@ def know_effects(files: Iterable[Path] | None) -> None:
         load_effects(file)
 
 
-def open_inputs(dataset: Path, model: Path | None, effects_files: Iterable[Path] | None = None) -> Inputs[Dataset]:
-    """Open and check everything before any work starts; what was repaired is said on stderr."""
+def open_inputs(
+    dataset: Path, model: Path | None, effects_files: Iterable[Path] | None = None, observed: float = math.inf
+) -> Inputs[Dataset]:
+    """Open and check everything before any work starts; what was repaired is said on stderr.
+
+    Args: observed: s from the start of each track from which the noise may be learned, where nobody states it.
+    """
     from ballfg.estimation import with_readings
     from ballfg.tracks import read_dataset
 
     know_effects(effects_files)
-    return _inputs(with_readings(read_dataset(dataset)), model)
+    return _inputs(with_readings(read_dataset(dataset)), model, observed)
 
 
 def open_sighted(
@@ -115,19 +124,25 @@ def open_sighted(
     return _inputs(read_sighted(dataset), model)
 
 
-def _inputs(data: Opened, model: Path | None) -> Inputs[Opened]:
+def _inputs(data: Opened, model: Path | None, observed: float = math.inf) -> Inputs[Opened]:
+    from ballfg.estimation import dataset_surfaces
+
+    return Inputs(data, open_model(data, model), dataset_surfaces(data), observed)
+
+
+def open_model(data: Dataset | SightedDataset, model: Path | None) -> BallModel:
+    """The model of a file, or the nominal one; what the user should know of data and model is said on stderr."""
     import torch
 
     from ballfg.dynamics import load_model, nominal_model, nominal_note
-    from ballfg.estimation import dataset_settings, dataset_surfaces, table_note, unused_model
+    from ballfg.estimation import table_note, unused_model
 
     torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
     notes = [*data.notes, *filter(None, [table_note(data)])]
     if model is None:
         notes += [note for note in (nominal_note(data.ball), *unused_model(data.path, data.ball)) if note]
     print_notes(notes)
-    ball = nominal_model(data.ball) if model is None else load_model(model, radius=data.ball.radius)
-    return Inputs(data, ball, dataset_surfaces(data), dataset_settings(data, ball))
+    return nominal_model(data.ball) if model is None else load_model(model, radius=data.ball.radius)
 
 
 def check_out(out: Path, dataset: Path) -> None:

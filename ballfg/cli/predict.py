@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -13,7 +15,8 @@ from ballfg.progress import progress
 if TYPE_CHECKING:
     import numpy as np
 
-    from ballfg.estimation import TrackPrediction
+    from ballfg.estimation import ConformalScales, Estimator, TrackPrediction
+    from ballfg.tracks import Dataset
 
 
 def predict(
@@ -23,6 +26,16 @@ def predict(
     method: inputs.MethodName = "smoother",
     model: inputs.ModelFile = None,
     effects_file: inputs.EffectsFiles = None,
+    conformal: Annotated[
+        Path | None,
+        typer.Option(
+            help="Dataset of calibration tracks of the same kind, or the file of --save-conformal: sigmas are scaled "
+            "so that +-1.645 of them hold 90 % of the measured coordinates."
+        ),
+    ] = None,
+    save_conformal: Annotated[
+        Path | None, typer.Option(help="YAML file to keep the scales of --conformal in, for later predictions.")
+    ] = None,
     jobs: inputs.Jobs = inputs.CORES,
 ) -> None:
     """Positions at every stamp after the observed part, with the standard deviation of a measurement there.
@@ -32,30 +45,126 @@ def predict(
     Example: ballfg predict data/ballgun --observe 0.25 --out predictions.csv
     """
     from ballfg.estimation import check_observe, predict_tracks
+    from ballfg.files.whole_file import check_file
     from ballfg.tracks import TableWriter
 
-    statuses: Counter[str] = Counter()
-    doubts: list[str] = []
-    rows, squares, ended = 0, 0.0, 0
+    outcome = _Outcome()
     with TableWriter(out) as table:
         inputs.check_out(out, dataset)
         check_observe(observe)
-        opened = inputs.open_inputs(dataset, model, effects_file)
+        if save_conformal is not None:
+            check_file(save_conformal, "save_conformal")
+            if conformal is None:
+                raise ValueError("save_conformal must come with --conformal, whose scales it keeps. Add --conformal.")
+        opened = inputs.open_inputs(dataset, model, effects_file, observe)
         count = len(opened.dataset)
-        predictions = predict_tracks(opened.estimator(method), opened.dataset, count, observe, jobs=jobs)
-        for result in progress(predictions, count, "tracks predicted"):
+        estimator = opened.estimator(method)
+        scales = None
+        if conformal is not None:
+            scales = _conformal_scales(conformal, opened.dataset, estimator, method, observe, jobs)
+        predictions = predict_tracks(estimator, opened.dataset, count, observe, jobs=jobs)
+        for plain in progress(predictions, count, "tracks predicted"):
+            result = plain if scales is None else scales.scaled(plain)
             table.write(_columns(result))
-            statuses[result.status.value] += 1
-            doubts += [f"track {result.name!r}: {note}" for note in result.estimate.notes]
-            rows += len(result.times)
-            ended += len(result.times) == 0
-            squares += float(((result.positions - result.measured) ** 2).sum())
-    print(f"{out}: {rows} positions of {count} tracks, from the first {observe:g} s of each by {method}")
-    inputs.print_outcome(statuses, doubts)
-    if rows:
-        print(f"  RMSE against what was measured there: {1e3 * (squares / rows) ** 0.5:.1f} mm over all stamps")
-    if ended:
-        print(f"  {ended} of the tracks end within {observe:g} s: nothing to predict")
+            outcome.add(result, plain.sigmas)
+    print(f"{out}: {outcome.rows} positions of {count} tracks, from the first {observe:g} s of each by {method}")
+    outcome.print(observe)
+    if scales is not None:
+        _print_conformal(scales, outcome)
+        if save_conformal is not None:
+            scales.save(save_conformal)
+            print(f"{save_conformal}: the scales, for --conformal")
+
+
+def _conformal_scales(
+    source: Path, dataset: Dataset, estimator: Estimator, method: str, observe: float, jobs: int
+) -> ConformalScales:
+    """Scales from the calibration tracks of a folder, or from a file that keeps them."""
+    from ballfg.estimation import (
+        ConformalScales,
+        check_calibration_tracks,
+        load_conformal,
+        predict_tracks,
+        with_readings,
+    )
+    from ballfg.tracks import read_dataset
+
+    if source.is_file():
+        scales = load_conformal(source)
+        scales.check_fits(observe, method)
+        return scales
+    calibration = with_readings(read_dataset(source))
+    check_calibration_tracks(calibration, dataset)
+    inputs.print_notes(f"calibration tracks: {note}" for note in calibration.notes)
+    count = len(calibration)
+    predictions = predict_tracks(estimator, calibration, count, observe, jobs=jobs)
+    watched = progress(predictions, count, "calibration tracks predicted")
+    return ConformalScales.of(watched, calibration.info.name, observe, method)
+
+
+def _print_conformal(scales: ConformalScales, outcome: _Outcome) -> None:
+    """Prints what the intervals hold, of the calibration tracks and of those predicted, and where they are infinite."""
+    from ballfg.estimation import Status
+    from ballfg.estimation.conformal import BIN, FEWEST
+
+    what = "the model's own hold {:.0f} %, the conformal ones {:.0f} %"
+    if (scales.tracks > FEWEST).any():
+        count, own, held = sum(scales.statuses.values()), 100 * scales.own_coverage, 100 * scales.coverage
+        print(f"  90 % intervals on the {count} calibration tracks of {scales.source!r}: {what.format(own, held)}")
+    for text, number in scales.statuses.items():
+        if text != Status.OK.value:
+            print(f"  {number} calibration track{'s' if number > 1 else ''}: {text}")
+    if outcome.finite:
+        own, held = 100 * outcome.held_by_own / outcome.finite, 100 * outcome.held / outcome.finite
+        print(f"  90 % intervals on the {outcome.statuses.total()} predicted tracks: {what.format(own, held)}")
+    infinite = 3 * outcome.rows - outcome.finite
+    if infinite:
+        inputs.print_notes(
+            [
+                f"{infinite} of {3 * outcome.rows} sigmas are infinite: a finite 90 % interval needs {FEWEST} "
+                f"calibration tracks with samples as far ahead; up to {BIN * len(scales.tracks):g} s there are so many"
+            ]
+        )
+
+
+@dataclass
+class _Outcome:
+    """Sums over the predicted tracks."""
+
+    rows: int = 0
+    squares: float = 0.0
+    ended: int = 0
+    held: int = 0
+    held_by_own: int = 0
+    finite: int = 0
+    statuses: Counter[str] = field(default_factory=Counter)
+    doubts: list[str] = field(default_factory=list)
+
+    def add(self, result: TrackPrediction, own_sigmas: np.ndarray) -> None:
+        """Counts a track; coordinates in 90 % intervals are counted where the interval is finite."""
+        import numpy as np
+
+        from ballfg.estimation.conformal import HALF_WIDTH
+
+        errors = np.abs(result.positions - result.measured)
+        finite = np.isfinite(result.sigmas)
+        self.rows += len(result.times)
+        self.squares += float((errors**2).sum())
+        self.ended += len(result.times) == 0
+        self.finite += int(finite.sum())
+        self.held += int((finite & (errors <= HALF_WIDTH * result.sigmas)).sum())
+        self.held_by_own += int((finite & (errors <= HALF_WIDTH * own_sigmas)).sum())
+        self.statuses[result.status.value] += 1
+        self.doubts += [f"track {result.name!r}: {note}" for note in result.estimate.notes]
+
+    def print(self, observe: float) -> None:
+        """Prints how the tracks ended and how far off their predictions are."""
+        inputs.print_outcome(self.statuses, self.doubts)
+        if self.rows:
+            rmse = 1e3 * (self.squares / self.rows) ** 0.5
+            print(f"  RMSE against what was measured there: {rmse:.1f} mm over all stamps")
+        if self.ended:
+            print(f"  {self.ended} of the tracks end within {observe:g} s: nothing to predict")
 
 
 def _columns(result: TrackPrediction) -> dict[str, str | np.ndarray]:

@@ -31,6 +31,8 @@ def simulate(
     outlier_size: Annotated[float, _noise(help="Typical distance of an outlier, m.")] = 0.1,
     spin_noise: Annotated[float, _noise(help="Standard deviation of each component of the spin labels, rad/s.")] = 4.0,
     spin_labels: Annotated[bool, _noise(help="Spin labels in labels.csv; launcher settings are always there.")] = True,
+    memory: Annotated[float, _noise(help="Standard deviation of an error that lasts from frame to frame, m.")] = 0.0,
+    memory_time: Annotated[float, _noise(help="Time over which that error lasts, s.")] = 0.015,
     process_noise: Annotated[float, _noise(help="Density of a white acceleration in flight, m/s^1.5.")] = 0.0,
     spin_process_noise: Annotated[float, _noise(help="Density of a white angular acceleration, rad/s^1.5.")] = 0.0,
     contact_noise: Annotated[float, _noise(help="Random kick to the velocity after each bounce, m/s.")] = 0.0,
@@ -64,7 +66,9 @@ def simulate(
         seed=seed,
         ball=_ball(ball, model),
         settings=simulation.parse_settings(settings) if settings else {},
-        noise=simulation.MeasurementNoise(noise, dropout, jitter, outliers, outlier_size, spin_noise),
+        noise=simulation.MeasurementNoise(
+            noise, dropout, jitter, outliers, outlier_size, spin_noise, memory, memory_time
+        ),
         process=simulation.MotionNoise(process_noise, spin_process_noise, contact_noise, contact_spin_noise),
         undeclared=simulation.parse_effects(effect or ()),
         spin_labels=spin_labels,

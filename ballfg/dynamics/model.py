@@ -16,6 +16,7 @@ from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, VELOCITY, VZ, Z
 
 if TYPE_CHECKING:
     from ballfg.dynamics.trained import Trained
+    from ballfg.tracks import TrackNoise
 
 THIN_SHELL: Final = 2.0 / 3.0
 """Moment of inertia of a thin spherical shell divided by m R^2."""
@@ -46,6 +47,7 @@ class BallModel(nn.Module, ABC):
         radius: m.
         inertia_factor: moment of inertia divided by m R^2.
         trained: the noise and the launcher that were learned together with the model; None where nothing was.
+        noise: how far tracks scatter about the model; None where nobody has looked.
 
     Raises: ValueError: if the radius is not within 0.001 to 1 m, or the inertia factor not within 0 to 1.
     """
@@ -61,6 +63,7 @@ class BallModel(nn.Module, ABC):
         self.radius = float(radius)
         self.inertia_factor = float(inertia_factor)
         self.trained: Trained | None = None
+        self.noise: TrackNoise | None = None
 
     @functools.cached_property
     def parameter_count(self) -> int:

@@ -15,9 +15,12 @@ from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.networks.learned_file import has_learned_part, read_learned, remove_others, write_learned
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.whole_file import write_text
+from ballfg.tracks import TrackNoise
 
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
 SECTIONS = (*KINDS, "learned")
+NOISE: Final = "noise"
+"""Entry of the section `measurement` that is no effect: how far tracks scatter about the model."""
 
 
 def load_model(path: str | Path, *, radius: float = 0.02, inertia_factor: float = THIN_SHELL) -> BallModel:
@@ -68,6 +71,7 @@ def model_from_dict(
             raise ValueError(f"{where}: unknown section '{section}'{_nearest(section, SECTIONS)}")
     if content.get("learned") is not None:
         raise ValueError(f"{where}: section 'learned' must be null; only a file tells where a learned part lies")
+    content, noise = _without_noise(content, where)
     effects: list[Effect] = []
     for kind in KINDS:
         section = content.get(kind)
@@ -82,7 +86,21 @@ def model_from_dict(
         effects = after_needs(effects)
     except ValueError as error:
         raise ValueError(f"{where}: {error}") from error
-    return AnalyticModel(effects, radius=radius, inertia_factor=inertia_factor)
+    model = AnalyticModel(effects, radius=radius, inertia_factor=inertia_factor)
+    model.noise = noise
+    return model
+
+
+def _without_noise(content: Mapping[str, Any], where: str) -> tuple[Mapping[str, Any], TrackNoise | None]:
+    """The content without `measurement.noise`, which is no effect, and what that says."""
+    section = content.get("measurement")
+    if not isinstance(section, Mapping) or section.get(NOISE) is None:
+        return content, None
+    try:
+        noise = TrackNoise.from_mapping(section[NOISE])
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{where}: measurement.{error}") from error
+    return {**content, "measurement": {name: v for name, v in section.items() if name != NOISE}}, noise
 
 
 def _effect(name: str, kind: Kind, values: Any, where: str) -> Effect:
@@ -109,6 +127,8 @@ def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
     content: dict[str, Any] = {}
     for kind, group in zip(KINDS, (model.flight, model.bounce, model.measurement), strict=True):
         content[kind] = {name: cast(Effect, effect).values() for name, effect in group.items()}
+    if model.noise is not None:
+        content["measurement"][NOISE] = model.noise.to_mapping()
     return content | {"learned": None}
 
 
@@ -121,6 +141,8 @@ def save_model(model: BallModel, path: str | Path) -> None:
     """
     path = Path(path)
     content = model_to_dict(_analytic_part(model))
+    if model.noise is not None:
+        content["measurement"][NOISE] = model.noise.to_mapping()
     if has_learned_part(model):
         content["learned"] = write_learned(model, path.parent, path.stem)
     write_text(path, yaml.safe_dump(content, sort_keys=False))

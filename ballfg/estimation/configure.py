@@ -4,19 +4,30 @@ from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
 
+import numpy as np
+
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.dynamics.trained import Trained
 from ballfg.estimation.launcher import Launcher
 from ballfg.estimation.measurement.position_noise import estimate_position_noise
+from ballfg.estimation.noise.estimate import estimate_noise, spread_over
+from ballfg.estimation.noise.parameters import with_noise
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
 from ballfg.estimation.settings import MEASURED, Settings
 from ballfg.estimation.table_extent import TableExtent, find_table_extent
 from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
+from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Dataset, DatasetInfo
 
 TRACKS_FOR_NOISE = 50
 """How many tracks the measurement noise is estimated from, when a dataset does not state it."""
+QUICK_TRACKS = 20
+"""How many tracks tell all other noise, evenly over the first `TRACKS_FOR_TABLE`, which may be of several groups."""
+KEPT = 8
+"""How many datasets' noise is remembered: their tracks may be estimated one by one."""
+LEAST_TRACKS = 5
+"""Fewer tracks do not tell how much tracks differ."""
 STATED_EDGE_SIGMA = 0.01
 """m, of the ends of a table that a dataset states: a ball touches an edge up to its radius beside it."""
 TRACKS_FOR_TABLE = 200
@@ -28,7 +39,8 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
 
     The position noise is the dataset's; where it states none, it is estimated from the scatter of the first tracks
     about short polynomials. The coefficients of an analytic model are estimated with each track, within their priors; a
-    trained model is taken as it is, with the noise and the launcher that were learned together with it.
+    trained model is taken as it is, with the noise and the launcher that were learned together with it. Where the
+    dataset or the model states more of the noise, that holds, the model's before the dataset's.
     """
     info, trained = dataset.info, model.trained
     if info.position_noise is not None:
@@ -48,7 +60,55 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
         )
         if trained.launcher is None and trained.spin_noise is not None:
             settings = replace(settings, spin_label_noise=trained.spin_noise)
-    return settings if info.spin_noise is None else replace(settings, spin_label_noise=info.spin_noise)
+    if info.spin_noise is not None:
+        settings = replace(settings, spin_label_noise=info.spin_noise)
+    for stated in (info.noise, model.noise):
+        settings = settings if stated is None else with_noise(settings, stated)
+    return settings
+
+
+def fitted_settings(
+    dataset: Dataset | SightedDataset, model: BallModel, observed: float = np.inf, watch: Watch = unwatched
+) -> Settings:
+    """`dataset_settings`, and where neither dataset nor model states the noise, the noise that the tracks show.
+
+    Args:
+        dataset: a few of its tracks are estimated once (`estimate_noise`); with fewer than `LEAST_TRACKS` of them, or
+            where cameras saw the ball, or with a trained model, the settings are those of `dataset_settings`.
+        model: the ball.
+        observed: s from the start of each track that may be looked at.
+        watch: told of each track, and of each step of the search.
+    """
+    settings = dataset_settings(dataset, model)
+    stated = dataset.info.noise is not None or model.noise is not None or model.trained is not None
+    if stated or dataset.rough or len(dataset) < LEAST_TRACKS:
+        return settings
+    values = tuple(float(p.detach()) for p in model.parameters() if p.numel() == 1)
+    key = (dataset, model, values, observed)
+    if key not in _FITTED:
+        while len(_FITTED) >= KEPT:
+            del _FITTED[next(iter(_FITTED))]
+        _FITTED[key] = _fitted(dataset, model, observed, watch)
+    return _FITTED[key] or settings
+
+
+_FITTED: dict[tuple[Dataset | SightedDataset, BallModel, tuple[float, ...], float], Settings | None] = {}
+
+
+def _fitted(dataset: Dataset | SightedDataset, model: BallModel, observed: float, watch: Watch) -> Settings | None:
+    """The settings with the noise that the tracks show; None where they show none."""
+    tracks = spread_over(dataset, min(len(dataset), TRACKS_FOR_TABLE), QUICK_TRACKS)
+    parts = [track.until(float(track.times[0]) + observed) for track in tracks] if np.isfinite(observed) else tracks
+    found = estimate_noise(
+        model,
+        dataset_surfaces(dataset),
+        dataset_settings(dataset, model),
+        parts,
+        position_known=dataset.info.position_noise is not None,
+        errors=False,
+        watch=watch,
+    )
+    return None if found is None else found.settings
 
 
 @lru_cache(maxsize=8)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.dynamics.analytic import coefficient_sigmas
@@ -121,9 +120,13 @@ class Settings:
         return max(self.memory) > 0.0
 
     @property
-    def bias_sigmas(self) -> NDArray[np.float64]:
+    def bias_sigmas(self) -> Array:
         """(3,) m, standard deviations of the errors that last; an axis without any has as good as none."""
         return np.maximum(self.memory, LEAST_BIAS)
+
+    def for_track(self, track: Track) -> Settings:
+        """The settings of a track: positions that were made from other observations have no tracker's errors."""
+        return replace(self, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0) if track.rough else self
 
     def renamed(self, model: BallModel) -> Settings:
         """These settings with coefficients under the names that the model has today."""
@@ -148,18 +151,24 @@ MEASURED = ProcessNoise(contact_tangential=0.2, contact_spin=10.0)
 tangential restitution as coefficients of a track would say the same, along a kink that no minimisation likes."""
 
 
-def spin_start(label: SpinLabel | None, settings: Settings) -> tuple[NDArray[np.float64], float]:
+def spin_start(label: SpinLabel | None, settings: Settings) -> tuple[Array, float]:
     """Mean (3,) and standard deviation per axis, rad/s, of the spin at a start: those of the label or the prior."""
     return (np.zeros(3), settings.spin_prior) if label is None else (label.spin, label.sigma)
 
 
-def sample_sigmas(settings: Settings, count: int, own: NDArray[np.float64] | None) -> NDArray[np.float64]:
+def sample_sigmas(settings: Settings, count: int, own: Array | None) -> Array:
     """(n, 3) m, the caller's to change: a track's own sigmas where it has them, else the settings', both scaled.
 
     They are those of the white part of a position's error.
     """
     sigmas = np.broadcast_to(np.array(settings.position_noise), (count, 3)) if own is None else own
     return settings.position_scale * sigmas
+
+
+def stamp_covariance(settings: Settings, velocity: Array) -> Array:
+    """(..., 3, 3) m^2, of the ways that the ball makes during the errors of stamps, at velocities (..., 3) m/s."""
+    way = settings.stamp_jitter * velocity
+    return np.asarray(way[..., :, None] * way[..., None, :])
 
 
 def total_sigmas(settings: Settings, white: Array, velocities: Array) -> Array:

@@ -1,9 +1,12 @@
 """Prediction of whole tracks: observe the first part, predict what will be measured at every later stamp."""
 
+from __future__ import annotations
+
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -19,6 +22,9 @@ from ballfg.prediction.belief import Belief
 from ballfg.prediction.propagate import Propagator
 from ballfg.state import POSITION, VELOCITY
 from ballfg.tracks import Track
+
+if TYPE_CHECKING:
+    from ballfg.estimation.conformal import ConformalScales
 
 BLOCK = 64
 """Tracks that are propagated together; memory grows with it."""
@@ -38,6 +44,7 @@ class TrackPrediction:
             they are right to the share by which those stretch lengths and to a lag times the velocity's sigma.
         measured: (k, 3) m, what the track has at those stamps.
         estimate: from the observed part.
+        conformal: by which the sigmas were scaled; None where they are the model's own.
     """
 
     name: str
@@ -46,6 +53,7 @@ class TrackPrediction:
     sigmas: Array
     measured: Array
     estimate: Estimate
+    conformal: ConformalScales | None = None
 
     def __repr__(self) -> str:
         return f"TrackPrediction({self.name!r}, {len(self.times)} positions, {self.status.name.lower()})"

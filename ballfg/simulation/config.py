@@ -39,6 +39,12 @@ class MeasurementNoise:
     spin: float = bounded(4.0, 0.0, 1000.0)
     """rad/s, standard deviation of each component of the spin labels."""
 
+    memory: float = bounded(0.0, 0.0, 1.0)
+    """m, standard deviation of an error of each coordinate that lasts from frame to frame; no file states it."""
+
+    memory_time: float = bounded(0.015, 1e-4, 10.0)
+    """s, over which the correlation of that error falls to 1 / e."""
+
     def __post_init__(self) -> None:
         check_bounds(self, "noise.")
 

@@ -57,6 +57,7 @@ def measure(
     stamps = model.stamps(torch.from_numpy(true_times)).numpy() + jitter
     positions = _apparent_positions(config, model, motion.states, exists)
     positions += _position_noise(noise, config.seed, block, shape)
+    positions += _lasting_errors(noise, config.rate, config.seed, block, shape)
     label_noise = noise.spin * generator(config.seed, Purpose.LABEL, block).standard_normal((shape[0], 3))
     width = max(3, len(str(config.tracks - 1)))
     tracks = []
@@ -89,6 +90,17 @@ def _position_noise(noise: MeasurementNoise, seed: int, block: int, shape: tuple
     direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
     distance = noise.outlier_size * rng.uniform(0.5, 1.5, shape)
     return added + np.where(is_outlier, distance, 0.0)[..., None] * direction
+
+
+def _lasting_errors(noise: MeasurementNoise, rate: float, seed: int, block: int, shape: tuple[int, ...]) -> Array:
+    """(n, k, 3) m, errors whose correlation fades exponentially, on all frames, taken or dropped."""
+    if noise.memory == 0.0:
+        return np.zeros((*shape, 3))
+    errors = noise.memory * generator(seed, Purpose.MEMORY, block).standard_normal((*shape, 3))
+    kept = np.exp(-1.0 / (rate * noise.memory_time))
+    for k in range(1, shape[1]):
+        errors[:, k] = kept * errors[:, k - 1] + np.sqrt(1.0 - kept**2) * errors[:, k]
+    return np.asarray(errors)
 
 
 def _apparent_positions(config: SimulationConfig, model: BallModel, states: Array, exists: NDArray[np.bool_]) -> Array:

@@ -25,6 +25,7 @@ class Purpose(IntEnum):
     JITTER = 6
     OUTLIER = 7
     LABEL = 8
+    MEMORY = 9
     SCENE_START = 100
     SCENE_DROPOUT = 101
     SCENE_JITTER = 102

@@ -6,6 +6,7 @@ from .info import TABLE_TENNIS as TABLE_TENNIS
 from .info import TENNIS as TENNIS
 from .info import Ball as Ball
 from .info import DatasetInfo as DatasetInfo
+from .noise import TrackNoise as TrackNoise
 from .sightings import Sightings as Sightings
 from .table import TableWriter as TableWriter
 from .track import SPIN_LABELS as SPIN_LABELS

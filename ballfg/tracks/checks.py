@@ -41,6 +41,10 @@ MAX_RATE_RATIO = 100.0
 
 BASELINE: Final = 0.05
 """s to each side over which an acceleration is read off: 3 mm of noise make 3 m/s^2 of one, 0.5 of a track's median."""
+LEAST_FALLING: Final = 0.2
+"""Share of a track that falls along -z as a ball does, from which on its axes are not doubted."""
+MOSTLY: Final = 0.5
+"""Share of a track that falls along +z, from which on z seems to point down."""
 FALLS: Final = (0.4, 1.9)
 """Multiples of gravity between which a flying ball's vertical acceleration lies; strong topspin doubles it."""
 LEAST_REVERSAL: Final = 0.8
@@ -240,12 +244,17 @@ def _some(names: list[str]) -> str:
 def _other_axis(times: Array, positions: Array, reach: int) -> tuple[str, ...]:
     before, middle, after = positions[: -2 * reach], positions[reach:-reach], positions[2 * reach :]
     span = (times[2 * reach :] - times[: -2 * reach]) / 2
-    acceleration = np.median((after - 2 * middle + before) / span[:, None] ** 2, axis=0)
+    accelerations = (after - 2 * middle + before) / span[:, None] ** 2
+    acceleration = np.median(accelerations, axis=0)
     low, high = FALLS[0] * STANDARD_GRAVITY, FALLS[1] * STANDARD_GRAVITY
-    if abs(acceleration[Z]) >= low / 2:
-        if -high <= acceleration[Z] < 0.0 or abs(acceleration[Z]) > high:
-            return ()
+    falls = (-high <= accelerations[:, Z]) & (accelerations[:, Z] <= -low)
+    rises = (low <= accelerations[:, Z]) & (accelerations[:, Z] <= high)
+    if falls.mean() >= LEAST_FALLING:  # a bounce in a short track outweighs its flights in the median
+        return ()
+    if rises.mean() >= MOSTLY:
         return ("the ball rises faster and faster along z: z seems to point down. Turn the sign of z.",)
+    if abs(acceleration[Z]) >= low / 2:
+        return ()
     other = int(np.abs(acceleration[:2]).argmax())
     if not low <= abs(acceleration[other]) <= high:
         return ()

@@ -10,11 +10,12 @@ import yaml
 
 from ballfg.checks import check_number, check_text, did_you_mean, nearest, type_name
 from ballfg.files.strict_yaml import YamlError, read_yaml
+from ballfg.tracks.noise import TrackNoise
 
 INFO_FILE = "dataset.yaml"
 _REQUIRED = ("name", "frame", "ball")
 _OPTIONAL = ("rate", "position_noise", "spin_noise", "source", "licence")
-_KNOWN = (*_REQUIRED, *_OPTIONAL, "labels")
+_KNOWN = (*_REQUIRED, *_OPTIONAL, "noise", "labels")
 
 # The largest values that can be meant in SI units; above them the unit is almost surely another one.
 _MAX_RADIUS = 0.5  # m
@@ -86,9 +87,14 @@ class DatasetInfo:
     table_extent: tuple[float, float, float, float] | None = None
     """(x_low, x_high, y_low, y_high) m, the table's ends; None where they are not stated."""
 
+    noise: TrackNoise | None = None
+    """All noise that is known of the tracks, as `ballfg noise` finds it; it comes before the two numbers above."""
+
     def __post_init__(self) -> None:
         for key in ("name", "source", "licence"):
             check_text(key, getattr(self, key), optional=key != "name")
+        if not isinstance(self.noise, TrackNoise | None):
+            raise TypeError(f"noise must be a TrackNoise or None; got {type(self.noise).__name__}.")
         if not isinstance(self.ball, Ball):
             raise TypeError(f"ball must be a Ball; got {type(self.ball).__name__}. Pass Ball(radius, mass).")
         height = check_number("frame.table_height", self.table_height, "m", limit=MAX_HEIGHT, instead="mm")
@@ -126,6 +132,7 @@ class DatasetInfo:
             table_height=frame["table_height"],
             ball=Ball(radius=ball["radius"], mass=ball["mass"]),
             table_extent=_stated_extent(frame),
+            noise=None if content.get("noise") is None else TrackNoise.from_mapping(content["noise"]),
             **{key: content.get(key) for key in _OPTIONAL},
         )
 
@@ -140,7 +147,8 @@ class DatasetInfo:
             "ball": {field.name: getattr(self.ball, field.name) for field in fields(Ball)},
         }
         optional = {key: getattr(self, key) for key in _OPTIONAL}
-        return content | {key: value for key, value in optional.items() if value is not None}
+        content |= {key: value for key, value in optional.items() if value is not None}
+        return content if self.noise is None else content | {"noise": self.noise.to_mapping()}
 
 
 def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:

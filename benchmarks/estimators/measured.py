@@ -10,6 +10,7 @@ from itertools import islice, pairwise
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.benchmarks.estimators.conformal import conformal_coverage
 from ballfg.benchmarks.estimators.scoring import LEVELS, sums_and_counts
 from ballfg.benchmarks.metrics import Statistic, bootstrap, inside, pooled_mean, quantile, root_mean_square
 from ballfg.benchmarks.results import CURVE_MARK, Results
@@ -118,6 +119,9 @@ def _add_predictions(results: Results, measured: Measured) -> None:
         for level in CALIBRATION:
             held, total = covered(predictions, level)
             add(f"coverage{CURVE_MARK}{level:g}", "1", float(held.sum() / total.sum()), n)
+        conformal = conformal_coverage(predictions, OBSERVE, results.seed)
+        if conformal is not None:
+            add("conformal_coverage_90", "1", conformal, n)
         # chi-square with 3 degrees of freedom has the median 2.37; one outlier decides the mean
         nis = np.concatenate([p.estimate.nis for p in predictions])
         nis = nis[np.isfinite(nis)]

@@ -14,7 +14,18 @@ from pydantic import BaseModel, ConfigDict
 from ballfg.arrays import Array
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation import Estimate, Settings, Smoother, Status, dataset_settings, dataset_surfaces, estimate_tracks
+from ballfg.estimation import (
+    Estimate,
+    NoiseEstimate,
+    Settings,
+    Smoother,
+    Status,
+    dataset_settings,
+    dataset_surfaces,
+    estimate_noise,
+    estimate_tracks,
+    spread_over,
+)
 from ballfg.learning.calibration.coefficients import Chosen, choose, with_values
 from ballfg.learning.calibration.population import Evidence, evidence, fit_population
 from ballfg.learning.config.calibration import CalibrationConfig
@@ -133,6 +144,21 @@ def population_settings(problem: Problem, step: Step) -> Settings:
     """Settings with the population's distribution of a new track as the prior of each calibrated coefficient."""
     learned = dict(zip(problem.chosen.names, step.next_track, strict=True))
     return replace(problem.settings, coefficients={**problem.settings.coefficients, **learned})
+
+
+def fitted_noise(
+    problem: Problem, model: AnalyticModel, settings: Settings, watch: Watch = unwatched
+) -> NoiseEstimate | None:
+    """The noise that the fitted tracks show about the calibrated model; None where it cannot be told.
+
+    Args: model: with the calibrated coefficients.  settings: with the population as the prior of each coefficient.
+    """
+    if not model.measures_plainly:
+        return None
+    names = problem.split.fit
+    tracks = spread_over(tracks_of(problem.dataset, names), len(names))
+    known = problem.dataset.info.position_noise is not None
+    return estimate_noise(model, problem.surfaces, settings, tracks, position_known=known, watch=watch)
 
 
 def _advance(problem: Problem, last: Step, watch: Watch) -> Step:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ballfg.estimation import NoiseEstimate
 from ballfg.learning.calibration.calibrate import Problem, Step, has_converged
 from ballfg.learning.evaluation import Summary, TrackScore, summary
 
@@ -19,6 +20,7 @@ class Comparison:
 
     Attributes:
         with_spread: with the calibrated model, each track's prior as wide as the population.
+        with_noise: with the noise besides that the fitted tracks show.
         better: number of tracks whose RMSE fell.
         pairs: (n, 2) m, RMSE before and after of each track.
         failed: number of tracks that could not be judged each time.
@@ -27,29 +29,35 @@ class Comparison:
     before: Summary | None
     after: Summary | None
     with_spread: Summary | None
+    with_noise: Summary | None
     better: int
     pairs: np.ndarray
     failed: int
 
 
 def compare(
-    before: Sequence[TrackScore | None], after: Sequence[TrackScore | None], spread: Sequence[TrackScore | None]
+    before: Sequence[TrackScore | None],
+    after: Sequence[TrackScore | None],
+    spread: Sequence[TrackScore | None],
+    noise: Sequence[TrackScore | None],
 ) -> Comparison:
     """Compare scores of the same tracks in the same order."""
-    rows = [(b, a, s) for b, a, s in zip(before, after, spread, strict=True) if b and a and s]
-    pairs = np.array([(b.rmse, a.rmse) for b, a, _ in rows]).reshape(-1, 2)
+    rows = [(b, a, s, n) for b, a, s, n in zip(before, after, spread, noise, strict=True) if b and a and s and n]
+    pairs = np.array([(b.rmse, a.rmse) for b, a, *_ in rows]).reshape(-1, 2)
     return Comparison(
-        before=summary([b for b, _, _ in rows]),
-        after=summary([a for _, a, _ in rows]),
-        with_spread=summary([s for _, _, s in rows]),
+        before=summary([b for b, *_ in rows]),
+        after=summary([a for _, a, *_ in rows]),
+        with_spread=summary([s for _, _, s, _ in rows]),
+        with_noise=summary([n for *_, n in rows]),
         better=int((pairs[:, 1] < pairs[:, 0]).sum()),
         pairs=pairs,
         failed=len(before) - len(rows),
     )
 
 
-def report(problem: Problem, last: Step, comparison: Comparison) -> dict[str, Any]:
+def report(problem: Problem, last: Step, comparison: Comparison, noise: NoiseEstimate | None) -> dict[str, Any]:
     """The content of `report.json`, without times and paths: the same run writes the same bytes."""
+    shown = None if noise is None else {**noise.noise.to_mapping(), "relative_errors": noise.relative_errors}
     return {
         "dataset": problem.dataset.info.name,
         "converged": has_converged(problem.config, last),
@@ -70,7 +78,9 @@ def report(problem: Problem, last: Step, comparison: Comparison) -> dict[str, An
             "before": _plain(comparison.before),
             "after": _plain(comparison.after),
             "after_with_spread": _plain(comparison.with_spread),
+            "after_with_noise": _plain(comparison.with_noise),
         },
+        "noise": shown,
         "verdict": verdict(problem, last, comparison),
     }
 
@@ -117,6 +127,11 @@ def verdict(problem: Problem, last: Step, comparison: Comparison) -> str:
         sentences.append(
             f"With the population as each track's prior it has {1e3 * comparison.with_spread.rmse_median:.1f} mm."
         )
+    if comparison.with_noise is not None:
+        sentences.append(
+            f"With the noise that the fitted tracks show, {1e3 * comparison.with_noise.rmse_median:.1f} mm, and 90 % "
+            f"intervals hold {100 * comparison.with_noise.coverage_90:.0f} %."
+        )
     for k, name in enumerate(problem.chosen.names):
         found = _coefficient(problem, last, k)
         if not found["told_by_data"]:
@@ -132,8 +147,10 @@ def table(problem: Problem, last: Step, comparison: Comparison) -> str:
     for k, name in enumerate(problem.chosen.names):
         values = (problem.chosen.start[k], last.mean[k], last.sigma[k], last.spread[k])
         rows.append((name, problem.chosen.units[k], *(f"{value:.4g}" for value in values)))
-    errors: list[tuple[str, ...]] = [("judged tracks", "unit", "before", "after", "after, spread as prior", "")]
-    summaries = (comparison.before, comparison.after, comparison.with_spread)
+    errors: list[tuple[str, ...]] = [
+        ("judged tracks", "unit", "before", "after", "after, spread as prior", "and noise")
+    ]
+    summaries = (comparison.before, comparison.after, comparison.with_spread, comparison.with_noise)
     for label, unit, field, scale in (
         ("RMSE, median", "mm", "rmse_median", 1e3),
         ("RMSE, pooled", "mm", "rmse_pooled", 1e3),
@@ -142,7 +159,7 @@ def table(problem: Problem, last: Step, comparison: Comparison) -> str:
         ("NIS of observed part (3)", "1", "nis", 1.0),
     ):
         cells = ("-" if s is None else f"{scale * getattr(s, field):.4g}" for s in summaries)
-        errors.append((label, unit, *cells, ""))
+        errors.append((label, unit, *cells))
     return "\n\n".join(_aligned(part) for part in (rows, errors))
 
 

@@ -11,7 +11,16 @@ import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ballfg.dynamics import model_to_dict, save_model
-from ballfg.learning.calibration.calibrate import Problem, Step, calibrate, has_ended, population_settings, pose, score
+from ballfg.learning.calibration.calibrate import (
+    Problem,
+    Step,
+    calibrate,
+    fitted_noise,
+    has_ended,
+    population_settings,
+    pose,
+    score,
+)
 from ballfg.learning.calibration.coefficients import with_values
 from ballfg.learning.calibration.picture import draw
 from ballfg.learning.calibration.report import compare, report, table
@@ -87,13 +96,17 @@ def _line(problem: Problem, step: Step, left: float) -> str:
 
 
 def _finish(problem: Problem, steps: Sequence[Step], folder: Path, watch: Watch) -> None:
-    """Judge once more with the spread as the prior, write the results and print their paths."""
+    """Judge once more with the spread as the prior and with the noise, write the results and print their paths."""
     last = steps[-1]
-    mean = np.array(last.mean)
-    spread = score(problem, mean, watch, population_settings(problem, last))
-    comparison = compare(steps[0].scores, last.scores, spread)
-    found = report(problem, last, comparison)
-    save_model(with_values(problem.model, problem.chosen.names, mean), folder / files.MODEL)
+    mean, population = np.array(last.mean), population_settings(problem, last)
+    model = with_values(problem.model, problem.chosen.names, mean)
+    noise = fitted_noise(problem, model, population, watch)
+    spread = score(problem, mean, watch, population)
+    shown = spread if noise is None else score(problem, mean, watch, noise.settings)
+    comparison = compare(steps[0].scores, last.scores, spread, shown)
+    found = report(problem, last, comparison, noise)
+    model.noise = None if noise is None else noise.noise
+    save_model(model, folder / files.MODEL)
     files.write_json(folder / files.REPORT, found)
     draw(problem, last, comparison, folder / files.PICTURE)
     print(f"\n{table(problem, last, comparison)}\n\n{found['verdict']}\n")

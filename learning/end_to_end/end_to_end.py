@@ -32,7 +32,7 @@ from ballfg.learning.gradient.objective import BatchObjective
 from ballfg.learning.run.run_folder import MODEL
 from ballfg.learning.shots import Shot
 from ballfg.learning.trainee import BatchLoss, Trainee
-from ballfg.state import POSITION
+from ballfg.state import POSITION, STATE_DIM
 
 LOSS_UNIT: Final = 0.01
 """m. Squared errors are divided by its square, so that losses are of order one."""
@@ -148,7 +148,7 @@ class EndToEnd(Trainee):
             self.linear_solver(factors, layout.owners()),
             leaves,
         )
-        first = layout.unpack(point)[0][list(layout.starts)]
+        first = layout.unpack(point)[0][list(layout.starts), :STATE_DIM]
         prediction = self.predict(solved, first, epoch)
         wild = (~prediction.finite()).nonzero()[:, 0].tolist()
         if wild:

@@ -67,7 +67,10 @@ class Solved:
 
 
 class WarmStarts:
-    """The last estimate of each shot, seen from where it was measured: states, coefficients, contacts."""
+    """The last estimate of each shot, seen from where it was measured: states, coefficients, contacts.
+
+    The tracker's biases start from zero again: the objective is a parabola in them.
+    """
 
     def __init__(self) -> None:
         self._last: dict[int, tuple[Array, Array, tuple[Contact, ...]]] = {}
@@ -124,7 +127,7 @@ class BatchSolver:
 
         Args: numbers: of the shots.  poses: for those that are not seen as measured.
         """
-        smoothers: dict[tuple[int, Surfaces], Smoother] = {}
+        smoothers: dict[tuple[int, Surfaces, bool], Smoother] = {}
         searches = [self._search(number, poses.get(number), smoothers) for number in numbers]
         solved, failed = [], []
         for number, solution in zip(numbers, run_together(searches), strict=True):
@@ -139,13 +142,16 @@ class BatchSolver:
         return solved, failed
 
     def _search(
-        self, number: int, pose: Pose | None, smoothers: dict[tuple[int, Surfaces], Smoother]
+        self, number: int, pose: Pose | None, smoothers: dict[tuple[int, Surfaces, bool], Smoother]
     ) -> Search[Solution]:
         shot = self.shots[number]
-        key = id(shot.settings), shot.surfaces
+        key = id(shot.settings), shot.surfaces, pose is not None
         if key not in smoothers:
             # hits were looked for once, in the shots: what a model in training cannot explain yet is no hit
             settings = replace(self.learnables.noise.settings(shot.settings), find_events=False)
+            if pose is not None:
+                x, y, z = settings.memory
+                settings = replace(settings, memory=(np.hypot(x, y) / np.sqrt(2.0),) * 2 + (z,))
             smoothers[key] = Smoother(self.learnables.model, shot.surfaces, settings, self.optimizer)
         smoother = smoothers[key]
         track, segmentation = shot.seen, shot.segmentation
@@ -158,4 +164,4 @@ class BatchSolver:
             return smoother.search(smoother.problem(track, segmentation, sigma))
         values, contacts = warm
         problem = smoother.problem(track, replace(segmentation, contacts=contacts), sigma)
-        return smoother.search(problem, Earlier(values))
+        return smoother.search(problem, Earlier(replace(values, biases=problem.start(values.states).biases)))

@@ -15,7 +15,6 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.factors.covariance import SquareRootInformation
-from ballfg.state import STATE_DIM
 
 Product = Callable[[Tensor], Tensor]
 
@@ -38,10 +37,10 @@ class GaussNewtonFactors(SquareRootInformation):
     def solve(self, vector: Tensor) -> Tensor:
         """R^-1 R^-T times a vector (n,) in the order of `Layout`: the solution (n,), in SI units."""
         given = vector.detach().numpy()
-        split = self.lengths.sum() * STATE_DIM
+        split = self.lengths.sum() * self.width
         inside = np.arange(self.inverse.shape[1]) < self.lengths[:, None]
-        states = np.zeros((*inside.shape, STATE_DIM))
-        states[inside] = given[:split].reshape(-1, STATE_DIM)
+        states = np.zeros((*inside.shape, self.width))
+        states[inside] = given[:split].reshape(-1, self.width)
         shared = given[split:].reshape(self.tracks, self.coefficients).copy()
         self._solve_transposed(states, shared)
         self._solve(states, shared)
@@ -49,7 +48,7 @@ class GaussNewtonFactors(SquareRootInformation):
 
     def _solve_transposed(self, states: Array, shared: Array) -> None:
         """R^T y = b in place: forwards along the tracks, then the coefficients."""
-        carried = np.zeros((self.tracks, STATE_DIM, 1))
+        carried = np.zeros((self.tracks, self.width, 1))
         for i in range(states.shape[1]):
             carried = self.inverse[:, i].mT @ (states[:, i, :, None] - carried)
             states[:, i] = carried[..., 0]
@@ -63,7 +62,7 @@ class GaussNewtonFactors(SquareRootInformation):
         if self.coefficients:
             shared[:] = (self.last @ shared[..., None])[..., 0]
             states -= np.einsum("tnip,tp->tni", self.shared, shared)
-        later = np.zeros((self.tracks, STATE_DIM, 1))
+        later = np.zeros((self.tracks, self.width, 1))
         for i in range(states.shape[1] - 1, -1, -1):
             later = self.inverse[:, i] @ (states[:, i, :, None] - self.following[:, i] @ later)
             states[:, i] = later[..., 0]

@@ -25,10 +25,12 @@ class Layout:
     Attributes:
         lengths: number of states of each of t tracks.
         coefficients: number p of coefficients of each track.
+        width: numbers w of a state: 9, or 12 where the tracker's bias stands behind it.
     """
 
     lengths: tuple[int, ...]
     coefficients: int
+    width: int = STATE_DIM
 
     @property
     def states(self) -> int:
@@ -42,18 +44,18 @@ class Layout:
 
     def pack(self, values: Sequence[Values]) -> Tensor:
         """One vector from the values of each track."""
-        parts = [v.states.reshape(-1) for v in values] + [v.coefficients for v in values]
-        return torch.from_numpy(np.concatenate(parts))
+        states = [v.gather(np.arange(len(v.states)), with_biases=True).reshape(-1) for v in values]
+        return torch.from_numpy(np.concatenate(states + [v.coefficients for v in values]))
 
     def unpack(self, point: Tensor) -> tuple[Tensor, Tensor]:
-        """States (n, 9) and coefficients (t, p) of a vector."""
-        states = point[: self.states * STATE_DIM].view(-1, STATE_DIM)
-        return states, point[self.states * STATE_DIM :].view(len(self.lengths), self.coefficients)
+        """States with their biases (n, w) and coefficients (t, p) of a vector."""
+        states = point[: self.states * self.width].view(-1, self.width)
+        return states, point[self.states * self.width :].view(len(self.lengths), self.coefficients)
 
     def owners(self) -> Tensor:
         """Track number of each entry of the vector."""
         track = torch.arange(len(self.lengths))
-        of_states = track.repeat_interleave(torch.tensor(self.lengths) * STATE_DIM)
+        of_states = track.repeat_interleave(torch.tensor(self.lengths) * self.width)
         return torch.cat((of_states, track.repeat_interleave(self.coefficients)))
 
 
@@ -72,10 +74,18 @@ class BatchObjective:
     Args:
         graphs: one per track.
         values: of each track, for the number of states and coefficients.
+
+    Raises: ValueError: if some tracks have a tracker's biases and others none.
     """
 
     def __init__(self, graphs: Sequence[BallGraph], values: Sequence[Values]) -> None:
-        self.layout = Layout(tuple(len(v.states) for v in values), len(values[0].coefficients))
+        width = values[0].width
+        if any(v.width != width for v in values):
+            raise ValueError(
+                "tracks of a batch must all have measured positions where errors last (memory in the settings); some "
+                "were made from sightings. Train on one sort of tracks, or without memory."
+            )
+        self.layout = Layout(tuple(len(v.states) for v in values), len(values[0].coefficients), width)
         groups: defaultdict[Hashable, list[tuple[int, FactorBatch]]] = defaultdict(list)
         for track, graph in enumerate(graphs):
             for kind in graph.batches:
@@ -89,10 +99,12 @@ class BatchObjective:
 
         Args: point: (n,) vector of `layout.pack`, SI units.  noise: learned noise.
         """
-        states, coefficients = self.layout.unpack(point)
+        whole, coefficients = self.layout.unpack(point)
+        states = whole[:, :STATE_DIM]
         total = point.new_zeros(len(self.layout.lengths))
         for block in self._blocks:
-            inputs = tuple((coefficients if shared else states)[index] for shared, index in block.places)
+            seen = whole if block.kind.sees_biases else states
+            inputs = tuple((coefficients if shared else seen)[index] for shared, index in block.places)
             residual = rewhitened(block.kind.residual(inputs), block.kind.rewhitening(noise))
             total = total.index_add(0, block.tracks, block.kind.loss.of_square(residual.square().sum(-1)))
         return total

@@ -8,8 +8,10 @@ import numpy as np
 import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 import pytest
+import yaml
 
 from ballfg.cli.main import run
+from ballfg.estimation import ConformalScales, load_conformal
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import Dataset, read_dataset
 
@@ -114,3 +116,96 @@ def test_bad_observe(
 def test_missing_observe(dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert status("predict", dataset.path, "--out", tmp_path / "p.csv") == 2
     assert "--observe" in capsys.readouterr().err
+
+
+# --- conformal intervals
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory: pytest.TempPathFactory) -> Dataset:
+    folder = tmp_path_factory.mktemp("calibration") / "shots"
+    write_simulation(folder, SimulationConfig(tracks=12, rate=60.0, seed=3))
+    return read_dataset(folder)
+
+
+def sigmas(path: Path) -> np.ndarray:
+    table = pa_csv.read_csv(path)
+    return np.stack([table[name].to_numpy() for name in COLUMNS[5:]], axis=1)
+
+
+def test_conformal_sigmas_from_a_dataset_and_from_the_file_that_keeps_them(
+    dataset: Dataset, calibration: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    names = ("plain.csv", "scaled.csv", "again.csv", "scales.yaml")
+    plain, scaled, again, scales = (tmp_path / name for name in names)
+    command = ["predict", dataset.path, "--observe", 0.3, "--method", "ekf", "--out"]
+    assert status(*command, plain) == 0
+    capsys.readouterr()
+    assert status(*command, scaled, "--conformal", calibration.path, "--save-conformal", scales) == 0
+    said = capsys.readouterr()
+    assert (
+        "  90 % intervals on the 12 calibration tracks of 'simulated table-tennis': the model's own hold " in said.out
+    )
+    assert "  90 % intervals on the 6 predicted tracks: the model's own hold " in said.out
+    assert f"{scales}: the scales, for --conformal" in said.out
+    assert status(*command, again, "--conformal", scales) == 0
+    assert again.read_bytes() == scaled.read_bytes()
+    found = load_conformal(scales)
+    ratios = sigmas(scaled) / sigmas(plain)
+    assert set(np.unique(ratios.round(9))) <= {*np.unique(found.scales.round(9)), np.inf}
+    infinite = int(np.isinf(ratios).sum())
+    note = f"note: {infinite} of {ratios.size} sigmas are infinite: a finite 90 % interval needs 9 calibration tracks"
+    assert (note in said.err) == (infinite > 0)
+    assert pa_csv.read_csv(scaled).drop(COLUMNS[5:]).equals(pa_csv.read_csv(plain).drop(COLUMNS[5:]))
+
+
+def test_calibration_tracks_that_fail_are_reported(
+    dataset: Dataset, calibration: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["predict", dataset.path, "--observe", 1e-3, "--method", "ekf", "--out", tmp_path / "p.csv"]
+    assert status(*command, "--conformal", calibration.path) == 0
+    assert "  12 calibration tracks: there are too few samples to tell a velocity" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("case", "message"),
+    [
+        ("few", "conformal must hold at least 9 tracks with samples after their first 0.3 s: "),
+        ("same", "conformal must hold other tracks than those that are predicted; got "),
+        ("table", "conformal must hold tracks above the same table, at 0.76 m; got 0.5 m in "),
+        ("ball", "conformal must hold tracks of the same ball, Ball(radius=0.02, mass=0.0027); got "),
+        ("none", "folder must exist; "),
+        ("yaml", "section 'conformal' must be a mapping"),
+        ("method", "conformal must be calibrated as the tracks are predicted: with 0.3 s observed, by ekf; "),
+        ("save", "save_conformal must come with --conformal"),
+    ],
+)
+def test_bad_calibration_tracks(
+    dataset: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str], case: str, message: str
+) -> None:
+    folder, out, kept = tmp_path / "made", tmp_path / "out", tmp_path / "kept.yaml"
+    out.mkdir()
+    write_simulation(folder, SimulationConfig(tracks=8, rate=60.0, seed=3))
+    info = yaml.safe_load((folder / "dataset.yaml").read_text())
+    if case == "table":
+        info["frame"]["table_height"] = 0.5
+    if case == "ball":
+        info["ball"]["mass"] = 0.003
+    (folder / "dataset.yaml").write_text(yaml.safe_dump(info))
+    ones = np.ones((1, 3))
+    ConformalScales("shots", 0.3, "smoother", np.array([20]), ones, ones, ones).save(kept)
+    options: dict[str, list[object]] = {
+        "same": ["--conformal", dataset.path],
+        "none": ["--conformal", tmp_path / "nothing"],
+        "yaml": ["--conformal", folder / "dataset.yaml"],
+        "method": ["--conformal", kept],
+        "save": ["--save-conformal", out / "scales.yaml"],
+    }
+    command = ["predict", dataset.path, "--observe", 0.3, "--method", "ekf", "--out", out / "p.csv"]
+    assert status(*command, *options.get(case, ["--conformal", folder])) == 2
+    said = capsys.readouterr()
+    lines = [line for line in said.err.splitlines() if not line.endswith("tracks predicted")]  # progress may show
+    assert (said.out, len(lines)) == ("", 1)
+    assert lines[0].startswith("ballfg: error: ")
+    assert message in lines[0]
+    assert list(out.iterdir()) == []

@@ -58,7 +58,7 @@ def test_leave_one_out_takes_the_sample_back_out(loss) -> None:
     assert core.sum() >= 2
     expected = whiten_innovation(z - mean, C + R)
     np.testing.assert_allclose(
-        leave_position_out(states, covariances, z, sigma, rows)[core], expected[core], rtol=1e-4, atol=1e-5
+        leave_position_out(states, covariances, z, R, rows)[core], expected[core], rtol=1e-4, atol=1e-5
     )
 
 
@@ -68,7 +68,8 @@ def test_a_sample_that_stands_alone_surprises_nobody() -> None:
     states = np.zeros((1, 9))
     covariances = np.eye(9)[None] * 1e-4  # all of it the sample's own
     rows = PositionFactors(np.array([0]), states[:, :3], sigma).linearize(Values(states, np.zeros(0)))
-    whitened = leave_position_out(states, covariances, states[:, :3] + 1e-3, sigma, rows)
+    noise = np.diag(sigma[0] ** 2)
+    whitened = leave_position_out(states, covariances, states[:, :3] + 1e-3, noise, rows)
     np.testing.assert_allclose(whitened, 1e-3 / 0.01 * np.sqrt(LEAST_INFORMATION), rtol=1e-3)
 
 

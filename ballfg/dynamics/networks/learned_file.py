@@ -152,6 +152,7 @@ def _empty_model(config: _Config, analytic: AnalyticModel, folder: Path) -> Ball
             )
         base = analytic if architecture.residual else None
         model = build(architecture, radius=analytic.radius, inertia_factor=analytic.inertia_factor, base=base)
+    model.noise = analytic.noise
     if config.trained is not None:
         model.trained = _trained(config.trained, folder)
     return model

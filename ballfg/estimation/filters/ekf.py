@@ -22,15 +22,17 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.rts import FilterRecord, fly_back, rts_smooth
 from ballfg.estimation.filters.sliding_window import SlidingWindow, first_pair
-from ballfg.estimation.filters.window_velocity import WINDOW
-from ballfg.estimation.observations.innovation import FilterInnovation, leave_position_out
+from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
+from ballfg.estimation.observations.innovation import FilterInnovation
 from ballfg.estimation.observations.observation import Context, refuse_unknowns
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact, Quality
-from ballfg.estimation.settings import Settings, sample_sigmas, spin_start
+from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, stamp_covariance, total_sigmas
 from ballfg.estimation.smoother.near_contact import other_sides
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.factors.batch import FactorBatch
+from ballfg.factors.dynamics import model_width
+from ballfg.factors.tracker import bias_step
 from ballfg.state import POSITION, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
 from ballfg.tracks import Ball, Track
 
@@ -53,24 +55,36 @@ NEAR_SURFACE = 0.05
 class _BallFilter(FilterpyEKF):
     """filterpy's filter with the ball's own prediction: x, P, F, Q, R are its attributes, the update is its own.
 
+    The first `width` numbers of x move with the ball: its state and the model's coefficients. The tracker's bias, where
+    it has one, stands behind them.
+
     Its update uses the Joseph form (I - K H) P (I - K H)^T + K R K^T, positive definite under rounding.
     """
 
-    def __init__(self, model: BallModel, surfaces: Surfaces, mean: Array, covariance: Array) -> None:
+    def __init__(self, model: BallModel, surfaces: Surfaces, mean: Array, covariance: Array, H: Array) -> None:
         super().__init__(dim_x=len(mean), dim_z=3)
         self.model = model
         self.surfaces = surfaces
         self.x = mean
         self.P = covariance
-        self.H = np.eye(3, len(mean))
+        self.H = H
+        self.width = STATE_DIM + model_width(model)
         self.predicted = mean
 
-    def move(self, point: Array, dt: float) -> Motion:
+    def move(self, point: Array, dt: float, decay: float) -> Motion:
         """Sets F at the linearisation point, and the mean that `predict_x` will put into x."""
-        motion = advance_jacobian(self.model, torch.from_numpy(point)[None], dt, self.surfaces)
-        self.F = motion.jacobian.numpy()
-        self.predicted = motion.after[0].numpy() + self.F @ (self.x - point)
+        width = self.width
+        motion = advance_jacobian(self.model, torch.from_numpy(point[:width])[None], dt, self.surfaces)
+        self.F = np.diag(np.full(len(point), decay))
+        self.F[:width, :width] = motion.jacobian.numpy()
+        self.predicted = decay * self.x
+        self.predicted[:width] = motion.after[0].numpy() + self.F[:width, :width] @ (self.x - point)[:width]
         return motion
+
+    @property
+    def velocity_is_wide(self) -> bool:
+        """Whether the velocity is hardly known."""
+        return bool(np.trace(self.P[VELOCITY, VELOCITY]) >= WIDE_VELOCITY**2)
 
     def predict_x(self, u: float = 0) -> None:
         """The mean follows the nonlinear motion, not F x."""
@@ -81,10 +95,9 @@ class _BallFilter(FilterpyEKF):
 
         It is no information, only the place of the tangent: the sample itself still updates the state once.
         """
-        P = self.P
-        if np.trace(P[VELOCITY, VELOCITY]) < WIDE_VELOCITY**2:
+        if not self.velocity_is_wide:
             return self.x
-        H = self.H.copy()
+        P, H = self.P, self.H.copy()
         H[:, VELOCITY] = dt * np.eye(3)
         miss = measured - H @ self.x
         miss[Z] += 0.5 * STANDARD_GRAVITY * dt**2
@@ -94,19 +107,19 @@ class _BallFilter(FilterpyEKF):
 
     def innovation(self, measured: Array) -> Array:
         """(3,) whitened: measured minus predicted position over the root of its covariance H P H^T + R."""
-        root = np.linalg.cholesky(self.P[POSITION, POSITION] + self.R)
-        return np.asarray(np.linalg.solve(root, measured - self.x[POSITION]))
+        root = np.linalg.cholesky(self.H @ self.P @ self.H.T + self.R)
+        return np.asarray(np.linalg.solve(root, measured - self.H @ self.x))
 
     def correct(self, measured: Array) -> None:
         """The update of filterpy with a measured position."""
-        self.update(measured, lambda _: self.H, lambda x: x[POSITION])
+        self.update(measured, lambda _: self.H, lambda x: self.H @ x)
 
     def correct_by(self, factor: FactorBatch, gated: bool) -> Array:
         """(dim,) whitened innovation of a factor on the present state; the update of filterpy with its residual.
 
         The factor's loss gives the noise its weight; with a gate, a measurement beyond it is not used.
         """
-        found = FilterInnovation.of(factor, self.x, self.P)
+        found = FilterInnovation.of(factor, self.x, self.P, biases=len(self.x) - self.width)
         if not gated or found.whitened @ found.whitened <= chi2.isf(GATE_CHANCE, factor.dim):
             self.update(np.zeros(factor.dim), lambda _: found.H, lambda _: found.residual, R=found.R)
         return found.whitened
@@ -115,10 +128,11 @@ class _BallFilter(FilterpyEKF):
 class ExtendedKalmanFilter(Estimator):
     """The extended Kalman filter; with `smooth`, followed by a Rauch-Tung-Striebel pass.
 
-    The state is the 9-vector and, with `settings.coefficients`, the model's uncertain coefficients. Contacts happen
-    where the predicted flight meets a surface. With `settings.find_events`, samples beyond the gate are outliers,
-    and four of them in a row make a hit: the filter goes back to before the first one, widens velocity and spin by
-    `settings.process.hit_velocity` and `hit_spin`, and starts anew at the measurements.
+    The state is the 9-vector and, with `settings.coefficients`, the model's uncertain coefficients; with
+    `settings.memory` the tracker's bias follows, which no estimate shows. Contacts happen where the predicted flight
+    meets a surface. With `settings.find_events`, samples beyond the gate are outliers, and four of them in a row make
+    a hit: the filter goes back to before the first one, widens velocity and spin by `settings.process.hit_velocity`
+    and `hit_spin`, and starts anew at the measurements.
 
     Args:
         model: the ball.  surfaces: what it may bounce on.  settings: noise and priors.
@@ -162,16 +176,12 @@ class ExtendedKalmanFilter(Estimator):
             return self._failed(track, run)
         mean, covariance = rts_smooth(record) if self.smooth else (record.mean, record.covariance)
         if record.start > 0 and (self.smooth or self.initialise == "prior"):
-            fly_back(self.ball, record.start, track.times, run.flight_noise, mean, covariance)
-        whitened = record.whitened
-        if self.smooth:
-            samples = record.position_rows(mean, track.positions, run.sigma)
-            states = mean[:, :STATE_DIM], covariance[:, :STATE_DIM, :STATE_DIM]
-            whitened = leave_position_out(*states, track.positions, run.sigma, samples)
+            fly_back(self.ball, record.start, track.times, run.flight_noise, run.fading, mean, covariance)
+        whitened = record.innovations(run.H, mean, covariance, track.positions) if self.smooth else record.whitened
         return self._result(track, run, mean, covariance, whitened)
 
     def _result(self, track: Track, run: _Run, mean: Array, covariance: Array, whitened: Array) -> Estimate:
-        states = mean[:, :STATE_DIM]
+        states, own = mean[:, :STATE_DIM], slice(STATE_DIM, STATE_DIM + len(run.means))
         contacts = tuple(contact for i in sorted(run.record.contacts) for contact in run.record.contacts[i])
         of_states = covariance[:, :STATE_DIM, :STATE_DIM]
         others = other_sides(track.times, states, of_states, contacts, self.model, self.surfaces)
@@ -186,9 +196,9 @@ class ExtendedKalmanFilter(Estimator):
             world=self.world,
             notes=self.doubts(track),
             coefficient_names=tuple(self.settings.coefficients),
-            coefficients=mean[-1, STATE_DIM:],
-            coefficient_covariance=covariance[-1, STATE_DIM:, STATE_DIM:],
-            cross_covariances=covariance[:, :STATE_DIM, STATE_DIM:],
+            coefficients=mean[-1, own],
+            coefficient_covariance=covariance[-1, own, own],
+            cross_covariances=covariance[:, :STATE_DIM, own],
             contacts=contacts,
             hits=np.array(run.record.hits, dtype=np.int64),
             quality=run.record.quality,
@@ -215,17 +225,23 @@ class _Run:
     def __init__(self, owner: ExtendedKalmanFilter, track: Track) -> None:
         self.owner = owner
         self.track = track
-        self.settings = owner.settings
+        self.settings = owner.settings.for_track(track)
         self.sigma = sample_sigmas(owner.settings, len(track), track.sigmas)
+        self.velocities = window_velocities(track.times, track.positions)
         self.flight_noise = owner.settings.process.flight(np.diff(track.times))
         self.means = coefficient_means(owner.model, owner.settings)
+        self.bias_sigmas = self.settings.bias_sigmas[: 3 * self.settings.has_memory]
+        self.fading = bias_step(np.diff(track.times), self.bias_sigmas, self.settings.memory_time)
+        self.H = np.concatenate((np.eye(3, STATE_DIM + len(self.means)), np.eye(3, len(self.bias_sigmas))), axis=1)
         self.skipped: set[int] = set()
         context = Context(track, owner.model, owner.settings, self.sigma)
         beside = [one for one in track.observations if not one.locates]
         refuse_unknowns(beside, owner.settings, owner.name)
         self.beside = [(one, one.batch(context)) for one in beside]
         self.innovations = {one.name: np.full((len(batch), batch.dim), np.nan) for one, batch in self.beside}
-        self.record = FilterRecord.empty(len(track), STATE_DIM + len(self.means))
+        self.record = FilterRecord.empty(len(track), self.H.shape[1])
+        for k in range(len(track)):
+            self.record.measurement_noise[k] = self._measurement_noise(k, self.velocities[k])
         with np.errstate(over="ignore", invalid="ignore"):  # ends in Status.FAILED
             self._filter()
 
@@ -236,14 +252,25 @@ class _Run:
     def prior(self, i: int) -> tuple[Array, Array]:
         """What is known at sample i from it alone: mean (d,) and covariance (d, d)."""
         spin, spin_sigma = spin_start(self.settings.spin_label(self.track), self.settings)
-        mean = np.concatenate((self.track.positions[i], np.zeros(3), spin, self.means))
+        mean = np.concatenate((self.track.positions[i], np.zeros(3), spin, self.means, np.zeros(len(self.bias_sigmas))))
         sigma = (
             self.sigma[i],
             np.full(3, self.settings.velocity_prior),
             np.full(3, spin_sigma),
             np.array(list(self.settings.coefficients.values())),
+            self.bias_sigmas,
         )
-        return mean, np.diag(np.concatenate(sigma) ** 2)
+        covariance = np.diag(np.concatenate(sigma) ** 2)
+        covariance[POSITION, POSITION] = self._measurement_noise(i, self.velocities[i])
+        if len(self.bias_sigmas):  # the position is the measured one less its bias
+            lasting = covariance[-3:, -3:]
+            covariance[POSITION, POSITION] += lasting
+            covariance[POSITION, -3:] = covariance[-3:, POSITION] = -lasting
+        return mean, covariance
+
+    def _measurement_noise(self, k: int, velocity: Array) -> Array:
+        """(3, 3) m^2, of a sample's white error and of the error of its stamp at a velocity (3,) m/s."""
+        return np.diag(self.sigma[k] ** 2) + stamp_covariance(self.settings, velocity)
 
     def _filter(self) -> None:
         """All samples in turn; back to before the first of four that were rejected, with a hit there."""
@@ -282,10 +309,15 @@ class _Run:
             record.covariance[:] = covariance
             record.covariance[:, :STATE_DIM, :STATE_DIM] = window.covariances
             mean, covariance = record.mean[start].copy(), record.covariance[start].copy()
+            if len(self.bias_sigmas) and start > 0:  # the window takes the errors of its two ends to be independent
+                slope = covariance[POSITION, -3:] / (
+                    self.track.times[start] - self.track.times[max(start - WINDOW + 1, 0)]
+                )
+                covariance[VELOCITY, -3:] = covariance[-3:, VELOCITY] = slope
         record.start = start
         record.quality[:first] = Quality.OUTLIER
         self.skipped.update(range(first + 1, second))
-        ball = _BallFilter(owner.ball, owner.surfaces, mean, covariance)
+        ball = _BallFilter(owner.ball, owner.surfaces, mean, covariance, self.H)
         self._correct_beside(ball, start)
         self._store(ball, start, used=True)
         return ball
@@ -296,6 +328,7 @@ class _Run:
         self.skipped.update(range(since, first))
         self.skipped.update(range(first + 1, second))
         self.record.hits.append(first - 1)
+        self.velocities = window_velocities(self.track.times, self.track.positions, self.record.hits)
         ball.x = self.record.mean[since - 1].copy()
         ball.P = self.record.covariance[since - 1].copy()
 
@@ -305,18 +338,20 @@ class _Run:
             return first, first + 1
         z = self.track.positions[:, Z, None] - self.owner.model.radius
         near = np.abs(z - np.array(self.owner.surfaces.heights())).min(axis=-1) < NEAR_SURFACE
-        return first_pair(self.track.times, self.track.positions, self.sigma, near, first)
+        sigma = total_sigmas(self.settings, self.sigma, self.velocities)
+        return first_pair(self.track.times, self.track.positions, sigma, near, first)
 
     def _predict(self, ball: _BallFilter, k: int) -> None:
         """To the time of sample k."""
         times, record = self.track.times, self.record
         used = next((i for i in range(k, len(times)) if i not in self.skipped), k)
-        R = np.diag(self.sigma[used] ** 2)
+        R = self._measurement_noise(used, self.velocities[used])
         point = ball.linearisation_point(self.track.positions[used], times[used] - times[k - 1], R)
-        motion = ball.move(point, times[k] - times[k - 1])
+        motion = ball.move(point, times[k] - times[k - 1], float(self.fading[0][k - 1]))
         ball.Q = self._noise(k, motion)
-        ball.R = np.diag(self.sigma[k] ** 2)
         ball.predict()
+        velocity = self.velocities[k] if ball.velocity_is_wide else ball.x[VELOCITY]
+        ball.R = record.measurement_noise[k] = self._measurement_noise(k, velocity)
         record.contacts.pop(k - 1, None)
         if motion.contacts:
             begin = float(times[k - 1])
@@ -335,6 +370,8 @@ class _Run:
             covariance[POSITION, POSITION] += HIT_POSITION**2 * np.eye(3)
         noise = np.zeros((len(self.record.mean[k]),) * 2)
         noise[:STATE_DIM, :STATE_DIM] = covariance
+        renewed = np.arange(len(noise))[len(noise) - len(self.bias_sigmas) :]
+        noise[renewed, renewed] = self.fading[1][k - 1] ** 2
         return noise
 
     def _accept(self, ball: _BallFilter, k: int) -> bool:

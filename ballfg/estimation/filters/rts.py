@@ -15,15 +15,16 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import fly_jacobian
+from ballfg.estimation.observations.innovation import leave_position_out
 from ballfg.estimation.segmentation import Contact, Quality
 from ballfg.factors.batch import Rows
 from ballfg.factors.loss import Loss
-from ballfg.state import POSITION, STATE_DIM
+from ballfg.state import STATE_DIM
 
 
 @dataclass
 class FilterRecord:
-    """What a filter knew at each of n samples; states of dimension d = 9 + p, coefficients of the model at the end.
+    """What a filter knew at each of n samples, in d numbers: the state, coefficients of the model, the tracker's bias.
 
     Attributes:
         start: first sample that the filter knows something of.
@@ -31,6 +32,7 @@ class FilterRecord:
         mean: (n, d) and covariance: (n, d, d), after it.
         transition: (n, d, d), Jacobian of the motion from the sample before.
         noise: (n, d, d), process noise gathered since the sample before.
+        measurement_noise: (n, 3, 3) m^2, covariance of the sample's white error and of that of its stamp.
         whitened: (n, 3), innovations divided by their standard deviations; NaN where there is none.
         quality: (n,) `Quality`.
         contacts: for each interval that has any.
@@ -43,6 +45,7 @@ class FilterRecord:
     covariance: Array
     transition: Array
     noise: Array
+    measurement_noise: Array
     whitened: Array
     quality: NDArray[np.int8]
     start: int = 0
@@ -60,6 +63,7 @@ class FilterRecord:
             covariance=np.zeros(square),
             transition=np.zeros(square),
             noise=np.zeros(square),
+            measurement_noise=np.zeros((n, 3, 3)),
             whitened=np.full((n, 3), np.nan),
             quality=np.full(n, Quality.GOOD, dtype=np.int8),
         )
@@ -69,16 +73,21 @@ class FilterRecord:
         """(n,) samples that took part."""
         return self.quality != Quality.OUTLIER
 
-    def position_rows(self, mean: Array, measured: Array, sigma: Array) -> Rows:
-        """The samples that took part, as whitened position residuals at `mean` (n, d).
+    def innovations(self, H: Array, mean: Array, covariance: Array, measured: Array) -> Array:
+        """(n, 3) whitened: each sample against its prediction from all others.
 
-        Args: mean: (n, d).  measured: (n, 3) m.  sigma: (n, 3) m.
+        Args:
+            H: (3, d) of a measured position.
+            mean: (n, d) and covariance: (n, d, d), given all samples.
+            measured: (n, 3) m.
         """
-        n = len(mean)
-        whitening = (self.used & (np.arange(n) >= self.start))[:, None] / sigma
-        jacobian = np.zeros((n, 3, STATE_DIM))
-        jacobian[:, np.arange(3), np.arange(3)] = whitening
-        return Rows(np.arange(n)[:, None], whitening * (mean[:, POSITION] - measured), (jacobian,), Loss())
+        n, expected = len(mean), mean @ H.T
+        used = self.used & (np.arange(n) >= self.start)
+        root = np.linalg.inv(np.linalg.cholesky(self.measurement_noise))
+        whitening = np.where(used[:, None, None], root, 0.0)
+        residual = (whitening @ (expected - measured)[..., None])[..., 0]
+        samples = Rows(np.arange(n)[:, None], residual, (whitening,), Loss())
+        return leave_position_out(expected, H @ covariance @ H.T, measured, self.measurement_noise, samples)
 
 
 def rts_smooth(record: FilterRecord) -> tuple[Array, Array]:
@@ -110,7 +119,15 @@ def _gain(cross: Array, covariance: Array) -> Array:
     return np.asarray(np.linalg.solve(correlation, (cross * scale).T).T * scale)
 
 
-def fly_back(model: BallModel, start: int, times: Array, noise: Array, mean: Array, covariance: Array) -> None:
+def fly_back(
+    model: BallModel,
+    start: int,
+    times: Array,
+    noise: Array,
+    fading: tuple[Array, Array],
+    mean: Array,
+    covariance: Array,
+) -> None:
     """Fills the states before sample `start`, in place: free flight back from it.
 
     Args:
@@ -118,14 +135,19 @@ def fly_back(model: BallModel, start: int, times: Array, noise: Array, mean: Arr
         start: the first sample with a state.
         times: (n,) s.
         noise: (n - 1, 9, 9), process noise of free flight over each interval.
+        fading: (n - 1,) decay of the bias over each interval and (n - 1, b) m its new part's standard deviation, the
+            same in both directions of time.
         mean: (n, d).
         covariance: (n, d, d).
     """
+    width = mean.shape[1] - fading[1].shape[1]
     for k in range(start - 1, -1, -1):
-        after, jacobian = fly_jacobian(
-            model, torch.from_numpy(mean[k + 1 : k + 2]), torch.from_numpy(times[k : k + 1] - times[k + 1 : k + 2])
-        )
-        F = jacobian[0].numpy()
+        state, dt = torch.from_numpy(mean[k + 1 : k + 2, :width]), torch.from_numpy(times[k : k + 1] - times[k + 1])
+        after, jacobian = fly_jacobian(model, state, dt)
+        F = np.diag(np.full(len(mean[k]), fading[0][k]))
+        F[:width, :width] = jacobian[0].numpy()
         widened = covariance[k + 1].copy()
         widened[:STATE_DIM, :STATE_DIM] += noise[k]
-        mean[k], covariance[k] = after[0].numpy(), F @ widened @ F.T
+        mean[k, :width], mean[k, width:] = after[0].numpy(), fading[0][k] * mean[k + 1, width:]
+        covariance[k] = F @ widened @ F.T
+        covariance[k, width:, width:] += np.diag(fading[1][k] ** 2)

@@ -16,9 +16,9 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import rate_jacobian
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
-from ballfg.estimation.filters.window_velocity import WINDOW
+from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
 from ballfg.estimation.result import Estimate, Status
-from ballfg.estimation.settings import sample_sigmas, spin_start
+from ballfg.estimation.settings import sample_sigmas, spin_start, total_sigmas
 from ballfg.factors.batch import FactorBatch
 from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
 from ballfg.tracks import Track
@@ -36,8 +36,9 @@ FRICTION_SHARE = 0.5
 class SlidingWindow(Estimator):
     """The mean velocity over a causal window of five samples; a baseline, not corrected for what it neglects.
 
-    - Position: as measured. Velocity: (p_k - p_j) / (t_k - t_j) with j = max(k - 4, 0); at the first sample, zero with
-      the prior's covariance. Spin: the label, or zero.
+    - Position: as measured, with the standard deviation of the whole error: white, lasting, and that of the stamp.
+      Velocity: (p_k - p_j) / (t_k - t_j) with j = max(k - 4, 0); at the first sample, zero with the prior's covariance.
+      Spin: the label, or zero.
     - The mean velocity is that of the window's middle, so it lags by half a window times the acceleration. The
       covariance is the matrix of mean squared errors: measurement noise (and its correlation with the position),
       plus the outer product of the lag that the model gives, plus the part of it that an unknown spin makes.
@@ -52,8 +53,9 @@ class SlidingWindow(Estimator):
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
         """The states of a track, from its positions alone; a single sample has no velocity and the status says so."""
         track = self.prepared(track, factors)
-        n = len(track)
-        sigma = sample_sigmas(self.settings, n, track.sigmas)
+        n, settings = len(track), self.settings.for_track(track)
+        white = sample_sigmas(settings, n, track.sigmas)
+        sigma = total_sigmas(settings, white, window_velocities(track.times, track.positions))
         first = np.maximum(np.arange(n) - WINDOW + 1, 0)
         span = track.times - track.times[first]
         span[0] = 1.0  # the first sample's difference is zero; its velocity is the prior's

@@ -26,6 +26,8 @@ START_EVERY: Final = 0.05
 """s between two starts of forecasts in a track."""
 EARLIEST_START: Final = 0.2
 """s after the first sample. Before that the start of the track decides, and no robot acts on it yet."""
+ROUNDING: Final = 1e-9
+"""s. A sample this little before a horizon is at it."""
 MARGINAL_WEIGHT: Final = 0.1
 NEXT_FROM: Final = 3
 """Samples that determine a state; the marginal likelihood counts those after them."""
@@ -64,14 +66,19 @@ class Score:
     """How forecasts compare with what was measured.
 
     Attributes:
-        value: () mean negative logarithm of a density, of forecasts and of next samples.
+        by_track: (t,) each track's share of the mean negative logarithm of a density, of forecasts and next samples.
         held: share of forecast coordinates inside the central 90 % intervals.
         starts: number of moments that forecasts were made from.
     """
 
-    value: Tensor
+    by_track: Tensor
     held: float
     starts: int
+
+    @property
+    def value(self) -> Tensor:
+        """() the mean over all tracks."""
+        return self.by_track.sum()
 
 
 class Forecaster:
@@ -79,7 +86,6 @@ class Forecaster:
 
     Args:
         tracks: linearised.
-        white: (t, n, 3) m, white standard deviations of the samples.
         velocity_prior: m/s, standard deviation per axis at the start of a track.
         earliest: s after the first sample, of the first start of a forecast.
         every: s between starts.
@@ -91,12 +97,11 @@ class Forecaster:
     def __init__(
         self,
         tracks: LinearTracks,
-        white: Tensor,
         velocity_prior: float,
         earliest: float = EARLIEST_START,
         every: float = START_EVERY,
     ) -> None:
-        self.tracks, self.white, self.velocity_prior = tracks, white, velocity_prior
+        self.tracks, self.velocity_prior = tracks, velocity_prior
         self.count, self.samples = tracks.times.shape
         self.own = tracks.transitions.shape[-1]
         self.width = self.own + BIAS_DIM
@@ -120,7 +125,7 @@ class Forecaster:
         horizons, plan = torch.tensor(HORIZONS, dtype=torch.float64), []
         for ahead in range(1, self.samples):
             sample = (start + ahead).clamp(max=self.samples - 1)
-            elapsed = self.tracks.times[track, sample] - begin
+            elapsed = self.tracks.times[track, sample] - begin + ROUNDING
             fresh = (start + ahead < self.samples) & self.tracks.used[track, sample]
             due = ((horizons > reached[:, None]) & (horizons <= elapsed[:, None])).any(dim=1)
             scored = torch.nonzero(fresh & due)[:, 0]
@@ -138,8 +143,8 @@ class Forecaster:
         measured = self._measurement(noise)
         means, covariances, following, nexts = self._filter(noise, transitions, gathered, measured)
         total, inside, count = self._forecast(means, covariances, transitions, gathered, measured)
-        value = total / max(count, 1) + MARGINAL_WEIGHT * following / max(nexts, 1)
-        return Score(value, inside / max(3 * count, 1), len(self.starts))
+        by_track = total / max(count, 1) + MARGINAL_WEIGHT * following / max(nexts, 1)
+        return Score(by_track, inside / max(3 * count, 1), len(self.starts))
 
     def _motion(self, noise: Noise) -> tuple[Tensor, Tensor]:
         """(t, n - 1, w, w) transitions and covariances gathered, of state, coefficients and biases."""
@@ -157,13 +162,13 @@ class Forecaster:
     def _measurement(self, noise: Noise) -> Tensor:
         """(t, n, 3, 3) m^2, of the part of a measured position that is new in each sample."""
         way = noise.stamp_jitter * self.tracks.velocities
-        white = torch.diag_embed((noise.position * self.white).square())
+        white = torch.diag_embed((noise.position * self.tracks.white).square())
         return white + way[..., :, None] * way[..., None, :]
 
     def _filter(
         self, noise: Noise, transitions: Tensor, gathered: Tensor, measured: Tensor
     ) -> tuple[Tensor, Tensor, Tensor, int]:
-        """Means (t, n, w) and covariances after each sample; the summed score of next samples, and their number."""
+        """Means (t, n, w) and covariances after each sample; (t,) summed scores of next samples, and their number."""
         tracks, observe = self.tracks, self.measure
         prior = tracks.prior_variances(noise.spin_prior, noise.spin_label, noise.coefficients, self.velocity_prior)
         biases = noise.memory.square().expand(self.count, BIAS_DIM)
@@ -171,14 +176,15 @@ class Forecaster:
         mean = torch.cat((tracks.starts, torch.zeros((self.count, BIAS_DIM), dtype=torch.float64)), dim=1)
         unit = torch.eye(self.width, dtype=torch.float64)
         departures = torch.nn.functional.pad(tracks.departures, (0, BIAS_DIM))
-        total, nexts = torch.zeros((), dtype=torch.float64), 0
+        total, nexts = torch.zeros(self.count, dtype=torch.float64), 0
         means, covariances = [], []
+        # taken apart once: the derivative of an index would fill a tensor of the whole size at every step
+        steps, added, news = transitions.unbind(1), gathered.unbind(1), measured.unbind(1)
         for k in range(self.samples):
             if k:
-                step = transitions[:, k - 1]
-                mean = (step @ mean[..., None])[..., 0] + departures[:, k - 1]
-                covariance = step @ covariance @ step.mT + gathered[:, k - 1]
-            spread = observe @ covariance @ observe.mT + measured[:, k]
+                mean = (steps[k - 1] @ mean[..., None])[..., 0] + departures[:, k - 1]
+                covariance = steps[k - 1] @ covariance @ steps[k - 1].mT + added[k - 1]
+            spread = observe @ covariance @ observe.mT + news[k]
             root = torch.linalg.cholesky(spread)
             missed = tracks.errors[:, k] - mean @ observe.mT
             whitened = torch.linalg.solve_triangular(root, missed[..., None], upper=False)[..., 0]
@@ -186,13 +192,13 @@ class Forecaster:
             if k >= NEXT_FROM:
                 used = tracks.used[:, k]
                 volume = torch.diagonal(root, dim1=-2, dim2=-1).log().sum(dim=-1)
-                total = total + ((_half_square(square, NEXT_TAIL) + volume) * used).sum()
+                total = total + (_half_square(square, NEXT_TAIL) + volume) * used
                 nexts += int(used.sum())
             gain = torch.cholesky_solve(observe @ covariance, root).mT
             gain = gain * (tracks.used[:, k] & (square < GATE))[:, None, None]
             mean = mean + (gain @ missed[..., None])[..., 0]
             rest = unit - gain @ observe
-            covariance = rest @ covariance @ rest.mT + gain @ measured[:, k] @ gain.mT
+            covariance = rest @ covariance @ rest.mT + gain @ news[k] @ gain.mT
             means.append(mean)
             covariances.append(covariance)
         return torch.stack(means, dim=1), torch.stack(covariances, dim=1), total, nexts
@@ -200,23 +206,25 @@ class Forecaster:
     def _forecast(
         self, means: Tensor, covariances: Tensor, transitions: Tensor, gathered: Tensor, measured: Tensor
     ) -> tuple[Tensor, float, int]:
-        """The summed score of forecasts, coordinates inside their 90 % intervals, and the number of forecasts."""
+        """(t,) summed scores of forecasts, coordinates inside their 90 % intervals, and the number of forecasts."""
         track, start = self.starts.T
         mean, covariance = means[track, start], covariances[track, start]
         departures = torch.nn.functional.pad(self.tracks.departures, (0, BIAS_DIM))
-        total, inside, count = torch.zeros((), dtype=torch.float64), 0.0, 0
+        intervals = (start[:, None] + torch.arange(len(self._plan))).clamp(max=self.samples - 2)
+        steps, added = (x[track[:, None], intervals].unbind(1) for x in (transitions, gathered))
+        total, inside, count = torch.zeros(self.count, dtype=torch.float64), 0.0, 0
         for ahead, scored in enumerate(self._plan, start=1):
-            before = (start + ahead - 1).clamp(max=self.samples - 2)
-            step = transitions[track, before]
-            mean = (step @ mean[..., None])[..., 0] + departures[track, before]
-            covariance = step @ covariance @ step.mT + gathered[track, before]
+            step = steps[ahead - 1]
+            mean = (step @ mean[..., None])[..., 0] + departures[track, intervals[:, ahead - 1]]
+            covariance = step @ covariance @ step.mT + added[ahead - 1]
             if not len(scored):
                 continue
             at = track[scored], start[scored] + ahead
             spread = self.measure @ covariance[scored] @ self.measure.mT + measured[at]
             variance = torch.diagonal(spread, dim1=-2, dim2=-1)
             square = (self.tracks.errors[at] - mean[scored] @ self.measure.mT).square() / variance
-            total = total + (_half_square(square, TAIL) + 0.5 * variance.log()).sum()
+            scores = (_half_square(square, TAIL) + 0.5 * variance.log()).sum(dim=1)
+            total = total.index_add(0, track[scored], scores)
             inside += float((square.detach() < NINETY**2).sum())
             count += len(scored)
         return total, inside, count

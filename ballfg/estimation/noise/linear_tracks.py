@@ -12,11 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.estimation.segmentation import Quality
-from ballfg.estimation.settings import spin_start
+from ballfg.estimation.settings import sample_sigmas
 from ballfg.estimation.smoother.problem import START_POSITION_SIGMA, TrackProblem, coefficient_means
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.estimation.smoother.solution import Solution
@@ -38,8 +39,9 @@ class LinearTracks:
     With t tracks of up to n samples, and d = 9 + p numbers for state and coefficients:
 
     Attributes:
-        times: (t, n) s since the first stamp.
+        times: (t, n) s since the first sample that is used.
         errors: (t, n, 3) m, measured minus estimated positions.
+        white: (t, n, 3) m, standard deviations of the samples' white errors.
         velocities: (t, n, 3) m/s.
         used: (t, n) bool, good samples.
         transitions: (t, n - 1, d, d) F, in the units of state and coefficients.
@@ -52,6 +54,7 @@ class LinearTracks:
 
     times: Tensor
     errors: Tensor
+    white: Tensor
     velocities: Tensor
     used: Tensor
     transitions: Tensor
@@ -86,6 +89,7 @@ class _Piece:
 
     times: Array
     errors: Array
+    white: Array
     velocities: Array
     used: Array
     transitions: Array
@@ -96,7 +100,7 @@ class _Piece:
 
 
 def linearise(smoother: Smoother, tracks: Sequence[Track], watch: Watch = unwatched) -> LinearTracks | None:
-    """The tracks about what a smoother makes of them, each up to its first hit; None where no track is long enough.
+    """The tracks about what a smoother makes of them, each in its longest time between hits; None where all are short.
 
     Args: smoother: model, surfaces and the noise to linearise with.  tracks: measured.  watch: told of each track.
     """
@@ -130,25 +134,38 @@ def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
             departures[where, :STATE_DIM] = (spread @ rows.residual[..., None])[..., 0]
             kicks[where] = Kicks(batch.kick_times, batch.hit).basis(batch.dt)
             linked[where] = True
-    breaks = np.union1d(np.flatnonzero(~linked), solution.events.segmentation.hits)
-    end = int(breaks[0]) + 1 if len(breaks) else len(track)
-    label = problem.settings.spin_label(track)
+    breaks = np.union1d(np.flatnonzero(~linked), solution.events.segmentation.hits).astype(np.int64)
+    first, end = _longest_stretch(track.times, breaks)
+    label = problem.settings.spin_label(track) if first == 0 else None
     start = np.zeros(STATE_DIM + width)
-    start[POSITION] = track.positions[0] - values.states[0, POSITION]
-    start[VELOCITY] = -values.states[0, VELOCITY]
-    start[SPIN] = spin_start(label, problem.settings)[0] - values.states[0, SPIN]
+    start[POSITION] = track.positions[first] - values.states[first, POSITION]
+    start[VELOCITY] = -values.states[first, VELOCITY]
+    start[SPIN] = (np.zeros(3) if label is None else label.spin) - values.states[first, SPIN]
     start[STATE_DIM:] = coefficient_means(problem.model, problem.settings) - values.coefficients[:width]
+    samples, intervals_within = slice(first, end), slice(first, end - 1)
     return _Piece(
-        track.times[:end] - track.times[0],
-        (track.positions - values.states[:, POSITION])[:end],
-        values.states[:end, VELOCITY],
-        solution.events.segmentation.quality[:end] == Quality.GOOD,
-        transitions[: end - 1],
-        departures[: end - 1],
-        kicks[: end - 1],
+        track.times[samples] - track.times[first],
+        (track.positions - values.states[:, POSITION])[samples],
+        sample_sigmas(problem.settings, len(track), track.sigmas)[samples],
+        values.states[samples, VELOCITY],
+        solution.events.segmentation.quality[samples] == Quality.GOOD,
+        transitions[intervals_within],
+        departures[intervals_within],
+        kicks[intervals_within],
         start,
         label is not None,
     )
+
+
+def _longest_stretch(times: Array, breaks: NDArray[np.int64]) -> tuple[int, int]:
+    """First sample, and the one after the last, of the longest time without a break between two samples.
+
+    Args: times: (n,) s.  breaks: intervals, between samples i and i + 1, in which the motion is not known.
+    """
+    firsts = np.concatenate(([0], breaks + 1))
+    ends = np.concatenate((breaks + 1, [len(times)]))
+    longest = int(np.argmax(times[ends - 1] - times[firsts]))
+    return int(firsts[longest]), int(ends[longest])
 
 
 def _side_by_side(pieces: Sequence[_Piece], coefficient_sigmas: Tensor) -> LinearTracks:
@@ -165,6 +182,7 @@ def _side_by_side(pieces: Sequence[_Piece], coefficient_sigmas: Tensor) -> Linea
     return LinearTracks(
         times=stacked((p.times for p in pieces), longest, "edge"),
         errors=stacked((p.errors for p in pieces), longest, "zero"),
+        white=stacked((p.white for p in pieces), longest, "edge"),
         velocities=stacked((p.velocities for p in pieces), longest, "edge"),
         used=stacked((p.used for p in pieces), longest, "zero"),
         transitions=stacked((p.transitions for p in pieces), longest - 1, "edge"),

@@ -33,20 +33,22 @@ class FilterInnovation:
     whitened: Array
 
     @classmethod
-    def of(cls, factor: FactorBatch, mean: Array, covariance: Array) -> "FilterInnovation":
+    def of(cls, factor: FactorBatch, mean: Array, covariance: Array, biases: int = 0) -> "FilterInnovation":
         """The innovation of a batch of one factor.
 
         Args:
             factor: on the state, and perhaps on the coefficients behind it in the filter's state.
-            mean: (d,) m, m/s, rad/s, then the coefficients in their own units.
+            mean: (d,) m, m/s, rad/s, then the coefficients in their own units, then the tracker's biases in m.
             covariance: (d, d) in the squares of these units.
+            biases: how many numbers at the end of the mean are biases, which the factor does not look at.
         """
-        inputs = (mean[None, :STATE_DIM], mean[None, STATE_DIM:])[: factor.variables.shape[1]]
+        own = slice(STATE_DIM, len(mean) - biases)
+        inputs = (mean[None, :STATE_DIM], mean[None, own])[: factor.variables.shape[1]]
         (residual,), blocks = factor.compute(slice(None), inputs)
         H = np.zeros((factor.dim, len(mean)))
         H[:, :STATE_DIM] = blocks[0][0]
         if len(blocks) > 1:
-            H[:, STATE_DIM:] = blocks[1][0]
+            H[:, own] = blocks[1][0]
         unit = np.eye(factor.dim)
         spread = H @ covariance @ H.T
         whitened = np.linalg.solve(np.linalg.cholesky(spread + unit), -residual)
@@ -60,7 +62,7 @@ def whiten_innovation(innovation: Array, covariance: Array) -> Array:
     return np.asarray(np.linalg.solve(root, innovation[..., None])[..., 0])
 
 
-def leave_position_out(states: Array, covariances: Array, measured: Array, sigma: Array, samples: Rows) -> Array:
+def leave_position_out(states: Array, covariances: Array, measured: Array, noise: Array, samples: Rows) -> Array:
     """(n, 3) whitened innovations of positions.
 
     With the sample's share M taken out of the posterior information, the others know the position to C = (P^-1 - M)^-1;
@@ -68,8 +70,10 @@ def leave_position_out(states: Array, covariances: Array, measured: Array, sigma
     z lies z - x - C g from there, with covariance R + C.
 
     Args:
-        states: (n, 9).  covariances: (n, 9, 9).
-        measured: (n, 3) m.  sigma: (n, 3) m.
+        states: (n, 3) m, the positions x that measurements should show, or (n, 9), beginning with them.
+        covariances: (n, 3, 3) or (n, 9, 9) of the states.
+        measured: (n, 3) m.
+        noise: (n, 3, 3) m^2, covariances R of the measurements.
         samples: the position factors, linearised at the states.
     """
     residual, (jacobian,) = weighted(samples)
@@ -82,7 +86,7 @@ def leave_position_out(states: Array, covariances: Array, measured: Array, sigma
     others[:, axes, axes] += LEAST_INFORMATION * information[:, axes, axes]
     covariance = np.linalg.inv(others)
     distance = measured - states[:, POSITION] - (covariance @ pull[..., None])[..., 0]
-    covariance[:, axes, axes] += sigma**2
+    covariance += noise
     return whiten_innovation(distance, np.asarray(covariance, dtype=np.float64))
 
 

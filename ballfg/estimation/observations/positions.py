@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.estimation.observations.innovation import leave_one_out, leave_position_out
 from ballfg.estimation.observations.observation import Context, Observation
+from ballfg.estimation.settings import stamp_covariance
 from ballfg.factors.batch import Rows, Values
 from ballfg.factors.covariance import Covariances
 from ballfg.factors.position import PositionFactors
@@ -36,11 +37,10 @@ class Positions(Observation):
         settings = context.settings
         if not settings.has_memory and context.velocities is None:
             return PositionFactors(self.state, self.positions, context.sigma, settings.loss)
-        covariance = context.sigma[:, :, None] ** 2 * np.eye(3)
-        if context.velocities is not None:
-            way = settings.stamp_jitter * context.velocities
-            covariance += way[:, :, None] * way[:, None, :]
-        return BiasedPositionFactors(self.state, self.positions, covariance, settings.loss, settings.has_memory)
+        stamps = None if context.velocities is None else stamp_covariance(settings, context.velocities)
+        return BiasedPositionFactors(
+            self.state, self.positions, context.sigma, stamps, settings.loss, settings.has_memory
+        )
 
     def taken(self, samples: NDArray[np.bool_]) -> Positions:
         """The positions of some samples."""
@@ -50,7 +50,8 @@ class Positions(Observation):
         """(n, 3) whitened: each position against its prediction from all others."""
         if rows.jacobians[0].shape[-1] > STATE_DIM or context.velocities is not None:
             return leave_one_out(rows, covariances)
-        return leave_position_out(values.states, covariances.states, self.positions, context.sigma, rows)
+        noise = context.sigma[:, :, None] ** 2 * np.eye(3)
+        return leave_position_out(values.states, covariances.states, self.positions, noise, rows)
 
 
 def observations_of(track: Track) -> tuple[Observation, ...]:

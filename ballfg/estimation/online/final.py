@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array, Index
 from ballfg.estimation.online.events import SIGMA_FACTOR
 from ballfg.estimation.online.isam import Sample
+from ballfg.estimation.online.tracker import without_bias
 from ballfg.estimation.online.window import Window
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation import Contact, Segmentation
@@ -39,7 +40,7 @@ def freeze(window: Window, count: int) -> list[Frozen]:
     shared, states, frozen = [COEFFICIENT_KEY] * (window.p > 0), window.states, []
     for k in range(count):
         joint = window.isam.jointMarginalCovariance([STATE_KEY + window.first + k, *shared]).fullMatrix()
-        frozen.append(Frozen(window.samples[k], states[k], joint))
+        frozen.append(Frozen(window.samples[k], states[k], without_bias(joint, window.width)))
     return frozen
 
 
@@ -62,14 +63,15 @@ class LinearFactors(FactorBatch):
     def __init__(self, factor: gtsam.NonlinearFactor, values: Values, first: int) -> None:
         keys = list(factor.keys())
         numbers = [COEFFICIENTS if k == COEFFICIENT_KEY else k - STATE_KEY - first for k in keys]
+        self.sees_biases = values.biases is not None  # type: ignore[misc]  # the class's is that of states alone
+        self.points = tuple(np.array(values.gather(np.array([n]), with_biases=True)) for n in numbers)
         at = gtsam.Values()
-        for number, key in zip(numbers, keys, strict=True):
-            at.insert(key, values.coefficients if number == COEFFICIENTS else values.states[number])
+        for key, point in zip(keys, self.points, strict=True):
+            at.insert(key, point[0])
         matrix, self.b = factor.linearize(at).jacobian()
         super().__init__(np.array([numbers]), len(self.b))
-        widths = [len(values.coefficients) if n == COEFFICIENTS else STATE_DIM for n in numbers]
+        widths = [point.shape[1] for point in self.points]
         self.blocks = tuple(np.split(matrix, np.cumsum(widths)[:-1], axis=1))
-        self.points = tuple(np.array(values.gather(np.array([n]))) for n in numbers)
 
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Residual (1, r) and Jacobians (1, r, d)."""
@@ -91,7 +93,7 @@ def final_estimate(
     """
     first = window.first
     part = track if first == 0 else track.between(float(track.times[first]), float(track.times[-1]))
-    values = Values(window.states, window.coefficients)
+    values = window.values
     summaries = [LinearFactors(factor, values, first) for factor in (window.shared if first else [])]
     problem = smoother.problem(part, found)
     late = smoother.result(problem, smoother.solve(problem, Earlier(values, summaries)))

@@ -89,7 +89,7 @@ def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coeffici
 
     Args:
         intervals: k of them.
-        start: (k, 9) states at which they begin.
+        start: (k, 9) states at which they begin; biases may stand behind these and the next.
         after: (l, 9) states at which the first l of them end; what the others lack is for `store` to put.
         coefficients: (p,).
     Returns: for each interval the propagated state and its Jacobian side by side, (9, 1 + 9 + p); number of calls.
@@ -102,7 +102,7 @@ def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coeffici
     for members in groups.values():
         batch = merge([intervals[k].batch for k in members])
         point = np.empty((len(members), STATE_DIM + len(coefficients)))
-        point[:, :STATE_DIM], point[:, STATE_DIM:] = start[members], coefficients
+        point[:, :STATE_DIM], point[:, STATE_DIM:] = start[members, :STATE_DIM], coefficients
         moved, jacobian = batch.propagate(torch.from_numpy(point), slice(None))
         pieces = np.concatenate((moved.numpy()[:, :STATE_DIM, None], jacobian.numpy()[:, :STATE_DIM]), axis=2)
         for row, k in enumerate(members):
@@ -126,7 +126,7 @@ Answers = tuple[tuple[Array, ...], Array, tuple[Array, ...]]
 
 
 def _whitened(batch: DynamicsFactors, pieces: Array, start: Array, after: Array, coefficients: Array) -> Answers:
-    root = batch.whitening[: len(pieces)]
+    root, start, after = batch.whitening[: len(pieces)], start[:, :STATE_DIM], after[:, :STATE_DIM]
     residual = (root @ (after - pieces[:, :, 0])[..., None])[..., 0]
     by_start = -(root @ pieces[:, :, 1:])
     inputs: tuple[Array, ...] = (start, after)

@@ -16,14 +16,16 @@ from ballfg.dynamics.model import BallModel
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.online.interval import Interval, IntervalMaker, evaluate, store
 from ballfg.estimation.online.measurement import Measurement, prepare
-from ballfg.estimation.settings import Settings
+from ballfg.estimation.online.tracker import bias_link, bias_start, carried_with_bias, linear_factor, without_bias
+from ballfg.estimation.settings import Settings, stamp_covariance
 from ballfg.estimation.smoother.motion import FLIGHT, Motion
 from ballfg.estimation.smoother.problem import coefficient_means, start_priors
-from ballfg.factors.batch import FactorBatch
+from ballfg.factors.batch import FactorBatch, Values
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
 from ballfg.factors.dynamics import model_width
 from ballfg.factors.position import PositionFactors
 from ballfg.factors.prior import coefficient_prior
+from ballfg.factors.tracker import BIAS_DIM, BiasedPositionFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 VELOCITY_THRESHOLD = 0.3
@@ -37,7 +39,8 @@ POSITION_THRESHOLD = 0.5
 """Measurement standard deviations. Flight does not depend on the position; a robust loss's weight does."""
 COEFFICIENT_THRESHOLD = 0.5
 """Prior standard deviations. The coefficients touch every factor: moving them relinearises the whole window."""
-_UNIT3 = gtsam.noiseModel.Unit.Create(3)
+WIDE_VELOCITY = 1.0
+"""m/s. A predicted velocity that is less well known does not tell along which way a stamp's error moved the ball."""
 WILDFIRE = 1e-7
 """m, m/s, rad/s. Back-substitution stops where the solution changes by less."""
 
@@ -47,11 +50,15 @@ class Sample:
     """One observation, and what is believed of it.
 
     Attributes:
-        time: s.  position: (3,) m.  stated: (3,) m, its standard deviation as stated.
-        factor: multiple of that with which it takes part.
+        time: s.  position: (3,) m.
+        stated: (3,) m, standard deviation of its white error as stated.
+        whole: (3,) m, that of its whole error: with a lasting part and the error of the stamp.
+        velocity: (3,) m/s, rough, along which the stamp's error moves it.
+        factor: multiple of the whole error with which it takes part if it is not good; 1 if it is.
         motion: how the ball got here from the sample before.
         label: what is known of the spin, on the first sample of a track.
         slots: where iSAM2 keeps the sample's own factors: its position's first, where it was measured.
+        bias_slot: where it keeps the factor that leads here from the bias of the sample before; None without.
         measured: whether the position was measured; if not, it was made from the measurements and helps to find events.
         measurements: everything else that was measured at this moment.
     """
@@ -63,13 +70,16 @@ class Sample:
     motion: Motion = FLIGHT
     label: SpinLabel | None = None
     slots: tuple[int, ...] = ()
+    bias_slot: int | None = None
+    whole: Array = field(default_factory=lambda: np.zeros(3))
+    velocity: Array = field(default_factory=lambda: np.zeros(3))
     measured: bool = True
     measurements: list[Measurement] = field(default_factory=list)
 
     @property
     def sigma(self) -> Array:
-        """(3,) m, the standard deviation with which it takes part."""
-        return self.stated * self.factor
+        """(3,) m, standard deviation of the white error with which it takes part."""
+        return self.stated if self.factor == 1.0 else self.whole * self.factor
 
 
 @dataclass(frozen=True)
@@ -95,21 +105,24 @@ class IncrementalWindow:
     Args:
         model: the ball, from `problem.trackwise_model`.  settings: noise and priors.
         position_sigma: m, of a good measurement; scales the threshold of relinearisation in position.
+        biased: whether the tracker's bias, a vector of three, stands behind each state.
 
     Attributes:
         first: number of the window's first state since the stream began.
         samples: n of them.  intervals: n - 1, None where nothing links two samples.
-        theta: (n, 9) linearisation points.  delta: (n, 9) solution about them.
+        theta: (n, w) linearisation points of states and biases, w = 9 or 12.  delta: (n, w) solution about them.
         coefficient_theta, coefficient_delta: (p,) the same for the coefficients.
         shared: factors that belong to no sample: the prior of the coefficients; once the window was cut, the linear
             factors that took its place and that of all states that left.
-        newest_covariance: (9 + p, 9 + p) of the newest state and the coefficients.
+        newest_covariance: (w + p, w + p) of the newest state with its bias and the coefficients.
     """
 
-    def __init__(self, model: BallModel, settings: Settings, position_sigma: float) -> None:
+    def __init__(self, model: BallModel, settings: Settings, position_sigma: float, biased: bool = False) -> None:
         self.model = model
         self.settings = settings
         self.position_sigma = position_sigma
+        self.biased = biased
+        self.width = STATE_DIM + BIAS_DIM * biased
         self.maker = IntervalMaker(model, settings.process)
         self.p = model_width(model)
         self._own_means = coefficient_means(model.model, settings) if self.p else np.zeros(0)  # type: ignore[arg-type]
@@ -120,15 +133,14 @@ class IncrementalWindow:
         self.shared: list[gtsam.NonlinearFactor] = []
         if self.p:
             self.shared.append(Bridge(coefficient_prior(self._own_means, self._own_sigmas), "row").factor(0))
-        self.threshold = np.empty(STATE_DIM)
-        self.threshold[POSITION] = POSITION_THRESHOLD * position_sigma
+        self.threshold = np.full(self.width, POSITION_THRESHOLD * position_sigma)
         self.threshold[VELOCITY], self.threshold[SPIN] = VELOCITY_THRESHOLD, SPIN_THRESHOLD
         self._clear()
 
     def _clear(self) -> None:
         """An empty iSAM2 and no states."""
         self.isam = self._new_isam()
-        self.theta, self.delta = np.zeros((0, STATE_DIM)), np.zeros((0, STATE_DIM))
+        self.theta, self.delta = np.zeros((0, self.width)), np.zeros((0, self.width))
         self.coefficient_theta, self.coefficient_delta = self._own_means.copy(), np.zeros(self.p)
         self.newest_covariance = np.zeros((0, 0))
 
@@ -136,9 +148,25 @@ class IncrementalWindow:
         return gtsam.ISAM2(_parameters(self.threshold, COEFFICIENT_THRESHOLD * self._own_sigmas))
 
     @property
+    def points(self) -> Array:
+        """(n, w) the present estimate of states and biases."""
+        return self.theta + self.delta
+
+    @property
     def states(self) -> Array:
         """(n, 9) the present estimate."""
-        return self.theta + self.delta
+        return self.points[:, :STATE_DIM]
+
+    @property
+    def values(self) -> Values:
+        """The present estimate of everything."""
+        return Values(self.states, self.coefficients, self.points[:, STATE_DIM:] if self.biased else None)
+
+    @property
+    def newest_belief(self) -> tuple[Array, Array]:
+        """Mean (9 + p,) and covariance (9 + p, 9 + p) of the newest state and the coefficients, without the bias."""
+        mean = np.concatenate((self.theta[-1, :STATE_DIM] + self.delta[-1, :STATE_DIM], self.coefficients))
+        return mean, without_bias(self.newest_covariance, self.width)
 
     @property
     def coefficients(self) -> Array:
@@ -159,11 +187,16 @@ class IncrementalWindow:
             return self._append_start(sample)
         dt = sample.time - self.samples[-1].time
         interval = self.maker.make(self.first + len(self.samples) - 1, sample.motion, dt)
-        estimate = self.states[-1], self.coefficients
+        estimate = self.points[-1], self.coefficients
         piece, count, calls = self._relinearize(interval)
         away = np.concatenate((estimate[0] - self.theta[-1], estimate[1] - self.coefficient_theta))
-        predicted = piece[:, 0] + piece[:, 1:] @ away
-        covariance = piece[:, 1:] @ self.newest_covariance @ piece[:, 1:].T + interval.covariance
+        carried, noise = piece, interval.covariance
+        if self.biased:
+            carried, noise = carried_with_bias(piece, noise, self.theta[-1, STATE_DIM:], dt, self.settings)
+        predicted = carried[:, 0] + carried[:, 1:] @ away
+        covariance = carried[:, 1:] @ self.newest_covariance @ carried[:, 1:].T + noise
+        if np.trace(covariance[VELOCITY, VELOCITY]) < WIDE_VELOCITY**2:
+            sample.velocity = predicted[VELOCITY]
         state, innovation = self._corrected(predicted, covariance, sample)
         store(interval, self.theta[-1], state, self.coefficient_theta, piece)
         variables = self._insert(sample, state, interval)
@@ -171,7 +204,7 @@ class IncrementalWindow:
 
     def _append_start(self, sample: Sample) -> Update:
         """A sample that nothing predicts: its state has a wide prior of its own."""
-        state = np.zeros(STATE_DIM)
+        state = np.zeros(self.width)
         state[POSITION] = sample.position
         if sample.label is not None:
             state[SPIN] = sample.label.spin
@@ -189,22 +222,31 @@ class IncrementalWindow:
             for measurement in sample.measurements:
                 predicted, covariance = measurement.corrected(predicted, covariance)
             return predicted, sample.measurements[0].innovation
-        innovation = sample.position - predicted[POSITION]
-        noise = np.diag(sample.sigma**2)
-        inverse = np.linalg.inv(np.linalg.cholesky(covariance[POSITION, POSITION] + noise))
+        innovation = sample.position - self._measured_part(predicted)
+        noise = self._measurement_noise(sample)
+        cross, rows = self._measured_part(covariance.T).T, self._measured_part(covariance)
+        spread = self._measured_part(cross)
+        inverse = np.linalg.inv(np.linalg.cholesky(spread + noise))
         whitened = inverse @ innovation
         pull = whitened @ inverse
         if self.settings.loss.name != "squared":
             weight = self.settings.loss.weight(np.array([np.linalg.norm(whitened)]))
-            spread = covariance[POSITION, POSITION] + noise / weight
-            pull = np.asarray(np.linalg.solve(spread, innovation), dtype=np.float64)
-        state = predicted + covariance[:, POSITION] @ pull
+            pull = np.asarray(np.linalg.solve(spread + noise / weight, innovation), dtype=np.float64)
+        state = predicted + cross @ pull
         if sample.measurements:
-            gain = np.linalg.solve(covariance[POSITION, POSITION] + noise, covariance[POSITION]).T
-            covariance = covariance - gain @ covariance[POSITION]
+            gain = np.linalg.solve(spread + noise, rows).T
+            covariance = covariance - gain @ rows
             for measurement in sample.measurements:
                 state, covariance = measurement.corrected(state, covariance)
         return state, whitened
+
+    def _measured_part(self, rows: Array) -> Array:
+        """(3, ...) the rows (w, ...) that a measured position looks at: those of position and bias, added."""
+        return rows[POSITION] + rows[STATE_DIM:] if self.biased else rows[POSITION]
+
+    def _measurement_noise(self, sample: Sample) -> Array:
+        """(3, 3) m^2, of a position's white error and of that of its stamp."""
+        return np.diag(sample.sigma**2) + stamp_covariance(self.settings, sample.velocity)
 
     def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
         """Do ahead what iSAM2 will do: move the states whose solution left the thresholds, evaluate their factors.
@@ -254,8 +296,12 @@ class IncrementalWindow:
             graph.push_back(factor)
         for prior in priors:
             graph.push_back(Bridge(prior, "row").factor(0, [key - STATE_KEY]))
+        if self.biased and priors and not self.samples:
+            graph.push_back(bias_start(key, self.settings))
         values.insert(key, state)
         own = graph.size()
+        if self.biased and self.samples:
+            graph.push_back(bias_link(key, sample.time - self.samples[-1].time, self.settings))
         if len(self.theta) == 0:
             for factor in self.shared:
                 graph.push_back(factor)
@@ -265,6 +311,7 @@ class IncrementalWindow:
         if interval is not None:
             interval.slot = slots[0]
         sample.slots = tuple(slots[interval is not None : own])
+        sample.bias_slot = slots[own] if self.biased and self.samples else None
         if self.samples:
             self.intervals.append(interval)
         self.samples.append(sample)
@@ -278,16 +325,20 @@ class IncrementalWindow:
         return position + [measurement.factor(state) for measurement in sample.measurements]
 
     def _position_factor(self, sample: Sample, state: int) -> gtsam.NonlinearFactor:
-        """The observation's factor; without a robust loss it is linear, and GTSAM never has to ask for it."""
-        if self.settings.loss.name == "squared":
+        """The observation's factor; without a robust loss it is linear."""
+        where, position, loss = np.array([state]), sample.position[None], self.settings.loss
+        if self.biased or self.settings.stamp_jitter > 0.0:
+            stamps = stamp_covariance(self.settings, sample.velocity)[None]
+            batch = BiasedPositionFactors(where, position, sample.sigma[None], stamps, loss, self.biased)
+            if loss.name == "squared":
+                (residual,), (block,) = batch.compute(slice(None), (np.zeros((1, self.width)),))
+                return linear_factor([STATE_KEY + state], [block[0]], -residual)
+            return Bridge(batch, "row").factor(0)
+        if loss.name == "squared":
             root = np.zeros((3, STATE_DIM))
             root[:, POSITION] = np.diag(1.0 / sample.sigma)
-            factor = gtsam.JacobianFactor(STATE_KEY + state, root, sample.position / sample.sigma, _UNIT3)
-            origin = gtsam.Values()
-            origin.insert(STATE_KEY + state, np.zeros(STATE_DIM))
-            return gtsam.LinearContainerFactor(factor, origin)
-        batch = PositionFactors(np.array([state]), sample.position[None], sample.sigma[None], self.settings.loss)
-        return Bridge(batch, "row").factor(0)
+            return linear_factor([STATE_KEY + state], [root], sample.position / sample.sigma)
+        return Bridge(PositionFactors(where, position, sample.sigma[None], loss), "row").factor(0)
 
     def _update(
         self, graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, remove: list[int], last: dict[int, int]
@@ -310,7 +361,7 @@ class IncrementalWindow:
         """The linear solution of all states, and the newest one's covariance."""
         newest = STATE_KEY + self.first + len(self.theta) - 1
         solution = self.isam.getDelta()
-        self.delta = solution.vector(range(STATE_KEY + self.first, newest + 1)).reshape(-1, STATE_DIM)
+        self.delta = solution.vector(range(STATE_KEY + self.first, newest + 1)).reshape(-1, self.width)
         if self.p:
             self.coefficient_delta = solution.at(COEFFICIENT_KEY)
             self.newest_covariance = self.isam.jointMarginalCovariance([newest, COEFFICIENT_KEY]).fullMatrix()

@@ -10,6 +10,7 @@ from ballfg.arrays import Array
 from ballfg.estimation.observations.innovation import FilterInnovation
 from ballfg.factors.batch import FactorBatch, merge
 from ballfg.factors.bridge import Bridge, checked
+from ballfg.state import STATE_DIM
 
 
 class Measurement:
@@ -33,9 +34,10 @@ class Measurement:
     def corrected(self, state: Array, covariance: Array) -> tuple[Array, Array]:
         """State (9,) and its covariance (9, 9), moved by the measurement as an extended Kalman filter would.
 
+        A tracker's bias may stand behind the state; the measurement does not look at it.
         A robust loss gets the weight that the innovation gives it. The innovation is kept the first time.
         """
-        found = FilterInnovation.of(self.batch, state, covariance)
+        found = FilterInnovation.of(self.batch, state, covariance, biases=len(state) - STATE_DIM)
         if np.isnan(self.innovation).any():
             self.innovation = found.whitened
         gain = np.linalg.solve(found.spread + found.R, found.H @ covariance).T
@@ -45,6 +47,8 @@ class Measurement:
 def prepare(measurements: Sequence[Measurement], states: Array) -> None:
     """Evaluate measurements at their states (k, 9), one call for each sort, and keep the answers for iSAM2's questions.
 
+    Biases may stand behind the states.
+
     Raises: ValueError: if a residual is not finite: a ball is not in front of its camera, for instance.
     """
     groups: defaultdict[Hashable, list[int]] = defaultdict(list)
@@ -52,7 +56,7 @@ def prepare(measurements: Sequence[Measurement], states: Array) -> None:
         groups[measurement.batch.group].append(k)
     for members in groups.values():
         batch = merge([measurements[k].batch for k in members])
-        inputs = (np.ascontiguousarray(states[members]),)
+        inputs = (np.ascontiguousarray(states[members, :STATE_DIM]),)
         residual, (jacobian,) = checked(batch, slice(None), inputs, *batch.compute(slice(None), inputs))
         for row, k in enumerate(members):
             measurements[k].bridge.keep(0, (inputs[0][row],), residual[row], (jacobian[row],))

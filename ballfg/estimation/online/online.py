@@ -10,6 +10,7 @@ from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
+from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
 from ballfg.estimation.observations.observation import Context, Observation, refuse_unknowns
 from ballfg.estimation.online.events import SIGMA_FACTOR, EventTracker, contact_step, first_difference
 from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unknown
@@ -19,7 +20,7 @@ from ballfg.estimation.online.stream import SightingStream
 from ballfg.estimation.online.window import Window
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import physics_of
-from ballfg.estimation.settings import Settings, sample_sigmas
+from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
 from ballfg.estimation.smoother.motion import FLIGHT, Motion, motions_of
 from ballfg.estimation.smoother.problem import trackwise_model
 from ballfg.estimation.smoother.smoother import Smoother
@@ -167,9 +168,10 @@ class Online(Estimator):
 
     def _observe(self, sample: Sample) -> OnlineState:
         """Take in a sample."""
-        changed = self.events.push(sample.time, sample.position, sample.stated)  # also checks the numbers
+        self._tell_whole_error(sample)
+        changed = self.events.push(sample.time, sample.position, sample.whole)  # also checks the numbers
         if self.window is None:
-            self.window = Window(self.ball, self.settings, float(sample.stated.min()))
+            self.window = self._new_window(sample)
         self._counts[:] = 0
         self._samples.append(sample)
         status, rebuilt = Status.OK if len(self._samples) > 1 else Status.NO_VELOCITY, False
@@ -179,6 +181,23 @@ class Online(Estimator):
             rebuilt, revised = True, len(self._samples) - 1
             status, update = self._repair(error, status)
         return self._state(self.window, self._samples[-1], update, revised, rebuilt, status)
+
+    def _new_window(self, sample: Sample) -> Window:
+        """A window that begins with a sample; only measured positions have a tracker's bias."""
+        biased = self.settings.has_memory and sample.measured
+        return Window(self.ball, self.settings, float(sample.stated.min()), biased)
+
+    def _tell_whole_error(self, sample: Sample) -> None:
+        """Standard deviations of a new sample's whole error, and the rough velocity that its stamp's error needs."""
+        sample.whole = sample.stated
+        if not sample.measured:
+            return
+        last = [*self._samples[1 - WINDOW :], sample]
+        in_order = len(last) > 1 and sample.time > last[-2].time and np.isfinite(sample.position).all()
+        if self.settings.stamp_jitter > 0.0 and in_order:
+            times, positions = np.array([s.time for s in last]), np.array([s.position for s in last])
+            sample.velocity = window_velocities(times, positions)[-1]
+        sample.whole = total_sigmas(self.settings, sample.stated, sample.velocity)
 
     def _join(self, sighting: Measurement) -> OnlineState:
         """Take in one more sighting of the newest sample."""
@@ -196,6 +215,8 @@ class Online(Estimator):
     def _take_in(self, window: Window, sample: Sample, changed: bool) -> tuple[int, Update]:
         """Explain, go back to where the explanation changed, append, move contacts, keep the window's length."""
         again = self._explain(window) if changed else []
+        if self.settings.stamp_jitter > 0.0 and sample.measured:
+            self._tell_velocities(window)
         for old in again:
             self._append(window, old)
         update = self._append(window, sample)
@@ -206,6 +227,22 @@ class Online(Estimator):
             window.shorten(self.lag)
             self._samples = list(window.samples)
         return max(len(again), moved), update
+
+    def _tell_velocities(self, window: Window) -> None:
+        """Rough velocities of the samples to come, by line fits between the events; they shape the errors of stamps.
+
+        A start or a hit just before the last sample in the window left its velocity open; now there are more samples.
+        """
+        samples, held = self._samples, len(window)
+        times, positions = np.array([s.time for s in samples]), np.array([s.position for s in samples])
+        breaks = [k - 1 for k, s in enumerate(samples) if k and s.motion != FLIGHT]
+        velocities = window_velocities(times, positions, breaks)
+        last = samples[max(held - 1, 0)].motion
+        begins = held > 0 and (held == 1 or last.hit or not last.linked) and held - 1 not in breaks
+        for k in range(held - begins, len(samples)):
+            samples[k].velocity = velocities[k]
+        if begins:
+            window.reweigh([held - 1])
 
     def _append(self, window: Window, sample: Sample) -> Update:
         update = window.append(sample)
@@ -271,8 +308,8 @@ class Online(Estimator):
             if self._frozen is not None:
                 self._frozen += [unknown(s, self.settings, self.window.p) for s in self._samples[:-1]]
             first = self.window.first + len(self._samples) - 1
-            newest = replace(self._samples[-1], motion=FLIGHT, slots=())
-        self.window = Window(self.ball, self.settings, float(newest.stated.min()))
+            newest = replace(self._samples[-1], motion=FLIGHT, slots=(), bias_slot=None)
+        self.window = self._new_window(newest)
         self.window.first = first
         self._samples = [newest]
         try:
@@ -283,10 +320,11 @@ class Online(Estimator):
     def _state(
         self, window: Window, sample: Sample, update: Update, revised: int, rebuilt: bool, status: Status
     ) -> OnlineState:
+        mean, joint = window.newest_belief
         return OnlineState(
             time=sample.time,
-            mean=np.concatenate((window.theta[-1] + window.delta[-1], window.coefficients)),
-            joint=window.newest_covariance.copy(),
+            mean=mean,
+            joint=joint.copy(),
             coefficient_names=tuple(self.settings.coefficients),
             world=self.world,
             name="stream",

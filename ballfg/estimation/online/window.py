@@ -5,8 +5,8 @@ import numpy as np
 
 from ballfg.estimation.online.isam import IncrementalWindow, Sample, Update
 from ballfg.estimation.online.measurement import Measurement, prepare
+from ballfg.estimation.online.tracker import bias_start
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
-from ballfg.state import STATE_DIM
 
 
 class Window(IncrementalWindow):
@@ -23,6 +23,7 @@ class Window(IncrementalWindow):
         gone = self.samples[count:]
         slots = [slot for sample in gone for slot in sample.slots]
         slots += [i.slot for i in self.intervals[count - 1 :] if i is not None and i.slot is not None]
+        slots += [sample.bias_slot for sample in gone if sample.bias_slot is not None]
         self._relinearize(None)
         del self.samples[count:], self.intervals[count - 1 :]
         self._update(gtsam.NonlinearFactorGraph(), gtsam.Values(), slots, {})
@@ -35,7 +36,7 @@ class Window(IncrementalWindow):
         Raises: RuntimeError or ValueError: as `append`.
         """
         _, count, calls = self._relinearize(None)
-        measurement.corrected(self.states[-1], self.newest_covariance[:STATE_DIM, :STATE_DIM])
+        measurement.corrected(self.points[-1], self.newest_covariance[: self.width, : self.width])
         prepare([measurement], self.theta[-1:])
         newest = STATE_KEY + self.first + len(self.samples) - 1
         graph = gtsam.NonlinearFactorGraph()
@@ -63,19 +64,21 @@ class Window(IncrementalWindow):
         """Let go of all but the newest states; what the others know becomes a linear factor on the first that stays.
 
         The factors of the leaving states are eliminated, by QR, at their linearisation points; iSAM2 is then made
-        anew from those that stay, whose linearisations are all at hand: no torch call.
+        anew from those that stay, whose linearisations are all at hand: no torch call. Where nothing but a bias links
+        the first that stays to them, after a long gap, the bias starts anew.
 
         Raises: RuntimeError: from GTSAM, when the leaving part is singular.
         """
         leaving = len(self.samples) - keep
         self._relinearize(None)
         before = self.first, self.samples, self.intervals, self.theta, self.delta, self.shared
+        linked = self.intervals[leaving - 1] is not None
         try:
             self.shared = self._summary(leaving)
             self.first += leaving
             self.samples, self.intervals = self.samples[leaving:], self.intervals[leaving:]
             self.theta, self.delta = self.theta[leaving:], self.delta[leaving:]
-            self._renew()
+            self._renew(linked)
         except RuntimeError:
             self.first, self.samples, self.intervals, self.theta, self.delta, self.shared = before
             raise
@@ -84,7 +87,9 @@ class Window(IncrementalWindow):
         """What the oldest states know, as linear factors on the first state that stays and on the coefficients."""
         point = self._point(range(leaving + 1))
         old = gtsam.GaussianFactorGraph()
-        for factor in (*self._factors(range(leaving), range(leaving)), *self.shared):
+        cut = leaving - (self.intervals[leaving - 1] is None)
+        factors = self._factors(range(leaving), range(leaving), range(1, cut + 1))
+        for factor in (*factors, *self.shared):
             old.push_back(factor.linearize(point))
         ordering = gtsam.Ordering()
         present = set(old.keyVector())
@@ -106,18 +111,24 @@ class Window(IncrementalWindow):
             values.insert(COEFFICIENT_KEY, self.coefficient_theta)
         return values
 
-    def _factors(self, samples: range, intervals: range) -> list[gtsam.NonlinearFactor]:
-        """The factors of some samples and intervals, out of iSAM2."""
+    def _factors(self, samples: range, intervals: range, biases: range) -> list[gtsam.NonlinearFactor]:
+        """Factors out of iSAM2: of some samples, of some intervals, those that lead to the biases of some samples."""
         held = self.isam.getFactorsUnsafe()
         slots = [slot for k in samples for slot in self.samples[k].slots]
         slots += [i.slot for k in intervals if (i := self.intervals[k]) is not None and i.slot is not None]
+        slots += [slot for k in biases if (slot := self.samples[k].bias_slot) is not None]
         return [held.at(slot) for slot in slots]
 
-    def _renew(self) -> None:
-        """A new iSAM2 out of the window as it is."""
+    def _renew(self, linked: bool) -> None:
+        """A new iSAM2 out of the window as it is; its first state may have no link to those that left."""
         n = len(self.samples)
         graph = gtsam.NonlinearFactorGraph()
-        for factor in (*self._factors(range(n), range(n - 1)), *self.shared):
+        for factor in self._factors(range(n), range(n - 1), range(1, n)):
+            graph.push_back(factor)
+        self.samples[0].bias_slot = None
+        if self.biased and not linked:
+            graph.push_back(bias_start(STATE_KEY + self.first, self.settings))
+        for factor in self.shared:
             graph.push_back(factor)
         self.isam = self._new_isam()
         last = {STATE_KEY + self.first + n - 1: 1, COEFFICIENT_KEY: 2} if self.p else {}
@@ -127,6 +138,11 @@ class Window(IncrementalWindow):
         for interval in self.intervals:
             if interval is not None:
                 interval.slot = next(slots)
+        for sample in self.samples[1:]:
+            if sample.bias_slot is not None:
+                sample.bias_slot = next(slots)
+        if self.biased and not linked:
+            self.samples[0].slots += (next(slots),)
         self._read_back()
 
     def start_anew(self, samples: list[Sample]) -> Update:
@@ -135,11 +151,11 @@ class Window(IncrementalWindow):
         Returns: of the last sample's update.
         Raises: RuntimeError or ValueError: if that fails as well.
         """
-        start, coefficients = self.states[:1], self.coefficients
+        start, coefficients = self.points[:1], self.coefficients
         self._clear()
         self.samples, self.intervals = [], []
         for sample in samples:
-            sample.slots = ()
+            sample.slots, sample.bias_slot = (), None
         update = Update(np.full(3, np.nan), 0, 0, 0)
         if self.first:
             self.coefficient_theta = coefficients

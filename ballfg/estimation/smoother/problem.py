@@ -17,7 +17,7 @@ from ballfg.dynamics.motion.integrate import steps_over
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns, unknowns_of
-from ballfg.estimation.observations.positions import Positions, observations_of
+from ballfg.estimation.observations.positions import observations_of
 from ballfg.estimation.segmentation import Contact, Quality, Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
 from ballfg.estimation.smoother.initial import bridged_positions
@@ -40,6 +40,8 @@ from ballfg.factors.tracker import BIAS_DIM, BiasFactors, BiasStartFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Track
 
+LEAST_SPIN_PRIOR = 60.0
+"""rad/s, of a ball after a hit, however well a launcher repeats its spin."""
 START_POSITION_SIGMA = 5.0
 """m, prior of the first position about its measurement: wide enough to say nothing."""
 QUALITY_SIGMA = {Quality.WIDE: 4.0, Quality.SHIFTED: 20.0, Quality.OUTLIER: 200.0}
@@ -67,6 +69,7 @@ def coefficient_means(model: BallModel, settings: Settings) -> Array:
 
 def effective_sigmas(track: Track, segmentation: Segmentation, settings: Settings) -> Array:
     """(n, 3) m: standard deviations of the samples' white errors, larger for wide, shifted ones and outliers."""
+    settings = settings.for_track(track)
     sigma = sample_sigmas(settings, len(track), track.sigmas)
     whole = total_sigmas(settings, sigma, window_velocities(track.times, track.positions))
     for quality, factor in QUALITY_SIGMA.items():
@@ -105,7 +108,7 @@ class TrackProblem:
     ) -> None:
         self.track = track
         self.model = model
-        self.settings = settings
+        self.settings = settings = settings.for_track(track)
         self.segmentation = segmentation
         self.sigma = effective_sigmas(track, segmentation, settings) if sigma is None else sigma
         self.ball = trackwise_model(model, settings)
@@ -113,7 +116,7 @@ class TrackProblem:
         self.unknowns: Unknowns = unknowns_of(self.observations, settings)
         self.width = model_width(self.ball)
         columns = {name: self.width + k for k, name in enumerate(self.unknowns.names)}
-        self.biased = settings.has_memory and any(one.name == Positions.name for one in self.observations)
+        self.biased = settings.has_memory
         self.context = Context(track, model, settings, self.sigma, columns, _velocities(track, segmentation, settings))
         self.observed = {one.name: one.batch(self.context) for one in self.observations}
         self.added: list[FactorBatch] = []
@@ -223,8 +226,9 @@ def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> lis
         batches.append(_wide_prior(0, track.positions[0], settings))
     else:
         batches += start_priors(0, track.positions[0], settings.spin_label(track), settings)
+    anew = replace(settings, spin_prior=max(settings.spin_prior, LEAST_SPIN_PRIOR))
     for interval in segmentation.restarts:
-        batches += start_priors(int(interval) + 1, track.positions[int(interval) + 1], None, settings)
+        batches += start_priors(int(interval) + 1, track.positions[int(interval) + 1], None, anew)
     return batches
 
 

@@ -31,6 +31,7 @@ from ballfg.factors.covariance import Covariances, marginal_covariances
 from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum, Search, run
 from ballfg.factors.prior import PriorFactors
+from ballfg.factors.tracker import BiasStartFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Ball, Track
 
@@ -65,8 +66,8 @@ class Earlier:
 
     def join(self, graph: BallGraph) -> BallGraph:
         """The window's graph with the summaries in it."""
-        known = {int(v) for summary in self.summaries for v in summary.variables[0]}
-        kept = [b for b in graph.batches if not (isinstance(b, PriorFactors) and int(b.variables[0, 0]) in known)]
+        known, priors = {int(v) for s in self.summaries for v in s.variables[0]}, (PriorFactors, BiasStartFactors)
+        kept = [b for b in graph.batches if not (isinstance(b, priors) and int(b.variables[0, 0]) in known)]
         return BallGraph((*kept, *self.summaries))
 
 
@@ -126,8 +127,9 @@ class Smoother(Estimator):
 
     def segment(self, track: Track) -> Segmentation:
         """The events in a track."""
-        white = sample_sigmas(self.settings, len(track), track.sigmas)
-        sigma = total_sigmas(self.settings, white, window_velocities(track.times, track.positions))
+        settings = self.settings.for_track(track)
+        white = sample_sigmas(settings, len(track), track.sigmas)
+        sigma = total_sigmas(settings, white, window_velocities(track.times, track.positions))
         physics = physics_of(self.model)
         found = segment(track.times, track.positions, sigma, surfaces=self.surfaces, physics=physics)
         return found if self.settings.find_events else found.only_contacts()

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from ballfg.benchmarks.estimators.conformal import conformal_coverage
 from ballfg.benchmarks.estimators.measured import WHOLE, Measured, _add_smoothing, prediction_rmse
 from ballfg.benchmarks.results import Results
 from ballfg.estimation import Estimate, Status, TrackPrediction
@@ -37,3 +38,18 @@ def test_innovations_next_to_a_hit_do_not_count_and_marked_ones_count_as_failure
     assert results.value("toy", WHOLE, "share_marked") == pytest.approx(1 / 4)
     assert results.value("toy", WHOLE, "share_wide") == pytest.approx(1 / 4)
     assert results.value("toy", WHOLE, "hits") == 1
+
+
+def test_conformal_intervals_of_random_halves_hold() -> None:
+    """60 tracks whose sigmas are three times too small; 30 tracks calibrate, so that 90 to 96.5 % are right."""
+    rng = np.random.default_rng(0)
+    predictions = []
+    for i in range(60):
+        estimate = Estimate(str(i), np.zeros(1), np.zeros((1, 9)), np.eye(9)[None], Status.OK)
+        times, errors = np.arange(1, 11) / 100, 3.0 * rng.normal(size=(10, 3))
+        predictions.append(TrackPrediction(str(i), times, np.zeros((10, 3)), np.ones((10, 3)), errors, estimate))
+    figure = conformal_coverage(predictions, 0.25, 0)
+    assert figure is not None
+    assert 0.89 <= figure.value <= 0.965
+    assert figure.low < figure.value < figure.high
+    assert conformal_coverage(predictions[:17], 0.25, 0) is None

@@ -7,6 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ballfg.estimation.estimator import Estimator
+from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
+from ballfg.estimation.filters.sliding_window import SlidingWindow
 from ballfg.estimation.online.online import Online, OnlineState
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
@@ -121,3 +124,13 @@ def test_refuses_what_is_no_stream(ball: World) -> None:
         online.push_sighting(0.05, "right", [600.0, 400.0], noise)
     with pytest.raises(ValueError, match="in order of true time"):
         online.push_sighting(0.1, "left", [600.0, 400.0], noise)
+
+
+@pytest.mark.parametrize("build", [Smoother, Online, ExtendedKalmanFilter, SlidingWindow])
+def test_sightings_have_no_tracker_s_memory(ball: World, build: type[Estimator]) -> None:
+    """Their rough positions are not measured: memory and jitter of a tracker change nothing."""
+    track = track_of(scene(1, ball, phases=(0.0, 1 / 3, 2 / 3), duration=0.3))
+    told = replace(Settings(), memory=(0.004,) * 3, stamp_jitter=0.001)
+    plain, other = (build(ball.model, ball.surfaces, settings).estimate(track) for settings in (Settings(), told))
+    np.testing.assert_array_equal(other.states, plain.states)
+    np.testing.assert_array_equal(other.covariances, plain.covariances)

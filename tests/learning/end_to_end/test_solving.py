@@ -67,6 +67,25 @@ def test_a_warm_start_saves_iterations_and_changes_nothing() -> None:
     assert [s.solution.minimum.iterations > 2 for s in third] == [False, True]
 
 
+def test_a_warm_start_with_a_tracker_s_memory() -> None:
+    """Biases start from zero again and are at their minimum after a step; a turn mixes the memory of x and y."""
+    tells = replace(TELLS, memory=(0.003, 0.004, 0.002), stamp_jitter=0.0005)
+    made = shots(measured(usual_ball(), lengths=(24, 20, 26)), usual_ball(), tells)
+    batch = BatchSolver(
+        made, Learnables(usual_ball(), tells.launcher.embedding, NoiseScales(NOISE, learned=False)), TIGHT
+    )
+    cold, _ = batch((0, 1, 2), {})
+    again, _ = batch((0, 1, 2), {})
+    for one, other in zip(cold, again, strict=True):
+        first, second = (s.solution.minimum.values for s in (one, other))
+        np.testing.assert_allclose(first.states, second.states, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(first.biases, second.biases, atol=1e-9)
+    turned, failed = batch((1,), {1: POSE})
+    assert not failed
+    moved = turned[0].solution.minimum.values.biases
+    assert np.linalg.norm(moved) == pytest.approx(np.linalg.norm(cold[1].solution.minimum.values.biases), rel=0.5)
+
+
 def test_a_warm_start_follows_the_pose() -> None:
     """Kept as measured, so that it serves wherever the shot is seen from the next time."""
     batch = solver()

@@ -117,6 +117,24 @@ def test_spin_embedding(analytic: Estimates) -> None:
     assert worst(analytic, {"weight": [embedding.weight]}, [0.01]) < SAME
 
 
+def test_a_tracker_with_memory_and_jitter() -> None:
+    """Biases behind the states: the gradient of the states by coefficients and by the noise."""
+    tracker = {"memory": (0.002, 0.003, 0.002), "memory_time": 0.03, "stamp_jitter": 0.0005}
+    noise = NoiseScales(NOISE, learned=True)
+    estimates = Estimates(usual_ball(), measured(TRUTH), replace(SETTINGS, launcher=launcher(), **tracker), noise)
+    own = dict(estimates.model.named_parameters())
+    leaves = [own["flight.drag.k"], own["bounce.restitution.e"], noise.position, noise.process]
+
+    def value(point: Tensor) -> Tensor:
+        return outer(point.view(-1, 12)[:, :9].reshape(-1))
+
+    found = torch.autograd.grad(value(estimates.attached(ImplicitGradient(), leaves)), leaves)
+    for leaf, gradient, step in zip(leaves, found, (5e-4, 2e-3, 3e-3, 3e-3), strict=True):
+        direction = torch.linspace(0.5, 1.5, leaf.numel(), dtype=torch.float64).view(leaf.shape)
+        expected = directional(lambda: value(estimates.point()), [leaf], [direction], step)
+        assert float((gradient * direction).sum()) == pytest.approx(expected, rel=SAME)
+
+
 @pytest.mark.parametrize(("kind", "step"), [("mnn+gs", 1e-4), ("mlp", 3e-5)])
 def test_weights_of_networks(kind, step) -> None:
     """Random directions in all weights of a network; small steps, since a residual lies 8e-5 from Huber's bend."""

@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from ballfg.factors.batch import Noise, Values
+from ballfg.factors.graph import BallGraph
 from ballfg.factors.noise import PROCESS_NOISE
 from ballfg.learning.end_to_end.learnables import NoiseScales
-from ballfg.learning.gradient.objective import Layout, rewhitened
+from ballfg.learning.gradient.objective import BatchObjective, Layout, rewhitened
 from tests.learning.estimates import (
     NOISE,
     SETTINGS,
@@ -106,8 +107,21 @@ def test_layout_packs_and_unpacks() -> None:
     for k, (start, one) in enumerate(zip(layout.starts, values, strict=True)):
         np.testing.assert_array_equal(states[start : start + len(one.states)], one.states)
         np.testing.assert_array_equal(coefficients[k], one.coefficients)
+    biased = [replace(v, biases=rng.standard_normal((len(v.states), 3))) for v in values]
+    layout = Layout((3, 1, 4), 2, 12)
+    whole, coefficients = layout.unpack(layout.pack(biased))
+    np.testing.assert_array_equal(whole[3:4], np.concatenate((biased[1].states, biased[1].biases), axis=1))
+    np.testing.assert_array_equal(coefficients[2], biased[2].coefficients)
+    assert layout.owners().bincount().tolist() == [38, 14, 50]
+    layout = Layout((3, 1, 4), 2)
     numbered = [Values(np.full((n, 9), float(k)), np.full(2, float(k))) for k, n in enumerate((3, 1, 4))]
     np.testing.assert_array_equal(layout.owners(), layout.pack(numbered))
+
+
+def test_tracks_with_and_without_memory_do_not_mix() -> None:
+    plain = Values(np.zeros((2, 9)), np.zeros(0))
+    with pytest.raises(ValueError, match="tracks of a batch must all have measured positions where errors last"):
+        BatchObjective([BallGraph(())] * 2, [plain, replace(plain, biases=np.zeros((2, 3)))])
 
 
 def test_rewhitening_forms() -> None:

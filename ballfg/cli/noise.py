@@ -1,0 +1,115 @@
+"""`ballfg noise`: the noise that the tracks of a dataset show, with error bars."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ballfg.cli import inputs
+from ballfg.progress import progress
+
+if TYPE_CHECKING:
+    from ballfg.dynamics import BallModel
+    from ballfg.estimation import NoiseEstimate
+    from ballfg.tracks import Dataset
+
+MEANINGS = {
+    "position": ("error of a position, new in each sample, along {}", 1e3, "mm"),
+    "memory": ("error of a position that lasts, along {}", 1e3, "mm"),
+    "memory_time": ("time over which it lasts", 1e3, "ms"),
+    "stamp_jitter": ("error of a stamp", 1e3, "ms"),
+    "spin_label": ("error of a spin label, per axis", 1.0, "rad/s"),
+    "spin_prior": ("spin of a ball without a label, per axis", 1.0, "rad/s"),
+    "acceleration": ("acceleration that the model lacks", 1.0, "m/s^2/sqrt(Hz)"),
+    "contact_velocity": ("scatter of the velocity after a bounce", 1.0, "m/s"),
+    "contact_tangential": ("the same, in addition, along the surface", 1.0, "m/s"),
+    "contact_spin": ("scatter of the spin after a bounce", 1.0, "rad/s"),
+    "coefficients": ("spread of coefficients from track to track / usual", 1.0, ""),
+}
+"""For each number its meaning, the factor to the unit that is printed, and that unit."""
+UNKNOWN = 0.7
+"""Standard deviation of a logarithm from which on the tracks hardly tell more than the order of magnitude."""
+
+
+def noise(
+    dataset: inputs.DatasetFolder,
+    model: inputs.ModelFile = None,
+    effects_file: inputs.EffectsFiles = None,
+    tracks: Annotated[int, typer.Option(min=5, help="Number of tracks that are used, evenly over the dataset.")] = 20,
+    out: Annotated[
+        Path | None, typer.Option(metavar="<path>", help="Model file to write: the model with this noise.")
+    ] = None,
+    write: Annotated[bool, typer.Option("--write", help="Write the noise into the dataset's dataset.yaml.")] = False,
+) -> None:
+    """The noise of the tracker, of flights, bounces, labels and spins that the tracks of a dataset show.
+
+    It is the noise with which forecasts 20 to 300 ms ahead, within the tracks, are most probable. The model stays as it
+    is: an effect that it lacks counts as noise. `estimate` and `predict` do the same on fewer tracks where neither
+    dataset.yaml nor the model states the noise.
+
+    Example: ballfg noise data/ballgun --out noisy.yaml
+    """
+    from ballfg.estimation import dataset_settings, dataset_surfaces, estimate_noise, spread_over, with_readings
+    from ballfg.tracks import read_dataset
+
+    inputs.know_effects(effects_file)
+    data = with_readings(read_dataset(dataset))
+    ball = inputs.open_model(data, model)
+    if out is not None and out.resolve() == (dataset / "dataset.yaml").resolve():
+        raise ValueError(f"out must be a model file; got {out}. Use --write for dataset.yaml.")
+    found = estimate_noise(
+        ball,
+        dataset_surfaces(data),
+        dataset_settings(data, ball),
+        spread_over(data, len(data), tracks),
+        watch=progress,
+    )
+    if found is None:
+        raise ValueError(f"{dataset} must hold tracks with undisturbed flights of 0.1 s or more; none has one")
+    print(f"{dataset}: noise from {found.tracks} tracks, {found.starts} forecasts of up to 0.3 s in them")
+    for line in _table(found):
+        print(line)
+    print(
+        f"90 % intervals of these forecasts hold {100 * found.held:.0f} %; with the noise assumed so far "
+        f"{100 * found.held_before:.0f} %"
+    )
+    _write(found, data, ball, out, write)
+
+
+def _table(found: NoiseEstimate) -> list[str]:
+    """A line for each number: meaning, value, error bar."""
+    content: dict[str, Any] = found.noise.to_mapping() | {"coefficients": found.coefficient_factor}
+    lines = []
+    for name, error in found.relative_errors.items():
+        field, _, axis = name.partition(".")
+        meaning, factor, unit = MEANINGS[field]
+        value = content[field]
+        number = factor * (value["xyz".index(axis)] if axis else value)
+        doubt = "  (hardly known)" if error >= UNKNOWN else ""
+        lines.append(f"  {meaning.format(axis):52} {number:8.3g} x/: {_ratio(error)}  {unit}{doubt}")
+    return lines
+
+
+def _ratio(error: float) -> str:
+    """The factor by which a number may be larger or smaller, one standard deviation."""
+    return f"{2.718281828**error:4.2f}"
+
+
+def _write(found: NoiseEstimate, data: Dataset, ball: BallModel, out: Path | None, write: bool) -> None:
+    from dataclasses import replace
+
+    from ballfg.dynamics import save_model
+    from ballfg.tracks.info import INFO_FILE, write_info
+
+    if out is not None:
+        ball.noise = found.noise
+        save_model(ball, out)
+        print(f"{out}: the model with this noise")
+    if write:
+        path = data.path / INFO_FILE
+        write_info(path, replace(data.info, noise=found.noise))
+        print(f"{path}: states this noise now")
+    if out is None and not write:
+        print("Write it with --out MODEL.yaml into a model file, or with --write into dataset.yaml.")

@@ -1,0 +1,220 @@
+"""The noise of a set of tracks, from how well forecasts within the tracks keep their promise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+
+from ballfg.arrays import Array
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.measurement.as_measured import plainly_measured
+from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
+from ballfg.estimation.noise.forecasts import EARLIEST_START, START_EVERY, Forecaster
+from ballfg.estimation.noise.linear_tracks import LEAST_SAMPLES, LinearTracks, linearise
+from ballfg.estimation.noise.parameters import (
+    COEFFICIENTS,
+    Parameter,
+    parameters_of,
+    tensors_of,
+    track_noise,
+    with_noise,
+)
+from ballfg.estimation.settings import Settings
+from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.progress import Watch, unwatched
+from ballfg.tracks import Track, TrackNoise
+
+LONGEST_PART: Final = 0.75
+"""s of a track that are used: a start at 0.2 s or later, and 0.3 s of forecast behind it."""
+MOST_TRACKS: Final = 20
+"""Tracks that are used; twice as many move no number by more than its error bar, and take twice as long."""
+MOST_ITERATIONS: Final = 25
+EARLIEST_SHARE: Final = 0.7
+"""Share of a short track that is seen before the first forecast."""
+EVERY_SHARE: Final = 0.12
+"""Share of a short track between two starts."""
+DIFFERENCE: Final = 0.02
+"""Step of a logarithm for the second derivatives behind the error bars."""
+
+
+@dataclass(frozen=True)
+class NoiseEstimate:
+    """What tracks tell of their noise.
+
+    Attributes:
+        noise: standard deviations.
+        relative_errors: standard deviation of each number's logarithm, by name, with `.x`, `.y`, `.z` where there is
+            one per axis, from the scatter of the score from track to track.
+        coefficient_factor: spread of coefficients from track to track, as a multiple of the settings'.
+        settings: with that noise.
+        held_before: share of forecast coordinates inside their 90 % intervals with the settings given.
+        held: the same with this noise.
+        tracks: number of tracks that were used.
+        starts: number of moments that forecasts were made from.
+    """
+
+    noise: TrackNoise
+    relative_errors: dict[str, float]
+    coefficient_factor: float
+    settings: Settings
+    held_before: float
+    held: float
+    tracks: int
+    starts: int
+
+
+def estimate_noise(
+    model: BallModel,
+    surfaces: Surfaces,
+    settings: Settings,
+    tracks: Iterable[Track],
+    *,
+    position_known: bool = False,
+    errors: bool = True,
+    watch: Watch = unwatched,
+) -> NoiseEstimate | None:
+    """The noise that makes forecasts 20 to 300 ms ahead within the tracks most probable.
+
+    Every track is estimated once and linearised about the estimate; trying a noise is then a Kalman filter. The model
+    is not changed: what it lacks counts as noise.
+
+    Args:
+        model: the ball, and how it is measured.
+        surfaces: what it may bounce on.
+        settings: prior medians of all numbers.
+        tracks: measured positions; each contributes its first part (`LONGEST_PART`).
+        position_known: whether the settings' white noise of positions stays as it is.
+        errors: whether to compute error bars, which doubles the time.
+        watch: told of each track, and of each step of the search.
+    Returns: None where no track is long enough.
+    """
+    parts = [part for track in tracks if len(part := _first_part(track)) >= LEAST_SAMPLES]
+    own_sigmas = any(part.sigmas is not None for part in parts)
+    plain = replace(settings, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0)
+    if not model.measures_plainly:  # of measured positions as they happened
+        inverse = InvertMeasurement(Smoother, model, surfaces, plain)
+        parts, model = [inverse.undo(part).track for part in parts], plainly_measured(model)
+    linear = linearise(Smoother(model, surfaces, plain), parts, watch)
+    if linear is None:
+        return None
+    forecaster = _forecaster(linear, parts, settings)
+    if not len(forecaster.starts):
+        return None
+    parameters = parameters_of(settings, linear, position_known or own_sigmas)
+    search = _Search(forecaster, parameters, settings)
+    watched = watch(range(2 * MOST_ITERATIONS), 2 * MOST_ITERATIONS, "steps of the noise")
+    with closing(step for step in watched) as steps:
+        logs = search.minimised(lambda: next(steps, None))
+    found = track_noise(parameters, logs, settings)
+    return NoiseEstimate(
+        noise=found,
+        relative_errors=search.errors(logs) if errors else {},
+        coefficient_factor=float(np.exp(logs[-1])) if parameters[-1].name == COEFFICIENTS else 1.0,
+        settings=with_noise(settings, found),
+        held_before=search.held(search.start),
+        held=search.held(logs),
+        tracks=len(linear),
+        starts=len(forecaster.starts),
+    )
+
+
+def spread_over(tracks: Iterable[Track], count: int, most: int = MOST_TRACKS) -> list[Track]:
+    """Up to `most` tracks, evenly from the first `count` of a stream."""
+    chosen = set(np.linspace(0, count - 1, min(most, count)).round().astype(int).tolist()) if count else set()
+    found = []
+    for number, track in enumerate(tracks):
+        if number in chosen:
+            found.append(track)
+        if number + 1 >= count:
+            break
+    return found
+
+
+def _first_part(track: Track) -> Track:
+    return track.until(float(track.times[0]) + LONGEST_PART) if track.duration > LONGEST_PART else track
+
+
+def _forecaster(linear: LinearTracks, parts: Sequence[Track], settings: Settings) -> Forecaster:
+    """Forecasts that start where a robot would use them, or earlier in tracks that are too short for that."""
+    typical = float(np.median([part.duration for part in parts]))
+    return Forecaster(
+        linear,
+        settings.velocity_prior,
+        earliest=min(EARLIEST_START, EARLIEST_SHARE * typical),
+        every=min(START_EVERY, EVERY_SHARE * typical),
+    )
+
+
+class _Search:
+    """The minimisation of the score, with the prior of each number, over their logarithms."""
+
+    def __init__(self, forecaster: Forecaster, parameters: list[Parameter], settings: Settings) -> None:
+        self.forecaster, self.parameters, self.settings = forecaster, parameters, settings
+        self.low = np.log([p.low for p in parameters])
+        self.high = np.log([p.high for p in parameters])
+        self.start = np.clip(np.log([p.start for p in parameters]), self.low, self.high)
+        self.spread = np.array([p.spread for p in parameters])
+        self.weight = float(len(forecaster.starts))
+
+    def value(self, logs: Array) -> tuple[float, Array]:
+        """Negative log posterior and its gradient (k,); every start counts as one observation."""
+        leaf = torch.tensor(logs, dtype=torch.float64, requires_grad=True)
+        score = self.forecaster.score(tensors_of(self.parameters, leaf, self.settings)).value
+        (gradient,) = torch.autograd.grad(score, leaf)
+        away = (logs - self.start) / self.spread
+        value = self.weight * float(score.detach()) + 0.5 * float(away @ away)
+        return value, self.weight * gradient.numpy() + away / self.spread
+
+    def minimised(self, tick: Callable[[], object]) -> Array:
+        """(k,) logarithms at the minimum."""
+
+        def told(logs: Array) -> tuple[float, Array]:
+            tick()
+            return self.value(logs)
+
+        bounds = list(zip(self.low, self.high, strict=True))
+        options = {"maxiter": MOST_ITERATIONS, "maxfun": 2 * MOST_ITERATIONS, "ftol": 1e-5}
+        found = minimize(told, self.start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
+        return np.asarray(found.x)
+
+    def errors(self, logs: Array) -> dict[str, float]:
+        """Standard deviations of the logarithms: tracks are independent, forecasts within a track are not.
+
+        With H the Hessian of the objective, G the sum over tracks of the squares of their gradients and P the precision
+        of the prior, the covariance is H^-1 (G + P) H^-1 (P. J. Huber 1967; clusters: K.-Y. Liang, S. L. Zeger 1986).
+        """
+        size = len(logs)
+        hessian = np.empty((size, size))
+        for k in range(size):
+            step = np.zeros(size)
+            step[k] = DIFFERENCE
+            hessian[k] = (self.value(logs + step)[1] - self.value(logs - step)[1]) / (2.0 * DIFFERENCE)
+        values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T))
+        least = 1.0 / self.spread.max() ** 2  # where the score bends downwards the prior alone is what is known
+        inverse = (vectors / np.maximum(values, least)) @ vectors.T
+        covariance = inverse @ (self._scatter(logs) + np.diag(self.spread**-2)) @ inverse
+        names = [p.name if p.axis is None else f"{p.name}.{'xyz'[p.axis]}" for p in self.parameters]
+        return dict(zip(names, np.sqrt(np.diagonal(covariance)).tolist(), strict=True))
+
+    def _scatter(self, logs: Array) -> Array:
+        """(k, k) sum over tracks of the squares of their gradients about the mean."""
+        leaf = torch.tensor(logs, dtype=torch.float64, requires_grad=True)
+        by_track = self.weight * self.forecaster.score(tensors_of(self.parameters, leaf, self.settings)).by_track
+        gradients = np.stack(
+            [torch.autograd.grad(one, leaf, retain_graph=True)[0].numpy() for one in by_track.unbind()]
+        )
+        count, away = len(gradients), gradients - gradients.mean(axis=0)
+        return np.asarray(away.T @ away * count / max(count - 1, 1))
+
+    def held(self, logs: Array) -> float:
+        """Share of forecast coordinates inside their 90 % intervals."""
+        with torch.no_grad():
+            noise = tensors_of(self.parameters, torch.from_numpy(np.asarray(logs, dtype=np.float64)), self.settings)
+            return self.forecaster.score(noise).held

@@ -1,0 +1,146 @@
+"""The numbers of the noise that tracks tell, as a vector of logarithms with a prior, and back to settings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ballfg.arrays import Array
+from ballfg.estimation.noise.forecasts import Noise
+from ballfg.estimation.noise.linear_tracks import LinearTracks
+from ballfg.estimation.settings import Settings
+from ballfg.factors.noise import PROCESS_NOISE
+from ballfg.tracks import TrackNoise
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One number of the noise.
+
+    Attributes:
+        name: a field of `TrackNoise`.
+        axis: 0, 1, 2 for x, y, z; None where there is one number for all.
+        start: its prior median, in its own unit.
+        spread: standard deviation of its logarithm beforehand.
+        low, high: limits, in its own unit.
+    """
+
+    name: str
+    axis: int | None
+    start: float
+    spread: float
+    low: float
+    high: float
+
+
+FACTOR_FOUR: Final = 1.4
+"""Standard deviation of a logarithm of which nothing but the order of magnitude is known."""
+FACTOR_TWO: Final = 0.7
+"""The same where it is known to a factor of two or so."""
+MEMORY_SHARE: Final = 0.4
+"""Prior median of the part with a memory, as a share of the white part."""
+USUAL_JITTER: Final = 1e-4
+"""s. Stamps of a driver are good to a tenth of a millisecond, arrival times to one."""
+COEFFICIENTS: Final = "coefficients"
+
+
+def parameters_of(settings: Settings, tracks: LinearTracks, position_known: bool) -> list[Parameter]:
+    """The numbers that some tracks can tell.
+
+    Args:
+        settings: prior medians.
+        tracks: that are asked; without labels, balls without a label, or bounces they do not tell of these.
+        position_known: whether the white noise of positions is stated, and stays.
+    """
+    process, found = settings.process, []
+    white = settings.position_scale * np.array(settings.position_noise)
+    for axis in range(3):
+        if not position_known:
+            found.append(Parameter("position", axis, white[axis], FACTOR_FOUR, 1e-5, 0.1))
+    for axis in range(3):
+        memory = settings.memory[axis] or MEMORY_SHARE * white[axis]
+        found.append(Parameter("memory", axis, memory, FACTOR_FOUR, 1e-5, 0.1))
+    found.append(Parameter("memory_time", None, settings.memory_time, FACTOR_FOUR, 0.002, 0.5))
+    found.append(Parameter("stamp_jitter", None, settings.stamp_jitter or USUAL_JITTER, FACTOR_FOUR, 1e-6, 0.01))
+    found.append(Parameter("acceleration", None, process.acceleration, FACTOR_FOUR, 0.003, 10.0))
+    if bool((tracks.kicks[:, :, PROCESS_NOISE.index("contact_velocity")] != 0.0).any()):
+        tangential = process.contact_tangential or process.contact_velocity
+        found.append(Parameter("contact_velocity", None, process.contact_velocity, FACTOR_FOUR, 1e-3, 2.0))
+        found.append(Parameter("contact_tangential", None, tangential, FACTOR_FOUR, 1e-3, 3.0))
+        found.append(Parameter("contact_spin", None, process.contact_spin, FACTOR_FOUR, 0.5, 300.0))
+    if bool(tracks.labelled.any()):
+        label = settings.spin_label_noise if settings.launcher is None else settings.launcher.sigma
+        found.append(Parameter("spin_label", None, label, FACTOR_FOUR, 1.0, 300.0))
+    if not bool(tracks.labelled.all()):
+        found.append(Parameter("spin_prior", None, settings.spin_prior, FACTOR_FOUR, 3.0, 500.0))
+    if settings.coefficients:
+        found.append(Parameter(COEFFICIENTS, None, 1.0, FACTOR_TWO, 0.03, 5.0))
+    return found
+
+
+def tensors_of(parameters: list[Parameter], logs: Tensor, settings: Settings) -> Noise:
+    """The noise that a vector of logarithms (k,) stands for; what is not among the parameters is the settings'."""
+    values = {(p.name, p.axis): torch.exp(log) for p, log in zip(parameters, logs, strict=True)}
+
+    def one(name: str, otherwise: float) -> Tensor:
+        return values.get((name, None), torch.tensor(otherwise, dtype=torch.float64))
+
+    white = settings.position_scale * np.array(settings.position_noise)
+    scales = [values.get(("position", a), torch.tensor(white[a], dtype=torch.float64)) / white[a] for a in range(3)]
+    memory = [values[("memory", a)] for a in range(3)]
+    process = [one(name, getattr(settings.process, name)) for name in PROCESS_NOISE]
+    return Noise(
+        position=torch.stack(scales),
+        memory=torch.stack(memory),
+        memory_time=one("memory_time", settings.memory_time),
+        stamp_jitter=one("stamp_jitter", settings.stamp_jitter),
+        process=torch.stack(process),
+        spin_label=one("spin_label", settings.spin_label_noise),
+        spin_prior=one("spin_prior", settings.spin_prior),
+        coefficients=one(COEFFICIENTS, 1.0),
+    )
+
+
+def track_noise(parameters: list[Parameter], logs: Array, settings: Settings) -> TrackNoise:
+    """The noise of a vector of logarithms (k,), as a file states it."""
+    values: dict[str, object] = {}
+    for name in dict.fromkeys(p.name for p in parameters):
+        numbers = [float(np.exp(log)) for p, log in zip(parameters, logs, strict=True) if p.name == name]
+        values[name] = tuple(numbers) if len(numbers) == 3 else numbers[0]
+    factor = values.pop(COEFFICIENTS, 1.0)
+    assert isinstance(factor, float)
+    spreads = {name: factor * sigma for name, sigma in settings.coefficients.items()}
+    return TrackNoise(**values, coefficients=spreads)  # type: ignore[arg-type]
+
+
+def with_noise(settings: Settings, noise: TrackNoise) -> Settings:
+    """Settings with all that is known of the noise.
+
+    Spreads of coefficients replace those of the settings for coefficients that are estimated with each track; where the
+    settings estimate none, all that the noise names are.
+    """
+    own: dict[str, Any] = {
+        "position_noise": noise.position,
+        "memory": noise.memory,
+        "memory_time": noise.memory_time,
+        "stamp_jitter": noise.stamp_jitter,
+        "spin_label_noise": noise.spin_label,
+        "spin_prior": noise.spin_prior,
+    }
+    process = {name: value for name in PROCESS_NOISE if (value := getattr(noise, name, None)) is not None}
+    coefficients = {name: noise.coefficients.get(name, sigma) for name, sigma in settings.coefficients.items()}
+    launcher = settings.launcher
+    if launcher is not None and noise.spin_label is not None:
+        launcher = replace(launcher, sigma=noise.spin_label)
+    return replace(
+        settings,
+        **{name: value for name, value in own.items() if value is not None},
+        position_scale=settings.position_scale if noise.position is None else 1.0,
+        launcher=launcher,
+        process=replace(settings.process, **process),
+        coefficients=coefficients or dict(noise.coefficients),
+    )

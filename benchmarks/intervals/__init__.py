@@ -1,0 +1,1 @@
+"""Do prediction intervals hold what they promise?"""

@@ -1,0 +1,118 @@
+"""Coverage of 90 % intervals on measured datasets, and on simulated ones whose trackers have a memory and jitter."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+import numpy as np
+
+from ballfg.benchmarks.intervals.protocol import METHODS, OTHER_TRACKS, USUAL, Judged, judged_both_ways
+from ballfg.benchmarks.metrics import inside
+from ballfg.benchmarks.results import Results
+from ballfg.dynamics import load_model, nominal_model
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation import dataset_settings, dataset_surfaces
+from ballfg.progress import progress
+from ballfg.simulation import MeasurementNoise, SimulationConfig, write_simulation
+from ballfg.tracks import Dataset, read_dataset
+
+LEVEL: Final = 0.9
+RATES: Final = (60.0, 90.0, 120.0, 180.0, 240.0)
+MEMORY_TIMES: Final = (0.0, 0.005, 0.01, 0.02, 0.03)
+JITTERS: Final = (0.0, 0.0005, 0.001, 0.002)
+MOST_JITTER: Final = 0.15
+"""Share of a frame; the simulator refuses more, because stamps would change places."""
+DROPS: Final = (0.0, 0.05, 0.2)
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How much is run: number of simulated settings, and tracks in each."""
+
+    settings: int
+    tracks: int
+
+
+FULL: Final = Plan(settings=20, tracks=50)
+QUICK: Final = Plan(settings=2, tracks=16)
+
+
+def run_intervals(
+    results: Results, datasets: Sequence[Dataset], plan: Plan, jobs: int, first: int | None = None
+) -> None:
+    """Rows for measured datasets, or for simulated ones where there are none.
+
+    Args: first: how many tracks of a measured dataset are used, the first ones; None for all.
+    """
+    if datasets:
+        work = [(dataset, method) for dataset in datasets for method in METHODS]
+        for dataset, method in progress(work, len(work), "sets judged"):
+            _measured(results, dataset, method, first, jobs)
+        return
+    for number in progress(range(plan.settings), plan.settings, "simulated settings judged"):
+        _simulated(results, number, plan.tracks, jobs)
+
+
+def _measured(results: Results, dataset: Dataset, method: str, first: int | None, jobs: int) -> None:
+    tracks = list(dataset)[:first]
+    model = nominal_model(dataset.ball)
+    # the table's ends are known only where they are stated: others would come from the predicted parts
+    surfaces = (
+        Surfaces.table_tennis(dataset.info.table_height)
+        if dataset.info.table_extent is None
+        else dataset_surfaces(dataset)
+    )
+    known = dataset.info.position_noise is not None
+    judged = judged_both_ways(method, model, surfaces, dataset_settings(dataset, model), tracks, jobs, known)
+    _add(results, dataset.info.name, method, judged)
+
+
+def _simulated(results: Results, number: int, tracks: int, jobs: int) -> None:
+    config = simulated_config(results.seed, number, tracks)
+    noise = config.noise
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "shots"
+        write_simulation(path, config)
+        dataset = read_dataset(path)
+        model = load_model(path / "model.yaml", radius=dataset.ball.radius)
+        settings, surfaces = dataset_settings(dataset, model), dataset_surfaces(dataset)
+        case = (
+            f"{config.rate:g} Hz, {1e3 * noise.position:.1f} mm, memory {1e3 * noise.memory:.1f} mm "
+            f"{1e3 * noise.memory_time:g} ms, jitter {1e3 * noise.jitter:.2f} ms, {100 * noise.dropout:g} % dropped"
+            f"{', labels' if config.spin_labels else ''}"
+        )
+        for method in (USUAL, OTHER_TRACKS):
+            judged = judged_both_ways(method, model, surfaces, settings, list(dataset), jobs, position_known=True)
+            _add(results, case, method, judged)
+
+
+def simulated_config(seed: int, number: int, tracks: int) -> SimulationConfig:
+    """One of the simulated settings: rate, noise, memory, jitter, drops and labels drawn by its number."""
+    rng = np.random.default_rng([seed, number])
+    rate, memory_time = float(rng.choice(RATES)), float(rng.choice(MEMORY_TIMES))
+    noise = MeasurementNoise(
+        position=float(rng.uniform(0.001, 0.006)),
+        dropout=float(rng.choice(DROPS)),
+        jitter=min(float(rng.choice(JITTERS)), MOST_JITTER / rate),
+        memory=float(rng.uniform(0.001, 0.004)) if memory_time else 0.0,
+        memory_time=memory_time or 0.015,
+    )
+    return SimulationConfig(
+        tracks=tracks, rate=rate, seed=seed + number, noise=noise, spin_labels=bool(rng.integers(2))
+    )
+
+
+def _add(results: Results, case: str, method: str, judged: Judged) -> None:
+    held = inside(judged.errors, judged.sigmas, LEVEL)
+    rmse = judged.rmse_by_track()
+    count = len(rmse)
+    results.add(case, method, "coverage_90", "%", 100.0 * float(held.mean()), count)
+    for axis, share in zip("xyz", held.mean(axis=0).tolist(), strict=True):
+        results.add(case, method, f"coverage_90_{axis}", "%", 100.0 * share, count)
+    results.add(case, method, "nis_median", "1", float(np.median(judged.nis)), count)
+    results.add(case, method, "prediction_rmse_median", "mm", 1e3 * float(np.median(rmse)), count)
+    results.add(case, method, "failed", "1", judged.failed, count)

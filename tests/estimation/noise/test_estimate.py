@@ -1,0 +1,85 @@
+"""The noise that tracks show: planted numbers come back, and intervals with them hold what they promise."""
+
+import numpy as np
+import pytest
+
+from ballfg.dynamics import load_model
+from ballfg.estimation import (
+    Smoother,
+    dataset_settings,
+    dataset_surfaces,
+    estimate_noise,
+    predict_tracks,
+    spread_over,
+)
+from ballfg.simulation import MeasurementNoise, MotionNoise, SimulationConfig, parse_effects, write_simulation
+from ballfg.tracks import read_dataset
+
+
+def held(model, surfaces, settings, tracks):
+    """Share of predicted coordinates inside their 90 % intervals, 0.3 s after 0.25 s are seen."""
+    smoother = Smoother(model, surfaces, settings)
+    found = list(predict_tracks(smoother, tracks, len(tracks), 0.25, horizon=0.3))
+    errors = np.concatenate([(p.measured - p.positions) / p.sigmas for p in found])
+    return float((np.abs(errors) < 1.645).mean())
+
+
+@pytest.fixture(scope="module")
+def lasting(recorded):
+    """A tracker with a memory: 3 mm of lasting errors, 15 ms long, beside 1.5 mm of white ones."""
+    return recorded(MeasurementNoise(position=0.0015, memory=0.003, memory_time=0.015), tracks=40)
+
+
+@pytest.fixture(scope="module")
+def found(lasting):
+    model, surfaces, settings, tracks = lasting
+    return estimate_noise(model, surfaces, settings, spread_over(tracks[1::2], 20), position_known=True)
+
+
+def test_planted_memory_comes_back(found):
+    noise = found.noise
+    assert np.sqrt(np.mean(np.square(noise.memory))) == pytest.approx(0.003, rel=0.15)
+    assert 0.0075 < noise.memory_time < 0.03  # forecasts hardly tell how long it lasts
+    assert noise.stamp_jitter < 4e-4  # there is none; 4e-4 s along the flight are as large as the white errors
+    assert noise.acceleration < 0.03  # the motion is exact
+
+
+def test_error_bars_are_of_the_size_of_the_errors(found):
+    for axis, value in zip("xyz", found.noise.memory, strict=True):
+        assert abs(np.log(value / 0.003)) < 3.0 * found.relative_errors[f"memory.{axis}"]
+
+
+def test_intervals_hold_with_it_on_other_tracks(lasting, found):
+    model, surfaces, settings, tracks = lasting
+    others = tracks[0::2]
+    assert 0.84 < held(model, surfaces, found.settings, others) < 0.95
+    plain = held(model, surfaces, settings, others)
+    assert abs(plain - 0.9) > abs(held(model, surfaces, found.settings, others) - 0.9)
+
+
+def test_planted_acceleration_comes_back(recorded):
+    process = MotionNoise(acceleration=0.5)
+    model, surfaces, settings, tracks = recorded(MeasurementNoise(position=0.002), process, tracks=20)
+    found = estimate_noise(model, surfaces, settings, tracks, position_known=True, errors=False)
+    assert found.noise.acceleration == pytest.approx(0.5, rel=0.25)
+
+
+def test_nothing_to_tell(recorded):
+    model, surfaces, settings, tracks = recorded(MeasurementNoise(position=0.002), tracks=2)
+    short = [track.until(float(track.times[0]) + 0.03) for track in tracks]
+    assert estimate_noise(model, surfaces, settings, short) is None
+
+
+def test_measurement_effects_are_undone_first(tmp_path):
+    """A tracker that lags by 5 ms is no noise to a model that says so."""
+    config = SimulationConfig(8, 100.0, seed=3, undeclared=parse_effects(["velocity_lag.lag=0.005"]))
+    write_simulation(tmp_path / "shots", config)
+    dataset = read_dataset(tmp_path / "shots")
+    text = (tmp_path / "shots" / "model.yaml").read_text()
+    text = text.replace("measurement: {}", "measurement: {velocity_lag: {lag: 0.005}}")
+    (tmp_path / "lagging.yaml").write_text(text)
+    model = load_model(tmp_path / "lagging.yaml")
+    settings = dataset_settings(dataset, model)
+    found = estimate_noise(model, dataset_surfaces(dataset), settings, dataset, position_known=True, errors=False)
+    assert found.noise.acceleration < 0.03
+    assert 0.84 < found.held < 0.96

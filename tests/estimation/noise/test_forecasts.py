@@ -1,0 +1,134 @@
+"""Forecasts of linearised tracks against a dense Gaussian, the estimators' own predictions, and differences."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ballfg.estimation import Smoother, predict_tracks
+from ballfg.estimation.noise.forecasts import HORIZONS, ROUNDING, Forecaster
+from ballfg.estimation.noise.linear_tracks import linearise
+from ballfg.estimation.noise.parameters import parameters_of, tensors_of
+from ballfg.simulation import MeasurementNoise
+from ballfg.state import POSITION, STATE_DIM
+
+
+@pytest.fixture(scope="module")
+def case(recorded):
+    model, surfaces, settings, tracks = recorded(MeasurementNoise(position=0.003, memory=0.002), tracks=3)
+    tracks = [track.until(float(track.times[0]) + 0.7) for track in tracks]
+    linear = linearise(Smoother(model, surfaces, settings), tracks)
+    return model, surfaces, settings, tracks, linear, Forecaster(linear, settings.velocity_prior)
+
+
+def noise_of(settings, linear, shift=0.0):
+    parameters = parameters_of(settings, linear, position_known=False)
+    return tensors_of(parameters, torch.tensor([np.log(p.start) + shift for p in parameters]), settings)
+
+
+def dense(linear, forecaster, noise, track):
+    """Mean (3 n,) and covariance of all measured positions of a track, as deviations, from the joint Gaussian."""
+    n, own, width = linear.times.shape[1], forecaster.own, forecaster.width
+    transitions, gathered = (x[track].numpy() for x in forecaster._motion(noise))
+    prior = linear.prior_variances(noise.spin_prior, noise.spin_label, noise.coefficients, forecaster.velocity_prior)
+    mean, cov = np.zeros(n * width), np.zeros((n * width, n * width))
+    mean[:own] = linear.starts[track]
+    cov[:width, :width] = np.diag(np.concatenate((prior[track].numpy(), noise.memory.numpy() ** 2)))
+    for k in range(1, n):
+        now, last = slice(k * width, (k + 1) * width), slice((k - 1) * width, k * width)
+        step = transitions[k - 1]
+        mean[now] = step @ mean[last]
+        mean[k * width : k * width + own] += linear.departures[track, k - 1].numpy()
+        cov[now, : k * width] = step @ cov[last, : k * width]
+        cov[: k * width, now] = cov[now, : k * width].T
+        cov[now, now] = step @ cov[last, last] @ step.T + gathered[k - 1]
+    observe = np.kron(np.eye(n), forecaster.measure.numpy())
+    spread = observe @ cov @ observe.T
+    for k in range(n):
+        spread[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += forecaster._measurement(noise)[track, k].numpy()
+    return observe @ mean, spread
+
+
+def test_score_is_that_of_the_joint_gaussian(case):
+    *_, settings, _, linear, forecaster = case
+    noise = noise_of(settings, linear)
+    total, count = 0.0, 0
+    horizons = np.array(HORIZONS)
+    for track in range(len(linear)):
+        mean, cov = dense(linear, forecaster, noise, track)
+        times, used, errors = (x[track].numpy() for x in (linear.times, linear.used, linear.errors))
+        for start in forecaster.starts[forecaster.starts[:, 0] == track, 1].tolist():
+            seen = np.flatnonzero(np.repeat(used[: start + 1], 3))
+            ahead = {
+                int(np.flatnonzero(used & (times >= times[start] + h - ROUNDING))[0])
+                for h in horizons
+                if (used & (times >= times[start] + h - ROUNDING)).any()
+            } - {start}
+            gain = np.linalg.solve(cov[np.ix_(seen, seen)], cov[seen]).T
+            known = mean + gain @ (errors.reshape(-1)[seen] - mean[seen])
+            left = np.diag(cov - gain @ cov[seen])
+            for k in ahead:
+                rows = slice(3 * k, 3 * k + 3)
+                z = np.abs(errors[k] - known[rows]) / np.sqrt(left[rows])
+                loss = np.where(z < 3.0, z**2 / 2, 3 * z - 4.5)
+                total, count = total + float((loss + 0.5 * np.log(left[rows])).sum()), count + 1
+    transitions, gathered = forecaster._motion(noise)
+    measured = forecaster._measurement(noise)
+    means, covariances, _, _ = forecaster._filter(noise, transitions, gathered, measured)
+    own, _, scored = forecaster._forecast(means, covariances, transitions, gathered, measured)
+    assert scored == count
+    np.testing.assert_allclose(float(own.sum()) / scored, total / count, rtol=1e-6)
+
+
+def test_gradient_is_that_of_differences(case):
+    *_, settings, _, linear, forecaster = case
+    parameters = parameters_of(settings, linear, position_known=False)
+    logs = torch.tensor([np.log(p.start) for p in parameters], requires_grad=True)
+    (gradient,) = torch.autograd.grad(forecaster.score(tensors_of(parameters, logs, settings)).value, logs)
+    for k in range(len(parameters)):
+        step = torch.zeros(len(parameters), dtype=torch.float64)
+        step[k] = 1e-5
+        up, down = (
+            float(forecaster.score(tensors_of(parameters, logs.detach() + s * step, settings)).value) for s in (1, -1)
+        )
+        assert float(gradient[k]) == pytest.approx((up - down) / 2e-5, rel=1e-4, abs=1e-8)
+
+
+def test_forecast_has_the_sigmas_of_a_prediction(case):
+    """What the linear filter says 0.2 s ahead, the smoother of the seen part and the propagator say too."""
+    model, surfaces, settings, tracks, linear, forecaster = case
+    noise = noise_of(settings, linear)
+    parameters = parameters_of(settings, linear, position_known=False)
+    own = replace(
+        settings,
+        memory=tuple(noise.memory.tolist()),
+        memory_time=float(noise.memory_time),
+        stamp_jitter=float(noise.stamp_jitter),
+        find_events=False,
+    )
+    assert {p.name for p in parameters} >= {"position", "memory", "acceleration"}
+    transitions, gathered = forecaster._motion(noise)
+    measured = forecaster._measurement(noise)
+    _, covariances, _, _ = forecaster._filter(noise, transitions, gathered, measured)
+    for track in range(len(tracks)):
+        start = int(np.searchsorted(linear.times[track].numpy(), 0.25))
+        end = int(np.searchsorted(linear.times[track].numpy(), 0.35))
+        covariance = covariances[track, start]
+        for k in range(start, end):
+            covariance = transitions[track, k] @ covariance @ transitions[track, k].T + gathered[track, k]
+        spread = forecaster.measure @ covariance @ forecaster.measure.T + measured[track, end]
+        seen = float(linear.times[track, start]) + 1e-6
+        (prediction,) = predict_tracks(Smoother(model, surfaces, own), [tracks[track]], 1, seen)
+        if prediction.estimate.contacts:
+            continue  # the seen part moves its contact; the linear filter keeps that of the whole track
+        np.testing.assert_allclose(spread.diagonal().sqrt().numpy(), prediction.sigmas[end - start - 1], rtol=0.06)
+
+
+def test_linear_tracks_follow_the_smoother(case):
+    *_, tracks, linear, _ = case
+    assert len(linear) == len(tracks)
+    assert linear.transitions.shape[-1] == STATE_DIM + len(linear.coefficient_sigmas)
+    assert float(linear.errors.abs()[linear.used].max()) < 0.02
+    steps = linear.transitions[:, :, POSITION, POSITION].diagonal(dim1=-2, dim2=-1)
+    assert float((steps[..., :2] - 1.0).abs().max()) < 0.01  # a bounce turns z alone
