@@ -51,9 +51,11 @@ POSITIONS = {
     "frame_tilt": "frame_tilt.x=0.01",
     "scale": "scale.z=0.01",
     "radial_bias": "radial_bias.offset=0.005",
+    "distortion": "distortion.k=0.005",
 }
 STAMPS_AND_LABELS = {
     "time_scale": "time_scale.s=0.01",
+    "counted_frames": "counted_frames.missing=0.25",
     "spin_label_scale": "spin_label_scale.s=0.1",
     "spin_label_offset": "spin_label_offset.x=10",
     "spin_label_frame": "spin_label_frame.yy=-1",
@@ -108,7 +110,7 @@ def test_measurement_effects_leave_the_truth_alone(name: str, plain: list[Simula
 
 
 def test_stamps_and_labels_are_written_as_the_effects_say(plain: list[SimulatedTrack]) -> None:
-    texts = (*STAMPS_AND_LABELS.values(), "spin_label_frame.xx=2")
+    texts = (*(t for n, t in STAMPS_AND_LABELS.items() if n != "counted_frames"), "spin_label_frame.xx=2")
     (scale,) = parse_effects([STAMPS_AND_LABELS["time_scale"]])
     model = true_model(nominal_model(), [scale])
     for changed, old in zip(run(*texts), plain, strict=True):
