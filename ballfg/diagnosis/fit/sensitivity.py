@@ -3,8 +3,9 @@
 Derivatives are torch's forward mode: the batch is repeated once per direction, with a dual number in that direction.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import torch
@@ -15,8 +16,9 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.fit.dual import dual_level, make_dual
 from ballfg.diagnosis.fit.shooting import Trajectories, shoot
 from ballfg.diagnosis.fit.stretches import Stretches
+from ballfg.diagnosis.fit.tangents import RepeatedMotion
 from ballfg.dynamics import BallModel, substitute
-from ballfg.state import SPIN, STATE_DIM
+from ballfg.state import POSITION, SPIN, STATE_DIM
 
 MOST_ROWS = 3000
 """Rows of one forward pass. More rows take several passes; a row needs some 50 kB of memory."""
@@ -113,10 +115,26 @@ def _derivatives(
             primals[name][rows] = value
     with dual_level():
         columns = {name: make_dual(primals[name], tangents[name]) for name in values}
-        dual = make_dual(state, state_tangent)
-        measured = _measured(substitute(model, columns), repeated, dual)[:2]
-        moved, relabelled = (_tangent(part).numpy().reshape(d, n, *part.shape[1:]) for part in measured)
-    return Sensitivity(np.moveaxis(moved, 0, -1), np.moveaxis(relabelled, 0, -1))
+        positions, labels = _moved(substitute(model, columns), repeated, make_dual(state, state_tangent), d)
+    return Sensitivity(positions, labels)
+
+
+def _moved(model: BallModel, stretches: Stretches, starts: Tensor, directions: int) -> tuple[Array, Array]:
+    """Derivatives (n, k, 3, d) of measured positions and (n, 3, d) of labels; stretches repeated for d directions."""
+    times = _true_times(model, stretches)
+    motion = shoot(model, starts, stretches.heights, stretches.contacts, times[-1].detach())
+    repeated = RepeatedMotion(motion, directions, positions_only=model.measures_plainly)
+    if model.measures_plainly:
+        positions = repeated.states(times)[1][:, :, POSITION].numpy()
+    else:
+        measured = model.measured(repeated.dual_states(times), partial(_later, repeated.dual_states, times))
+        positions = _by_direction(_tangent(measured).transpose(0, 1), directions)
+    return positions, _by_direction(_tangent(model.labelled(starts[:, SPIN])), directions)
+
+
+def _by_direction(tangent: Tensor, directions: int) -> Array:
+    """(n, ..., d) of (d n, ...)."""
+    return np.moveaxis(tangent.numpy().reshape(directions, -1, *tangent.shape[1:]), 0, -1)
 
 
 def _tangent(dual: Tensor) -> Tensor:
@@ -124,15 +142,20 @@ def _tangent(dual: Tensor) -> Tensor:
     return torch.zeros_like(dual) if tangent is None else tangent
 
 
+def _true_times(model: BallModel, stretches: Stretches) -> Tensor:
+    """(k, r) s of true time, of the samples."""
+    # stamps run along the first axis: a coefficient of shape (r, 1) then goes with (k, r, 1)
+    return model.true_stamps(stretches.times.T.unsqueeze(-1)).squeeze(-1)
+
+
+def _later(states: Callable[[Tensor], Tensor], times: Tensor, delay: Tensor | float) -> Tensor:
+    shift = delay.squeeze(-1) if isinstance(delay, Tensor) and delay.dim() else delay
+    return states(times + shift)
+
+
 def _measured(model: BallModel, stretches: Stretches, starts: Tensor) -> tuple[Tensor, Tensor, Trajectories]:
     """Positions (r, k, 3) and labels (r, 3) as they are measured, and the motion behind them."""
-    # stamps run along the first axis: a coefficient of shape (r, 1) then goes with (k, r, 1)
-    times = model.true_stamps(stretches.times.T.unsqueeze(-1)).squeeze(-1)
-    motion = shoot(model, starts, stretches.heights, stretches.contacts, times[-1].detach())
-
-    def later(delay: Tensor | float) -> Tensor:
-        shift = delay.squeeze(-1) if isinstance(delay, Tensor) and delay.dim() else delay
-        return motion.states(times + shift)
-
-    positions = model.measured(motion.states(times), later)
+    times = _true_times(model, stretches)
+    motion = shoot(model, starts, stretches.heights, stretches.contacts, times[-1])
+    positions = model.measured(motion.states(times), partial(_later, motion.states, times))
     return positions.transpose(0, 1), model.labelled(starts[:, SPIN]), motion
