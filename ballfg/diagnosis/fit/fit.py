@@ -130,11 +130,13 @@ def _moved(now: Fit, system: System, damping: float) -> Fit:
     q, precision = len(problem.free), problem.common_precision
     values = np.array([unknowns.values[name] for name in problem.free])
     pull = precision * np.concatenate((problem.centres - values, -unknowns.launcher.ravel()))
-    eliminated = system.eliminated(damping)
-    step = eliminated.common_step(precision, pull, damping) if problem.shared else np.zeros_like(pull)
     low, high = (np.array([getattr(c, end) for c in problem.free.values()]) for end in ("low", "high"))
-    moved = np.clip(values + step[:q], low, high)
-    starts = unknowns.starts + eliminated.start_step(np.concatenate((moved - values, step[q:])))
+    endless = np.full(unknowns.launcher.size, np.inf)
+    limits = np.concatenate((low - values, -endless)), np.concatenate((high - values, endless))
+    eliminated = system.eliminated(damping)
+    step = eliminated.common_step(precision, pull, *limits, damping) if problem.shared else np.zeros_like(pull)
+    moved = np.clip(values + step[:q], low, high)  # rounding
+    starts = unknowns.starts + eliminated.start_step(step)
     launcher = unknowns.launcher + step[q:].reshape(-1, 3)
     named = dict(zip(problem.free, moved.tolist(), strict=True))
     return Fit.at(problem, Unknowns(starts, named, launcher), now.noise, now.steps)

@@ -25,15 +25,31 @@ class Eliminated:
     solved: Array
     gram: Array
 
-    def common_step(self, precision: Array, pull: Array, damping: float = 0.0) -> Array:
-        """(q,) step of the common unknowns.
+    def common_step(self, precision: Array, pull: Array, low: Array, high: Array, damping: float = 0.0) -> Array:
+        """(q,) best step of the common unknowns within limits.
 
-        Args: precision: (q,) of the priors.  pull: (q,) prior mean minus present value, times the precision.
+        An unknown whose step would pass its limit ends there, and the others are solved for beside it: a full step of
+        theirs would count on a move that does not happen.
+
+        Args:
+            precision: (q,) of the priors.
+            pull: (q,) prior mean minus present value, times the precision.
+            low, high: (q,) limits of the step.
+            damping: as in `System.eliminated`.
         """
         total = self.gram.sum(axis=0)
-        hessian = total[:-1, :-1] + np.diag(precision)
+        hessian, gradient = total[:-1, :-1] + np.diag(precision), total[:-1, -1] + pull
         hessian[np.diag_indices_from(hessian)] *= 1.0 + damping
-        return np.asarray(np.linalg.solve(hessian, total[:-1, -1] + pull))
+        free, step = np.ones(len(gradient), dtype=np.bool_), np.zeros(len(gradient))
+        while free.any():
+            left = gradient[free] - hessian[np.ix_(free, ~free)] @ step[~free]
+            step[free] = np.linalg.solve(hessian[np.ix_(free, free)], left)
+            outside = free & ((step < low) | (step > high))
+            if not outside.any():
+                break
+            step[outside] = np.clip(step, low, high)[outside]
+            free &= ~outside
+        return step
 
     def start_step(self, common: Array) -> Array:
         """(n, 9) step of the first states that goes with a step (q,) of the common unknowns."""

@@ -98,8 +98,8 @@ class _RepeatedArc:
         weights, slopes = _weights((place - index).unsqueeze(-1), self.step[:, None, None], still)
         shift = None
         if not still:
-            shift = -self.began[:, None, :] if self.began is not None else 0.0
-            shift = (shift if moved is None else moved + shift) / self.step[:, None, None]
+            began = torch.zeros(()) if self.began is None else self.began[:, None, :]
+            shift = ((0.0 if moved is None else moved) - began) / self.step[:, None, None]
         found = []
         for part in wanted:
             sources = self._sources(part)

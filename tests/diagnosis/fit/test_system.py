@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import lsq_linear
 
 from ballfg.diagnosis.fit.system import System, by_track
 from ballfg.diagnosis.search.signatures import Signatures
@@ -61,9 +62,31 @@ def test_the_step_is_that_of_the_dense_normal_equations(system, damping):
         shared = np.linalg.solve(schur, right[: Q + P] - across @ np.linalg.solve(own, right[Q + P :]))
         step = np.append(shared, np.linalg.solve(own, right[Q + P :] - across.T @ shared))
     eliminated = system.eliminated(damping)
-    shared = eliminated.common_step(precision, pull, damping)
+    endless = np.full(Q + P, np.inf)
+    shared = eliminated.common_step(precision, pull, -endless, endless, damping)
     np.testing.assert_allclose(shared, step[: Q + P], atol=1e-11)
     np.testing.assert_allclose(eliminated.start_step(shared).ravel(), step[Q + P :], atol=1e-11)
+
+
+def test_a_limited_step_is_the_best_one_within_its_limits(system):
+    """A bounded least squares over everything; where a limit is not met nothing changes."""
+    states, common, residual = stacked(system)
+    precision = np.append(PRECISION, [0.0, 0.0])
+    eliminated, endless = system.eliminated(), np.full(Q + P, np.inf)
+    pull = np.zeros(Q + P)
+    unlimited = eliminated.common_step(precision, pull, -endless, endless)
+    high = endless.copy()
+    high[0] = unlimited[0] - 0.5 * abs(unlimited[0])
+    priors = np.zeros((Q, Q + P + states.shape[1]))
+    priors[:, :Q] = np.diag(np.sqrt(PRECISION))
+    rows = np.concatenate((np.column_stack((common, states)), priors))
+    bounds = np.full(rows.shape[1], np.inf)
+    upper = bounds.copy()
+    upper[0] = high[0]
+    best = lsq_linear(rows, np.append(residual, np.zeros(Q)), (-bounds, upper), tol=1e-14).x
+    limited = eliminated.common_step(precision, pull, -endless, high)
+    np.testing.assert_allclose(limited, best[: Q + P], atol=1e-6)
+    assert limited[0] == high[0] and abs(limited[1:] - unlimited[1:]).max() > 1e-3
 
 
 def test_sums_over_the_stretches_of_each_track(system):
