@@ -5,7 +5,7 @@ from functools import partial
 
 import numpy as np
 
-from ballfg.diagnosis.fit.fit import values_of
+from ballfg.diagnosis.fit.fit import noise_by_axis, values_of
 from ballfg.diagnosis.fit.holdout import Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.remains.fallback import fallback
@@ -127,9 +127,8 @@ def _verdict(search: Search, tests: Sequence[GenericTest]) -> Verdict:
 
 def _noise(fit: Fit, holdout: Holdout) -> dict[str, Value]:
     """Position noise along each axis, as estimated and as the dataset states it or its scatter shows."""
-    stated, used = holdout.settings.position_noise, fit.problem.stretches.used.numpy()
-    count = float(used.sum())
+    stated, count = holdout.settings.position_noise, float(fit.problem.stretches.used.sum())
     return {
-        axis: Value(float(np.median(fit.sigmas[..., a][used])), float(stated[a] / np.sqrt(2.0 * count)), "m", stated[a])
-        for a, axis in enumerate("xyz")
+        axis: Value(shown, shown / np.sqrt(2.0 * count), "m", stated[a])
+        for a, (axis, shown) in enumerate(zip("xyz", noise_by_axis(fit).tolist(), strict=True))
     }

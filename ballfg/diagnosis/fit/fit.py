@@ -6,13 +6,13 @@ effects declare, so that those which the data cannot determine keep their declar
 """
 
 import copy
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
 
-from ballfg.arrays import Mask
+from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.fit.problem import Fit, Noise, Problem, Robust, Unknowns, declared_free
 from ballfg.diagnosis.fit.sensitivity import Predicted, predict
 from ballfg.diagnosis.fit.stretches import Stretches
@@ -89,12 +89,20 @@ def values_of(fit: Fit, names: Iterable[str], declared: Mapping[str, float]) -> 
 
     Args: names: those wanted.  declared: values that the model stated before the fit, for those that it did.
     """
-    total = fit.linearised().eliminated().gram.sum(axis=0)[:-1, :-1] + np.diag(fit.problem.common_precision)
-    sigmas = dict(zip(fit.problem.free, np.sqrt(np.diagonal(np.linalg.inv(total))).tolist(), strict=False))
+    names = list(names)
+    sigmas = dict(zip(names, np.sqrt(np.diagonal(covariance_of(fit, names))).tolist(), strict=True))
     units = fit.problem.model.declared_coefficients()
     return {
         name: Value(fit.unknowns.values[name], sigmas[name], units[name].unit, declared.get(name)) for name in names
     }
+
+
+def covariance_of(fit: Fit, names: Sequence[str]) -> Array:
+    """(p, p) covariance of fitted coefficients by the noise, everything else being free; names: p parameters."""
+    total = fit.linearised().eliminated().gram.sum(axis=0)[:-1, :-1] + np.diag(fit.problem.common_precision)
+    listed = list(fit.problem.free)
+    chosen = [listed.index(name) for name in names]
+    return np.asarray(np.linalg.inv(total)[np.ix_(chosen, chosen)])
 
 
 def _minimise(now: Fit) -> Fit:
@@ -164,12 +172,27 @@ def _followed_up(moved: Fit, system: System, weights: Robust) -> Fit:
 
 
 def _settled(result: Fit) -> Noise:
-    """Noise from the residuals: median absolute deviation per axis, with the degrees of freedom that states took."""
+    """Noise from the residuals: their median absolute deviation, with the degrees of freedom that states took.
+
+    One scale for all axes: what a model lacks often acts along one of them. With a scale for each, that axis would
+    count as noisy and hide it.
+    """
+    position = result.noise.position * _spread(result, result.whitened[result.problem.stretches.used.numpy()])
+    return replace(result.noise, position=position, spin=_spin_scatter(result))
+
+
+def noise_by_axis(result: Fit) -> Array:
+    """(3,) m: how far measured positions lie from fitted ones along each axis; the median over all samples."""
+    used = result.problem.stretches.used.numpy()
+    residual = result.whitened[used] * result.sigmas[used]
+    return np.array([_spread(result, residual[:, axis]) for axis in range(3)])
+
+
+def _spread(result: Fit, residuals: Array) -> float:
+    """Median absolute deviation as a standard deviation, with the degrees of freedom that states took."""
     used = result.problem.stretches.used.numpy()
     taken = (STATE_DIM - 3) * len(used) / (3.0 * used.sum())
-    spread = np.array([np.median(np.abs(result.whitened[..., a][used])) for a in range(3)]) / NORMAL_MEDIAN
-    position = result.noise.position * spread / np.sqrt(1.0 - taken)
-    return replace(result.noise, position=position, spin=_spin_scatter(result))
+    return float(np.median(np.abs(residuals)) / NORMAL_MEDIAN / np.sqrt(1.0 - taken))
 
 
 def _spin_scatter(result: Fit) -> float:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy import stats
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.fit.fit import fit_problem, reachable, values_of
+from ballfg.diagnosis.fit.fit import covariance_of, fit_problem, reachable
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import by_track
@@ -73,22 +73,28 @@ def significance(fit: Fit, hypothesis: Hypothesis, first: Fit) -> Significance:
 
     Args: fit: with the effect, which has strengths.  first: of the declared model, without the named effects.
     """
-    values = list(values_of(fit, hypothesis.columns, {}).values())
-    noise = np.array([value.sigma for value in values])
+    covariance = covariance_of(fit, hypothesis.columns)
+    noise = np.sqrt(np.diagonal(covariance))
     (score,) = own_scores(fit, [hypothesis])
     if score is None:
-        return Significance(False, np.full(len(values), np.inf))
+        return Significance(False, np.full(len(noise), np.inf))
     absent = np.array([hypothesis.coefficients[n].absent for n in hypothesis.strengths], dtype=np.float64)
-    size, sigmas = np.abs(np.array([value.value for value in values]) - absent), np.maximum(noise, score.sigma)
+    strengths = np.array([fit.unknowns.values[name] for name in hypothesis.columns]) - absent
+    sigmas = np.maximum(noise, score.sigma)
     # the score leaves out directions that change nothing, such as the same time offset of all axes
-    if score.p_value <= CHANCE and (np.abs(score.estimate) > SIGMAS * score.sigma).any():
+    differs = score.p_value <= CHANCE and bool((np.abs(score.estimate) > SIGMAS * score.sigma).any())
+    if len(noise) > 1:
+        # so it leaves out the strength of an effect whose shape makes up for any strength; the covariance does not
+        seen = np.isfinite(score.sigma)
+        excess = max(1.0, float((score.sigma[seen] / noise[seen]).max()))
+        wald = float(strengths @ np.linalg.solve(covariance, strengths)) / excess**2
+        return Significance(differs and float(stats.chi2.sf(wald, len(noise))) <= CHANCE, sigmas)
+    if differs:
         return Significance(True, sigmas)
-    if len(values) > 1:
-        return Significance(False, sigmas)
     gain = 2.0 * (without_named(fit, hypothesis, first).cost - fit.cost) * float((noise / sigmas)[0]) ** 2
     if gain < SIGMAS**2:
         return Significance(False, sigmas)
-    return Significance(True, np.clip(size / np.sqrt(gain), noise, sigmas))
+    return Significance(True, np.clip(np.abs(strengths) / np.sqrt(gain), noise, sigmas))
 
 
 def insignificant(fit: Fit, named: Sequence[Hypothesis], first: Fit) -> list[Hypothesis]:

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 from scipy.optimize import least_squares
 
-from ballfg.diagnosis.fit.fit import first_guess, fit_problem, reachable
+from ballfg.diagnosis.fit.fit import first_guess, fit_problem, noise_by_axis, reachable
 from ballfg.diagnosis.fit.problem import (
     LABEL_LOSS,
     Fit,
@@ -119,12 +120,14 @@ def cost_beside(found, index, step):
     return Fit.at(found.problem, moved, found.noise).cost
 
 
-def test_noise_of_each_axis_is_estimated(make_ball, make_launches, make_shots, make_fit):
+def test_noise_of_each_axis_is_told_and_its_scale_estimated(make_ball, make_launches, make_shots, make_fit):
     data = make_shots(make_ball(), make_launches(8, 13), 13, noise=0.0).stretches
     noise = 0.003 * np.array([0.5, 1.0, 2.0]) * np.random.default_rng(0).standard_normal(data.positions.shape)
     found = make_fit(make_ball(), replace(data, positions=data.positions + torch.from_numpy(noise)))
     # 336 residuals an axis: the median absolute deviation is known to 6 %
-    np.testing.assert_allclose(found.noise.position, [0.5, 1.0, 2.0], rtol=0.2)
+    np.testing.assert_allclose(noise_by_axis(found), 0.003 * np.array([0.5, 1.0, 2.0]), rtol=0.2)
+    middle = float(np.median(np.abs(noise))) / stats.norm.ppf(0.75) / 0.003
+    np.testing.assert_allclose(found.noise.position, np.full(3, middle), rtol=0.1)
 
 
 def test_noise_stays_where_asked(calm_fit):
