@@ -33,3 +33,4 @@ from .nominal import nominal_model as nominal_model
 from .nominal import nominal_note as nominal_note
 from .surfaces import Surfaces as Surfaces
 from .trained import Trained as Trained
+from .variation import Variation as Variation

@@ -4,7 +4,7 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, TypeVar
+from typing import TYPE_CHECKING, Final, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -16,7 +16,8 @@ from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, VELOCITY, VZ, Z
 
 if TYPE_CHECKING:
     from ballfg.dynamics.trained import Trained
-    from ballfg.tracks import TrackNoise
+    from ballfg.dynamics.variation import Variation
+    from ballfg.tracks import Track, TrackNoise
 
 THIN_SHELL: Final = 2.0 / 3.0
 """Moment of inertia of a thin spherical shell divided by m R^2."""
@@ -48,6 +49,7 @@ class BallModel(nn.Module, ABC):
         inertia_factor: moment of inertia divided by m R^2.
         trained: the noise and the launcher that were learned together with the model; None where nothing was.
         noise: how far tracks scatter about the model; None where nobody has looked.
+        variations: coefficients that differ between tracks, by name as in `named_parameters()`.
 
     Raises: ValueError: if the radius is not within 0.001 to 1 m, or the inertia factor not within 0 to 1.
     """
@@ -64,6 +66,13 @@ class BallModel(nn.Module, ABC):
         self.inertia_factor = float(inertia_factor)
         self.trained: Trained | None = None
         self.noise: TrackNoise | None = None
+        self.variations: Mapping[str, Variation] = {}
+
+    def for_track(self, track: "Track") -> Self:
+        """The model with the coefficients of one track: itself, unless some of them differ between tracks."""
+        found = {name: variation.value(track) for name, variation in self.variations.items()}
+        values = {name: torch.tensor(value, dtype=torch.float64) for name, value in found.items() if value is not None}
+        return substitute(self, values) if values else self
 
     @functools.cached_property
     def parameter_count(self) -> int:

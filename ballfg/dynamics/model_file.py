@@ -7,18 +7,21 @@ from typing import Any, Final, cast
 
 import yaml
 
+from ballfg.checks import check_range
 from ballfg.dynamics.analytic import AnalyticModel, after_needs
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import effect_class
 from ballfg.dynamics.model import THIN_SHELL, BallModel
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.networks.learned_file import has_learned_part, read_learned, remove_others, write_learned
+from ballfg.dynamics.variation import Variation
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.whole_file import write_text
 from ballfg.tracks import TrackNoise
 
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
-SECTIONS = (*KINDS, "learned")
+VARIATIONS: Final = "variations"
+SECTIONS = (*KINDS, VARIATIONS, "learned")
 NOISE: Final = "noise"
 """Entry of the section `measurement` that is no effect: how far tracks scatter about the model."""
 
@@ -27,7 +30,7 @@ def load_model(path: str | Path, *, radius: float = 0.02, inertia_factor: float 
     """Read a model file.
 
     Args:
-        path: YAML file with the sections `flight`, `bounce`, `measurement`, `learned` (docs/models.md).
+        path: YAML file with the sections `flight`, `bounce`, `measurement`, `variations`, `learned` (docs/models.md).
         radius: m, of the ball, usually from the dataset.
         inertia_factor: moment of inertia divided by m R^2.
     Returns: the analytic model where `learned` is null; else what the folder holds, a `LearnedModel` or an analytic
@@ -58,7 +61,7 @@ def model_from_dict(
     """The model that a parsed model file without a learned part describes.
 
     Args:
-        content: the sections `flight`, `bounce` and `measurement` (docs/models.md).
+        content: the sections `flight`, `bounce`, `measurement` and `variations` (docs/models.md).
         radius: m, of the ball.
         inertia_factor: moment of inertia divided by m R^2.
         where: begins the error messages.
@@ -88,7 +91,27 @@ def model_from_dict(
         raise ValueError(f"{where}: {error}") from error
     model = AnalyticModel(effects, radius=radius, inertia_factor=inertia_factor)
     model.noise = noise
+    model.variations = _variations(content.get(VARIATIONS), model, where)
     return model
+
+
+def _variations(section: Any, model: AnalyticModel, where: str) -> dict[str, Variation]:
+    """Coefficients that differ between tracks, by name."""
+    if section is None:
+        return {}
+    if not isinstance(section, Mapping):
+        raise ValueError(f"{where}: section '{VARIATIONS}' must map coefficients to their values; got {section!r}")
+    declared, found = model.declared_coefficients(), {}
+    for name, content in section.items():
+        if name not in declared:
+            raise ValueError(f"{where}: {VARIATIONS}: unknown coefficient '{name}'{_nearest(name, tuple(declared))}")
+        try:
+            found[name] = Variation.from_mapping(content)
+            for value in found[name].values.values():
+                check_range("each value", value, declared[name].low, declared[name].high)
+        except (ValueError, TypeError) as error:
+            raise ValueError(f"{where}: {VARIATIONS}.{name}: {error}") from error
+    return found
 
 
 def _without_noise(content: Mapping[str, Any], where: str) -> tuple[Mapping[str, Any], TrackNoise | None]:
@@ -129,6 +152,8 @@ def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
         content[kind] = {name: cast(Effect, effect).values() for name, effect in group.items()}
     if model.noise is not None:
         content["measurement"][NOISE] = model.noise.to_mapping()
+    if model.variations:
+        content[VARIATIONS] = {name: variation.to_mapping() for name, variation in model.variations.items()}
     return content | {"learned": None}
 
 

@@ -25,6 +25,9 @@ BATCH = 16
 
 def estimate_tracks(estimator: Estimator, tracks: Iterable[Track], count: int, jobs: int) -> Iterator[Estimate]:
     """Estimates in the order of the tracks: `map_tracks` of an estimator."""
+    if estimator.model.variations:  # the world of each estimate is that of its track
+        yield from map_tracks(estimator.estimate, tracks, count, jobs)
+        return
     for estimate in map_tracks(partial(_without_world, estimator), tracks, count, jobs):
         yield replace(estimate, world=estimator.world)
 

@@ -53,6 +53,10 @@ class Estimator(ABC):
         noise = " / ".join(f"{1e3 * s:g}" for s in self.settings.position_noise)
         return f"{type(self).__name__}({effects}, {self.surfaces}, noise {noise} mm)"
 
+    def of(self, track: Track) -> "Estimator":
+        """The estimator with the coefficients of a track: this one, unless they differ between tracks."""
+        return self
+
     @abstractmethod
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
         """The states of a track, one per stamp.

@@ -1,9 +1,11 @@
 """The estimators by name: those of the package, of the user, and of other installed packages."""
 
+from functools import partial
 from typing import Final
 
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.each_its_model import EachItsModel
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
 from ballfg.estimation.filters.sliding_window import SlidingWindow
@@ -23,7 +25,10 @@ for _own in (Smoother, Online, ExtendedKalmanFilter, SlidingWindow):
 
 
 def make_estimator(name: str, model: BallModel, surfaces: Surfaces | float, settings: Settings) -> Estimator:
-    """The estimator of a name; one that undoes the model's measurement effects, where there are any.
+    """The estimator of a name.
+
+    It undoes the model's measurement effects, where there are any, and gives each track its own coefficients, where the
+    model says that they differ between tracks.
 
     Args:
         name: of a registered estimator.
@@ -32,6 +37,11 @@ def make_estimator(name: str, model: BallModel, surfaces: Surfaces | float, sett
     """
     if name not in ESTIMATORS:
         raise ValueError(f"method must be one of {', '.join(ESTIMATORS)}; got '{name}'")
+    make = partial(_estimator, ESTIMATORS[name], surfaces, settings)
+    return EachItsModel(make, model, surfaces, settings) if model.variations else make(model)
+
+
+def _estimator(kind: type[Estimator], surfaces: Surfaces | float, settings: Settings, model: BallModel) -> Estimator:
     if not model.measures_plainly:
-        return InvertMeasurement(ESTIMATORS[name], model, surfaces, settings)
-    return ESTIMATORS[name](model, surfaces, settings)
+        return InvertMeasurement(kind, model, surfaces, settings)
+    return kind(model, surfaces, settings)

@@ -134,6 +134,19 @@ def _tolerance(track: Track) -> float:
 def _predict_block(
     estimator: Estimator, propagator: Propagator, estimates: list[Estimate], tracks: list[Track], horizon: float
 ) -> Iterator[TrackPrediction]:
+    """Predictions in the order of the tracks; those with the same coefficients are predicted together."""
+    owners = [estimator.of(track) for track in tracks]
+    found: dict[int, TrackPrediction] = {}
+    for owner in dict.fromkeys(owners):
+        rows = [i for i, own in enumerate(owners) if own is owner]
+        alike = _predict_alike(owner, propagator, [estimates[i] for i in rows], [tracks[i] for i in rows], horizon)
+        found.update(zip(rows, alike, strict=True))
+    yield from (found[i] for i in range(len(tracks)))
+
+
+def _predict_alike(
+    estimator: Estimator, propagator: Propagator, estimates: list[Estimate], tracks: list[Track], horizon: float
+) -> Iterator[TrackPrediction]:
     later = [_later(t, float(e.times[-1]), horizon) for t, e in zip(tracks, estimates, strict=True)]
     clocks = [true_times(estimator.model, t.times) for t in tracks]
     ends = [float(clock[len(e.times) - 1]) for clock, e in zip(clocks, estimates, strict=True)]

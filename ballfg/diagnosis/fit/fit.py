@@ -51,7 +51,9 @@ def fit_model(model: AnalyticModel, stretches: Stretches, settings: Settings, *,
     return fit_problem(problem, *start, settle_noise=settle_noise)
 
 
-def reachable(model: AnalyticModel, stretches: Stretches, values: Mapping[str, float] | None = None) -> Stretches:
+def reachable(
+    model: AnalyticModel, stretches: Stretches, values: Mapping[str, float | Array] | None = None
+) -> Stretches:
     """Those stretches whose contacts a model reaches from the first guess of their states.
 
     Args: values: coefficients by parameter name that differ from the model's own, as fitted.
@@ -91,15 +93,13 @@ def values_of(fit: Fit, names: Iterable[str], declared: Mapping[str, float]) -> 
     """
     names = list(names)
     sigmas = dict(zip(names, np.sqrt(np.diagonal(covariance_of(fit, names))).tolist(), strict=True))
-    units = fit.problem.model.declared_coefficients()
-    return {
-        name: Value(fit.unknowns.values[name], sigmas[name], units[name].unit, declared.get(name)) for name in names
-    }
+    free = fit.problem.free
+    return {name: Value(fit.unknowns.values[name], sigmas[name], free[name].unit, declared.get(name)) for name in names}
 
 
 def covariance_of(fit: Fit, names: Sequence[str]) -> Array:
     """(p, p) covariance of fitted coefficients by the noise, everything else being free; names: p parameters."""
-    total = fit.linearised().eliminated().gram.sum(axis=0)[:-1, :-1] + np.diag(fit.problem.common_precision)
+    total = fit.gram.sum(axis=0)[:-1, :-1] + np.diag(fit.problem.common_precision)
     listed = list(fit.problem.free)
     chosen = [listed.index(name) for name in names]
     return np.asarray(np.linalg.inv(total)[np.ix_(chosen, chosen)])

@@ -46,6 +46,7 @@ class Holdout:
         launcher: which labels of a shot tell its spin; its weights mean nothing.
         search, held_out: stretches of the two halves.
         search_tracks, held_out_tracks: tracks of the two halves up to their first hit.
+        tracks: those of both halves, whole and in the order of the recording.
         stamps: what is wrong with the stamps of all tracks; the stretches have frames in their places.
         excluded: sentences on tracks that are not used.
     """
@@ -58,6 +59,7 @@ class Holdout:
     held_out: Stretches
     search_tracks: tuple[EvaluationTrack, ...]
     held_out_tracks: tuple[EvaluationTrack, ...]
+    tracks: tuple[Track, ...]
     stamps: Stamps
     excluded: tuple[str, ...]
 
@@ -105,7 +107,17 @@ def hold_out(
     if lost:
         excluded.append(f"{lost} of {len(tracks)} tracks hold no free flight that is long enough")
     return Holdout(
-        dataset, settings, surfaces, launcher, search, held_out, search_tracks, held_out_tracks, stamps, tuple(excluded)
+        dataset,
+        settings,
+        surfaces,
+        launcher,
+        search,
+        held_out,
+        search_tracks,
+        held_out_tracks,
+        tuple(tracks),
+        stamps,
+        tuple(excluded),
     )
 
 

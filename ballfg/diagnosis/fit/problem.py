@@ -1,6 +1,6 @@
 """A fit problem with its unknowns, priors and losses, and the linearised rows at some unknowns."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Self
@@ -8,10 +8,10 @@ from typing import Self
 import numpy as np
 
 from ballfg.arrays import Array, Index
-from ballfg.diagnosis.fit.sensitivity import Predicted, predict, sensitivity
+from ballfg.diagnosis.fit.sensitivity import Predicted, Sensitivity, predict, sensitivity
 from ballfg.diagnosis.fit.stretches import Stretches
-from ballfg.diagnosis.fit.system import System
-from ballfg.dynamics import AnalyticModel, Coefficient
+from ballfg.diagnosis.fit.system import System, by_track
+from ballfg.dynamics import AnalyticModel, Coefficient, Variation
 from ballfg.dynamics.networks.spin_embedding import SOFT_SPEED
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, STATE_DIM, VELOCITY
@@ -46,27 +46,52 @@ class Noise:
 
 
 @dataclass(frozen=True)
+class Deviation:
+    """An unknown of a fit by which a coefficient is off on some tracks.
+
+    Attributes:
+        coefficient: its parameter name.
+        weights: by name of the track; the coefficient is off by the unknown times the weight.
+        by, level, line: of the `Variation` that it becomes in a model file, and its key there.
+        first: the first track, of a place in the recording: there the coefficient is not off.
+    """
+
+    coefficient: str
+    weights: Mapping[str, float]
+    by: str
+    level: str
+    first: str = ""
+    line: bool = False
+
+    def along(self, stretches: Stretches) -> Array:
+        """(n,) weights of stretches."""
+        return np.array([self.weights.get(name, 0.0) for name in stretches.names])
+
+
+@dataclass(frozen=True)
 class Problem:
     """Data and the model that is fitted to them.
 
     Attributes:
         model: with every effect that has a coefficient among `free`.
         stretches: the data.
-        free: declared coefficients to estimate, by parameter name, with their priors.
+        free: coefficients to estimate, by parameter name, with their priors; deviations too, by their names.
         shared: whether coefficients and launcher are estimated. Otherwise only first states are, as in an evaluation
             on other tracks.
+        deviations: those among `free`, by name.
     """
 
     model: AnalyticModel
     stretches: Stretches
     free: Mapping[str, Coefficient]
     shared: bool = True
+    deviations: Mapping[str, Deviation] = field(default_factory=dict)
 
     @property
     def declared(self) -> dict[str, float]:
-        """Prior means of the coefficients to estimate: the model's own values."""
+        """Prior means of the coefficients to estimate: the model's own values, and no deviations."""
         parameters = dict(self.model.named_parameters())
-        return {name: float(parameters[name].detach()) for name in self.free}
+        return {name: float(parameters[name].detach()) if name in parameters else 0.0 for name in self.free}
 
     @property
     def centres(self) -> Array:
@@ -88,6 +113,20 @@ class Problem:
     def common_precision(self) -> Array:
         """(q + 3 s,) of the priors of all common columns: coefficients, then launcher settings."""
         return np.concatenate((self.precisions, np.repeat(self.launcher_precision, 3)))
+
+    def by_stretch(self, values: Mapping[str, float], stretches: Stretches | None = None) -> dict[str, float | Array]:
+        """Coefficients by parameter name: one number, or (n,) where deviations make them differ between n stretches.
+
+        Args: values: of all unknowns, by name.  stretches: the problem's own where None.
+        """
+        found: dict[str, float | Array] = {n: value for n, value in values.items() if n not in self.deviations}
+        parameters, declared = dict(self.model.named_parameters()), self.model.declared_coefficients()
+        for name, deviation in self.deviations.items():
+            own = found.get(deviation.coefficient, float(parameters[deviation.coefficient].detach()))
+            found[deviation.coefficient] = own + values[name] * deviation.along(stretches or self.stretches)
+        for name in {deviation.coefficient for deviation in self.deviations.values()}:
+            found[name] = np.clip(found[name], declared[name].low, declared[name].high)
+        return found
 
 
 @dataclass(frozen=True)
@@ -115,8 +154,26 @@ class Fit:
     @classmethod
     def at(cls, problem: Problem, unknowns: Unknowns, noise: Noise, steps: int = 0) -> Self:
         """The prediction at some unknowns."""
-        predicted = predict(problem.model, problem.stretches, unknowns.starts, unknowns.values)
+        values = problem.by_stretch(unknowns.values)
+        predicted = predict(problem.model, problem.stretches, unknowns.starts, values)
         return cls(problem, unknowns, noise, predicted, steps)
+
+    @property
+    def values(self) -> dict[str, float | Array]:
+        """Fitted coefficients, as `Problem.by_stretch`."""
+        return self.problem.by_stretch(self.unknowns.values)
+
+    def variations(self) -> dict[str, Variation]:
+        """Coefficients that differ between tracks, as fitted, by parameter name."""
+        parameters, found = dict(self.problem.model.named_parameters()), dict[str, Variation]()
+        declared = self.problem.model.declared_coefficients()
+        for unknown, deviation in self.problem.deviations.items():
+            name = deviation.coefficient
+            base = self.unknowns.values.get(name, float(parameters[name].detach()))
+            value = float(np.clip(base + self.unknowns.values[unknown], declared[name].low, declared[name].high))
+            known = found[name].values if name in found else {deviation.first: base} if deviation.first else {}
+            found[name] = Variation(deviation.by, {**known, deviation.level: value}, deviation.line)
+        return found
 
     @cached_property
     def sigmas(self) -> Array:
@@ -169,11 +226,40 @@ class Fit:
         scale = np.sqrt(self.robust.samples[stretches])[..., None] / self.sigmas[stretches]
         return np.asarray((derivative * scale[..., None]).reshape(len(derivative), -1, derivative.shape[-1]))
 
+    def sensitivity(self) -> Sensitivity:
+        """Derivatives of the samples by first states and by all of `Problem.free`.
+
+        That by a deviation is that by its coefficient, times the weight of each stretch.
+        """
+        problem, deviations = self.problem, self.problem.deviations
+        behind = [deviations[name].coefficient if name in deviations else name for name in problem.free]
+        names = list(dict.fromkeys(behind))
+        found = sensitivity(problem.model, problem.stretches, self.unknowns.starts, self._known(names), names)
+        if not deviations:
+            return found
+        chosen = [*range(STATE_DIM), *(STATE_DIM + names.index(name) for name in behind)]
+        weights = np.ones((len(problem.stretches), len(chosen)))
+        for place, name in enumerate(problem.free, start=STATE_DIM):
+            if name in deviations:
+                weights[:, place] = deviations[name].along(problem.stretches)
+        return Sensitivity(
+            found.positions[..., chosen] * weights[:, None, None], found.labels[..., chosen] * weights[:, None]
+        )
+
+    def _known(self, names: Iterable[str]) -> dict[str, float | Array]:
+        """All fitted coefficients, and the model's own values of others that are named."""
+        parameters = dict(self.problem.model.named_parameters())
+        return {name: float(parameters[name].detach()) for name in names} | self.values
+
+    @cached_property
+    def gram(self) -> Array:
+        """(t, q + 1, q + 1) inner products of the common columns on each of t tracks, the residual last."""
+        return by_track(self.linearised().eliminated().gram, self.problem.stretches.track)
+
     def linearised(self) -> System:
         """The whitened, robustly weighted rows; common columns are coefficients, then launcher settings."""
         stretches, unknowns, noise = self.problem.stretches, self.unknowns, self.noise
-        names = tuple(self.problem.free)
-        derivative = sensitivity(self.problem.model, stretches, unknowns.starts, unknowns.values, names)
+        derivative = self.sensitivity()
         positions, labelled = self.position_rows(derivative.positions), stretches.labelled[:, None, None]
         spins = np.zeros((len(stretches), 3, derivative.labels.shape[-1]))
         spins[:, range(3), range(SPIN.start, SPIN.stop)] = 1.0 / noise.spin

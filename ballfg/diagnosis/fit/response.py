@@ -81,7 +81,7 @@ def fitted_path(fit: Fit) -> FittedPath:
     """The motion at a fit's minimum."""
     stretches = fit.problem.stretches
     with torch.no_grad():
-        model = with_values(fit.problem.model, fit.unknowns.values, len(stretches))
+        model = with_values(fit.problem.model, fit.values, len(stretches))
         times = model.true_stamps(stretches.times.T.unsqueeze(-1)).squeeze(-1)
         starts = torch.from_numpy(fit.unknowns.starts)
         motion = shoot(model, starts, stretches.heights, stretches.contacts, times[-1])
@@ -146,7 +146,8 @@ def _shot(fit: Fit, path: FittedPath, number: int, part: Tensor, nodes: Tensor) 
     m = len(part)
     start = arc.nodes[0][part].repeat(STATE_DIM, 1)
     times = path.times[:, rows] - begun
-    model = with_values(fit.problem.model, fit.unknowns.values, len(rows))
+    values = {name: value if isinstance(value, float) else value[rows.numpy()] for name, value in fit.values.items()}
+    model = with_values(fit.problem.model, values, len(rows))
     with dual_level():
         first = make_dual(start, torch.eye(STATE_DIM, dtype=torch.float64).repeat_interleave(m, dim=0))
         guesses = path.motion.contacts[rows, number:] - begun.unsqueeze(-1)

@@ -44,18 +44,25 @@ class Sensitivity:
     labels: Array
 
 
-def predict(model: BallModel, stretches: Stretches, starts: Array, values: Mapping[str, float]) -> Predicted:
-    """The samples that a model predicts from states (n, 9) at the first samples; values: those of some coefficients."""
+def predict(model: BallModel, stretches: Stretches, starts: Array, values: Mapping[str, float | Array]) -> Predicted:
+    """The samples that a model predicts from states (n, 9) at the first samples.
+
+    Args: values: those of some coefficients, the same for all stretches or (n,) one for each.
+    """
     with torch.no_grad():
         valued = with_values(model, values, len(stretches))
         positions, labels, motion = _measured(valued, stretches, torch.from_numpy(starts))
     return Predicted(positions.numpy(), labels.numpy(), motion.contacts.numpy())
 
 
-def with_values(model: BallModel, values: Mapping[str, float], count: int) -> BallModel:
-    """The model with other values of some coefficients, for a batch of `count` rows."""
-    columns = {name: torch.full((count, 1), value, dtype=torch.float64) for name, value in values.items()}
-    return substitute(model, columns)
+def with_values(model: BallModel, values: Mapping[str, float | Array], count: int) -> BallModel:
+    """The model with other values of some coefficients, one for all or one for each row of a batch of `count`."""
+    return substitute(model, {name: _column(value, count) for name, value in values.items()})
+
+
+def _column(value: float | Array, count: int) -> Tensor:
+    """(count, 1) of one number, or of as many."""
+    return torch.from_numpy(np.broadcast_to(np.asarray(value, dtype=np.float64), count).reshape(count, 1).copy())
 
 
 @dataclass(frozen=True)
@@ -71,7 +78,7 @@ def sensitivity(
     model: BallModel,
     stretches: Stretches,
     starts: Array,
-    values: Mapping[str, float],
+    values: Mapping[str, float | Array],
     names: Sequence[str],
     *,
     by_start: bool = True,
@@ -97,13 +104,17 @@ def sensitivity(
 
 
 def _derivatives(
-    model: BallModel, stretches: Stretches, starts: Array, values: Mapping[str, float], wanted: Sequence[_Direction]
+    model: BallModel,
+    stretches: Stretches,
+    starts: Array,
+    values: Mapping[str, float | Array],
+    wanted: Sequence[_Direction],
 ) -> Sensitivity:
     n, d = len(stretches), len(wanted)
     repeated = stretches.take(np.tile(np.arange(n), d))
     state = torch.from_numpy(np.tile(starts, (d, 1)))
     state_tangent = torch.zeros_like(state)
-    primals = {name: torch.full((n * d, 1), value, dtype=torch.float64) for name, value in values.items()}
+    primals = {name: _column(value, n).repeat(d, 1) for name, value in values.items()}
     tangents = {name: torch.zeros(n * d, 1, dtype=torch.float64) for name in values}
     for block, direction in enumerate(wanted):
         rows = slice(block * n, (block + 1) * n)

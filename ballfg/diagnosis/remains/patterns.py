@@ -190,13 +190,14 @@ def drift_block(fit: Fit, system: System) -> Block | None:
     Args: system: of the fit, linearised at its minimum.
     Returns: None if there is nothing free, or one track only.
     """
-    free = fit.problem.free
+    free = {name: c for name, c in fit.problem.free.items() if name not in fit.problem.deviations}
     number = fit.problem.stretches.track.astype(np.float64)
     if not free or np.ptp(number) == 0.0:
         return None
     order = 2.0 * (number - number.min()) / np.ptp(number) - 1.0
     sigmas = np.array([c.sigma for c in free.values()])
-    columns = order[:, None, None] * system.by_common[..., : len(free)] * sigmas
+    chosen = [place for place, name in enumerate(fit.problem.free) if name in free]
+    columns = order[:, None, None] * system.by_common[..., chosen] * sigmas
     return Block(DRIFT, quantities=tuple(free), axes=("",), values=np.eye(len(free)), columns=columns)
 
 

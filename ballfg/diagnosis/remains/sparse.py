@@ -64,14 +64,14 @@ def sparse_terms(before: Fit) -> SparseTerms | None:
 
 
 def fit_with_terms(before: Fit, terms: SparseTerms) -> Fit:
-    """The joint fit with the terms in the model, noise settled again."""
+    """The joint fit with the terms in the model, at the noise of the fit before."""
     problem = before.problem
     for hypothesis in terms.hypotheses:
         problem = with_hypothesis(problem, hypothesis)
     listed = problem.free
     start = {n: float(np.clip(v, listed[n].low, listed[n].high)) for n, v in terms.estimates.items()}
     unknowns = replace(before.unknowns, values={**before.unknowns.values, **start})
-    return fit_problem(problem, unknowns, before.noise)
+    return fit_problem(problem, unknowns, before.noise, settle_noise=False)
 
 
 def select(information: Array, score: Array, penalty: float) -> list[int]:

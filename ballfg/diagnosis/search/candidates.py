@@ -76,11 +76,11 @@ def score_all(before: Fit, candidates: Sequence[Hypothesis]) -> list[Scored]:
     return sorted(scored, key=lambda s: s.explained, reverse=True)
 
 
-def shortlist(scored: Sequence[Scored]) -> list[Scored]:
+def shortlist(scored: Sequence[Scored], alarm: float = ALARM) -> list[Scored]:
     """The hypotheses to refit: significant, the best shape of each effect, not far behind the first."""
     best: dict[str, Scored] = {}
     for candidate in scored:
-        if candidate.score is not None and candidate.p_value < ALARM:
+        if candidate.score is not None and candidate.p_value < alarm:
             best.setdefault(candidate.hypothesis.name, candidate)
     listed = list(best.values())[:MOST_REFITS]
     return [s for s in listed if s.explained >= LEADING * listed[0].explained]
@@ -99,7 +99,7 @@ def refit(before: Fit, scored: Scored) -> Refit:
     """
     hypothesis, problem = scored.hypothesis, with_hypothesis(before.problem, scored.hypothesis)
     parameters = dict(problem.model.named_parameters())
-    absent = {name: float(parameters[name]) for name in hypothesis.free()}
+    absent = {name: float(parameters[name]) if name in parameters else 0.0 for name in hypothesis.free()}
     usual = absent | {hypothesis.parameter(n): hypothesis.coefficients[n].default for n in hypothesis.strengths}
     tried = [_started_at(before, hypothesis, problem, absent)]
     if usual != absent:
@@ -119,7 +119,12 @@ def _started_at(before: Fit, hypothesis: Hypothesis, problem: Problem, values: M
 
 def with_hypothesis(problem: Problem, hypothesis: Hypothesis) -> Problem:
     """The problem with an effect in its model and the effect's coefficients free."""
-    return replace(problem, model=hypothesis.added_to(problem.model), free={**problem.free, **hypothesis.free()})
+    return replace(
+        problem,
+        model=hypothesis.added_to(problem.model),
+        free={**problem.free, **hypothesis.free()},
+        deviations={**problem.deviations, **hypothesis.deviations()},
+    )
 
 
 def _starts_with_labels(problem: Problem, starts: Array) -> Array:

@@ -97,7 +97,7 @@ def held_out_gain(before: Fit, after: Fit, held_out: Stretches) -> HeldOutGain:
     Returns: the gain in natural units per track, and its probability by chance.
     """
     for fitted in (before, after):
-        held_out = reachable(fitted.problem.model, held_out, fitted.unknowns.values)
+        held_out = _reached(fitted, held_out)
     old, new = (_on(f, held_out, after.noise) for f in (before, after))
     left = old.weighted_residual(old.robust)
     columns = np.stack((left - new.weighted_residual(old.robust), left), axis=-1)
@@ -107,6 +107,16 @@ def held_out_gain(before: Fit, after: Fit, held_out: Stretches) -> HeldOutGain:
     if score is None or gain <= 0.0 or score.estimate[0] <= 0.0:
         return HeldOutGain(gain, 1.0)
     return HeldOutGain(gain, score.p_value / 2.0)
+
+
+def on_others(fitted: Fit, others: Stretches) -> Fit:
+    """The fit of first states to stretches of other tracks, everything else as it was fitted."""
+    return _on(fitted, _reached(fitted, others), fitted.noise)
+
+
+def _reached(fitted: Fit, stretches: Stretches) -> Stretches:
+    values = fitted.problem.by_stretch(fitted.unknowns.values, stretches)
+    return reachable(fitted.problem.model, stretches, values)
 
 
 def _on(fitted: Fit, stretches: Stretches, noise: Noise) -> Fit:

@@ -8,7 +8,8 @@ from typing import cast
 
 import numpy as np
 
-from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.problem import Deviation, Fit
+from ballfg.diagnosis.result import Value
 from ballfg.dynamics import AnalyticModel, Coefficient, Effect
 from ballfg.dynamics.effect import Scene, Vector
 
@@ -41,6 +42,29 @@ class Hypothesis:
         """Name of the effect."""
         return self.effect.name
 
+    @property
+    def sentence(self) -> str:
+        """Its meaning in words."""
+        return self.effect.sentence
+
+    @property
+    def decide(self) -> str:
+        """The measurement that would decide."""
+        return self.effect.decide
+
+    def known_as(self, coefficient: str) -> str:
+        """The coefficient as the table of plausible ranges names it."""
+        return f"{self.name}.{coefficient}"
+
+    def deviations(self) -> dict[str, Deviation]:
+        """Those unknowns that act on some tracks more than on others; none where the effect is the same for all."""
+        return {}
+
+    def told(self, fit: Fit, values: Mapping[str, Value]) -> dict[str, Value]:
+        """Coefficients for a report; values: those fitted, by coefficient."""
+        shape = {c: Value(v, 0.0, self.coefficients[c].unit) for c, v in self.shape.items() if c not in values}
+        return {**values, **shape}
+
     @cached_property
     def coefficients(self) -> dict[str, Coefficient]:
         """Coefficients of the effect, by name."""
@@ -63,13 +87,13 @@ class Hypothesis:
     def strain(self, values: Mapping[str, float]) -> float:
         """Prior standard deviations between the furthest strength and its usual value; values: by parameter name."""
         listed = self.coefficients
-        far = (abs(values[self.parameter(n)] - listed[n].default) / _spread(listed[n]) for n in self.strengths)
+        far = (abs(values[self.parameter(n)] - listed[n].default) / spread(listed[n]) for n in self.strengths)
         return max(far, default=0.0)
 
     def free(self) -> dict[str, Coefficient]:
         """Coefficients that a refit estimates in addition: strengths, and shapes that are uncertain."""
         listed = self.coefficients
-        loose = {self.parameter(n): replace(listed[n], sigma=LOOSE * _spread(listed[n])) for n in self.strengths}
+        loose = {self.parameter(n): replace(listed[n], sigma=LOOSE * spread(listed[n])) for n in self.strengths}
         formed = {self.parameter(n): listed[n] for n in self.shape if listed[n].absent is None and listed[n].sigma > 0}
         return loose | formed
 
@@ -81,7 +105,8 @@ class Hypothesis:
         return with_effects(model, self.effect(**{**self.shape, **absent}))
 
 
-def _spread(coefficient: Coefficient) -> float:
+def spread(coefficient: Coefficient) -> float:
+    """Prior standard deviation of a coefficient, and a small one where it is declared as exact."""
     return coefficient.sigma if coefficient.sigma > 0.0 else INEXACT * abs(coefficient.default)
 
 

@@ -2,6 +2,9 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
 
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
@@ -16,7 +19,7 @@ from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.diagnosis.search.ranking import NO_NAME, as_left, finding_of, fitted_values, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
 from ballfg.diagnosis.search.state import Confirmed, Search, left_out, without_named
-from ballfg.diagnosis.search.trial import try_hypotheses
+from ballfg.diagnosis.search.trial import try_hypotheses, try_varying
 from ballfg.dynamics import AnalyticModel, BallModel, Effect
 
 MOST_EFFECTS = 4
@@ -31,6 +34,10 @@ PLAUSIBLE = 10.0
 stronger than that (air that moves at 20 m/s through a part of the room) stands for something else."""
 POORER = 0.3
 """Share of an effect's gain that is there without the effect too, from which the fit before was in a poor minimum."""
+FEW_WORSE = 1.05
+MOST_BETTER = 0.9
+"""Where half of the tracks are predicted so much better, the root mean square over all may grow by so much: a few balls
+that miss another surface than before weigh more in it than all others."""
 ALIKE = 6.0
 """BIC difference below which two effects cannot be told apart: odds of 20 to 1."""
 
@@ -75,6 +82,12 @@ class SearchLoop:
             scored, refits = self._tried(search, number)
         outcomes: dict[str, Outcome] = {}
         winner, refused = self._confirmed(search, refits, outcomes)
+        if winner is None:  # a pattern that one effect explains for all tracks must not get a name for each group
+            tell = partial(self._tell, number)
+            more, refits = try_varying(search.fit, self.catalogue, self.holdout, tell)
+            scored = [*scored, *more]
+            winner, further = self._confirmed(search, refits, outcomes)
+            refused |= further
         if winner is None:
             self.watch(f"round {number}: nothing helps")
             rounds = (*search.rounds, ranking(scored, refits, outcomes))
@@ -98,7 +111,10 @@ class SearchLoop:
         return after, True
 
     def _tried(self, search: Search, number: int) -> tuple[list[Scored], list[Refit]]:
-        return try_hypotheses(search.fit, self.catalogue, lambda line: self.watch(f"round {number}: {line}"))
+        return try_hypotheses(search.fit, self.catalogue, partial(self._tell, number))
+
+    def _tell(self, number: int, line: str) -> None:
+        self.watch(f"round {number}: {line}")
 
     def _better_minimum(self, search: Search, best: Refit) -> Search | None:
         """The search from a better minimum of the same model, to which a refit has led; None if there is none.
@@ -164,7 +180,7 @@ class SearchLoop:
         if predictive.errors.prediction_rmse_mm > WORSE * search.predictive.errors.prediction_rmse_mm:
             return Outcome.MISLEADING, settled
         judged = self.judge(predictive.model)
-        if judged.prediction_rmse_mm > search.judged.prediction_rmse_mm:
+        if _worse(judged, search.judged):
             return Outcome.MISLEADING, settled
         return Confirmed(candidate, evidence, kept, settled, predictive, judged)
 
@@ -172,10 +188,10 @@ class SearchLoop:
         """Why the fitted strengths of an effect are not plausible; empty if they are."""
         values = fitted_values(fit, hypothesis)
         radius = fit.problem.model.radius
-        known = [implausible(f"{hypothesis.name}.{n}", values[n], radius) for n in hypothesis.strengths]
+        known = [implausible(hypothesis.known_as(n), values[n], radius) for n in hypothesis.strengths]
         if any(known):
             return next(text for text in known if text)
-        ranged = all(in_table(f"{hypothesis.name}.{n}", radius) for n in hypothesis.strengths)
+        ranged = all(in_table(hypothesis.known_as(n), radius) for n in hypothesis.strengths)
         if not ranged and hypothesis.strain(fit.unknowns.values) > self.plausible:
             return f"more than {self.plausible:g} times its typical distance from the usual value"
         return ""
@@ -183,7 +199,7 @@ class SearchLoop:
     def _refusal(self, hypothesis: Hypothesis, fit: Fit, outcome: Outcome) -> Refusal:
         """An effect that fits better and is no name; fit: with it."""
         reason = self._implausible(hypothesis, fit) if outcome is Outcome.IMPLAUSIBLE else ""
-        return Refusal(hypothesis.name, fitted_values(fit, hypothesis), outcome, reason, hypothesis.effect.decide)
+        return Refusal(hypothesis.name, fitted_values(fit, hypothesis), outcome, reason, hypothesis.decide)
 
     def _pruned(self, search: Search, *, examined: int = 1) -> Search:
         """The search without effects that are no names beside those that came after them; the last added goes first.
@@ -204,7 +220,7 @@ class SearchLoop:
                 refusal = self._refusal(hypothesis, search.fit, Outcome.IMPLAUSIBLE)
             elif hypothesis in idle:
                 refusal = self._refusal(hypothesis, search.fit, Outcome.INSIGNIFICANT)
-            elif judged.prediction_rmse_mm < search.judged.prediction_rmse_mm:
+            elif _worse(search.judged, judged):
                 reason = (
                     f"{search.judged.prediction_rmse_mm:.1f} mm off on the judging half with it, "
                     f"{judged.prediction_rmse_mm:.1f} mm without it"
@@ -214,3 +230,10 @@ class SearchLoop:
                 self.watch(f"{hypothesis.name} taken out again")
                 return self._pruned(left_out(search, hypothesis, fit, predictive, judged, refusal), examined=0)
         return search
+
+
+def _worse(after: Errors, before: Errors) -> bool:
+    """Whether predictions got worse."""
+    ratio = after.prediction_rmse_mm / before.prediction_rmse_mm
+    typical = float(np.median(after.by_track) / np.median(before.by_track))
+    return ratio > 1.0 and not (ratio < FEW_WORSE and typical < MOST_BETTER)

@@ -16,7 +16,6 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.fit.fit import covariance_of, fit_problem, reachable
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stretches import Stretches
-from ballfg.diagnosis.fit.system import by_track
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.diagnosis.search.score import Score, score_tests
 from ballfg.diagnosis.search.signatures import Signatures
@@ -35,13 +34,11 @@ def own_scores(fit: Fit, named: Sequence[Hypothesis]) -> list[Score | None]:
     Returns: for each its coefficients less their absent values, their standard deviations from the scatter of tracks,
         and the probability of so much by chance; None for an effect that the tracks do not show.
     """
-    system, problem = fit.linearised(), fit.problem
-    gram = by_track(system.eliminated().gram, problem.stretches.track)
-    return [_own_score(fit, hypothesis, gram) for hypothesis in named]
+    return [_own_score(fit, hypothesis) for hypothesis in named]
 
 
-def _own_score(fit: Fit, hypothesis: Hypothesis, gram: Array) -> Score | None:
-    """Args: gram: (t, q + 1, q + 1) inner products of the common columns of a fit, the residual last."""
+def _own_score(fit: Fit, hypothesis: Hypothesis) -> Score | None:
+    gram = fit.gram
     listed, precision = list(fit.problem.free), fit.problem.common_precision
     own = [listed.index(name) for name in hypothesis.columns]
     others = [number for number in range(len(precision)) if number not in own]
@@ -98,8 +95,10 @@ def significance(fit: Fit, hypothesis: Hypothesis, first: Fit) -> Significance:
 
 
 def insignificant(fit: Fit, named: Sequence[Hypothesis], first: Fit) -> list[Hypothesis]:
-    """Those effects of a model that do not differ from absent by themselves."""
-    return [h for h in named if h.strengths and not significance(fit, h, first).differs]
+    """Those effects of a model that do not differ from absent by themselves; not those that differ between tracks."""
+    varying = {h.effect.name for h in named if h.deviations()}
+    asked = [h for h in named if h.strengths and (h.deviations() or h.effect.name not in varying)]
+    return [h for h in asked if not significance(fit, h, first).differs]
 
 
 def halves_differ(fit: Fit, hypothesis: Hypothesis, held_out: Stretches) -> bool:
@@ -110,7 +109,7 @@ def halves_differ(fit: Fit, hypothesis: Hypothesis, held_out: Stretches) -> bool
     if not hypothesis.strengths:
         return False
     values = fit.unknowns.values
-    stretches = reachable(fit.problem.model, held_out, values)
+    stretches = reachable(fit.problem.model, held_out, fit.problem.by_stretch(values, held_out))
     unknowns = replace(fit.unknowns, starts=stretches.starts.numpy().copy())
     other = fit_problem(replace(fit.problem, stretches=stretches), unknowns, fit.noise, settle_noise=False)
     if not np.isfinite(other.cost):

@@ -48,7 +48,9 @@ def calibrated_model(fit: Fit, embedding: SpinEmbedding) -> AnalyticModel:
     parameters = dict(model.named_parameters())
     with torch.no_grad():
         for name, value in fit.unknowns.values.items():
-            parameters[name].fill_(value)
+            if name in parameters:
+                parameters[name].fill_(value)
+    model.variations = fit.variations()
     unlabelled = not fit.problem.stretches.labelled.all()
     learned = SpinEmbedding(embedding.labels, embedding.categories, torch.from_numpy(fit.unknowns.launcher))
     model.trained = Trained(

@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.diagnosis.fit.fit import values_of
+from ballfg.diagnosis.fit.fit import covariance_of, values_of
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Candidate, Finding, Outcome, Value
 from ballfg.diagnosis.search.candidates import Refit, Scored
@@ -30,8 +30,8 @@ def finding_of(refit: Refit, settled: Fit, evidence: HeldOutGain, alike: tuple[s
     return Finding(
         name=hypothesis.name,
         kind=hypothesis.effect.kind,
-        sentence=hypothesis.effect.sentence,
-        decide=hypothesis.effect.decide,
+        sentence=hypothesis.sentence,
+        decide=hypothesis.decide,
         parameters=fitted_values(settled, hypothesis),
         p_value=refit.scored.p_value,
         delta_bic=refit.delta_bic,
@@ -44,21 +44,27 @@ def finding_of(refit: Refit, settled: Fit, evidence: HeldOutGain, alike: tuple[s
 def fitted_values(fit: Fit, hypothesis: Hypothesis) -> dict[str, Value]:
     """Coefficients of an effect as fitted, and those of its shape that were not."""
     names = {hypothesis.parameter(name): name for name in hypothesis.coefficients}
-    values = {names[n]: v for n, v in values_of(fit, [n for n in names if n in fit.problem.free], {}).items()}
-    shape = {c: v for c, v in hypothesis.shape.items() if c not in values}
-    return values | {c: Value(v, 0.0, hypothesis.coefficients[c].unit) for c, v in shape.items()}
+    values = values_of(fit, [name for name in names if name in fit.problem.free], {})
+    return hypothesis.told(fit, {names[name]: value for name, value in values.items()})
 
 
 def as_left(findings: Sequence[Finding], named: Sequence[Hypothesis], fit: Fit, first: Fit) -> tuple[Finding, ...]:
     """Findings with the coefficients of the last fit, beside all the others.
 
-    The standard deviation of a strength is that of its significance; first: the fit without any of the findings.
+    The standard deviation of a strength is that of its significance; first: the fit without any of the findings. An
+    effect that turned out to differ between tracks is listed once, as that.
     """
     refreshed = []
+    varying = {h.effect.name for h in named if h.deviations()}
     for finding, hypothesis in zip(findings, named, strict=True):
+        if not hypothesis.deviations() and hypothesis.effect.name in varying:
+            continue
         values = fitted_values(fit, hypothesis)
-        sigmas = significance(fit, hypothesis, first).sigmas.tolist() if hypothesis.strengths else []
-        for name, sigma in zip(hypothesis.strengths, sigmas, strict=True):
+        sigmas = significance(fit, hypothesis, first).sigmas if hypothesis.strengths else np.zeros(0)
+        if hypothesis.deviations():  # what is told is the sum with the coefficient itself
+            noise = np.sqrt(np.diagonal(covariance_of(fit, hypothesis.columns)))
+            sigmas = sigmas / noise * [values[name].sigma for name in hypothesis.strengths]
+        for name, sigma in zip(hypothesis.strengths, sigmas.tolist(), strict=True):
             if np.isfinite(sigma):
                 values[name] = replace(values[name], sigma=sigma)
         refreshed.append(replace(finding, parameters=values))

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.problem import Deviation, Fit
 from ballfg.diagnosis.fit.sensitivity import sensitivity
 from ballfg.diagnosis.fit.system import System, by_track
 from ballfg.diagnosis.search.hypothesis import Hypothesis
@@ -115,18 +115,38 @@ def _columns(fit: Fit, candidates: Sequence[Hypothesis]) -> Array:
 def hypothesis_columns(fit: Fit, group: Sequence[Hypothesis]) -> Array:
     """(n, m, p) whitened, weighted derivatives of the samples by the strengths of hypotheses.
 
-    One model holds all of them. Each is absent, so that none sees another.
+    One model holds all of them. Each is absent, so that none sees another. A deviation needs no derivative of its own:
+    it is that of its coefficient, times a weight.
     """
     model = fit.problem.model
     for hypothesis in group:
         model = hypothesis.added_to(model)
-    own = [{h.parameter(n): v for n, v in h.shape.items()} for h in group]
-    names = [name for h in group for name in h.columns]
-    parameters = dict(model.named_parameters())
-    values = {name: float(parameters[name]) for name in [*names, *(n for shape in own for n in shape)]}
-    stretches, starts, values = fit.problem.stretches, fit.unknowns.starts, {**values, **fit.unknowns.values}
-    shapes = [shape for h, shape in zip(group, own, strict=True) for _ in h.strengths]
-    derivative = sensitivity(model, stretches, starts, values, names, by_start=False, shapes=shapes)
+    asked = [_asked(h) for h in group]
+    wanted = list(dict.fromkeys(key for own in asked for key, _ in own))
+    parameters, shapes = dict(model.named_parameters()), [dict(shape) for _, shape in wanted]
+    names = [name for name, _ in wanted]
+    values = {name: float(parameters[name]) for name in [*names, *(n for shape in shapes for n in shape)]}
+    stretches, starts = fit.problem.stretches, fit.unknowns.starts
+    known = {**values, **fit.values}
+    derivative = sensitivity(model, stretches, starts, known, names, by_start=False, shapes=shapes)
     scale = np.sqrt(fit.robust.spins) * stretches.labelled / fit.noise.label
     labels = derivative.labels * scale[:, None, None]
-    return np.concatenate((fit.position_rows(derivative.positions), labels), axis=1)
+    columns = np.concatenate((fit.position_rows(derivative.positions), labels), axis=1)
+    chosen = [wanted.index(key) for own in asked for key, _ in own]
+    found = columns[..., chosen]
+    for place, deviation in enumerate(d for own in asked for _, d in own):
+        if deviation is not None:
+            found[..., place] *= deviation.along(stretches)[:, None]
+    return found
+
+
+_Key = tuple[str, tuple[tuple[str, float], ...]]
+"""A coefficient by parameter name, and the values of others with which its derivative is taken."""
+
+
+def _asked(hypothesis: Hypothesis) -> list[tuple[_Key, Deviation | None]]:
+    """The derivative behind each strength of a hypothesis, and the deviation that it is multiplied for."""
+    shape = tuple((hypothesis.parameter(name), value) for name, value in hypothesis.shape.items())
+    deviations = hypothesis.deviations()
+    found = [(deviations.get(name), name) for name in hypothesis.columns]
+    return [((name if own is None else own.coefficient, shape), own) for own, name in found]

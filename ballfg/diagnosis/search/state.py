@@ -60,7 +60,7 @@ def left_out(
     search: Search, hypothesis: Hypothesis, fit: Fit, predictive: PredictiveModel, judged: Errors, refusal: Refusal
 ) -> Search:
     """The search after one of its effects was taken out; the fit and errors are those without it."""
-    kept = [h for h in search.named if h is not hypothesis and has_effect(fit.problem.model, h.name)]
+    kept = [h for h in search.named if h is not hypothesis and has_effect(fit.problem.model, h.effect.name)]
     return replace(
         search,
         fit=fit,
@@ -74,10 +74,15 @@ def left_out(
 
 def without_named(fit: Fit, hypothesis: Hypothesis, first: Fit) -> Fit:
     """The fit without one of the effects that were added to the first one's model, at the same noise."""
-    problem, name = fit.problem, hypothesis.name
-    model = problem.model if has_effect(first.problem.model, name) else without_effect(problem.model, name)
+    problem, name = fit.problem, hypothesis.effect.name
+    gone = set(hypothesis.columns)
+    needed = has_effect(first.problem.model, name)
+    if hypothesis.deviations():  # the effect itself may have been named too, the same for all tracks
+        needed |= any(n.startswith(f"{hypothesis.effect.kind}.{name}.") for n in problem.free if n not in gone)
+    model = problem.model if needed else without_effect(problem.model, name)
     left = dict(model.named_parameters())
-    free = {n: c for n, c in problem.free.items() if n in left and n not in hypothesis.columns}
-    values = {n: fit.unknowns.values[n] for n in free}
-    unknowns = replace(fit.unknowns, values=values)
-    return fit_problem(replace(problem, model=model, free=free), unknowns, fit.noise, settle_noise=False)
+    deviations = {n: d for n, d in problem.deviations.items() if d.coefficient in left and n not in gone}
+    free = {n: c for n, c in problem.free.items() if (n in left or n in deviations) and n not in gone}
+    unknowns = replace(fit.unknowns, values={n: fit.unknowns.values[n] for n in free})
+    problem = replace(problem, model=model, free=free, deviations=deviations)
+    return fit_problem(problem, unknowns, fit.noise, settle_noise=False)

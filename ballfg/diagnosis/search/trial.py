@@ -1,7 +1,10 @@
 """One round's trial of every hypothesis: score tests of all of them, and refits of those that deserve one."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import cast
 
+from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.search.candidates import (
     ALARM,
@@ -13,13 +16,59 @@ from ballfg.diagnosis.search.candidates import (
     score_all,
     shortlist,
 )
+from ballfg.diagnosis.search.evaluation import on_others
+from ballfg.diagnosis.search.grouping import groupings
 from ballfg.diagnosis.search.hypothesis import has_effect, hypotheses, scene_of
 from ballfg.diagnosis.search.label_frames import frame_hypotheses
+from ballfg.diagnosis.search.varying import Varying, between, near, varying_hypotheses
 from ballfg.dynamics import Effect
 from ballfg.dynamics.effects.measurement import SpinLabelFrame
 
+VARYING_ALARM = 0.01
+"""As `ALARM`, for effects that differ between tracks: they are many, and flexible."""
+AS_GOOD = 0.97
+"""Share of the best place's explained residual from which another place of a change is as good."""
 LABELLED = 0.5
 """Share of flights whose spin must be labelled for an effect that multiplies spins to show in a score test."""
+
+
+def try_varying(
+    before: Fit, catalogue: Sequence[type[Effect]], holdout: Holdout, tell: Callable[[str], None]
+) -> tuple[list[Scored], list[Refit]]:
+    """Every hypothesis that an effect differs between tracks, and refits of the leading ones, the best first."""
+    problem, tracks = before.problem, holdout.tracks
+    searched = list(dict.fromkeys(problem.stretches.names))
+    ways = groupings(tracks, searched)
+    listed = varying_hypotheses(problem.model, scene_of(before), catalogue, problem.free, ways)
+    tell(f"testing {len(listed)} ways in which tracks may differ")
+    scored = score_all(before, listed)
+    refits = []
+    for candidate in shortlist(scored, VARYING_ALARM):
+        tell(f"fitting with {candidate.hypothesis.name}")
+        names = [track.name for track in tracks]
+        closer = near(cast(Varying, candidate.hypothesis), searched, names)
+        best = _placed(before, closer) if len(closer) > 1 else candidate
+        same = between(cast(Varying, best.hypothesis), searched, names)
+        fitted = [refit(before, replace(best, hypothesis=h, p_value=candidate.p_value)) for h in same]
+        # the search half has no track between these places, so that the other half tells them apart
+        refits.append(
+            min(fitted, key=lambda r: on_others(r.fit, holdout.held_out).cost) if len(same) > 1 else fitted[0]
+        )
+    return scored, sorted(refits, key=lambda r: r.delta_bic)
+
+
+def _placed(before: Fit, closer: Sequence[Varying]) -> Scored:
+    """The change along the recording where it explains most.
+
+    Several places explain about the same where tracks between them do not show the coefficient. Then it is the place
+    of a change that was named before, since one new table changes several coefficients; else the middle of them.
+    """
+    known = {deviation.level for deviation in before.problem.deviations.values()}
+    scored = {id(s.hypothesis): s for s in score_all(before, closer)}
+    most = max(s.explained for s in scored.values())
+    good = [scored[id(h)] for h in closer if scored[id(h)].explained >= AS_GOOD * most]
+    named = [s for h, s in ((cast(Varying, s.hypothesis), s) for s in good) if known & set(h.grouping.weights)]
+    return named[0] if named else good[len(good) // 2]
 
 
 def try_hypotheses(

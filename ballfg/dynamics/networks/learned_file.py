@@ -153,6 +153,8 @@ def _empty_model(config: _Config, analytic: AnalyticModel, folder: Path) -> Ball
         base = analytic if architecture.residual else None
         model = build(architecture, radius=analytic.radius, inertia_factor=analytic.inertia_factor, base=base)
     model.noise = analytic.noise
+    if model is not analytic:
+        model.variations = {f"base.{name}": variation for name, variation in analytic.variations.items()}
     if config.trained is not None:
         model.trained = _trained(config.trained, folder)
     return model

@@ -106,8 +106,10 @@ def linearise(smoother: Smoother, tracks: Sequence[Track], watch: Watch = unwatc
     """
     pieces = []
     for track in watch(tracks, len(tracks), "linearising tracks"):
-        problem = smoother.problem(track)
-        solution = run(smoother.search(problem))
+        model = smoother.model.for_track(track)
+        own = smoother if model is smoother.model else Smoother(model, smoother.surfaces, smoother.settings)
+        problem = own.problem(track)
+        solution = run(own.search(problem))
         piece = _linearised(problem, solution)
         if len(piece.times) >= LEAST_SAMPLES and np.isfinite(piece.errors).all():
             pieces.append(piece)

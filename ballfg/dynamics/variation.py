@@ -1,0 +1,98 @@
+"""Coefficients that differ between tracks: by a label, or along the recording.
+
+A ball may be a new one after the lunch break, or a table may lean in one of two sessions. A model then holds one value
+for each group of tracks, or for each part of the recording, and `BallModel.for_track` gives the model of one track.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+
+from ballfg.checks import check_number
+from ballfg.tracks import Track
+
+TRACK: Final = "track"
+"""Stands for the name of a track where others are told apart by a label."""
+_FIELDS: Final = ("by", "values", "line")
+
+
+def place_of(name: str) -> tuple[tuple[int, str], ...]:
+    """A key that sorts names of tracks as people do: "9" before "10", and "a2" before "b1"."""
+    parts = re.findall(r"\d+|\D+", name)
+    return tuple((int(part), "") if part.isdigit() else (-1, part) for part in parts)
+
+
+def number_of(name: str) -> int | None:
+    """The last number in the name of a track; None where there is none."""
+    numbers = re.findall(r"\d+", name)
+    return int(numbers[-1]) if numbers else None
+
+
+@dataclass(frozen=True)
+class Variation:
+    """How one coefficient differs between tracks.
+
+    Attributes:
+        by: the label that tells tracks apart, or "track" for their place in the recording, which their names tell.
+        values: the coefficient by the text of the label; or by the name of the track from which on it holds, until
+            the next one named. A track with another label, or before the first name, has the model's own value.
+        line: of a place in the recording: the coefficient runs in a straight line from each value to the next one
+            over the numbers in the tracks' names, and stays constant beyond them.
+
+    Raises:
+        ValueError: if there is no value, one is not finite, or a line lacks numbers in its names.
+        TypeError: if a value is no number.
+    """
+
+    by: str
+    values: Mapping[str, float]
+    line: bool = False
+
+    def __post_init__(self) -> None:
+        if not self.values:
+            raise ValueError("values must hold at least one number, by label or by name of a track; got none")
+        for key, value in self.values.items():
+            check_number(f"values[{key!r}]", value)
+        if self.line and (self.by != TRACK or any(number_of(name) is None for name in self.values)):
+            raise ValueError(
+                f"line must be false unless by is '{TRACK}' and every track in values has a number in its name; got by "
+                f"'{self.by}' and {', '.join(self.values)}. Leave line out for values that hold until the next one."
+            )
+
+    def value(self, track: Track) -> float | None:
+        """The coefficient for a track; None where that is the model's own value."""
+        if self.by != TRACK:
+            label = track.labels.get(self.by)
+            return None if label is None else self.values.get(str(label))
+        if self.line:
+            place = number_of(track.name)
+            known = sorted((number_of(name) or 0, value) for name, value in self.values.items())
+            return None if place is None else float(np.interp(place, *zip(*known, strict=True)))
+        begun = [name for name in self.values if place_of(name) <= place_of(track.name)]
+        return self.values[max(begun, key=place_of)] if begun else None
+
+    @classmethod
+    def from_mapping(cls, content: Any) -> "Variation":
+        """A variation as a model file states it.
+
+        Raises:
+            ValueError: if an entry is missing, unknown or of another kind.
+            TypeError: if a value is no number.
+        """
+        if not isinstance(content, Mapping) or not {"by", "values"} <= set(content) <= set(_FIELDS):
+            raise ValueError(
+                f"must be a mapping with 'by' (a label, or '{TRACK}'), 'values' (numbers by label or by name of a "
+                f"track) and perhaps 'line' (true or false); got {content!r}"
+            )
+        by, values, line = content["by"], content["values"], content.get("line", False)
+        if not isinstance(by, str) or not isinstance(values, Mapping) or not isinstance(line, bool):
+            raise ValueError(f"'by' must be text, 'values' a mapping and 'line' true or false; got {content!r}")
+        return cls(by, {str(key): check_number(f"values[{str(key)!r}]", v) for key, v in values.items()}, line)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """What `from_mapping` reads."""
+        line = {"line": True} if self.line else {}
+        return {"by": self.by, "values": dict(self.values), **line}
