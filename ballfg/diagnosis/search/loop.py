@@ -84,10 +84,9 @@ class SearchLoop:
         winner, refused = self._confirmed(search, refits, outcomes)
         if winner is None:  # a pattern that one effect explains for all tracks must not get a name for each group
             tell = partial(self._tell, number)
-            more, refits = try_varying(search.fit, self.catalogue, self.holdout, tell)
-            scored = [*scored, *more]
-            winner, further = self._confirmed(search, refits, outcomes)
-            refused |= further
+            more, fitted = try_varying(search.fit, self.catalogue, self.holdout, tell)
+            winner, further = self._confirmed(search, fitted, outcomes)
+            scored, refits, refused = [*scored, *more], [*refits, *fitted], refused | further
         if winner is None:
             self.watch(f"round {number}: nothing helps")
             rounds = (*search.rounds, ranking(scored, refits, outcomes))

@@ -17,10 +17,9 @@ from ballfg.diagnosis.search.candidates import (
     shortlist,
 )
 from ballfg.diagnosis.search.evaluation import on_others
-from ballfg.diagnosis.search.grouping import groupings
 from ballfg.diagnosis.search.hypothesis import has_effect, hypotheses, scene_of
 from ballfg.diagnosis.search.label_frames import frame_hypotheses
-from ballfg.diagnosis.search.varying import Varying, between, near, varying_hypotheses
+from ballfg.diagnosis.search.varying import Varying, between, groupings, near, varying_hypotheses
 from ballfg.dynamics import Effect
 from ballfg.dynamics.effects.measurement import SpinLabelFrame
 

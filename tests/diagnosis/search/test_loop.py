@@ -21,7 +21,8 @@ CATALOGUE = [EFFECTS[name] for name in ("gravity", "wind", "table_tilt", "spin_d
 
 def holdout(search, held_out):
     """The part of a holdout that the search asks for."""
-    return SimpleNamespace(search=search, held_out=held_out, settings=Settings(spin_label_noise=4.0), stamps=Stamps())
+    settings = Settings(spin_label_noise=4.0)
+    return SimpleNamespace(search=search, held_out=held_out, settings=settings, stamps=Stamps(), tracks=())
 
 
 def shots(make_ball, make_launches, make_shots, seed, **truth):
