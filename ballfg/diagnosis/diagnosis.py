@@ -57,7 +57,7 @@ def diagnose(
     holdout = hold_out(dataset, model, jobs, tell)
     evaluate = partial(_errors, holdout, jobs)
     effects = tuple(catalogue or EFFECTS.values())
-    search = SearchLoop(holdout, effects, partial(_predictive, holdout, jobs), evaluate, tell).run(model)
+    search = SearchLoop(holdout, effects, partial(_predictive, holdout, jobs), evaluate, tell, jobs=jobs).run(model)
     tell("looking at what is left")
     tests = generic_tests(search.fit, search.first)
     verdict = _verdict(search, tests)

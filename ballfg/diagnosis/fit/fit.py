@@ -26,6 +26,8 @@ MOST_STEPS = 15
 """Gauss-Newton steps of one minimisation."""
 SCALE_ROUNDS = 3
 """Noise and weights are settled after so many minimisations."""
+SETTLED = 0.01
+"""Share by which the noise may still change when it is taken as settled."""
 TOLERANCE = 1e-5
 """A minimisation ends when the objective falls by less than this share."""
 FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e6
@@ -82,8 +84,17 @@ def fit_problem(problem: Problem, unknowns: Unknowns, noise: Noise, *, settle_no
     """
     result = _minimise(Fit.at(problem, unknowns, noise))
     for _ in range(SCALE_ROUNDS if settle_noise else 0):
-        result = _minimise(Fit.at(result.problem, result.unknowns, _settled(result), result.steps))
+        before, noise = result.noise, _settled(result)
+        result = _minimise(Fit.at(result.problem, result.unknowns, noise, result.steps))
+        if _near(before, noise):
+            break
     return result
+
+
+def _near(before: Noise, after: Noise) -> bool:
+    """Whether the noise has settled."""
+    ratios = np.append(after.position / before.position, after.spin / before.spin)
+    return bool(np.abs(np.log(ratios)).max() < SETTLED)
 
 
 def values_of(fit: Fit, names: Iterable[str], declared: Mapping[str, float]) -> dict[str, Value]:

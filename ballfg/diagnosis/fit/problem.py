@@ -232,6 +232,10 @@ class Fit:
         That by a deviation is that by its coefficient, times the weight of each stretch.
         """
         problem, deviations = self.problem, self.problem.deviations
+        if not problem.shared:  # first states only: columns of coefficients stay zero
+            found = sensitivity(problem.model, problem.stretches, self.unknowns.starts, self.values, ())
+            none = [(0, 0)] * (found.labels.ndim - 1) + [(0, len(problem.free))]
+            return Sensitivity(np.pad(found.positions, [(0, 0), *none]), np.pad(found.labels, none))
         behind = [deviations[name].coefficient if name in deviations else name for name in problem.free]
         names = list(dict.fromkeys(behind))
         found = sensitivity(problem.model, problem.stretches, self.unknowns.starts, self._known(names), names)

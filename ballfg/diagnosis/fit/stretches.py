@@ -22,6 +22,9 @@ from ballfg.tracks import Track
 
 LEAST_SAMPLES = 10
 """A stretch of fewer samples tells next to nothing once its nine start values are found."""
+MOST_CONTACTS = 3
+"""A stretch ends before the next contact: every further one costs as much as the first and makes the motion more
+sensitive to its start, and the last small hops of a ball tell next to nothing."""
 LEAST_DURATION = 0.08
 """s. A shorter stretch tells next to nothing either."""
 TENSORS = ("times", "positions", "sigmas", "starts", "heights", "contacts", "labels")
@@ -120,6 +123,9 @@ def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[Stretches
             continue
         begin, end = float(track.times[usable[0]]), track.times[usable[-1]]
         met = [c for c in estimate.contacts if usable[0] <= c.interval < usable[-1] and begin < c.time < end]
+        if len(met) > MOST_CONTACTS:
+            usable = usable[usable <= met[MOST_CONTACTS].interval]
+            end, met = track.times[usable[-1]], met[:MOST_CONTACTS]
         launched = usable[0] == 0
         rows = {
             "times": track.times[usable] - begin,

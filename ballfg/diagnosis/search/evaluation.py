@@ -83,7 +83,7 @@ class HeldOutGain:
     p_value: float
 
 
-def held_out_gain(before: Fit, after: Fit, held_out: Stretches) -> HeldOutGain:
+def held_out_gain(before: Fit, after: Fit, held_out: Stretches, on_before: Fit | None = None) -> HeldOutGain:
     """The gain of a larger model on tracks that neither fit has seen; only first states adapt to them.
 
     The gain shows whether the larger model helps. Its significance comes from the residual along the change that the
@@ -94,11 +94,14 @@ def held_out_gain(before: Fit, after: Fit, held_out: Stretches) -> HeldOutGain:
         before: fit on other tracks.
         after: fit of the larger model on the same other tracks.
         held_out: stretches to compare on.
+        on_before: `on_others(before, held_out)` where that was computed already.
     Returns: the gain in natural units per track, and its probability by chance.
     """
     for fitted in (before, after):
         held_out = _reached(fitted, held_out)
-    old, new = (_on(f, held_out, after.noise) for f in (before, after))
+    same = on_before is not None and before.noise is after.noise and len(on_before.problem.stretches) == len(held_out)
+    old = on_before if on_before is not None and same else _on(before, held_out, after.noise)
+    new = _on(after, held_out, after.noise)
     left = old.weighted_residual(old.robust)
     columns = np.stack((left - new.weighted_residual(old.robust), left), axis=-1)
     gram = by_track(columns.swapaxes(-1, -2) @ columns, held_out.track)

@@ -11,7 +11,7 @@ from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Errors, Outcome, Refusal
 from ballfg.diagnosis.search.candidates import Refit, Scored, delta_bic
-from ballfg.diagnosis.search.evaluation import held_out_gain
+from ballfg.diagnosis.search.evaluation import held_out_gain, on_others
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.diagnosis.search.parsimony import halves_differ, insignificant
 from ballfg.diagnosis.search.plausible import implausible, in_table
@@ -19,7 +19,7 @@ from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.diagnosis.search.ranking import NO_NAME, as_left, finding_of, fitted_values, ranking
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
 from ballfg.diagnosis.search.state import Confirmed, Search, left_out, without_named
-from ballfg.diagnosis.search.trial import try_hypotheses, try_varying
+from ballfg.diagnosis.search.trial import try_further, try_hypotheses, try_varying
 from ballfg.dynamics import AnalyticModel, BallModel, Effect
 
 MOST_EFFECTS = 4
@@ -47,7 +47,8 @@ class SearchLoop:
     """The inputs of a search, the same in every round.
 
     `predictive` gives a fitted model the process noise that predicts the tracks which it was fitted to; `judge` gives
-    the errors of its predictions on the judging half; `watch` is told of progress, in lines.
+    the errors of its predictions on the judging half; `watch` is told of progress, in lines; refits share `jobs`
+    processes.
     """
 
     holdout: Holdout
@@ -56,6 +57,7 @@ class SearchLoop:
     judge: Callable[[BallModel], Errors]
     watch: Callable[[str], None]
     plausible: float = PLAUSIBLE
+    jobs: int = 1
 
     def run(self, model: AnalyticModel) -> Search:
         """Add effects to the declared model until none helps, then take out those without which it predicts better."""
@@ -81,10 +83,13 @@ class SearchLoop:
             search = better
             scored, refits = self._tried(search, number)
         outcomes: dict[str, Outcome] = {}
+        tell = partial(self._tell, number)
         winner, refused = self._confirmed(search, refits, outcomes)
+        while winner is None and (fitted := try_further(search.fit, scored, refits, tell, self.jobs)):
+            winner, further = self._confirmed(search, fitted, outcomes)
+            refits, refused = [*refits, *fitted], refused | further
         if winner is None:  # a pattern that one effect explains for all tracks must not get a name for each group
-            tell = partial(self._tell, number)
-            more, fitted = try_varying(search.fit, self.catalogue, self.holdout, tell)
+            more, fitted = try_varying(search.fit, self.catalogue, self.holdout, tell, self.jobs)
             winner, further = self._confirmed(search, fitted, outcomes)
             scored, refits, refused = [*scored, *more], [*refits, *fitted], refused | further
         if winner is None:
@@ -110,7 +115,7 @@ class SearchLoop:
         return after, True
 
     def _tried(self, search: Search, number: int) -> tuple[list[Scored], list[Refit]]:
-        return try_hypotheses(search.fit, self.catalogue, partial(self._tell, number))
+        return try_hypotheses(search.fit, self.catalogue, partial(self._tell, number), self.jobs)
 
     def _tell(self, number: int, line: str) -> None:
         self.watch(f"round {number}: {line}")
@@ -142,10 +147,12 @@ class SearchLoop:
     ) -> tuple[Confirmed | None, dict[str, Refusal]]:
         """The best refit that deserves a name, and better ones that do not; fills in their outcomes."""
         refused: dict[str, Refusal] = {}
+        on_before: Fit | None = None
         for candidate in refits:
             if candidate.delta_bic >= 0.0:
                 break
-            examined = self._examined(search, candidate)
+            on_before = on_others(search.fit, self.holdout.held_out) if on_before is None else on_before
+            examined = self._examined(search, candidate, on_before)
             if isinstance(examined, Confirmed):
                 return examined, refused
             outcomes[candidate.name], settled = examined
@@ -153,10 +160,10 @@ class SearchLoop:
                 refused[candidate.name] = self._refusal(candidate.scored.hypothesis, settled, outcomes[candidate.name])
         return None, refused
 
-    def _examined(self, search: Search, candidate: Refit) -> Confirmed | tuple[Outcome, Fit]:
+    def _examined(self, search: Search, candidate: Refit, on_before: Fit) -> Confirmed | tuple[Outcome, Fit]:
         """A refit with all that confirms it, or why it is no name and its fit then; cheap questions come first."""
         hypothesis = candidate.scored.hypothesis
-        evidence = held_out_gain(search.fit, candidate.fit, self.holdout.held_out)
+        evidence = held_out_gain(search.fit, candidate.fit, self.holdout.held_out, on_before)
         if evidence.p_value >= CONFIRMED:
             return Outcome.NOT_HELPFUL, candidate.fit
         settled = fit_problem(candidate.fit.problem, candidate.fit.unknowns, candidate.fit.noise)

@@ -10,7 +10,7 @@ from ballfg.diagnosis.search.candidates import (
     ALARM,
     Refit,
     Scored,
-    refit,
+    refit_all,
     refit_driven,
     refit_usual,
     score_all,
@@ -32,7 +32,7 @@ LABELLED = 0.5
 
 
 def try_varying(
-    before: Fit, catalogue: Sequence[type[Effect]], holdout: Holdout, tell: Callable[[str], None]
+    before: Fit, catalogue: Sequence[type[Effect]], holdout: Holdout, tell: Callable[[str], None], jobs: int = 1
 ) -> tuple[list[Scored], list[Refit]]:
     """Every hypothesis that an effect differs between tracks, and refits of the leading ones, the best first."""
     problem, tracks = before.problem, holdout.tracks
@@ -48,12 +48,40 @@ def try_varying(
         closer = near(cast(Varying, candidate.hypothesis), searched, names)
         best = _placed(before, closer) if len(closer) > 1 else candidate
         same = between(cast(Varying, best.hypothesis), searched, names)
-        fitted = [refit(before, replace(best, hypothesis=h, p_value=candidate.p_value)) for h in same]
+        placed = [replace(best, hypothesis=h, p_value=candidate.p_value) for h in same]
+        fitted = refit_all(before, placed, jobs)
         # the search half has no track between these places, so that the other half tells them apart
         refits.append(
             min(fitted, key=lambda r: on_others(r.fit, holdout.held_out).cost) if len(same) > 1 else fitted[0]
         )
     return scored, sorted(refits, key=lambda r: r.delta_bic)
+
+
+def try_further(
+    before: Fit, scored: Sequence[Scored], tried: Sequence[Refit], tell: Callable[[str], None], jobs: int = 1
+) -> list[Refit]:
+    """Refits of the next hypotheses in the ranking, the best first; none if no further one is significant.
+
+    They are for a round in which none of those tried before deserves a name: flexible effects of implausible size
+    explain most of any pattern, and stand before its cause.
+    """
+    names = {refitted.name for refitted in tried}
+    return sorted(
+        _refitted(before, shortlist([s for s in scored if s.hypothesis.name not in names]), tell, jobs),
+        key=lambda r: r.delta_bic,
+    )
+
+
+def _refitted(before: Fit, leading: Sequence[Scored], tell: Callable[[str], None], jobs: int) -> list[Refit]:
+    shaped: list[Scored] = []
+    for candidate in leading:
+        tell(f"fitting with {candidate.hypothesis.name}")
+        if candidate.hypothesis.effect is SpinLabelFrame:
+            frames = frame_hypotheses(before, candidate.hypothesis)
+            shaped += [Scored(frame, None, candidate.p_value) for frame in frames]
+        else:
+            shaped.append(candidate)
+    return refit_all(before, shaped, jobs)
 
 
 def _placed(before: Fit, closer: Sequence[Varying]) -> Scored:
@@ -71,7 +99,7 @@ def _placed(before: Fit, closer: Sequence[Varying]) -> Scored:
 
 
 def try_hypotheses(
-    before: Fit, catalogue: Sequence[type[Effect]], tell: Callable[[str], None]
+    before: Fit, catalogue: Sequence[type[Effect]], tell: Callable[[str], None], jobs: int = 1
 ) -> tuple[list[Scored], list[Refit]]:
     """Every hypothesis, the one that explains most first; and the refits, the best first."""
     model = before.problem.model
@@ -81,14 +109,8 @@ def try_hypotheses(
     unlabelled = before.problem.stretches.labelled.mean() < LABELLED
     driven = [h for h in candidates if h.effect.multiplies_spin and unlabelled]
     scored = score_all(before, [h for h in candidates if h not in driven])
-    leading, refits = shortlist(scored), []
-    for candidate in leading:
-        tell(f"fitting with {candidate.hypothesis.name}")
-        shaped = [candidate]
-        if candidate.hypothesis.effect is SpinLabelFrame:
-            frames = frame_hypotheses(before, candidate.hypothesis)
-            shaped = [Scored(frame, None, candidate.p_value) for frame in frames]
-        refits += [refit(before, one) for one in shaped]
+    leading = shortlist(scored)
+    refits = _refitted(before, leading, tell, jobs)
     called = {candidate.hypothesis.name for candidate in leading}
     for place, hypothesis in enumerate([s.hypothesis for s in scored]):
         if hypothesis.name in called or not hypothesis.usual or has_effect(model, hypothesis.name):
