@@ -19,15 +19,15 @@ TRACK: Final = "track"
 _FIELDS: Final = ("by", "values", "line")
 
 
-def place_of(name: str) -> tuple[tuple[int, str], ...]:
+def place_of(name: str) -> tuple[tuple[bool, int, str], ...]:
     """A key that sorts names of tracks as people do: "9" before "10", and "a2" before "b1"."""
-    parts = re.findall(r"\d+|\D+", name)
-    return tuple((int(part), "") if part.isdigit() else (-1, part) for part in parts)
+    parts = re.findall(r"[0-9]+|[^0-9]+", name)
+    return tuple((False, int(part), "") if part[0] in "0123456789" else (True, 0, part) for part in parts)
 
 
 def number_of(name: str) -> int | None:
     """The last number in the name of a track; None where there is none."""
-    numbers = re.findall(r"\d+", name)
+    numbers = re.findall(r"[0-9]+", name)
     return int(numbers[-1]) if numbers else None
 
 
@@ -69,8 +69,8 @@ class Variation:
             return None if label is None else self.values.get(str(label))
         if self.line:
             place = number_of(track.name)
-            known = sorted((number_of(name) or 0, value) for name, value in self.values.items())
-            return None if place is None else float(np.interp(place, *zip(*known, strict=True)))
+            known = np.array(sorted((float(number_of(name) or 0), value) for name, value in self.values.items()))
+            return None if place is None else float(np.interp(place, known[:, 0], known[:, 1]))
         begun = [name for name in self.values if place_of(name) <= place_of(track.name)]
         return self.values[max(begun, key=place_of)] if begun else None
 

@@ -1,0 +1,75 @@
+"""Models whose coefficients differ between tracks: every estimator and prediction uses the track's own."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ballfg.dynamics import Surfaces, Variation, nominal_model
+from ballfg.estimation import Settings, estimate_tracks, make_estimator, predict_tracks
+from ballfg.estimation.noise.linear_tracks import linearise
+from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.simulation import SimulationConfig, parse_effects, simulate
+
+SETTINGS = Settings(position_noise=(0.002, 0.002, 0.002))
+TABLE = Surfaces.table_tennis(0.0)
+METHODS = ("smoother", "online", "ekf", "sliding-window")
+
+
+def varied(**values):
+    model = nominal_model()
+    model.variations = {"bounce.restitution.e": Variation("group", values)}
+    return model
+
+
+def with_restitution(e):
+    model = nominal_model()
+    model.bounce["restitution"].e.data.fill_(e)
+    return model
+
+
+@pytest.fixture(scope="module")
+def tracks():
+    """Two of an old table, two of a new one, two of none that the model knows."""
+    found = []
+    for group, e in (("old", 0.8), ("new", 0.95), ("other", 0.93)):
+        made = simulate(SimulationConfig(tracks=2, seed=3, undeclared=parse_effects((f"restitution.e={e}",))))
+        found += [replace(m.track, labels={"group": group}, name=f"{group}-{i}") for i, m in enumerate(made)]
+    return found[::2] + found[1::2]
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_track_is_estimated_with_its_own_values(tracks, method):
+    """The same numbers as from a model that has those values for all tracks."""
+    estimator = make_estimator(method, varied(old=0.8, new=0.95), TABLE, SETTINGS)
+    for track, estimate in zip(tracks, estimate_tracks(estimator, tracks, len(tracks), 1), strict=True):
+        e = {"old": 0.8, "new": 0.95}.get(track.labels["group"])
+        model = nominal_model() if e is None else with_restitution(e)
+        alone = make_estimator(method, model, TABLE, SETTINGS).estimate(track)
+        np.testing.assert_array_equal(estimate.states, alone.states)
+        predicted, expected = estimate.predict(0.3), alone.predict(0.3)
+        np.testing.assert_array_equal(predicted.states, expected.states)
+
+
+def test_predictions_come_in_the_order_of_the_tracks_with_their_own_values(tracks):
+    observe = 0.25
+    estimator = make_estimator("smoother", varied(old=0.8, new=0.95), TABLE, SETTINGS)
+    found = list(predict_tracks(estimator, tracks, len(tracks), observe))
+    assert [p.name for p in found] == [t.name for t in tracks]
+    for track, prediction in zip(tracks, found, strict=True):
+        e = {"old": 0.8, "new": 0.95}.get(track.labels["group"])
+        model = nominal_model() if e is None else with_restitution(e)
+        (alone,) = predict_tracks(make_estimator("smoother", model, TABLE, SETTINGS), [track], 1, observe)
+        np.testing.assert_allclose(prediction.positions, alone.positions, atol=1e-9)
+        np.testing.assert_allclose(prediction.sigmas, alone.sigmas, rtol=1e-6)
+
+
+def test_noise_is_looked_for_about_each_tracks_own_motion(tracks):
+    smoother = Smoother(varied(old=0.8, new=0.95), TABLE, SETTINGS)
+    together = linearise(smoother, tracks[:2])
+    for row, e in enumerate((0.8, 0.95)):
+        alone = linearise(Smoother(with_restitution(e), TABLE, SETTINGS), tracks[row : row + 1])
+        count = alone.errors.shape[1]
+        np.testing.assert_allclose(together.errors[row, :count], alone.errors[0], atol=1e-12)
