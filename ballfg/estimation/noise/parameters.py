@@ -48,24 +48,28 @@ USUAL_JITTER: Final = 1e-4
 COEFFICIENTS: Final = "coefficients"
 
 
-def parameters_of(settings: Settings, tracks: LinearTracks, position_known: bool) -> list[Parameter]:
+def parameters_of(
+    settings: Settings, tracks: LinearTracks, position_known: bool, tracker_known: bool = False
+) -> list[Parameter]:
     """The numbers that some tracks can tell.
 
     Args:
         settings: prior medians.
         tracks: that are asked; without labels, balls without a label, or bounces they do not tell of these.
         position_known: whether the white noise of positions is stated, and stays.
+        tracker_known: whether the memory of the tracker and the jitter of the stamps are, too.
     """
     process, found = settings.process, []
     white = settings.position_scale * np.array(settings.position_noise)
     for axis in range(3):
         if not position_known:
             found.append(Parameter("position", axis, white[axis], FACTOR_FOUR, 1e-5, 0.1))
-    for axis in range(3):
-        memory = settings.memory[axis] or MEMORY_SHARE * white[axis]
-        found.append(Parameter("memory", axis, memory, FACTOR_FOUR, 1e-5, 0.1))
-    found.append(Parameter("memory_time", None, settings.memory_time, FACTOR_FOUR, 0.002, 0.5))
-    found.append(Parameter("stamp_jitter", None, settings.stamp_jitter or USUAL_JITTER, FACTOR_FOUR, 1e-6, 0.01))
+    if not tracker_known:
+        for axis in range(3):
+            memory = settings.memory[axis] or MEMORY_SHARE * white[axis]
+            found.append(Parameter("memory", axis, memory, FACTOR_FOUR, 1e-5, 0.1))
+        found.append(Parameter("memory_time", None, settings.memory_time, FACTOR_FOUR, 0.002, 0.5))
+        found.append(Parameter("stamp_jitter", None, settings.stamp_jitter or USUAL_JITTER, FACTOR_FOUR, 1e-6, 0.01))
     found.append(Parameter("acceleration", None, process.acceleration, FACTOR_FOUR, 0.003, 10.0))
     if bool((tracks.kicks[:, :, PROCESS_NOISE.index("contact_velocity")] != 0.0).any()):
         tangential = process.contact_tangential or process.contact_velocity
@@ -91,7 +95,7 @@ def tensors_of(parameters: list[Parameter], logs: Tensor, settings: Settings) ->
 
     white = settings.position_scale * np.array(settings.position_noise)
     scales = [values.get(("position", a), torch.tensor(white[a], dtype=torch.float64)) / white[a] for a in range(3)]
-    memory = [values[("memory", a)] for a in range(3)]
+    memory = [values.get(("memory", a), torch.tensor(settings.memory[a], dtype=torch.float64)) for a in range(3)]
     process = [one(name, getattr(settings.process, name)) for name in PROCESS_NOISE]
     return Noise(
         position=torch.stack(scales),
