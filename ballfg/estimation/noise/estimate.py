@@ -170,7 +170,7 @@ class _Search:
     def value(self, logs: Array) -> tuple[float, Array]:
         """Negative log posterior and its gradient (k,); every start counts as one observation."""
         leaf = torch.tensor(logs, dtype=torch.float64, requires_grad=True)
-        score = self.forecaster.score(tensors_of(self.parameters, leaf, self.settings)).value
+        score = self.forecaster.score(tensors_of(self.parameters, leaf[None], self.settings)).value
         (gradient,) = torch.autograd.grad(score, leaf)
         away = (logs - self.start) / self.spread
         value = self.weight * float(score.detach()) + 0.5 * float(away @ away)
@@ -209,16 +209,16 @@ class _Search:
 
     def _scatter(self, logs: Array) -> Array:
         """(k, k) sum over tracks of the squares of their gradients about the mean."""
-        leaf = torch.tensor(logs, dtype=torch.float64, requires_grad=True)
-        by_track = self.weight * self.forecaster.score(tensors_of(self.parameters, leaf, self.settings)).by_track
-        gradients = np.stack(
-            [torch.autograd.grad(one, leaf, retain_graph=True)[0].numpy() for one in by_track.unbind()]
-        )
+        leaf = torch.tensor(np.tile(logs, (self.forecaster.count, 1)), dtype=torch.float64, requires_grad=True)
+        score = self.forecaster.score(tensors_of(self.parameters, leaf, self.settings)).value
+        gradients = self.weight * torch.autograd.grad(score, leaf)[0].numpy()
         count, away = len(gradients), gradients - gradients.mean(axis=0)
         return np.asarray(away.T @ away * count / max(count - 1, 1))
 
     def held(self, logs: Array) -> float:
         """Share of forecast coordinates inside their 90 % intervals."""
         with torch.no_grad():
-            noise = tensors_of(self.parameters, torch.from_numpy(np.asarray(logs, dtype=np.float64)), self.settings)
+            noise = tensors_of(
+                self.parameters, torch.from_numpy(np.asarray(logs[None], dtype=np.float64)), self.settings
+            )
             return self.forecaster.score(noise).held

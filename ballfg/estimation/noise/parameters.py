@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ballfg.arrays import Array
-from ballfg.estimation.noise.forecasts import Noise
+from ballfg.estimation.noise.linear_filter import Noise
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.estimation.settings import Settings
 from ballfg.factors.noise import PROCESS_NOISE
@@ -87,22 +87,23 @@ def parameters_of(
 
 
 def tensors_of(parameters: list[Parameter], logs: Tensor, settings: Settings) -> Noise:
-    """The noise that a vector of logarithms (k,) stands for; what is not among the parameters is the settings'."""
-    values = {(p.name, p.axis): torch.exp(log) for p, log in zip(parameters, logs, strict=True)}
+    """The noise that logarithms (r, k) stand for, a row for each track or one for all.
 
-    def one(name: str, otherwise: float) -> Tensor:
-        return values.get((name, None), torch.tensor(otherwise, dtype=torch.float64))
+    What is not among the parameters is the settings'.
+    """
+    values = {(p.name, p.axis): torch.exp(log) for p, log in zip(parameters, logs.unbind(-1), strict=True)}
+
+    def one(name: str, otherwise: float, axis: int | None = None) -> Tensor:
+        return values.get((name, axis), torch.full((len(logs),), otherwise, dtype=torch.float64))
 
     white = settings.position_scale * np.array(settings.position_noise)
-    scales = [values.get(("position", a), torch.tensor(white[a], dtype=torch.float64)) / white[a] for a in range(3)]
-    memory = [values.get(("memory", a), torch.tensor(settings.memory[a], dtype=torch.float64)) for a in range(3)]
     process = [one(name, getattr(settings.process, name)) for name in PROCESS_NOISE]
     return Noise(
-        position=torch.stack(scales),
-        memory=torch.stack(memory),
+        position=torch.stack([one("position", white[a], a) / white[a] for a in range(3)], dim=-1),
+        memory=torch.stack([one("memory", settings.memory[a], a) for a in range(3)], dim=-1).square(),
         memory_time=one("memory_time", settings.memory_time),
-        stamp_jitter=one("stamp_jitter", settings.stamp_jitter),
-        process=torch.stack(process),
+        stamp_jitter=one("stamp_jitter", settings.stamp_jitter).square(),
+        process=torch.stack(process, dim=-1),
         spin_label=one("spin_label", settings.spin_label_noise),
         spin_prior=one("spin_prior", settings.spin_prior),
         coefficients=one(COEFFICIENTS, 1.0),
