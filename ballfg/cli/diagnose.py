@@ -72,6 +72,7 @@ def _summary(diagnosis: Diagnosis) -> Iterator[str]:
         ("prediction RMSE, mm", fixed(before.prediction_rmse_mm, 1), fixed(after.prediction_rmse_mm, 1)),
         ("apex RMSE, mm", fixed(before.apex_rmse_mm, 1), fixed(after.apex_rmse_mm, 1)),
         ("NIS (1 is right)", fixed(before.nis, 2), fixed(after.nis, 2)),
+        ("intervals hold, %", fixed(100 * before.intervals_held, 0), fixed(100 * after.intervals_held, 0)),
         ("log likelihood", fixed(before.log_likelihood, 2), fixed(after.log_likelihood, 2)),
     ]
     yield from ("", *_aligned(errors))

@@ -16,7 +16,7 @@ from ballfg.diagnosis.result import Diagnosis, Errors, GenericTest, Unexplained,
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.loop import Search, SearchLoop
 from ballfg.diagnosis.search.plausible import implausible
-from ballfg.diagnosis.search.process_noise import PredictiveModel, calibrated_model, with_process_noise
+from ballfg.diagnosis.search.process_noise import Predicting, noise_about
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
 from ballfg.estimation import dataset_settings
 from ballfg.tracks import Dataset
@@ -57,15 +57,20 @@ def diagnose(
     holdout = hold_out(dataset, model, jobs, tell)
     evaluate = partial(_errors, holdout, jobs)
     effects = tuple(catalogue or EFFECTS.values())
-    search = SearchLoop(holdout, effects, partial(_predictive, holdout, jobs), evaluate, tell, jobs=jobs).run(model)
+    search = SearchLoop(holdout, effects, Predicting(holdout, jobs), evaluate, tell, jobs=jobs).run(model)
+    corrected, after = search.predictive.model, search.judged
+    if search.fit is not search.first:
+        tell("looking at the noise about the corrected model")
+        corrected.noise = noise_about(corrected, holdout.search_tracks, dataset)
+        after = evaluate(corrected)
     tell("looking at what is left")
     tests = generic_tests(search.fit, search.first)
     verdict = _verdict(search, tests)
     helped = None
     if verdict is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in _alarms(tests)):
         tell("describing what is left without a name")
-        tracks = [part.track for part in holdout.search_tracks]
-        helped = fallback(search.fit, holdout.launcher.embedding, dataset, tracks, search.judged, evaluate)
+        embedding, parts = holdout.launcher.embedding, holdout.search_tracks
+        helped = fallback(search.fit, embedding, corrected.noise, dataset, parts, after, evaluate)
     alarms = sorted(_alarms(tests), key=lambda test: test.name == "time")  # a place says more than a correlation
     unexplained = Unexplained(alarms[0].where if alarms else "", _share(tests), tests, helped)
     residuals = residuals_of(search.first)
@@ -78,13 +83,13 @@ def diagnose(
         findings=search.findings,
         rounds=search.rounds,
         before=search.before,
-        after=search.judged if helped is None else helped.after,
+        after=after if helped is None else helped.after,
         tracks_found_on=len(np.unique(holdout.search.track)),
         tracks_judged_on=len(search.before.by_track),
         calibrated=calibrated,
         noise=_noise(search.fit, holdout),
         unexplained=unexplained,
-        model=search.predictive.model if helped is None else helped.model,
+        model=corrected if helped is None else helped.model,
         residuals_before=residuals,
         residuals_after=residuals if search.fit is search.first else residuals_of(search.fit),
         excluded=holdout.excluded,
@@ -97,12 +102,6 @@ def _strange(calibrated: Mapping[str, Value], radius: float) -> list[str]:
     texts = [implausible(name.partition(".")[2], value, radius) for name, value in calibrated.items()]
     words = "Something that the model does not describe has moved it: a clock, lengths or spin labels, say"
     return [f"The fitted {text}. {words}." for text in texts if text]
-
-
-def _predictive(holdout: Holdout, jobs: int, fit: Fit) -> PredictiveModel:
-    """A fitted model with the process noise that predicts the search half best."""
-    model = calibrated_model(fit, holdout.launcher.embedding)
-    return with_process_noise(model, holdout.search_tracks, holdout.dataset, jobs)
 
 
 def _errors(holdout: Holdout, jobs: int, model: BallModel) -> Errors:

@@ -13,7 +13,7 @@ from ballfg.diagnosis.fit.problem import Problem, declared_free
 from ballfg.diagnosis.fit.stretches import Stretches, stretches_of
 from ballfg.diagnosis.result import Errors
 from ballfg.diagnosis.search.evaluation import prediction_errors
-from ballfg.diagnosis.search.process_noise import calibrated_model, with_process_noise
+from ballfg.diagnosis.search.process_noise import calibrated_model, noise_about
 from ballfg.dynamics import AnalyticModel
 from ballfg.dynamics.effect import Coefficient
 from ballfg.estimation import Smoother, dataset_settings
@@ -35,8 +35,8 @@ def true_errors(case: Case, dataset: Dataset) -> Errors:
     search = reachable(truth, _with_labelled_spins(truth, search))
     problem = Problem(truth, search, {**declared_free(declared), **planted_free(case)})
     start = first_guess(problem, holdout.settings.spin_label_noise, holdout.settings.spin_prior)
-    fitted = calibrated_model(fit_problem(problem, *start), holdout.launcher.embedding)
-    model = with_process_noise(fitted, holdout.search_tracks, dataset).model
+    model = calibrated_model(fit_problem(problem, *start), holdout.launcher.embedding)
+    model.noise = noise_about(model, holdout.search_tracks, dataset)
     return prediction_errors(model, holdout.held_out_tracks, holdout.surfaces, dataset_settings(dataset, model))
 
 

@@ -87,7 +87,7 @@ def errors(size: float, seed: int) -> Errors:
     """Errors of 25 tracks about a size in mm."""
     by_track = size * np.random.default_rng(seed).lognormal(-0.08, 0.4, 25)
     pooled = float(np.sqrt((by_track**2).mean()))
-    return Errors(pooled, 0.6 * pooled, (pooled / 8.0) ** 2, 3.9 - 0.02 * pooled, by_track)
+    return Errors(pooled, 0.6 * pooled, (pooled / 8.0) ** 2, 3.9 - 0.02 * pooled, by_track, 0.87, 2.6)
 
 
 def _candidate(

@@ -4,6 +4,7 @@ A few generic terms come first, because people can read them. Only if they do no
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
@@ -12,7 +13,7 @@ from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.remains.sparse import SparseTerms, fit_with_terms, sparse_terms
 from ballfg.diagnosis.result import Errors, Fallback
-from ballfg.diagnosis.search.process_noise import calibrated_model, with_process_noise
+from ballfg.diagnosis.search.process_noise import calibrated_model, noise_about
 from ballfg.dynamics import AnalyticModel, Architecture, BallModel, LearnedModel, SpinEmbedding, build
 from ballfg.estimation import Settings, Smoother, dataset_settings, dataset_surfaces
 from ballfg.estimation.measurement.as_measured import plainly_measured
@@ -24,7 +25,7 @@ from ballfg.learning.run.loop import Task, Training, TrainingStoppedError
 from ballfg.learning.run.ranks import Ranks
 from ballfg.learning.shots import Shot, shots_of
 from ballfg.progress import unwatched
-from ballfg.tracks import Dataset, Track
+from ballfg.tracks import Dataset, Track, TrackNoise
 
 HELPS = 0.9
 """A fallback must reduce the prediction error on the held-out half to this share of the error without it."""
@@ -43,29 +44,32 @@ POSITION_SCALE = 0.03
 def fallback(
     before: Fit,
     embedding: SpinEmbedding,
+    noise: TrackNoise | None,
     dataset: Dataset,
-    tracks: Sequence[Track],
+    parts: Sequence[EvaluationTrack],
     now: Errors,
     evaluate: Callable[[BallModel], Errors],
 ) -> Fallback | None:
     """A description of the rest without a name; None if nothing predicts better.
 
-    The fit before and the tracks are those of the search half. The errors `now`, of the model so far, and those that
-    `evaluate` gives are those on the held-out half.
+    The fit before and the tracks are those of the search half, the noise is what these show about it. The errors `now`,
+    of the model so far, and those that `evaluate` gives are those on the held-out half.
     """
     most = HELPS * now.prediction_rmse_mm
-    parts = [EvaluationTrack(track, np.zeros(0)) for track in tracks]
     terms = sparse_terms(before)
     if terms is not None:
         after = fit_with_terms(before, terms)
-        model = with_process_noise(calibrated_model(after, embedding), parts, dataset).model
+        model = calibrated_model(after, embedding)
+        model.noise = noise_about(model, parts, dataset, noise)
         errors = evaluate(model)
         if errors.prediction_rmse_mm < most:
             return Fallback("sparse terms", describe(terms, after), now, errors, model)
-    base = with_process_noise(calibrated_model(before, embedding), parts, dataset).model
-    network = learned_residual(base, dataset, tracks)
+    base = calibrated_model(before, embedding)
+    base.noise = noise
+    network = learned_residual(base, dataset, [part.track for part in parts])
     if network is None:
         return None
+    network.noise = noise_about(network, parts, dataset, noise)
     errors = evaluate(network)
     if errors.prediction_rmse_mm >= most:
         return None
@@ -115,7 +119,7 @@ def learned_residual(
 
 def _as_happened(base: AnalyticModel, dataset: Dataset, tracks: Sequence[Track]) -> tuple[list[Track], Settings]:
     """Tracks with the model's measurement effects undone, where that is possible, and the settings for them."""
-    settings = dataset_settings(dataset, base)
+    settings = replace(dataset_settings(dataset, base), coefficients={})  # the network makes up for them
     if base.measures_plainly:
         return list(tracks), settings
     through = InvertMeasurement(Smoother, base, dataset_surfaces(dataset), settings)

@@ -17,6 +17,7 @@ COLOURS = {Outcome.ADDED: "added", Outcome.ALIKE: "alike"}
 """Classes of the style for the verdict and for the outcome of a candidate."""
 SHOWN = 8
 """Rows of a ranking that are seen at once; the others unfold."""
+INTERVALS = "90 % is right: share of measured coordinates inside their 90 % intervals"
 RANKING = ("candidate", "squared residual it would explain", "by chance", "BIC", "first estimate", "outcome")
 
 
@@ -57,6 +58,7 @@ def _errors(diagnosis: Diagnosis) -> Html:
         _card("prediction error", before.prediction_rmse_mm, after.prediction_rmse_mm, " mm", changed),
         _card("error of the apex", before.apex_rmse_mm, after.apex_rmse_mm, " mm", changed),
         _card("NIS", before.nis, after.nis, "", changed, "1: errors are as large as predicted"),
+        _card("intervals hold", 100 * before.intervals_held, 100 * after.intervals_held, " %", changed, INTERVALS),
         _card("log likelihood", *likelihoods, "", changed, "per coordinate; more is better"),
         kind="cards",
     )

@@ -16,6 +16,7 @@ from ballfg.diagnosis.search.score import score_tests
 from ballfg.diagnosis.search.signatures import Signatures
 from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation import Settings, TrackPrediction, make_estimator, predict_tracks
+from ballfg.estimation.noise.forecasts import NINETY
 from ballfg.prediction.apexes import measured_apexes, path_apex
 
 OBSERVED = 0.4
@@ -48,8 +49,8 @@ def prediction_errors(
             "by; none does. Record longer tracks."
         )
     squares = [((p.positions - p.measured) ** 2).sum(axis=-1) for _, p in pairs]
-    scores = np.concatenate([((p.positions - p.measured) / p.sigmas).ravel() for _, p in pairs])
-    sigmas = np.concatenate([p.sigmas.ravel() for _, p in pairs])
+    scores = np.concatenate([(p.positions - p.measured) / p.sigmas for _, p in pairs])
+    sigmas = np.concatenate([p.sigmas for _, p in pairs])
     apexes = np.concatenate([_apex_distances(t, p) for t, p in pairs])
     return Errors(
         1e3 * float(np.sqrt(np.concatenate(squares).mean())),
@@ -57,6 +58,8 @@ def prediction_errors(
         float((scores**2).mean()),
         float((-0.5 * scores**2 - np.log(sigmas)).mean() - 0.5 * np.log(2 * np.pi)),
         1e3 * np.sqrt([s.mean() for s in squares]),
+        float((np.abs(scores) < NINETY).mean()),
+        float(np.median((scores**2).sum(axis=-1))),
     )
 
 

@@ -1,42 +1,37 @@
-"""From a fit to a model that others can use: fitted coefficients, noise and launcher, and the process noise.
+"""From a fit to a model that others can use: fitted coefficients, launcher and the noise that the tracks show.
 
-Process noise is how far measured balls stray from a model from one moment to the next. The fit is deterministic, so
-that all motion beside the model goes to the residual. Predictions need that motion as process noise. Too little of it
-makes them overconfident; too much makes them ignore the observed part. The usual process noise of measured tracks is
-scaled as a whole, to the scale at which predictions of the search half have the largest likelihood.
+The fit is deterministic, so that all motion beside the model goes to the residual. Predictions need that motion as
+noise: too little of it makes them overconfident, too much makes them ignore the observed part. `estimate_noise` finds
+it from forecasts within the tracks of the search half.
 """
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import cast
 
 import numpy as np
 import torch
 
-from ballfg.diagnosis.fit.holdout import EvaluationTrack
+from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Errors
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.hypothesis import with_effects
-from ballfg.dynamics import AnalyticModel, SpinEmbedding, Trained
-from ballfg.estimation import dataset_settings, dataset_surfaces
-from ballfg.estimation.settings import MEASURED
-from ballfg.tracks import Dataset
+from ballfg.dynamics import AnalyticModel, BallModel, SpinEmbedding, Trained
+from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.estimation import dataset_settings, dataset_surfaces, estimate_noise, spread_over
+from ballfg.tracks import Dataset, TrackNoise
 
-SCALES = (0.03, 0.1, 0.3, 1.0)
-"""Factors on the usual process noise that are tried; the likelihood is flat between neighbours."""
 MOST_PREDICTED = 15
-"""Tracks that are predicted to choose the scale, evenly over those given."""
-SCALED = ("acceleration", "spin", "contact_velocity", "contact_tangential", "contact_spin")
-"""Numbers of the process noise that are scaled; the noise of a hit stays."""
+"""Tracks of the search half that are predicted to see whether an effect misleads, evenly spread."""
 LEAST_SPIN_SIGMA = 1.0
 """rad/s. A launcher is not taken to repeat its spin better than that."""
+SPREAD = 0.3
+"""Prior median of the spread of coefficients between tracks, over the prior of a coefficient that nobody fitted."""
 
 
 @dataclass(frozen=True)
 class PredictiveModel:
-    """A model with the process noise that predicts best, and its errors on tracks that it was fitted to."""
+    """A model with the noise to predict with, and its errors on tracks that it was fitted to."""
 
     model: AnalyticModel
     errors: Errors
@@ -61,26 +56,54 @@ def calibrated_model(fit: Fit, embedding: SpinEmbedding) -> AnalyticModel:
     return model
 
 
-def with_process_noise(
-    model: AnalyticModel, tracks: Sequence[EvaluationTrack], dataset: Dataset, jobs: int = 1
-) -> PredictiveModel:
-    """The model with the process noise that predicts tracks best.
+def noise_about(
+    model: BallModel, tracks: Sequence[EvaluationTrack], dataset: Dataset, tracker: TrackNoise | None = None
+) -> TrackNoise | None:
+    """The noise that tracks show about a calibrated model; None where they are too short to tell.
 
-    Args: model: with `trained`, which is replaced.  tracks: those that it was fitted to.
+    Args:
+        model: with `trained`.
+        tracks: those that it was fitted to.
+        dataset: their origin.
+        tracker: memory of the tracker and jitter of the stamps, which stay; None: those that the dataset states.
     """
-    tried: list[Errors] = []
-    some = tracks[:: math.ceil(len(tracks) / MOST_PREDICTED)]
-    trained = cast(Trained, model.trained)
-    for scale in SCALES:
-        model.trained = _scaled(trained, scale)
-        settings = dataset_settings(dataset, model)
-        tried.append(prediction_errors(model, some, dataset_surfaces(dataset), settings, jobs))
-        if len(tried) > 1 and tried[-1].log_likelihood < tried[-2].log_likelihood:
-            break  # the likelihood has one maximum
-    best = int(np.argmax([errors.log_likelihood for errors in tried]))
-    model.trained = _scaled(trained, SCALES[best])
-    return PredictiveModel(model, tried[best])
+    tracker = tracker or TrackNoise()
+    settings = dataset_settings(dataset, model)
+    settings = replace(
+        settings,
+        coefficients={name: SPREAD * sigma for name, sigma in coefficient_sigmas(model).items()},
+        memory=tracker.memory or settings.memory,
+        memory_time=tracker.memory_time or settings.memory_time,
+        stamp_jitter=tracker.stamp_jitter or settings.stamp_jitter,
+    )
+    some = spread_over((part.track for part in tracks), len(tracks))
+    found = estimate_noise(model, dataset_surfaces(dataset), settings, some, tracker_known=True, errors=False)
+    if found is None:
+        return None
+    lasting = {"memory": settings.memory, "memory_time": settings.memory_time} if settings.has_memory else {}
+    return replace(found.noise, **lasting, stamp_jitter=settings.stamp_jitter or None)
 
 
-def _scaled(trained: Trained, scale: float) -> Trained:
-    return replace(trained, process_noise={name: scale * getattr(MEASURED, name) for name in SCALED})
+class Predicting:
+    """Makes models that predict from fits of one holdout, all with the same noise, so that effects alone differ.
+
+    It is the noise that the search half shows about the first fit. A declared model that lacks an effect has too much
+    of it for the corrected one, whose own noise is found once the search is over.
+
+    Args: holdout: the halves.  jobs: processes.
+    """
+
+    def __init__(self, holdout: Holdout, jobs: int) -> None:
+        self.holdout, self.jobs = holdout, jobs
+        self._noise: list[TrackNoise | None] = []
+
+    def __call__(self, fit: Fit) -> PredictiveModel:
+        """The fitted model with that noise, and its errors on some tracks of the search half."""
+        holdout, model = self.holdout, calibrated_model(fit, self.holdout.launcher.embedding)
+        if not self._noise:
+            self._noise.append(noise_about(model, holdout.search_tracks, holdout.dataset))
+        (model.noise,) = self._noise
+        count = len(holdout.search_tracks)
+        some = spread_over(holdout.search_tracks, count, MOST_PREDICTED)
+        settings = dataset_settings(holdout.dataset, model)
+        return PredictiveModel(model, prediction_errors(model, some, holdout.surfaces, settings, self.jobs))

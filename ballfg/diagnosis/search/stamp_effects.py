@@ -46,7 +46,7 @@ def as_declared(model: AnalyticModel, stamps: Stamps) -> AnalyticModel:
     bare = model
     for name in stamps.found:
         bare = without_effect(bare, name)
-    bare.trained = model.trained
+    bare.trained, bare.noise = model.trained, model.noise
     return bare
 
 

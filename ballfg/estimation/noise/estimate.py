@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 import torch
@@ -30,6 +30,8 @@ from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Track, TrackNoise
+
+T = TypeVar("T")
 
 LONGEST_PART: Final = 0.75
 """s of a track that are used: a start at 0.2 s or later, and 0.3 s of forecast behind it."""
@@ -77,6 +79,7 @@ def estimate_noise(
     tracks: Iterable[Track],
     *,
     position_known: bool = False,
+    tracker_known: bool = False,
     errors: bool = True,
     watch: Watch = unwatched,
 ) -> NoiseEstimate | None:
@@ -91,6 +94,7 @@ def estimate_noise(
         settings: prior medians of all numbers.
         tracks: measured positions; each contributes its first part (`LONGEST_PART`).
         position_known: whether the settings' white noise of positions stays as it is.
+        tracker_known: whether the settings' memory of the tracker and jitter of the stamps stay as they are.
         errors: whether to compute error bars, which doubles the time.
         watch: told of each track, and of each step of the search.
     Returns: None where no track is long enough.
@@ -107,7 +111,7 @@ def estimate_noise(
     forecaster = _forecaster(linear, parts, settings)
     if not len(forecaster.starts):
         return None
-    parameters = parameters_of(settings, linear, position_known or own_sigmas)
+    parameters = parameters_of(settings, linear, position_known or own_sigmas, tracker_known)
     search = _Search(forecaster, parameters, settings)
     watched = watch(range(2 * MOST_ITERATIONS), 2 * MOST_ITERATIONS, "steps of the noise")
     with closing(step for step in watched) as steps:
@@ -125,7 +129,7 @@ def estimate_noise(
     )
 
 
-def spread_over(tracks: Iterable[Track], count: int, most: int = MOST_TRACKS) -> list[Track]:
+def spread_over(tracks: Iterable[T], count: int, most: int = MOST_TRACKS) -> list[T]:
     """Up to `most` tracks, evenly from the first `count` of a stream."""
     chosen = set(np.linspace(0, count - 1, min(most, count)).round().astype(int).tolist()) if count else set()
     found = []
@@ -166,7 +170,7 @@ class _Search:
     def value(self, logs: Array) -> tuple[float, Array]:
         """Negative log posterior and its gradient (k,); every start counts as one observation."""
         leaf = torch.tensor(logs, dtype=torch.float64, requires_grad=True)
-        score = self.forecaster.score(tensors_of(self.parameters, leaf, self.settings)).value
+        score = self.forecaster.score(tensors_of(self.parameters, leaf[None], self.settings)).value
         (gradient,) = torch.autograd.grad(score, leaf)
         away = (logs - self.start) / self.spread
         value = self.weight * float(score.detach()) + 0.5 * float(away @ away)
@@ -205,16 +209,16 @@ class _Search:
 
     def _scatter(self, logs: Array) -> Array:
         """(k, k) sum over tracks of the squares of their gradients about the mean."""
-        leaf = torch.tensor(logs, dtype=torch.float64, requires_grad=True)
-        by_track = self.weight * self.forecaster.score(tensors_of(self.parameters, leaf, self.settings)).by_track
-        gradients = np.stack(
-            [torch.autograd.grad(one, leaf, retain_graph=True)[0].numpy() for one in by_track.unbind()]
-        )
+        leaf = torch.tensor(np.tile(logs, (self.forecaster.count, 1)), dtype=torch.float64, requires_grad=True)
+        score = self.forecaster.score(tensors_of(self.parameters, leaf, self.settings)).value
+        gradients = self.weight * torch.autograd.grad(score, leaf)[0].numpy()
         count, away = len(gradients), gradients - gradients.mean(axis=0)
         return np.asarray(away.T @ away * count / max(count - 1, 1))
 
     def held(self, logs: Array) -> float:
         """Share of forecast coordinates inside their 90 % intervals."""
         with torch.no_grad():
-            noise = tensors_of(self.parameters, torch.from_numpy(np.asarray(logs, dtype=np.float64)), self.settings)
+            noise = tensors_of(
+                self.parameters, torch.from_numpy(np.asarray(logs[None], dtype=np.float64)), self.settings
+            )
             return self.forecaster.score(noise).held

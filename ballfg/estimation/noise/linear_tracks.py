@@ -39,6 +39,7 @@ class LinearTracks:
     With t tracks of up to n samples, and d = 9 + p numbers for state and coefficients:
 
     Attributes:
+        numbers: (t,) of the tracks given, those that are used.
         times: (t, n) s since the first sample that is used.
         errors: (t, n, 3) m, measured minus estimated positions.
         white: (t, n, 3) m, standard deviations of the samples' white errors.
@@ -52,6 +53,7 @@ class LinearTracks:
         coefficient_sigmas: (p,) prior standard deviations, in the coefficients' own units.
     """
 
+    numbers: Array
     times: Tensor
     errors: Tensor
     white: Tensor
@@ -71,15 +73,15 @@ class LinearTracks:
         """(t, d) of the first state and the coefficients.
 
         Args:
-            spin: () rad/s, standard deviation per axis of spins without a label.
-            label: () rad/s, of a label.
-            coefficients: () multiple of `coefficient_sigmas`.
+            spin: (r,) rad/s, standard deviation per axis of spins without a label; one row for all tracks or for each.
+            label: (r,) rad/s, of a label.
+            coefficients: (r,) multiple of `coefficient_sigmas`.
             velocity: m/s, standard deviation per axis.
         """
         count = len(self)
         spins = torch.where(self.labelled, label, spin).square()[:, None].expand(count, 3)
         fixed = torch.tensor([START_POSITION_SIGMA**2] * 3 + [velocity**2] * 3, dtype=torch.float64)
-        own = (coefficients * self.coefficient_sigmas).square()
+        own = (coefficients[:, None] * self.coefficient_sigmas).square()
         return torch.cat((fixed.expand(count, 6), spins, own.expand(count, -1)), dim=1)
 
 
@@ -104,8 +106,8 @@ def linearise(smoother: Smoother, tracks: Sequence[Track], watch: Watch = unwatc
 
     Args: smoother: model, surfaces and the noise to linearise with.  tracks: measured.  watch: told of each track.
     """
-    pieces = []
-    for track in watch(tracks, len(tracks), "linearising tracks"):
+    pieces, numbers = [], []
+    for number, track in enumerate(watch(tracks, len(tracks), "linearising tracks")):
         model = smoother.model.for_track(track)
         own = smoother if model is smoother.model else Smoother(model, smoother.surfaces, smoother.settings)
         problem = own.problem(track)
@@ -113,10 +115,11 @@ def linearise(smoother: Smoother, tracks: Sequence[Track], watch: Watch = unwatc
         piece = _linearised(problem, solution)
         if len(piece.times) >= LEAST_SAMPLES and np.isfinite(piece.errors).all():
             pieces.append(piece)
+            numbers.append(number)
     if not pieces:
         return None
     sigmas = np.array(list(smoother.settings.coefficients.values()))
-    return _side_by_side(pieces, torch.from_numpy(sigmas))
+    return _side_by_side(pieces, np.array(numbers), torch.from_numpy(sigmas))
 
 
 def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
@@ -170,7 +173,7 @@ def _longest_stretch(times: Array, breaks: NDArray[np.int64]) -> tuple[int, int]
     return int(firsts[longest]), int(ends[longest])
 
 
-def _side_by_side(pieces: Sequence[_Piece], coefficient_sigmas: Tensor) -> LinearTracks:
+def _side_by_side(pieces: Sequence[_Piece], numbers: Array, coefficient_sigmas: Tensor) -> LinearTracks:
     longest = max(len(piece.times) for piece in pieces)
 
     def stacked(arrays: Iterable[Array], length: int, mode: str) -> Tensor:
@@ -182,6 +185,7 @@ def _side_by_side(pieces: Sequence[_Piece], coefficient_sigmas: Tensor) -> Linea
         return torch.from_numpy(np.stack(rows))
 
     return LinearTracks(
+        numbers=numbers,
         times=stacked((p.times for p in pieces), longest, "edge"),
         errors=stacked((p.errors for p in pieces), longest, "zero"),
         white=stacked((p.white for p in pieces), longest, "edge"),

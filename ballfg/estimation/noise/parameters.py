@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ballfg.arrays import Array
-from ballfg.estimation.noise.forecasts import Noise
+from ballfg.estimation.noise.linear_filter import Noise
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.estimation.settings import Settings
 from ballfg.factors.noise import PROCESS_NOISE
@@ -48,24 +48,28 @@ USUAL_JITTER: Final = 1e-4
 COEFFICIENTS: Final = "coefficients"
 
 
-def parameters_of(settings: Settings, tracks: LinearTracks, position_known: bool) -> list[Parameter]:
+def parameters_of(
+    settings: Settings, tracks: LinearTracks, position_known: bool, tracker_known: bool = False
+) -> list[Parameter]:
     """The numbers that some tracks can tell.
 
     Args:
         settings: prior medians.
         tracks: that are asked; without labels, balls without a label, or bounces they do not tell of these.
         position_known: whether the white noise of positions is stated, and stays.
+        tracker_known: whether the memory of the tracker and the jitter of the stamps are, too.
     """
     process, found = settings.process, []
     white = settings.position_scale * np.array(settings.position_noise)
     for axis in range(3):
         if not position_known:
             found.append(Parameter("position", axis, white[axis], FACTOR_FOUR, 1e-5, 0.1))
-    for axis in range(3):
-        memory = settings.memory[axis] or MEMORY_SHARE * white[axis]
-        found.append(Parameter("memory", axis, memory, FACTOR_FOUR, 1e-5, 0.1))
-    found.append(Parameter("memory_time", None, settings.memory_time, FACTOR_FOUR, 0.002, 0.5))
-    found.append(Parameter("stamp_jitter", None, settings.stamp_jitter or USUAL_JITTER, FACTOR_FOUR, 1e-6, 0.01))
+    if not tracker_known:
+        for axis in range(3):
+            memory = settings.memory[axis] or MEMORY_SHARE * white[axis]
+            found.append(Parameter("memory", axis, memory, FACTOR_FOUR, 1e-5, 0.1))
+        found.append(Parameter("memory_time", None, settings.memory_time, FACTOR_FOUR, 0.002, 0.5))
+        found.append(Parameter("stamp_jitter", None, settings.stamp_jitter or USUAL_JITTER, FACTOR_FOUR, 1e-6, 0.01))
     found.append(Parameter("acceleration", None, process.acceleration, FACTOR_FOUR, 0.003, 10.0))
     if bool((tracks.kicks[:, :, PROCESS_NOISE.index("contact_velocity")] != 0.0).any()):
         tangential = process.contact_tangential or process.contact_velocity
@@ -83,22 +87,23 @@ def parameters_of(settings: Settings, tracks: LinearTracks, position_known: bool
 
 
 def tensors_of(parameters: list[Parameter], logs: Tensor, settings: Settings) -> Noise:
-    """The noise that a vector of logarithms (k,) stands for; what is not among the parameters is the settings'."""
-    values = {(p.name, p.axis): torch.exp(log) for p, log in zip(parameters, logs, strict=True)}
+    """The noise that logarithms (r, k) stand for, a row for each track or one for all.
 
-    def one(name: str, otherwise: float) -> Tensor:
-        return values.get((name, None), torch.tensor(otherwise, dtype=torch.float64))
+    What is not among the parameters is the settings'.
+    """
+    values = {(p.name, p.axis): torch.exp(log) for p, log in zip(parameters, logs.unbind(-1), strict=True)}
+
+    def one(name: str, otherwise: float, axis: int | None = None) -> Tensor:
+        return values.get((name, axis), torch.full((len(logs),), otherwise, dtype=torch.float64))
 
     white = settings.position_scale * np.array(settings.position_noise)
-    scales = [values.get(("position", a), torch.tensor(white[a], dtype=torch.float64)) / white[a] for a in range(3)]
-    memory = [values[("memory", a)] for a in range(3)]
     process = [one(name, getattr(settings.process, name)) for name in PROCESS_NOISE]
     return Noise(
-        position=torch.stack(scales),
-        memory=torch.stack(memory),
+        position=torch.stack([one("position", white[a], a) / white[a] for a in range(3)], dim=-1),
+        memory=torch.stack([one("memory", settings.memory[a], a) for a in range(3)], dim=-1).square(),
         memory_time=one("memory_time", settings.memory_time),
-        stamp_jitter=one("stamp_jitter", settings.stamp_jitter),
-        process=torch.stack(process),
+        stamp_jitter=one("stamp_jitter", settings.stamp_jitter).square(),
+        process=torch.stack(process, dim=-1),
         spin_label=one("spin_label", settings.spin_label_noise),
         spin_prior=one("spin_prior", settings.spin_prior),
         coefficients=one(COEFFICIENTS, 1.0),

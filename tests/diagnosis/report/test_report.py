@@ -99,6 +99,7 @@ def test_json_has_the_agreed_keys_and_numbers() -> None:
     assert before["prediction_rmse_mm"] == diagnosis.before.prediction_rmse_mm
     assert before["apex_rmse_mm"] == diagnosis.before.apex_rmse_mm
     assert (before["nis"], before["log_likelihood"]) == (diagnosis.before.nis, diagnosis.before.log_likelihood)
+    assert (before["intervals_held"], before["nis_median"]) == (0.87, 2.6)
     assert before["by_track_mm"] == diagnosis.before.by_track.tolist()
     assert read["error"]["after"]["apex_rmse_mm"] is None
     assert read["error"]["tracks_judged_on"] == 25

@@ -82,6 +82,9 @@ def test_errors_of_predictions(make_ball, make_launches, make_shots, surfaces):
     assert right.by_track.shape == (4,)
     assert 0.003 * np.sqrt(3) * 0.5e3 < right.prediction_rmse_mm < 15.0
     assert 0.3 < right.nis < 2.0
+    assert 0.8 < right.intervals_held <= 1.0
+    assert 0.5 < right.nis_median < 3.5
+    assert wrong.intervals_held < right.intervals_held
     assert wrong.prediction_rmse_mm > 1.5 * right.prediction_rmse_mm
     assert wrong.log_likelihood < right.log_likelihood
     assert min(right.by_track) <= right.prediction_rmse_mm <= max(right.by_track)

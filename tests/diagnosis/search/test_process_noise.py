@@ -7,10 +7,13 @@ import pytest
 import torch
 
 from ballfg.diagnosis.fit.fit import values_of
+from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import launch_axes
-from ballfg.diagnosis.search.process_noise import calibrated_model
-from ballfg.dynamics import load_model, save_model
+from ballfg.diagnosis.search.process_noise import calibrated_model, noise_about
+from ballfg.dynamics import load_model, nominal_model, save_model
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.simulation import MeasurementNoise, SimulationConfig, dataset_info, simulate
+from ballfg.tracks import TrackNoise, read_dataset, write_dataset
 
 EMBEDDING = SpinEmbedding(("group",), {"group": ("one",)})
 
@@ -77,3 +80,36 @@ def test_the_model_goes_through_a_file(unlabelled, tmp_path):
     np.testing.assert_allclose(
         again.trained.launcher.weight.detach(), model.trained.launcher.weight.detach(), rtol=1e-9
     )
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory):
+    """Eight shots of an exact simulation with errors of 2 mm, and the tracks as they are evaluated."""
+    config = SimulationConfig(tracks=8, rate=60.0, seed=6, noise=MeasurementNoise(position=0.002))
+    folder = tmp_path_factory.mktemp("recording") / "shots"
+    write_dataset(folder, dataset_info(config), (s.track for s in simulate(config)), "csv")
+    dataset = read_dataset(folder)
+    return dataset, [EvaluationTrack(track, np.zeros(0)) for track in dataset]
+
+
+def test_noise_about_a_model_is_that_of_the_tracks(recording):
+    dataset, parts = recording
+    noise = noise_about(nominal_model(), parts, dataset)
+    np.testing.assert_allclose(noise.position, 0.002, rtol=0.2)
+    assert noise.memory is None
+    assert noise.stamp_jitter is None
+    assert noise.coefficients["flight.drag.k"] < 0.01  # the simulated balls are alike
+
+
+def test_a_known_tracker_stays(recording):
+    dataset, parts = recording
+    tracker = TrackNoise(memory=(0.001, 0.001, 0.002), memory_time=0.03, stamp_jitter=0.0002)
+    noise = noise_about(nominal_model(), parts, dataset, tracker)
+    assert (noise.memory, noise.memory_time, noise.stamp_jitter) == ((0.001, 0.001, 0.002), 0.03, 0.0002)
+    assert max(noise.position) < 0.002  # a part of the errors is the tracker's
+
+
+def test_tracks_that_are_too_short_tell_no_noise(recording):
+    dataset, parts = recording
+    short = [EvaluationTrack(part.track.until(float(part.track.times[3])), part.bounces) for part in parts]
+    assert noise_about(nominal_model(), short, dataset) is None

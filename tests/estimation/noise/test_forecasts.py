@@ -24,17 +24,19 @@ def case(recorded):
 
 def noise_of(settings, linear, shift=0.0):
     parameters = parameters_of(settings, linear, position_known=False)
-    return tensors_of(parameters, torch.tensor([np.log(p.start) + shift for p in parameters]), settings)
+    return tensors_of(parameters, torch.tensor([np.log(p.start) + shift for p in parameters])[None], settings)
 
 
 def dense(linear, forecaster, noise, track):
     """Mean (3 n,) and covariance of all measured positions of a track, as deviations, from the joint Gaussian."""
-    n, own, width = linear.times.shape[1], forecaster.own, forecaster.width
-    transitions, gathered = (x[track].numpy() for x in forecaster._motion(noise))
-    prior = linear.prior_variances(noise.spin_prior, noise.spin_label, noise.coefficients, forecaster.velocity_prior)
+    n, own, width = linear.times.shape[1], forecaster.filter.own, forecaster.filter.width
+    transitions, gathered = (x[track].numpy() for x in forecaster.filter.motion(noise))
+    prior = linear.prior_variances(
+        noise.spin_prior, noise.spin_label, noise.coefficients, forecaster.filter.velocity_prior
+    )
     mean, cov = np.zeros(n * width), np.zeros((n * width, n * width))
     mean[:own] = linear.starts[track]
-    cov[:width, :width] = np.diag(np.concatenate((prior[track].numpy(), noise.memory.numpy() ** 2)))
+    cov[:width, :width] = np.diag(np.concatenate((prior[track].numpy(), noise.memory[0].numpy())))
     for k in range(1, n):
         now, last = slice(k * width, (k + 1) * width), slice((k - 1) * width, k * width)
         step = transitions[k - 1]
@@ -43,10 +45,10 @@ def dense(linear, forecaster, noise, track):
         cov[now, : k * width] = step @ cov[last, : k * width]
         cov[: k * width, now] = cov[now, : k * width].T
         cov[now, now] = step @ cov[last, last] @ step.T + gathered[k - 1]
-    observe = np.kron(np.eye(n), forecaster.measure.numpy())
+    observe = np.kron(np.eye(n), forecaster.filter.measure.numpy())
     spread = observe @ cov @ observe.T
     for k in range(n):
-        spread[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += forecaster._measurement(noise)[track, k].numpy()
+        spread[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += forecaster.filter.measured(noise)[track, k].numpy()
     return observe @ mean, spread
 
 
@@ -73,10 +75,10 @@ def test_score_is_that_of_the_joint_gaussian(case):
                 z = np.abs(errors[k] - known[rows]) / np.sqrt(left[rows])
                 loss = np.where(z < 3.0, z**2 / 2, 3 * z - 4.5)
                 total, count = total + float((loss + 0.5 * np.log(left[rows])).sum()), count + 1
-    transitions, gathered = forecaster._motion(noise)
-    measured = forecaster._measurement(noise)
-    means, covariances, _, _ = forecaster._filter(noise, transitions, gathered, measured)
-    own, _, scored = forecaster._forecast(means, covariances, transitions, gathered, measured)
+    transitions, gathered = forecaster.filter.motion(noise)
+    measured = forecaster.filter.measured(noise)
+    filtered = forecaster.filter.run(noise, transitions, gathered, measured)
+    own, _, scored = forecaster._forecast(filtered, transitions, gathered, measured)
     assert scored == count
     np.testing.assert_allclose(float(own.sum()) / scored, total / count, rtol=1e-6)
 
@@ -85,12 +87,13 @@ def test_gradient_is_that_of_differences(case):
     *_, settings, _, linear, forecaster = case
     parameters = parameters_of(settings, linear, position_known=False)
     logs = torch.tensor([np.log(p.start) for p in parameters], requires_grad=True)
-    (gradient,) = torch.autograd.grad(forecaster.score(tensors_of(parameters, logs, settings)).value, logs)
+    (gradient,) = torch.autograd.grad(forecaster.score(tensors_of(parameters, logs[None], settings)).value, logs)
     for k in range(len(parameters)):
         step = torch.zeros(len(parameters), dtype=torch.float64)
         step[k] = 1e-5
         up, down = (
-            float(forecaster.score(tensors_of(parameters, logs.detach() + s * step, settings)).value) for s in (1, -1)
+            float(forecaster.score(tensors_of(parameters, (logs.detach() + s * step)[None], settings)).value)
+            for s in (1, -1)
         )
         assert float(gradient[k]) == pytest.approx((up - down) / 2e-5, rel=1e-4, abs=1e-8)
 
@@ -102,22 +105,22 @@ def test_forecast_has_the_sigmas_of_a_prediction(case):
     parameters = parameters_of(settings, linear, position_known=False)
     own = replace(
         settings,
-        memory=tuple(noise.memory.tolist()),
+        memory=tuple(noise.memory[0].sqrt().tolist()),
         memory_time=float(noise.memory_time),
-        stamp_jitter=float(noise.stamp_jitter),
+        stamp_jitter=float(noise.stamp_jitter.sqrt()),
         find_events=False,
     )
     assert {p.name for p in parameters} >= {"position", "memory", "acceleration"}
-    transitions, gathered = forecaster._motion(noise)
-    measured = forecaster._measurement(noise)
-    _, covariances, _, _ = forecaster._filter(noise, transitions, gathered, measured)
+    transitions, gathered = forecaster.filter.motion(noise)
+    measured = forecaster.filter.measured(noise)
+    covariances = forecaster.filter.run(noise, transitions, gathered, measured).covariances
     for track in range(len(tracks)):
         start = int(np.searchsorted(linear.times[track].numpy(), 0.25))
         end = int(np.searchsorted(linear.times[track].numpy(), 0.35))
         covariance = covariances[track, start]
         for k in range(start, end):
             covariance = transitions[track, k] @ covariance @ transitions[track, k].T + gathered[track, k]
-        spread = forecaster.measure @ covariance @ forecaster.measure.T + measured[track, end]
+        spread = forecaster.filter.measure @ covariance @ forecaster.filter.measure.T + measured[track, end]
         seen = float(linear.times[track, start]) + 1e-6
         (prediction,) = predict_tracks(Smoother(model, surfaces, own), [tracks[track]], 1, seen)
         if prediction.estimate.contacts:
