@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import CORES, DatasetFolder, EffectsFiles, Jobs, open_inputs
+from ballfg.cli.inputs import CORES, DatasetFolders, EffectsFiles, Jobs, open_inputs
 
 if TYPE_CHECKING:
     from ballfg.diagnosis.result import Diagnosis
 
 
 def diagnose(
-    dataset: DatasetFolder,
+    datasets: DatasetFolders,
     out: Annotated[Path, typer.Option(help="Folder of the report: new, empty or with an earlier report.")],
     model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal model of the ball.")] = None,
     effects_file: EffectsFiles = None,
@@ -30,29 +30,44 @@ def diagnose(
     evaluate them. The folder holds the report to read (report.html), the same
     for programs (report.json), and the corrected model for the --model of other
     commands (model.yaml).
+
+    Several datasets are diagnosed together: the ball is the same, rooms and rigs
+    are their own. model.yaml is then the ball's, for a room that had no part, and
+    model.NAME.yaml that of each room.
     """
     from ballfg.diagnosis import diagnose as find
-    from ballfg.diagnosis.report.report import MODEL, PAGE, REPORT, check_report_folder, write_report
+    from ballfg.diagnosis import diagnose_jointly
+    from ballfg.diagnosis.report.report import MODEL, PAGE, REPORT, check_report_folder, room_file, write_report
     from ballfg.dynamics import AnalyticModel
 
-    if out.resolve() == dataset.resolve():
+    if any(out.resolve() == dataset.resolve() for dataset in datasets):
         raise ValueError(f"out must not be the dataset itself; got {out}. Choose another folder.")
     check_report_folder(out)
     if model is not None and model.resolve() == out.resolve() / MODEL:
         raise ValueError(f"out must not hold the model itself; {model} would be replaced. Choose another folder.")
-    inputs = open_inputs(dataset, model, effects_file)
+    inputs, *others = [open_inputs(dataset, model, effects_file) for dataset in datasets]
     if not isinstance(inputs.model, AnalyticModel):
         raise ValueError(
             f"--model must be analytic: a diagnosis adds physical effects to it; {model} is a learned one. "
             "Give the analytic model that you believe in."
         )
-    diagnosis = find(
-        inputs.dataset, inputs.model, jobs=jobs, watch=lambda line: print(line, file=sys.stderr, flush=True)
-    )
-    write_report(diagnosis, out)
+    rooms: dict[str, AnalyticModel] = {}
+    if others:
+        together = [inputs.dataset, *(other.dataset for other in others)]
+        joint = diagnose_jointly(together, inputs.model, jobs=jobs, watch=_say)
+        diagnosis, rooms = joint.whole, joint.rooms
+    else:
+        diagnosis = find(inputs.dataset, inputs.model, jobs=jobs, watch=_say)
+    write_report(diagnosis, out, rooms)
     print(*_summary(diagnosis), sep="\n")
-    written = ", ".join(name for name in (PAGE, REPORT, MODEL) if (out / name).is_file())
-    print(f"\nwrote {written} to {out}")
+    if rooms:
+        print("", *diagnosis.remarks[: len(rooms) + 2], sep="\n")
+    files = (PAGE, REPORT, MODEL, *map(room_file, rooms))
+    print(f"\nwrote {', '.join(name for name in files if (out / name).is_file())} to {out}")
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
 
 
 def _summary(diagnosis: Diagnosis) -> Iterator[str]:

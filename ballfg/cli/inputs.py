@@ -40,6 +40,13 @@ def check_dataset(folder: Path) -> Path:
 DatasetFolder = Annotated[
     Path, typer.Argument(help="Folder with dataset.yaml and tracks.csv or tracks.parquet.", callback=check_dataset)
 ]
+DatasetFolders = Annotated[
+    list[Path],
+    typer.Argument(
+        help="Folder with dataset.yaml and tracks.csv or tracks.parquet; further ones of the same ball in other rooms.",
+        callback=lambda folders: [check_dataset(folder) for folder in folders],
+    ),
+]
 EffectsFiles = Annotated[
     list[Path] | None,
     typer.Option("--effects-file", help="Trusted Python file that defines custom effects; may be repeated."),

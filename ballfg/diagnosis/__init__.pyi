@@ -1,6 +1,8 @@
 from .diagnosis import diagnose as diagnose
 from .fit.fit import fit_model as fit_model
 from .fit.holdout import hold_out as hold_out
+from .joint import JointDiagnosis as JointDiagnosis
+from .joint import diagnose_jointly as diagnose_jointly
 from .remains.fallback import learned_residual as learned_residual
 from .remains.generic import generic_tests as generic_tests
 from .remains.residuals import residuals_of as residuals_of

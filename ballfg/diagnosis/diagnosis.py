@@ -65,14 +65,14 @@ def diagnose(
         after = evaluate(corrected)
     tell("looking at what is left")
     tests = generic_tests(search.fit, search.first)
-    verdict = _verdict(search, tests)
+    verdict = verdict_of(search, tests)
     helped = None
-    if verdict is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in _alarms(tests)):
+    if verdict is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in alarms(tests)):
         tell("describing what is left without a name")
         embedding, parts = holdout.launcher.embedding, holdout.search_tracks
         helped = fallback(search.fit, embedding, corrected.noise, dataset, parts, after, evaluate)
-    alarms = sorted(_alarms(tests), key=lambda test: test.name == "time")  # a place says more than a correlation
-    unexplained = Unexplained(alarms[0].where if alarms else "", _share(tests), tests, helped)
+    left = sorted(alarms(tests), key=lambda test: test.name == "time")  # a place says more than a correlation
+    unexplained = Unexplained(left[0].where if left else "", share_left(tests), tests, helped)
     residuals = residuals_of(search.first)
     declared = {name: float(value.detach()) for name, value in model.named_parameters()}
     calibrated = values_of(search.fit, [name for name in search.fit.problem.free if name in declared], declared)
@@ -93,11 +93,11 @@ def diagnose(
         residuals_before=residuals,
         residuals_after=residuals if search.fit is search.first else residuals_of(search.fit),
         excluded=holdout.excluded,
-        remarks=(*map(refusal, search.refused.values()), *_strange(calibrated, model.radius)),
+        remarks=(*map(refusal, search.refused.values()), *strange(calibrated, model.radius)),
     )
 
 
-def _strange(calibrated: Mapping[str, Value], radius: float) -> list[str]:
+def strange(calibrated: Mapping[str, Value], radius: float) -> list[str]:
     """Sentences on declared coefficients whose fitted values are not plausible."""
     texts = [implausible(name.partition(".")[2], value, radius) for name, value in calibrated.items()]
     words = "Something that the model does not describe has moved it: a clock, lengths or spin labels, say"
@@ -109,19 +109,21 @@ def _errors(holdout: Holdout, jobs: int, model: BallModel) -> Errors:
     return prediction_errors(model, holdout.held_out_tracks, holdout.surfaces, settings, jobs)
 
 
-def _alarms(tests: Sequence[GenericTest]) -> list[GenericTest]:
+def alarms(tests: Sequence[GenericTest]) -> list[GenericTest]:
+    """Tests that find a pattern."""
     return [test for test in tests if test.p_value < ALARM]
 
 
-def _share(tests: Sequence[GenericTest]) -> float:
-    return max((test.share for test in _alarms(tests)), default=0.0)
+def share_left(tests: Sequence[GenericTest]) -> float:
+    """The largest share of a first pattern that is still there, 0 to 1."""
+    return max((test.share for test in alarms(tests)), default=0.0)
 
 
-def _verdict(search: Search, tests: Sequence[GenericTest]) -> Verdict:
+def verdict_of(search: Search, tests: Sequence[GenericTest]) -> Verdict:
     """Effects explain the first pattern if they leave none, or next to nothing of it."""
     if not search.findings:
-        return Verdict.UNEXPLAINED if _alarms(tests) else Verdict.NOTHING
-    return Verdict.FOUND if _share(tests) < MOSTLY else Verdict.UNEXPLAINED
+        return Verdict.UNEXPLAINED if alarms(tests) else Verdict.NOTHING
+    return Verdict.FOUND if share_left(tests) < MOSTLY else Verdict.UNEXPLAINED
 
 
 def _noise(fit: Fit, holdout: Holdout) -> dict[str, Value]:

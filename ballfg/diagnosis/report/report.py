@@ -3,6 +3,7 @@
 import json
 import math
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final
@@ -11,7 +12,7 @@ import numpy as np
 
 from ballfg.diagnosis.report.page import page
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Value
-from ballfg.dynamics import save_model
+from ballfg.dynamics import BallModel, save_model
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 
 REPORT: Final = "report.json"
@@ -20,7 +21,14 @@ PAGE: Final = "report.html"
 MODEL: Final = "model.yaml"
 
 
-def write_report(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> None:
+def room_file(name: str) -> str:
+    """The model file of one of several rooms, by its name."""
+    return f"{Path(MODEL).stem}.{re.sub(r'[^A-Za-z0-9_-]', '_', name)}.yaml"
+
+
+def write_report(
+    diagnosis: Diagnosis, out: str | os.PathLike[str], rooms: Mapping[str, BallModel] | None = None
+) -> None:
     """Write `report.json`, `report.html` and `model.yaml` into a folder.
 
     The files are made in a folder beside it and moved at the end. A new folder thus appears at once; an earlier report
@@ -29,14 +37,20 @@ def write_report(diagnosis: Diagnosis, out: str | os.PathLike[str]) -> None:
     Args:
         diagnosis: to report.
         out: folder, new, empty or with an earlier report; its parent must exist.
+        rooms: models of single rooms, by name, written beside it.
     Raises:
         ValueError: if `out` is a file or holds other things than a report.
         FileNotFoundError: if its parent does not exist.
     """
     check_report_folder(Path(out))
     folder = Path(out).resolve()
-    with whole_folder(folder, earlier=(f"{Path(MODEL).stem}.learned-*",), last=REPORT) as made:
+    stem = Path(MODEL).stem
+    with whole_folder(
+        folder, earlier=(f"{stem}.learned-*", f"{stem}.*.learned-*", f"{stem}.*.yaml"), last=REPORT
+    ) as made:
         save_model(diagnosis.model, made / MODEL)
+        for name, model in (rooms or {}).items():
+            save_model(model, made / room_file(name))
         (made / PAGE).write_text(page(diagnosis), encoding="utf-8")
         text = json.dumps(content(diagnosis), indent=2, allow_nan=False, ensure_ascii=False)
         (made / REPORT).write_text(text + "\n", encoding="utf-8")

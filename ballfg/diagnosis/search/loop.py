@@ -20,6 +20,7 @@ from ballfg.diagnosis.search.ranking import NO_NAME, as_left, finding_of, fitted
 from ballfg.diagnosis.search.stamp_effects import as_declared, first_fit, stamp_findings, stamp_hypotheses
 from ballfg.diagnosis.search.state import Confirmed, Search, left_out, without_named
 from ballfg.diagnosis.search.trial import try_further, try_hypotheses, try_varying
+from ballfg.diagnosis.search.varying import Grouping, groupings
 from ballfg.dynamics import AnalyticModel, BallModel, Effect
 
 MOST_EFFECTS = 4
@@ -48,7 +49,8 @@ class SearchLoop:
 
     `predictive` gives a fitted model the process noise that predicts the tracks which it was fitted to; `judge` gives
     the errors of its predictions on the judging half; `watch` is told of progress, in lines; refits share `jobs`
-    processes.
+    processes. Effects `of_some` (all of the catalogue where None) may differ between tracks in `ways`, which are asked
+    for with the names of the tracks of the search half; None: by their labels and along the recording.
     """
 
     holdout: Holdout
@@ -58,12 +60,17 @@ class SearchLoop:
     watch: Callable[[str], None]
     plausible: float = PLAUSIBLE
     jobs: int = 1
+    of_some: Sequence[type[Effect]] | None = None
+    ways: Callable[[Sequence[str]], list[Grouping]] | None = None
 
-    def run(self, model: AnalyticModel) -> Search:
-        """Add effects to the declared model until none helps, then take out those without which it predicts better."""
+    def run(self, model: AnalyticModel, first: Fit | None = None) -> Search:
+        """Add effects to the declared model until none helps, then take out those without which it predicts better.
+
+        Args: model: as declared.  first: its fit, where that was made already.
+        """
         self.watch(f"fitting the declared model to {len(self.holdout.search)} flights")
         stamps = self.holdout.stamps
-        first = first_fit(model, self.holdout)
+        first = first_fit(model, self.holdout) if first is None else first
         declared = self.predictive(first)
         judged = self.judge(declared.model)
         before = self.judge(as_declared(declared.model, stamps)) if stamps.found else judged
@@ -89,7 +96,9 @@ class SearchLoop:
             winner, further = self._confirmed(search, fitted, outcomes)
             refits, refused = [*refits, *fitted], refused | further
         if winner is None:  # a pattern that one effect explains for all tracks must not get a name for each group
-            more, fitted = try_varying(search.fit, self.catalogue, self.holdout, tell, self.jobs)
+            ways = self.ways or partial(groupings, self.holdout.tracks)
+            some = self.of_some or self.catalogue
+            more, fitted = try_varying(search.fit, some, self.holdout.held_out, ways, tell, self.jobs)
             winner, further = self._confirmed(search, fitted, outcomes)
             scored, refits, refused = [*scored, *more], [*refits, *fitted], refused | further
         if winner is None:

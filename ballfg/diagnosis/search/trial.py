@@ -4,8 +4,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import cast
 
-from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.search.candidates import (
     ALARM,
     Refit,
@@ -19,9 +19,10 @@ from ballfg.diagnosis.search.candidates import (
 from ballfg.diagnosis.search.evaluation import on_others
 from ballfg.diagnosis.search.hypothesis import has_effect, hypotheses, scene_of
 from ballfg.diagnosis.search.label_frames import frame_hypotheses
-from ballfg.diagnosis.search.varying import Varying, between, groupings, near, varying_hypotheses
+from ballfg.diagnosis.search.varying import Grouping, Varying, between, near, varying_hypotheses
 from ballfg.dynamics import Effect
 from ballfg.dynamics.effects.measurement import SpinLabelFrame
+from ballfg.dynamics.variation import place_of
 
 VARYING_ALARM = 0.01
 """As `ALARM`, for effects that differ between tracks: they are many, and flexible."""
@@ -32,28 +33,40 @@ LABELLED = 0.5
 
 
 def try_varying(
-    before: Fit, catalogue: Sequence[type[Effect]], holdout: Holdout, tell: Callable[[str], None], jobs: int = 1
+    before: Fit,
+    catalogue: Sequence[type[Effect]],
+    held_out: Stretches,
+    ways: Callable[[Sequence[str]], list[Grouping]],
+    tell: Callable[[str], None],
+    jobs: int = 1,
 ) -> tuple[list[Scored], list[Refit]]:
-    """Every hypothesis that an effect differs between tracks, and refits of the leading ones, the best first."""
-    problem, tracks = before.problem, holdout.tracks
+    """Every hypothesis that an effect differs between tracks, and refits of the leading ones, the best first.
+
+    Args:
+        before: the fit without any of them.
+        catalogue: effects that may differ.
+        held_out: stretches of the other half.
+        ways: in which tracks may differ, of the names of those of the search half.
+        tell: is told of progress.
+        jobs: processes.
+    """
+    problem = before.problem
     searched = list(dict.fromkeys(problem.stretches.names))
-    ways = groupings(tracks, searched)
-    listed = varying_hypotheses(problem.model, scene_of(before), catalogue, problem.free, ways)
+    known = ways(searched)
+    listed = varying_hypotheses(problem.model, scene_of(before), catalogue, problem.free, known)
     tell(f"testing {len(listed)} ways in which tracks may differ")
     scored = score_all(before, listed)
     refits = []
     for candidate in shortlist(scored, VARYING_ALARM):
         tell(f"fitting with {candidate.hypothesis.name}")
-        names = [track.name for track in tracks]
+        names = sorted({name for way in known for level in way.weights.values() for name in level}, key=place_of)
         closer = near(cast(Varying, candidate.hypothesis), searched, names)
         best = _placed(before, closer) if len(closer) > 1 else candidate
         same = between(cast(Varying, best.hypothesis), searched, names)
         placed = [replace(best, hypothesis=h, p_value=candidate.p_value) for h in same]
         fitted = refit_all(before, placed, jobs)
         # the search half has no track between these places, so that the other half tells them apart
-        refits.append(
-            min(fitted, key=lambda r: on_others(r.fit, holdout.held_out).cost) if len(same) > 1 else fitted[0]
-        )
+        refits.append(min(fitted, key=lambda r: on_others(r.fit, held_out).cost) if len(same) > 1 else fitted[0])
     return scored, sorted(refits, key=lambda r: r.delta_bic)
 
 

@@ -114,7 +114,7 @@ def _by_place(names: Sequence[str], searched: Sequence[str]) -> list[Grouping]:
 
 
 def _step(names: Sequence[str], begin: str) -> Grouping:
-    return Grouping(TRACK, {begin: {n: 1.0 for n in names if place_of(n) >= place_of(begin)}}, names[0])
+    return Grouping(TRACK, {begin: {n: float(place_of(n) >= place_of(begin)) for n in names}}, names[0])
 
 
 @dataclass(frozen=True)

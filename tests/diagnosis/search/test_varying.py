@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -64,7 +65,7 @@ def before(two_balls, make_ball, make_fit) -> Fit:
 @pytest.fixture(scope="module")
 def found(before, holdout):
     catalogue = [EFFECTS[name] for name in ("drag", "restitution", "wind", "table_tilt")]
-    return try_varying(before, catalogue, holdout, lambda line: None)
+    return try_varying(before, catalogue, holdout.held_out, partial(groupings, holdout.tracks), lambda line: None)
 
 
 def test_another_ball_is_found_with_both_values_and_the_track_from_which_on_it_flew(found):
@@ -84,7 +85,8 @@ def test_nothing_differs_where_one_ball_flew_all_the_time(make_ball, make_launch
     stretches = make_shots(make_ball(), make_launches(COUNT, 90), 90).stretches
     names = tuple(f"{2 * i:03d}" for i in range(COUNT))
     alike = replace(stretches, names=names)
-    scored, refits = try_varying(make_fit(make_ball(), alike), list(EFFECTS.values()), holdout, lambda line: None)
+    fit, ways = make_fit(make_ball(), alike), partial(groupings, holdout.tracks)
+    scored, refits = try_varying(fit, list(EFFECTS.values()), holdout.held_out, ways, lambda line: None)
     assert len(scored) > 20
     assert refits == []
 

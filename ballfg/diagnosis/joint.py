@@ -1,0 +1,291 @@
+"""Several rooms diagnosed together: the ball is the same in all of them, rooms and rigs are their own.
+
+One fit holds the flights of all rooms. Coefficients of flight are shared; those of bounce and measurement have a value
+for each room, held together by their priors. An effect of the ball is looked for in all rooms alike, and any effect in
+each room by itself. What all rooms want is the ball's and predicts in a room that had no part.
+"""
+
+import copy
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+from weakref import WeakKeyDictionary
+
+import numpy as np
+import torch
+
+from ballfg.arrays import Array
+from ballfg.diagnosis.diagnosis import alarms, share_left, strange, verdict_of
+from ballfg.diagnosis.fit.fit import first_guess, fit_model, fit_problem, reachable, values_of
+from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, hold_out
+from ballfg.diagnosis.fit.problem import Deviation, Fit, Noise, Problem, declared_free
+from ballfg.diagnosis.fit.stretches import Stretches, joined
+from ballfg.diagnosis.remains.generic import generic_tests
+from ballfg.diagnosis.remains.patterns import DRIFT
+from ballfg.diagnosis.remains.residuals import residuals_of
+from ballfg.diagnosis.report.wording import joined as listed
+from ballfg.diagnosis.report.wording import refusal, sentence
+from ballfg.diagnosis.result import Diagnosis, Errors, Unexplained
+from ballfg.diagnosis.search.evaluation import prediction_errors
+from ballfg.diagnosis.search.hypothesis import LOOSE, effects_of, has_effect, with_effects, without_effect
+from ballfg.diagnosis.search.loop import SearchLoop
+from ballfg.diagnosis.search.process_noise import PredictiveModel, calibrated_model, noise_about
+from ballfg.diagnosis.search.varying import Grouping, Varying
+from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
+from ballfg.estimation import dataset_settings
+from ballfg.tracks import Dataset, TrackNoise
+
+ROOM: Final = "room"
+"""The label that tells the rooms apart."""
+MOST_TRACKS: Final = 60
+"""Tracks of a room that are used, evenly over it: rooms must not wait for the largest of them."""
+OF_ROOMS: Final = ("gravity", "buoyancy", "wind", "wind_shear", "gust_region", "table_height", "table_tilt")
+"""Effects of flight and bounce that belong to a room; all others belong to the ball, and measurement to the rig."""
+
+
+@dataclass(frozen=True)
+class Room:
+    """One room: its name, its tracks in two halves, and the noise about a fit of its own."""
+
+    name: str
+    holdout: Holdout
+    noise: Noise
+
+    @property
+    def settings(self) -> int:
+        """Number of its launcher's settings."""
+        return self.holdout.search.settings.shape[1]
+
+
+@dataclass(frozen=True)
+class JointDiagnosis:
+    """Findings of several rooms; `whole.model` is the ball's, for a new room, `rooms` hold the model of each room."""
+
+    whole: Diagnosis
+    rooms: dict[str, AnalyticModel]
+
+
+def diagnose_jointly(
+    datasets: Sequence[Dataset],
+    model: AnalyticModel,
+    *,
+    jobs: int = 1,
+    watch: Callable[[str], None] | None = None,
+    catalogue: Sequence[type[Effect]] | None = None,
+) -> JointDiagnosis:
+    """Find the effects that a model of the ball lacks in several rooms, and those of single rooms.
+
+    Args:
+        datasets: one for each room, of names of their own, at least two.
+        model: the analytic model that all tracks are held against.
+        jobs: processes.
+        watch: is told of each stage, in lines.
+        catalogue: effects to look for; by default all that are registered.
+    Returns: the findings, the model of the ball and those of the rooms.
+    Raises: ValueError: for fewer than two datasets, equal names, a dataset whose stamps are wrong, or too few tracks.
+    """
+    tell = watch or (lambda line: None)
+    rooms = _rooms(datasets, model, jobs, tell)
+    search_half, held_out = (_together(rooms, half) for half in ("search", "held_out"))
+    halves = replace(rooms[0].holdout, search=search_half, held_out=held_out, tracks=())
+    tell(f"fitting the ball to {len(halves.search)} flights of {len(rooms)} rooms")
+    way = _way(rooms)
+    first = _first_fit(model, halves, way)
+    predicting = _Predicting(rooms, jobs)
+    effects = tuple(catalogue or EFFECTS.values())
+    of_ball = tuple(e for e in effects if e.kind != "measurement" and e.name not in OF_ROOMS)
+    loop = SearchLoop(
+        halves, of_ball, predicting, predicting.judge, tell, jobs=jobs, of_some=effects, ways=lambda searched: [way]
+    )
+    search = loop.run(model, first)
+    tell("looking at what is left")
+    tests = tuple(test for test in generic_tests(search.fit, search.first) if test.name != DRIFT)
+    verdict = verdict_of(search, tests)
+    left = sorted(alarms(tests), key=lambda test: test.name == "time")
+    unexplained = Unexplained(left[0].where if left else "", share_left(tests), tests, None)
+    declared = {name: float(value.detach()) for name, value in model.named_parameters()}
+    calibrated = values_of(search.fit, [name for name in search.fit.problem.free if name in declared], declared)
+    models = predicting.models(search.predictive.model)
+    remarks = [*_of_whom(search.findings), *predicting.errors_by_room(search.declared.model, search.predictive.model)]
+    whole = Diagnosis(
+        dataset=", ".join(room.name for room in rooms),
+        verdict=verdict,
+        sentence=sentence(verdict, search.findings, unexplained),
+        findings=search.findings,
+        rounds=search.rounds,
+        before=search.before,
+        after=search.judged,
+        tracks_found_on=len(np.unique(halves.search.track)),
+        tracks_judged_on=len(search.before.by_track),
+        calibrated=calibrated,
+        noise={},
+        unexplained=unexplained,
+        model=_of_a_new_room(search.fit, model),
+        residuals_before=residuals_of(search.first),
+        residuals_after=residuals_of(search.fit),
+        excluded=tuple(f"{room.name}: {line}" for room in rooms for line in room.holdout.excluded),
+        remarks=(*remarks, *map(refusal, search.refused.values()), *strange(calibrated, model.radius)),
+    )
+    return JointDiagnosis(whole, models)
+
+
+def _rooms(datasets: Sequence[Dataset], model: AnalyticModel, jobs: int, tell: Callable[[str], None]) -> list[Room]:
+    names = [dataset.info.name for dataset in datasets]
+    if len(names) < 2 or len(set(names)) < len(names):
+        raise ValueError(
+            f"datasets must be two or more, each with a name of its own; got {', '.join(names)}. Correct 'name' in "
+            "dataset.yaml."
+        )
+    rooms = []
+    for name, dataset in zip(names, datasets, strict=True):
+        tell(f"room {name}")
+        holdout = hold_out(dataset, model, jobs, tell, most_tracks=MOST_TRACKS)
+        if holdout.stamps.found:
+            raise ValueError(
+                f"stamps of {name} must be times; they show {' and '.join(holdout.stamps.found)}. Diagnose it by "
+                "itself, correct its stamps, and come back."
+            )
+        rooms.append(Room(name, holdout, fit_model(model, holdout.search, holdout.settings).noise))
+    return rooms
+
+
+def _together(rooms: Sequence[Room], half: str) -> Stretches:
+    """The stretches of all rooms, each with the noise about its own fit and its launcher's own settings."""
+    parts, track, column = [], 0, 0
+    for room in rooms:
+        own: Stretches = getattr(room.holdout, half)
+        settings = np.zeros((len(own), sum(other.settings for other in rooms)))
+        settings[:, column : column + room.settings] = own.settings
+        names = tuple(f"{room.name}/{name}" for name in own.names)
+        sigmas = own.sigmas * torch.from_numpy(room.noise.position)
+        parts.append(replace(own, names=names, track=own.track + track, settings=settings, sigmas=sigmas))
+        track, column = int(parts[-1].track.max()) + 1, column + room.settings
+    return joined(parts)
+
+
+def _way(rooms: Sequence[Room]) -> Grouping:
+    """Rooms as groups of tracks."""
+    names = {room.name: (*room.holdout.search.names, *room.holdout.held_out.names) for room in rooms}
+    return Grouping(ROOM, {room: {f"{room}/{name}": 1.0 for name in own} for room, own in names.items()})
+
+
+def _first_fit(model: AnalyticModel, halves: Holdout, way: Grouping) -> Fit:
+    """The fit of the declared model; coefficients of bounce and measurement may differ as far as their priors say."""
+    model = copy.deepcopy(model).requires_grad_(False)
+    problem = Problem(model, reachable(model, halves.search), declared_free(model))
+    free, deviations = dict(problem.free), dict[str, Deviation]()
+    for effect in (e for e in effects_of(model) if e.kind != "flight"):
+        names = [c.name for c in effect.coefficients if f"{effect.kind}.{effect.name}.{c.name}" in problem.free]
+        varying = Varying.of(type(effect), names, way)
+        free |= {name: replace(c, sigma=c.sigma / LOOSE) for name, c in varying.free().items()}
+        deviations |= varying.deviations()
+    problem = replace(problem, free=free, deviations=deviations)
+    unknowns, noise = first_guess(problem, halves.settings.spin_label_noise, halves.settings.spin_prior)
+    return fit_problem(problem, unknowns, noise)
+
+
+def _of_a_new_room(fit: Fit, declared: AnalyticModel) -> AnalyticModel:
+    """The ball's model: what all rooms share, without effects that only single rooms have."""
+    model = with_effects(fit.problem.model)
+    parameters = dict(model.named_parameters())
+    with torch.no_grad():
+        for name, value in fit.unknowns.values.items():
+            if name in parameters:
+                parameters[name].fill_(value)
+    for deviation in fit.problem.deviations.values():
+        name = deviation.coefficient.split(".")[1]
+        if not has_effect(declared, name) and deviation.coefficient not in fit.problem.free:
+            model = without_effect(model, name)
+    return model
+
+
+class _Predicting:
+    """Makes the models of all rooms from a fit, and judges them on their held-out halves."""
+
+    def __init__(self, rooms: Sequence[Room], jobs: int) -> None:
+        self.rooms, self.jobs = rooms, jobs
+        self._noise: dict[str, TrackNoise | None] = {}
+        self._models: WeakKeyDictionary[BallModel, dict[str, AnalyticModel]] = WeakKeyDictionary()
+        self._judged: WeakKeyDictionary[BallModel, dict[str, Errors]] = WeakKeyDictionary()
+
+    def __call__(self, fit: Fit) -> PredictiveModel:
+        """The model with its rooms' models behind it, and the errors on the search half of each."""
+        models, column = {}, 0
+        for room in self.rooms:
+            launcher = fit.unknowns.launcher[column : column + room.settings]
+            column += room.settings
+            models[room.name] = self._model(fit, room, launcher)
+        model = with_effects(fit.problem.model)
+        self._models[model] = models
+        return PredictiveModel(model, _pooled(self._errors(models, "search_tracks")))
+
+    def models(self, model: BallModel) -> dict[str, AnalyticModel]:
+        """The models of the rooms behind one that was made here."""
+        return self._models[model]
+
+    def judge(self, model: BallModel) -> Errors:
+        """The errors on the judging halves of all rooms."""
+        if model not in self._judged:
+            self._judged[model] = self._errors(self._models[model], "held_out_tracks")
+        return _pooled(self._judged[model])
+
+    def errors_by_room(self, declared: BallModel, corrected: BallModel) -> list[str]:
+        """A sentence on each room's error of prediction before and after."""
+        before, after = self._judged[declared], self._judged[corrected]
+        return [
+            f"Room {room.name}: prediction RMSE {before[room.name].prediction_rmse_mm:.1f} mm before, "
+            f"{after[room.name].prediction_rmse_mm:.1f} mm after."
+            for room in self.rooms
+        ]
+
+    def _model(self, fit: Fit, room: Room, launcher: Array) -> AnalyticModel:
+        rows = np.array([name.startswith(f"{room.name}/") for name in fit.problem.stretches.names])
+        stretches = fit.problem.stretches.take(rows)
+        found = fit.problem.by_stretch(fit.unknowns.values, stretches)
+        values = {name: float(np.ravel(value)[0]) for name, value in found.items()}
+        noise = replace(fit.noise, position=fit.noise.position * room.noise.position)
+        own = replace(fit.problem, stretches=stretches, deviations={})
+        unknowns = replace(fit.unknowns, values=values, launcher=launcher)
+        model = calibrated_model(Fit(own, unknowns, noise, fit.predicted), room.holdout.launcher.embedding)
+        if room.name not in self._noise:
+            self._noise[room.name] = noise_about(model, room.holdout.search_tracks, room.holdout.dataset)
+        model.noise = self._noise[room.name]
+        return model
+
+    def _errors(self, models: dict[str, AnalyticModel], half: str) -> dict[str, Errors]:
+        found = {}
+        for room in self.rooms:
+            tracks: Sequence[EvaluationTrack] = getattr(room.holdout, half)
+            settings = dataset_settings(room.holdout.dataset, models[room.name])
+            found[room.name] = prediction_errors(models[room.name], tracks, room.holdout.surfaces, settings, self.jobs)
+        return found
+
+
+def _pooled(by_room: dict[str, Errors]) -> Errors:
+    """Errors of all rooms, each counting alike: geometric means of lengths, means of the rest."""
+    every = list(by_room.values())
+
+    def middle(name: str) -> float:
+        return float(np.mean([getattr(one, name) for one in every]))
+
+    def typical(name: str) -> float:
+        return float(np.exp(np.nanmean(np.log([getattr(one, name) for one in every]))))
+
+    return Errors(
+        typical("prediction_rmse_mm"),
+        typical("apex_rmse_mm"),
+        middle("nis"),
+        middle("log_likelihood"),
+        np.concatenate([one.by_track for one in every]),
+        middle("intervals_held"),
+        middle("nis_median"),
+    )
+
+
+def _of_whom(findings: Sequence[object]) -> list[str]:
+    """Which effects are the ball's, and which single rooms have."""
+    names = [str(getattr(finding, "name", "")) for finding in findings]
+    own = tuple(n for n in names if n.endswith("_by_group"))
+    shared = tuple(n for n in names if n not in own)
+    texts = [f"{listed(shared)}: of the ball, wanted alike in all rooms."] if shared else []
+    return [*texts, f"{listed(own)}: of single rooms."] if own else texts

@@ -1,0 +1,79 @@
+"""Two rooms with one ball: what is the ball's is found in both together, what one room has is that room's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ballfg.diagnosis import diagnose_jointly, write_report
+from ballfg.dynamics import EFFECTS, load_model, nominal_model
+from ballfg.simulation import SimulationConfig, parse_effects, write_simulation
+from ballfg.tracks import read_dataset
+
+GAIN, TILT = 1.0, 0.04
+CATALOGUE = [EFFECTS[name] for name in ("drag_spin", "magnus_saturation", "wind", "frame_tilt")]
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rooms")
+    effects = {"level": (), "leaning": (f"frame_tilt.x={TILT}",)}
+    for seed, (name, own) in enumerate(effects.items()):
+        ball = (f"drag_spin.gain={GAIN}",)
+        config = SimulationConfig(tracks=14, rate=60.0, seed=seed, undeclared=parse_effects((*ball, *own)))
+        write_simulation(folder / name, config)
+    found = [read_dataset(folder / name) for name in effects]
+    for dataset, name in zip(found, effects, strict=True):
+        dataset.info = replace(dataset.info, name=name)
+    return found
+
+
+@pytest.fixture(scope="module")
+def joint(rooms):
+    return diagnose_jointly(rooms, nominal_model(), catalogue=CATALOGUE)
+
+
+def test_what_both_rooms_want_is_the_balls_and_what_one_wants_is_its_own(joint):
+    found = {finding.name: finding for finding in joint.whole.findings}
+    assert set(found) == {"drag_spin", "frame_tilt_by_group"}
+    gain = found["drag_spin"].parameters["gain"]
+    assert gain.value == pytest.approx(GAIN, abs=4 * gain.sigma)
+    told = found["frame_tilt_by_group"].parameters
+    assert told["x[leaning]"].value == pytest.approx(TILT, abs=0.005)
+    assert told["x[level]"].value == pytest.approx(0.0, abs=0.005)
+    assert joint.whole.remarks[:2] == (
+        "drag_spin: of the ball, wanted alike in all rooms.",
+        "frame_tilt_by_group: of single rooms.",
+    )
+
+
+def test_the_balls_model_has_nothing_of_a_room_and_each_room_has_its_own(joint):
+    assert "drag_spin" in joint.whole.model.flight
+    assert "frame_tilt" not in joint.whole.model.measurement
+    assert joint.whole.model.trained is None
+    assert joint.whole.model.variations == {}
+    tilts = {name: float(model.measurement["frame_tilt"].x.detach()) for name, model in joint.rooms.items()}
+    assert tilts["leaning"] == pytest.approx(TILT, abs=0.005)
+    assert tilts["level"] == pytest.approx(0.0, abs=0.005)
+
+
+def test_predictions_get_better_in_both_rooms(joint):
+    assert joint.whole.after.prediction_rmse_mm < 0.7 * joint.whole.before.prediction_rmse_mm
+    assert len(joint.whole.before.by_track) == len(joint.whole.after.by_track)
+
+
+def test_the_folder_holds_the_ball_and_the_rooms(joint, tmp_path):
+    write_report(joint.whole, tmp_path / "out", joint.rooms)
+    files = {path.name for path in (tmp_path / "out").iterdir() if path.is_file()}
+    assert files == {"report.json", "report.html", "model.yaml", "model.level.yaml", "model.leaning.yaml"}
+    ball, room = (load_model(tmp_path / "out" / name) for name in ("model.yaml", "model.leaning.yaml"))
+    assert "frame_tilt" not in ball.measurement
+    assert room.noise == joint.rooms["leaning"].noise
+    np.testing.assert_allclose(room.measurement["frame_tilt"].x.detach(), TILT, atol=0.005)
+
+
+def test_rooms_need_names_of_their_own(rooms):
+    with pytest.raises(ValueError, match="datasets must be two or more, each with a name of its own; got level, level"):
+        diagnose_jointly([rooms[0], rooms[0]], nominal_model())
