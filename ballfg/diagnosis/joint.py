@@ -17,8 +17,9 @@ import torch
 from ballfg.arrays import Array
 from ballfg.diagnosis.diagnosis import alarms, share_left, strange, verdict_of
 from ballfg.diagnosis.fit.fit import first_guess, fit_model, fit_problem, reachable, values_of
+from ballfg.diagnosis.fit.free import LOOSE, Deviation, declared_free
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, hold_out
-from ballfg.diagnosis.fit.problem import Deviation, Fit, Noise, Problem, declared_free
+from ballfg.diagnosis.fit.problem import Fit, Noise, Problem
 from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.remains.generic import generic_tests
 from ballfg.diagnosis.remains.patterns import DRIFT
@@ -27,7 +28,7 @@ from ballfg.diagnosis.report.wording import joined as listed
 from ballfg.diagnosis.report.wording import refusal, sentence
 from ballfg.diagnosis.result import Diagnosis, Errors, Unexplained
 from ballfg.diagnosis.search.evaluation import prediction_errors
-from ballfg.diagnosis.search.hypothesis import LOOSE, effects_of, has_effect, with_effects, without_effect
+from ballfg.diagnosis.search.hypothesis import effects_of, has_effect, with_effects, without_effect
 from ballfg.diagnosis.search.loop import SearchLoop
 from ballfg.diagnosis.search.process_noise import PredictiveModel, calibrated_model, noise_about
 from ballfg.diagnosis.search.varying import Grouping, Varying
@@ -82,8 +83,14 @@ def diagnose_jointly(
         watch: is told of each stage, in lines.
         catalogue: effects to look for; by default all that are registered.
     Returns: the findings, the model of the ball and those of the rooms.
-    Raises: ValueError: for fewer than two datasets, equal names, a dataset whose stamps are wrong, or too few tracks.
+    Raises: ValueError: for fewer than two datasets, equal names, a dataset whose stamps are wrong, too few tracks, or a
+        model that differs between tracks.
     """
+    if model.variations:
+        raise ValueError(
+            f"model must be the same for all tracks of all rooms; {', '.join(model.variations)} differ between tracks. "
+            "Leave its section 'variations' out."
+        )
     tell = watch or (lambda line: None)
     rooms = _rooms(datasets, model, jobs, tell)
     search_half, held_out = (_together(rooms, half) for half in ("search", "held_out"))

@@ -8,8 +8,9 @@ from ballfg.benchmarks.diagnosis.cases import Case
 from ballfg.benchmarks.diagnosis.data import actual_model, declared_model
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.diagnosis.fit.fit import first_guess, fit_problem, reachable
+from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.holdout import hold_out
-from ballfg.diagnosis.fit.problem import Problem, declared_free
+from ballfg.diagnosis.fit.problem import Problem
 from ballfg.diagnosis.fit.stretches import Stretches, stretches_of
 from ballfg.diagnosis.result import Errors
 from ballfg.diagnosis.search.evaluation import prediction_errors

@@ -13,7 +13,8 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array, Mask
-from ballfg.diagnosis.fit.problem import Fit, Noise, Problem, Robust, Unknowns, declared_free
+from ballfg.diagnosis.fit.free import declared_deviations, declared_free
+from ballfg.diagnosis.fit.problem import Fit, Noise, Problem, Robust, Unknowns
 from ballfg.diagnosis.fit.sensitivity import Predicted, predict
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System
@@ -21,6 +22,7 @@ from ballfg.diagnosis.result import Value
 from ballfg.dynamics import AnalyticModel
 from ballfg.estimation import Settings
 from ballfg.state import SPIN, STATE_DIM
+from ballfg.tracks import Track
 
 MOST_STEPS = 15
 """Gauss-Newton steps of one minimisation."""
@@ -37,7 +39,14 @@ LEAST_SPIN_SCATTER = 1.0
 """rad/s. Unlabelled spins are taken to scatter at least so much."""
 
 
-def fit_model(model: AnalyticModel, stretches: Stretches, settings: Settings, *, settle_noise: bool = True) -> Fit:
+def fit_model(
+    model: AnalyticModel,
+    stretches: Stretches,
+    settings: Settings,
+    *,
+    settle_noise: bool = True,
+    tracks: Sequence[Track] = (),
+) -> Fit:
     """Fit a model's coefficients to stretches, with all first states.
 
     Args:
@@ -45,12 +54,17 @@ def fit_model(model: AnalyticModel, stretches: Stretches, settings: Settings, *,
         stretches: the data. Those whose contacts the model does not reach from the first guess are left out.
         settings: of the dataset; the noise of spin labels and the prior of spins.
         settle_noise: whether the scale of the noise is estimated too.
+        tracks: those of the stretches; needed where the model's coefficients differ between tracks.
     Returns: the minimum.
     """
     model = copy.deepcopy(model).requires_grad_(False)
-    problem = Problem(model, reachable(model, stretches), declared_free(model))
-    start = first_guess(problem, settings.spin_label_noise, settings.spin_prior)
-    return fit_problem(problem, *start, settle_noise=settle_noise)
+    free, deviations, values = declared_deviations(model, tracks)
+    problem = Problem(model, stretches, declared_free(model) | free, deviations=deviations)
+    reached = reachable(model, stretches, problem.by_stretch(problem.declared | values))
+    problem = replace(problem, stretches=reached)
+    unknowns, noise = first_guess(problem, settings.spin_label_noise, settings.spin_prior)
+    unknowns = replace(unknowns, values=unknowns.values | values)
+    return fit_problem(problem, unknowns, noise, settle_noise=settle_noise)
 
 
 def reachable(

@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 
 from ballfg.arrays import Array, Index
+from ballfg.diagnosis.fit.free import Deviation
 from ballfg.diagnosis.fit.sensitivity import Predicted, Sensitivity, predict, sensitivity
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.fit.system import System, by_track
@@ -43,29 +44,6 @@ class Noise:
     position: Array = field(default_factory=lambda: np.ones(3))
     label: float = 20.0
     spin: float = 60.0
-
-
-@dataclass(frozen=True)
-class Deviation:
-    """An unknown of a fit by which a coefficient is off on some tracks.
-
-    Attributes:
-        coefficient: its parameter name.
-        weights: by name of the track; the coefficient is off by the unknown times the weight.
-        by, level, line: of the `Variation` that it becomes in a model file, and its key there.
-        first: the first track, of a place in the recording: there the coefficient is not off.
-    """
-
-    coefficient: str
-    weights: Mapping[str, float]
-    by: str
-    level: str
-    first: str = ""
-    line: bool = False
-
-    def along(self, stretches: Stretches) -> Array:
-        """(n,) weights of stretches."""
-        return np.array([self.weights.get(name, 0.0) for name in stretches.names])
 
 
 @dataclass(frozen=True)
@@ -123,7 +101,9 @@ class Problem:
         parameters, declared = dict(self.model.named_parameters()), self.model.declared_coefficients()
         for name, deviation in self.deviations.items():
             own = found.get(deviation.coefficient, float(parameters[deviation.coefficient].detach()))
-            found[deviation.coefficient] = own + values[name] * deviation.along(stretches or self.stretches)
+            found[deviation.coefficient] = own + values[name] * deviation.along(
+                self.stretches if stretches is None else stretches
+            )
         for name in {deviation.coefficient for deviation in self.deviations.values()}:
             found[name] = np.clip(found[name], declared[name].low, declared[name].high)
         return found
@@ -284,8 +264,3 @@ def launch_axes(starts: Array) -> Array:
     x, y, zero = x / length, y / length, np.zeros_like(x)
     forward, across, up = (x, y, zero), (-y, x, zero), (zero, zero, zero + 1.0)
     return np.stack([np.stack(axis, axis=-1) for axis in (forward, across, up)], axis=-1)
-
-
-def declared_free(model: AnalyticModel) -> dict[str, Coefficient]:
-    """Coefficients that a fit of the declared model estimates: those whose prior leaves room."""
-    return {n: c for n, c in model.declared_coefficients().items() if c.sigma > 0.0 and c.absent is not None}

@@ -8,15 +8,12 @@ from typing import cast
 
 import numpy as np
 
-from ballfg.diagnosis.fit.problem import Deviation, Fit
+from ballfg.diagnosis.fit.free import LOOSE, Deviation, spread
+from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Value
 from ballfg.dynamics import AnalyticModel, Coefficient, Effect
 from ballfg.dynamics.effect import Scene, Vector
 
-LOOSE = 10.0
-"""Factor by which the prior of a hypothesis' coefficient is wider than the effect declares: the data are to decide."""
-INEXACT = 0.02
-"""Spread of a coefficient that is declared as exact, as a share of its value: a wrong clock or length shows so in g."""
 TWINS: Mapping[str, tuple[str, ...]] = {"gravity": ("buoyancy",)}
 """Effects that are exactly the same as another one of a model: the other one is listed for both."""
 LEAST_GAP = 1e-4
@@ -103,11 +100,6 @@ class Hypothesis:
             return model
         absent = {n: cast(float, self.coefficients[n].absent) for n in self.strengths}
         return with_effects(model, self.effect(**{**self.shape, **absent}))
-
-
-def spread(coefficient: Coefficient) -> float:
-    """Prior standard deviation of a coefficient, and a small one where it is declared as exact."""
-    return coefficient.sigma if coefficient.sigma > 0.0 else INEXACT * abs(coefficient.default)
 
 
 def effects_of(model: AnalyticModel) -> list[Effect]:

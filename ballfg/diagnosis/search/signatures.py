@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.fit.problem import Deviation, Fit
+from ballfg.diagnosis.fit.free import Deviation
+from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.sensitivity import sensitivity
 from ballfg.diagnosis.fit.system import System, by_track
 from ballfg.diagnosis.search.hypothesis import Hypothesis

@@ -3,8 +3,9 @@
 import numpy as np
 
 from ballfg.diagnosis.fit.fit import first_guess, fit_model, fit_problem, reachable
+from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.holdout import Holdout
-from ballfg.diagnosis.fit.problem import Fit, Problem, declared_free
+from ballfg.diagnosis.fit.problem import Fit, Problem
 from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.result import Finding
 from ballfg.diagnosis.search.hypothesis import Hypothesis, with_effects, without_effect
@@ -29,7 +30,7 @@ def first_fit(model: AnalyticModel, holdout: Holdout) -> Fit:
     stamps, search, settings = holdout.stamps, holdout.search, holdout.settings
     named = stamp_hypotheses(stamps)
     if not named:
-        return fit_model(model, search, settings)
+        return fit_model(model, search, settings, tracks=holdout.tracks)
     values = {"counted_frames": {"missing": stamps.missing}, "time_scale": {"s": stamps.scale}}
     stamped = with_effects(model, *(hypothesis.effect(**values[hypothesis.name]) for hypothesis in named))
     free = declared_free(model)

@@ -14,9 +14,10 @@ import numpy as np
 
 from ballfg.arrays import Index
 from ballfg.diagnosis.fit.fit import covariance_of
-from ballfg.diagnosis.fit.problem import Deviation, Fit
+from ballfg.diagnosis.fit.free import LOOSE, Deviation, spread
+from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Value
-from ballfg.diagnosis.search.hypothesis import LOOSE, Hypothesis, has_effect, spread, with_effects
+from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect, with_effects
 from ballfg.dynamics import AnalyticModel, Coefficient, Effect, Scene
 from ballfg.dynamics.variation import TRACK, number_of, place_of
 from ballfg.tracks import Track

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ballfg.diagnosis.fit.problem import declared_free
+from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.sensitivity import predict
 from ballfg.diagnosis.search.hypothesis import (
     LOOSE,

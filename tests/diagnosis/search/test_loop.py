@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ballfg.diagnosis.fit.problem import declared_free
+from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.result import Errors, Outcome
 from ballfg.diagnosis.search.hypothesis import has_effect, without_effect

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ballfg.diagnosis.fit.fit import covariance_of
+from ballfg.diagnosis.fit.fit import covariance_of, fit_model
 from ballfg.diagnosis.fit.problem import Fit, Unknowns
 from ballfg.diagnosis.fit.sensitivity import predict
 from ballfg.diagnosis.fit.stretches import joined
@@ -19,7 +19,8 @@ from ballfg.diagnosis.search.signatures import hypothesis_columns
 from ballfg.diagnosis.search.state import without_named
 from ballfg.diagnosis.search.trial import try_varying
 from ballfg.diagnosis.search.varying import Varying, between, groupings, near, varying_hypotheses
-from ballfg.dynamics import EFFECTS, Scene
+from ballfg.dynamics import EFFECTS, Scene, Variation
+from ballfg.estimation import Settings
 from ballfg.tracks import Track
 
 COUNT, CHANGE = 24, 10
@@ -89,6 +90,15 @@ def test_nothing_differs_where_one_ball_flew_all_the_time(make_ball, make_launch
     scored, refits = try_varying(fit, list(EFFECTS.values()), holdout.held_out, ways, lambda line: None)
     assert len(scored) > 20
     assert refits == []
+
+
+def test_values_that_a_model_declares_are_fitted(found, two_balls, holdout, make_ball):
+    """From poor ones to those that the search found, whose fit has the same minimum."""
+    model = make_ball()
+    model.variations = {"bounce.restitution.e": Variation("track", {"000": 0.9, f"{2 * CHANGE:03d}": 0.91})}
+    fitted = fit_model(model, two_balls[0], Settings(spin_label_noise=4.0), tracks=holdout.tracks)
+    (declared,), (searched,) = fitted.variations().values(), found[1][0].fit.variations().values()
+    np.testing.assert_allclose(list(declared.values.values()), list(searched.values.values()), atol=2e-4)
 
 
 def test_without_it_the_fit_is_the_one_before(found, before):
