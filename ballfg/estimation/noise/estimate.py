@@ -101,11 +101,7 @@ def estimate_noise(
     """
     parts = [part for track in tracks if len(part := _first_part(track)) >= LEAST_SAMPLES]
     own_sigmas = any(part.sigmas is not None for part in parts)
-    plain = replace(settings, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0)
-    if not model.measures_plainly:  # of measured positions as they happened
-        inverse = InvertMeasurement(Smoother, model, surfaces, plain)
-        parts, model = [inverse.undo(part).track for part in parts], plainly_measured(model)
-    linear = linearise(Smoother(model, surfaces, plain), parts, watch)
+    linear = linearised(model, surfaces, settings, parts, watch)
     if linear is None:
         return None
     forecaster = _forecaster(linear, parts, settings)
@@ -127,6 +123,25 @@ def estimate_noise(
         tracks=len(linear),
         starts=len(forecaster.starts),
     )
+
+
+def linearised(
+    model: BallModel, surfaces: Surfaces, settings: Settings, tracks: Sequence[Track], watch: Watch = unwatched
+) -> LinearTracks | None:
+    """Tracks about their estimates with white noise alone; None where all are short.
+
+    Args:
+        model: the ball, and how it is measured.
+        surfaces: what it may bounce on.
+        settings: of which memory and jitter play no part.
+        tracks: measured.
+        watch: told of each track.
+    """
+    plain = replace(settings, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0)
+    if not model.measures_plainly:  # of measured positions as they happened
+        inverse = InvertMeasurement(Smoother, model, surfaces, plain)
+        tracks, model = [inverse.undo(track).track for track in tracks], plainly_measured(model)
+    return linearise(Smoother(model, surfaces, plain), tracks, watch)
 
 
 def spread_over(tracks: Iterable[T], count: int, most: int = MOST_TRACKS) -> list[T]:
