@@ -104,7 +104,8 @@ def estimate_noise(
     linear = linearised(model, surfaces, settings, parts, watch)
     if linear is None:
         return None
-    forecaster = _forecaster(linear, parts, settings)
+    biased = settings.has_memory or not tracker_known
+    forecaster = _forecaster(linear, parts, settings, biased)
     if not len(forecaster.starts):
         return None
     parameters = parameters_of(settings, linear, position_known or own_sigmas, tracker_known)
@@ -160,7 +161,7 @@ def _first_part(track: Track) -> Track:
     return track.until(float(track.times[0]) + LONGEST_PART) if track.duration > LONGEST_PART else track
 
 
-def _forecaster(linear: LinearTracks, parts: Sequence[Track], settings: Settings) -> Forecaster:
+def _forecaster(linear: LinearTracks, parts: Sequence[Track], settings: Settings, biased: bool) -> Forecaster:
     """Forecasts that start where a robot would use them, or earlier in tracks that are too short for that."""
     typical = float(np.median([part.duration for part in parts]))
     return Forecaster(
@@ -168,6 +169,7 @@ def _forecaster(linear: LinearTracks, parts: Sequence[Track], settings: Settings
         settings.velocity_prior,
         earliest=min(EARLIEST_START, EARLIEST_SHARE * typical),
         every=min(START_EVERY, EVERY_SHARE * typical),
+        biased=biased,
     )
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Final
 
 import numpy as np
 import torch
 from scipy.optimize import minimize
-from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.estimation.noise.linear_filter import LinearFilter, Noise
@@ -26,7 +27,7 @@ class MarginalFit:
         tracks: the filter of the tracks.
         settings: values of what is not among the parameters.
         parameters: the numbers to estimate.
-        begin: another fit of these tracks, at whose values the search begins; else it begins at the prior medians.
+        begin: logarithms of numbers, by name and axis, at which the search begins; others at their prior medians.
         tolerance: largest derivative at the minimum, by numbers in their standard deviations.
 
     Attributes:
@@ -39,23 +40,22 @@ class MarginalFit:
         tracks: LinearFilter,
         settings: Settings,
         parameters: list[Parameter],
-        begin: MarginalFit | None = None,
+        begin: Mapping[tuple[str, int | None], float] = MappingProxyType({}),
         *,
         tolerance: float = 0.2,
     ) -> None:
         self.tracks, self.settings, self.parameters = tracks, settings, parameters
         self.start = np.log([p.start for p in parameters])
         self.precision = np.array([p.spread**-2 for p in parameters])
-        known = {} if begin is None else dict(zip(begin.names, begin.logs.tolist(), strict=True))
-        first = [known.get(name, log) for name, log in zip(self.names, self.start.tolist(), strict=True)]
+        first = [begin.get((p.name, p.axis), log) for p, log in zip(parameters, self.start.tolist(), strict=True)]
         self.logs = np.array(first)
         self.losses, self.gradients = self.at(self.logs)
         self._minimise(tolerance)
 
     @property
-    def names(self) -> list[tuple[str, int | None]]:
-        """Name and axis of each number."""
-        return [(p.name, p.axis) for p in self.parameters]
+    def known(self) -> dict[tuple[str, int | None], float]:
+        """The logarithms by name and axis."""
+        return {(p.name, p.axis): log for p, log in zip(self.parameters, self.logs.tolist(), strict=True)}
 
     def values(self, name: str) -> Array:
         """The values of a number along all its axes; (0,) if it is not estimated."""
@@ -64,13 +64,9 @@ class MarginalFit:
     def at(self, logs: Array) -> tuple[Array, Array]:
         """(t,) losses of the tracks at some logarithms, and (t, k) their derivatives."""
         rows = torch.tensor(np.tile(logs, (self.tracks.count, 1)), dtype=torch.float64, requires_grad=True)
-        losses = self.loss(tensors_of(self.parameters, rows, self.settings))
+        losses = self.tracks.losses(tensors_of(self.parameters, rows, self.settings))
         (gradients,) = torch.autograd.grad(losses.sum(), rows)
         return losses.detach().numpy(), gradients.numpy()
-
-    def loss(self, noise: Noise) -> Tensor:
-        """(t,) negative logarithm of the density of each track."""
-        return self.tracks.run(noise, *self.tracks.motion(noise), self.tracks.measured(noise)).following
 
     def noise(self) -> Noise:
         """The noise found, one row for each track."""

@@ -109,14 +109,19 @@ def tracker_noise(
     asked = [name for name, is_open in open_parts.items() if is_open]
     if min(held_out.sum(), (~held_out).sum()) < LEAST_TRACKS:
         return TrackerNoise((), TrackNoise())
-    linear = LinearFilter(tracks, settings.velocity_prior)
-    fits, found = [MarginalFit(linear, settings, _parameters(settings, tracks, ()), tolerance=COARSE)], list[Evidence]()
+    full, lean = (LinearFilter(tracks, settings.velocity_prior, biased=b) for b in (True, settings.has_memory))
+    fits, found = [MarginalFit(lean, settings, _parameters(settings, tracks, ()), tolerance=COARSE)], list[Evidence]()
     while asked:
-        best = min((e for name in asked for e in _evidence(fits[-1], name, held_out)), key=lambda e: e.p_values[0])
+        best = min(
+            (e for name in asked for e in _evidence(full, fits[-1], name, held_out)), key=lambda e: e.p_values[0]
+        )
         if not best.clear:
             break
         asked.remove(best.name)
-        fit = MarginalFit(linear, settings, _parameters(settings, tracks, [*found, best]), fits[-1], tolerance=COARSE)
+        needed = full if best.name == MEMORY or fits[-1].tracks is full else lean
+        fit = MarginalFit(
+            needed, settings, _parameters(settings, tracks, [*found, best]), fits[-1].known, tolerance=COARSE
+        )
         if best.name == MEMORY and fit.values("memory_time") > LONGEST_TIME:
             continue
         fits.append(fit)
@@ -141,12 +146,12 @@ def _parameters(settings: Settings, tracks: LinearTracks, parts: Iterable[Eviden
     ]
 
 
-def _evidence(fit: MarginalFit, name: str, held_out: Mask) -> list[Evidence]:
+def _evidence(full: LinearFilter, fit: MarginalFit, name: str, held_out: Mask) -> list[Evidence]:
     """The score tests of a part that a fit is without."""
     times = TIMES if name == MEMORY else (0.0,)
     found = []
     for time in times:
-        score = _score(fit, name, time)
+        score = _score(full if name == MEMORY else fit.tracks, fit, name, time)
         away, *_ = np.linalg.lstsq(fit.gradients, score, rcond=None)
         score = score - fit.gradients @ away
         freedom = (len(score) - fit.gradients.shape[1]) / len(score)
@@ -155,7 +160,7 @@ def _evidence(fit: MarginalFit, name: str, held_out: Mask) -> list[Evidence]:
     return found
 
 
-def _score(fit: MarginalFit, name: str, time: float) -> Array:
+def _score(tracks: LinearFilter, fit: MarginalFit, name: str, time: float) -> Array:
     """(t,) derivative of each track's log likelihood by the variance of a part, where that is zero."""
     noise = fit.noise()
     variance = torch.zeros(fit.tracks.count, dtype=torch.float64, requires_grad=True)
@@ -164,7 +169,7 @@ def _score(fit: MarginalFit, name: str, time: float) -> Array:
         noise = replace(noise, memory=variance[:, None] * white, memory_time=torch.full_like(variance, time).detach())
     else:
         noise = replace(noise, stamp_jitter=variance * JITTER_UNIT**2)
-    (gradient,) = torch.autograd.grad(fit.loss(noise).sum(), variance)
+    (gradient,) = torch.autograd.grad(tracks.losses(noise).sum(), variance)
     return np.asarray(-gradient.numpy())
 
 
@@ -203,7 +208,7 @@ def _settled(fit: MarginalFit, settings: Settings, stated: float | None) -> Marg
     """
     if stated is not None:
         sure = [replace(p, start=stated, spread=STATED_SPREAD) if p.name == "position" else p for p in fit.parameters]
-        believed = MarginalFit(fit.tracks, settings, sure)
+        believed = MarginalFit(fit.tracks, settings, sure, {n: v for n, v in fit.known.items() if n[0] != "position"})
         rows = [k for k, p in enumerate(sure) if p.name == "position"]
         others = np.delete(believed.gradients, rows, axis=1)
         score = believed.gradients[:, rows]
@@ -211,7 +216,7 @@ def _settled(fit: MarginalFit, settings: Settings, stated: float | None) -> Marg
         total = score.sum(axis=0)
         if float(total @ np.linalg.solve(score.T @ score, total)) < AGREES:
             return believed
-    return MarginalFit(fit.tracks, settings, fit.parameters, fit)
+    return MarginalFit(fit.tracks, settings, fit.parameters, fit.known)
 
 
 def _size(fit: MarginalFit, covariance: Array, name: str) -> tuple[float, float]:
