@@ -110,7 +110,7 @@ def _with_own_noise(
         search = replace(search, judged=evaluate(corrected))
     tracker = look_at_tracker(corrected, holdout)
     if not tracker.findings:
-        return corrected, None, search
+        return corrected, tracker.noise, search
     tell(f"{' and '.join(finding.name for finding in tracker.findings)} found")
     for model in (declared, corrected):
         model.noise = noise_about(model, holdout.search_tracks, holdout.dataset, tracker.noise)

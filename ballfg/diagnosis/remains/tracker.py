@@ -5,7 +5,7 @@ for errors that last from sample to sample and for stamps that err, by both halv
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -35,7 +35,10 @@ UNITS = {MEMORY: "m", JITTER: "s"}
 
 @dataclass(frozen=True)
 class Tracker:
-    """What tracks show of their tracker: findings, and the noise of its samples where that is not white."""
+    """What tracks show of their tracker: findings, and the noise of its samples where that is not white.
+
+    The noise has a memory and jitter that are declared, too.
+    """
 
     findings: tuple[Finding, ...] = ()
     noise: TrackNoise | None = None
@@ -52,7 +55,12 @@ def look_at_tracker(model: AnalyticModel, holdout: Holdout) -> Tracker:
     own = any(track.sigmas is not None for track in tracks)
     held_out = linear.numbers >= len(halves[0])
     found = tracker_noise(linear, held_out, settings, None if own else holdout.dataset.info.position_noise)
-    return Tracker(tuple(_finding(part) for part in found.parts), found.noise) if found.parts else Tracker()
+    noise, declared = found.noise, settings.has_memory or settings.stamp_jitter > 0.0
+    if settings.has_memory:
+        noise = replace(noise, memory=settings.memory, memory_time=settings.memory_time)
+    if settings.stamp_jitter > 0.0:
+        noise = replace(noise, stamp_jitter=settings.stamp_jitter)
+    return Tracker(tuple(_finding(part) for part in found.parts), noise if found.parts or declared else None)
 
 
 def _parts(half: Sequence[EvaluationTrack]) -> list[Track]:
@@ -67,11 +75,11 @@ def _finding(part: TrackerPart) -> Finding:
         name=name,
         kind="measurement",
         parameters={key: Value(value, sigma, units[key]) for key, (value, sigma) in part.values.items()},
-        p_value=part.evidence.p_values[0],
+        p_value=part.evidence.p_value,
         delta_bic=len(NUMBERS[name]) * float(np.log(searched.sum())) - 2.0 * float(part.gains[searched].sum()),
         indistinguishable_from=(),
         held_out_gain=float(part.gains[part.held_out].mean()),
-        held_out_p=part.evidence.p_values[1],
+        held_out_p=part.evidence.halves[1],
         sentence=SENTENCES[name],
         decide=DECIDE[name],
     )

@@ -32,10 +32,11 @@ TIMES: Final = (0.005, 0.01, 0.02, 0.04)
 """s. Memories that are looked for; the score falls little between neighbours."""
 LONGEST_TIME: Final = 0.06
 """s. Errors that last longer may be those of the motion, and are no memory."""
+CANDIDATES: Final = len(TIMES) + 1
 ALWAYS: Final = ("position", "acceleration")
 """Numbers that act from sample to sample as well: those of the white part, and of forces that the model lacks."""
-FOUND, CONFIRMED = 0.01, 0.05
-"""Probabilities by chance below which a part is found on one half, all candidates counted; confirmed on the other."""
+FOUND, CONFIRMED = 0.002, 0.05
+"""Probabilities by chance below which a part is found, all tracks and candidates counted; below which a half agrees."""
 COARSE: Final = 1.0
 """Tolerance of fits that only answer whether a part is there."""
 LEAST_TRACKS: Final = 5
@@ -55,17 +56,19 @@ class Evidence:
     Attributes:
         name: of the part.
         time: s, of a memory; 0 for jitter.
-        p_values: probability of such a score by chance on the searched half, all candidates counted, and on the other.
+        p_value: probability of such a score of all tracks by chance, all candidates counted.
+        halves: the same of each half, for this candidate alone.
     """
 
     name: str
     time: float
-    p_values: tuple[float, float]
+    p_value: float
+    halves: tuple[float, float]
 
     @property
     def clear(self) -> bool:
         """Whether both halves show it."""
-        return self.p_values[0] < FOUND and self.p_values[1] < CONFIRMED
+        return self.p_value < FOUND and max(self.halves) < CONFIRMED
 
 
 @dataclass(frozen=True)
@@ -108,26 +111,25 @@ def tracker_noise(
     open_parts = {MEMORY: not settings.has_memory, JITTER: settings.stamp_jitter == 0.0}
     asked = [name for name, is_open in open_parts.items() if is_open]
     if min(held_out.sum(), (~held_out).sum()) < LEAST_TRACKS:
-        return TrackerNoise((), TrackNoise())
+        white = np.array(settings.position_noise) * settings.position_scale
+        return TrackerNoise((), TrackNoise(position=(white[0], white[1], white[2])))
     full, lean = (LinearFilter(tracks, settings.velocity_prior, biased=b) for b in (True, settings.has_memory))
     fits, found = [MarginalFit(lean, settings, _parameters(settings, tracks, ()), tolerance=COARSE)], list[Evidence]()
     while asked:
-        best = min(
-            (e for name in asked for e in _evidence(full, fits[-1], name, held_out)), key=lambda e: e.p_values[0]
-        )
+        evidence = [e for name in asked for e in _evidence(full, fits[-1], name, held_out)]
+        best = min(evidence, key=lambda e: e.p_value)
         if not best.clear:
             break
         asked.remove(best.name)
         needed = full if best.name == MEMORY or fits[-1].tracks is full else lean
-        fit = MarginalFit(
-            needed, settings, _parameters(settings, tracks, [*found, best]), fits[-1].known, tolerance=COARSE
-        )
+        numbers = _parameters(settings, tracks, [*found, best])
+        fit = MarginalFit(needed, settings, numbers, fits[-1].known, tolerance=COARSE)
         if best.name == MEMORY and fit.values("memory_time") > LONGEST_TIME:
             continue
         fits.append(fit)
         found.append(best)
     if not found:
-        return TrackerNoise((), TrackNoise())
+        return TrackerNoise((), _noise_of(fits[0]))
     return _sizes(fits, found, held_out, settings, stated)
 
 
@@ -152,12 +154,16 @@ def _evidence(full: LinearFilter, fit: MarginalFit, name: str, held_out: Mask) -
     found = []
     for time in times:
         score = _score(full if name == MEMORY else fit.tracks, fit, name, time)
-        away, *_ = np.linalg.lstsq(fit.gradients, score, rcond=None)
-        score = score - fit.gradients @ away
+        score = _cleared(score, fit.gradients)
         freedom = (len(score) - fit.gradients.shape[1]) / len(score)
-        p_search, p_held_out = (_p_value(score[half], freedom) for half in (~held_out, held_out))
-        found.append(Evidence(name, time, (min(1.0, (len(TIMES) + 1) * p_search), p_held_out)))
+        whole, *halves = (_p_value(score[some], freedom) for some in (slice(None), ~held_out, held_out))
+        found.append(Evidence(name, time, min(1.0, CANDIDATES * whole), (halves[0], halves[1])))
     return found
+
+
+def _cleared(scores: Array, others: Array) -> Array:
+    """Scores (t,) or (t, m) of tracks without what the scores (t, k) of other numbers explain of them."""
+    return np.asarray(scores - others @ np.linalg.lstsq(others, scores, rcond=None)[0])
 
 
 def _score(tracks: LinearFilter, fit: MarginalFit, name: str, time: float) -> Array:
@@ -190,15 +196,19 @@ def _sizes(
         if evidence.name == MEMORY:
             values["time"] = _size(last, covariance, "memory_time")
         parts.append(TrackerPart(evidence, values, before.losses - after.losses, held_out))
-    memory, time, jitter = (last.values(name).tolist() for name in ("memory", "memory_time", "stamp_jitter"))
-    white = last.values("position").tolist()
-    noise = TrackNoise(
+    return TrackerNoise(tuple(parts), _noise_of(last))
+
+
+def _noise_of(fit: MarginalFit) -> TrackNoise:
+    white, memory, time, jitter = (
+        fit.values(n).tolist() for n in ("position", "memory", "memory_time", "stamp_jitter")
+    )
+    return TrackNoise(
         position=(white[0], white[1], white[2]),
         memory=(memory[0], memory[1], memory[2]) if memory else None,
         memory_time=time[0] if time else None,
         stamp_jitter=jitter[0] if jitter else None,
     )
-    return TrackerNoise(tuple(parts), noise)
 
 
 def _settled(fit: MarginalFit, settings: Settings, stated: float | None) -> MarginalFit:
@@ -211,8 +221,7 @@ def _settled(fit: MarginalFit, settings: Settings, stated: float | None) -> Marg
         believed = MarginalFit(fit.tracks, settings, sure, {n: v for n, v in fit.known.items() if n[0] != "position"})
         rows = [k for k, p in enumerate(sure) if p.name == "position"]
         others = np.delete(believed.gradients, rows, axis=1)
-        score = believed.gradients[:, rows]
-        score = score - others @ np.linalg.lstsq(others, score, rcond=None)[0]
+        score = _cleared(believed.gradients[:, rows], others)
         total = score.sum(axis=0)
         if float(total @ np.linalg.solve(score.T @ score, total)) < AGREES:
             return believed
