@@ -77,11 +77,13 @@ def open_dataset(folder: str) -> Dataset:
 def analytic_model(path: str | None, ball: Ball) -> AnalyticModel:
     """The analytic model of a file, or the nominal one of the ball for None.
 
-    Raises: ValueError: if the file's model has a learned part.
+    Raises: ValueError: if the file's model has a learned part, or coefficients that differ between tracks.
     """
     model = nominal_model(ball) if path is None else load_model(path, radius=ball.radius)
     if not isinstance(model, AnalyticModel):
         raise ValueError(f"model must be analytic; {path} has a learned part. Give its base, or leave it out.")
+    if model.variations:
+        raise ValueError(f"model must be the same for all tracks; {path} has variations. Leave that section out.")
     return model
 
 

@@ -1,6 +1,7 @@
 """The diagnosis of a dataset: search for effects, evaluate them, test the rest, and say it in one sentence."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -11,15 +12,17 @@ from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.remains.fallback import fallback
 from ballfg.diagnosis.remains.generic import ALARM, generic_tests
 from ballfg.diagnosis.remains.residuals import residuals_of
+from ballfg.diagnosis.remains.tracker import look_at_tracker
 from ballfg.diagnosis.report.wording import refusal, sentence
 from ballfg.diagnosis.result import Diagnosis, Errors, GenericTest, Unexplained, Value, Verdict
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.loop import Search, SearchLoop
 from ballfg.diagnosis.search.plausible import implausible
 from ballfg.diagnosis.search.process_noise import Predicting, noise_about
+from ballfg.diagnosis.search.stamp_effects import as_declared
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
 from ballfg.estimation import dataset_settings
-from ballfg.tracks import Dataset
+from ballfg.tracks import Dataset, TrackNoise
 
 MOSTLY = 0.1
 """Effects that leave less than this share of the first pattern are taken to explain it."""
@@ -58,19 +61,15 @@ def diagnose(
     evaluate = partial(_errors, holdout, jobs)
     effects = tuple(catalogue or EFFECTS.values())
     search = SearchLoop(holdout, effects, Predicting(holdout, jobs), evaluate, tell, jobs=jobs).run(model)
-    corrected, after = search.predictive.model, search.judged
-    if search.fit is not search.first:
-        tell("looking at the noise about the corrected model")
-        corrected.noise = noise_about(corrected, holdout.search_tracks, dataset)
-        after = evaluate(corrected)
+    corrected, tracker, search = _with_own_noise(search, holdout, evaluate, tell)
     tell("looking at what is left")
-    tests = generic_tests(search.fit, search.first)
+    tests = generic_tests(search.fit, search.first, tracker)
     verdict = verdict_of(search, tests)
     helped = None
     if verdict is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in alarms(tests)):
         tell("describing what is left without a name")
         embedding, parts = holdout.launcher.embedding, holdout.search_tracks
-        helped = fallback(search.fit, embedding, corrected.noise, dataset, parts, after, evaluate)
+        helped = fallback(search.fit, embedding, corrected.noise, dataset, parts, search.judged, evaluate)
     left = sorted(alarms(tests), key=lambda test: test.name == "time")  # a place says more than a correlation
     unexplained = Unexplained(left[0].where if left else "", share_left(tests), tests, helped)
     residuals = residuals_of(search.first)
@@ -83,7 +82,7 @@ def diagnose(
         findings=search.findings,
         rounds=search.rounds,
         before=search.before,
-        after=after if helped is None else helped.after,
+        after=search.judged if helped is None else helped.after,
         tracks_found_on=len(np.unique(holdout.search.track)),
         tracks_judged_on=len(search.before.by_track),
         calibrated=calibrated,
@@ -95,6 +94,35 @@ def diagnose(
         excluded=holdout.excluded,
         remarks=(*map(refusal, search.refused.values()), *strange(calibrated, model.radius)),
     )
+
+
+def _with_own_noise(
+    search: Search, holdout: Holdout, evaluate: Callable[[BallModel], Errors], tell: Callable[[str], None]
+) -> tuple[AnalyticModel, TrackNoise | None, Search]:
+    """The corrected model with its own noise, the tracker's noise if it is not white, and the search with both.
+
+    Errors of the declared model are those with the same tracker.
+    """
+    declared, corrected = search.declared.model, search.predictive.model
+    tell("looking at the noise about the corrected model")
+    if search.fit is not search.first:
+        corrected.noise = noise_about(corrected, holdout.search_tracks, holdout.dataset)
+        search = replace(search, judged=evaluate(corrected))
+    tracker = look_at_tracker(corrected, holdout)
+    if not tracker.findings:
+        return corrected, tracker.noise, search
+    tell(f"{' and '.join(finding.name for finding in tracker.findings)} found")
+    for model in (declared, corrected):
+        model.noise = noise_about(model, holdout.search_tracks, holdout.dataset, tracker.noise)
+        if declared is corrected:
+            break
+    search = replace(
+        search,
+        before=evaluate(as_declared(declared, holdout.stamps)),
+        judged=evaluate(corrected),
+        findings=(*search.findings, *tracker.findings),
+    )
+    return corrected, tracker.noise, search
 
 
 def strange(calibrated: Mapping[str, Value], radius: float) -> list[str]:

@@ -26,6 +26,7 @@ from ballfg.diagnosis.remains.whiteness import whiteness
 from ballfg.diagnosis.result import GenericTest
 from ballfg.diagnosis.search.score import pattern_tests
 from ballfg.diagnosis.search.signatures import signatures_of
+from ballfg.tracks import TrackNoise
 
 ALARM = 0.005
 """Probability that any of the tests of a fit that lacks nothing raises an alarm: p-values below it are alarms."""
@@ -51,16 +52,17 @@ class _Test:
     size: float
 
 
-def generic_tests(fit: Fit, reference: Fit | None = None) -> tuple[GenericTest, ...]:
+def generic_tests(fit: Fit, reference: Fit | None = None, tracker: TrackNoise | None = None) -> tuple[GenericTest, ...]:
     """All tests of a fit, p-values corrected for their number.
 
     Args:
         fit: of the model so far.
         reference: the fit of the declared model, to which shares refer; None: `fit` itself.
+        tracker: noise of a tracker whose errors are not white, as found.
     Returns: the tests, the least probable first.
     """
-    tests = _tests_of(fit)
-    first = tests if reference is None or reference is fit else _tests_of(reference)
+    tests = _tests_of(fit, tracker)
+    first = tests if reference is None or reference is fit else _tests_of(reference, tracker)
     sizes = {(test.kind, test.quantities): test.size for test in first}
     found = []
     for test in tests:
@@ -70,9 +72,10 @@ def generic_tests(fit: Fit, reference: Fit | None = None) -> tuple[GenericTest, 
     return tuple(sorted(found, key=lambda t: t.p_value))
 
 
-def _tests_of(fit: Fit) -> list[_Test]:
+def _tests_of(fit: Fit, tracker: TrackNoise | None) -> list[_Test]:
     system = fit.linearised()
-    drifting, drift, labels = drift_block(fit, system), whiteness(fit, system), check_labels(fit, system)
+    drifting, labels = drift_block(fit, system), check_labels(fit, system)
+    drift = whiteness(fit, system, tracker)
     tests = _block_tests(fit, system, [*blocks_of(fit), *([] if drifting is None else [drifting])])
     tests.append(_Test("time", (), drift.where, drift.p_value, drift.drift**2))
     if labels is not None:

@@ -4,6 +4,8 @@ Residuals of a good fit are not white themselves: r = M e, with white noise e an
 For a kernel W over pairs of different samples, U = r'(W + c) r over the stretch's own mean square, with c = -tr(M W) /
 tr(M), has mean zero whatever the scale of the noise on that stretch, and cumulants that are traces of powers of
 M (W + c). The sum of U over stretches is compared with the gamma distribution of the same first three cumulants.
+
+Errors of a tracker whose memory or jitter is known are whitened by their covariance first.
 """
 
 from dataclasses import dataclass
@@ -14,6 +16,7 @@ from scipy import stats
 from ballfg.arrays import Array, Mask
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
+from ballfg.tracks import TrackNoise
 
 REACHES = (0.02, 0.06, 0.18)
 """s. Widths of the Gaussian kernels in the time between two samples: from the size of a contact to that of an arc."""
@@ -45,15 +48,25 @@ class Whiteness:
         return f"time: samples within {1e3 * self.reach:.0f} ms err alike, by {1e3 * self.drift:.2g} mm"
 
 
-def whiteness(fit: Fit, system: System) -> Whiteness:
-    """The test of a fit for drift along its tracks; system: of the fit, linearised at its minimum."""
+def whiteness(fit: Fit, system: System, tracker: TrackNoise | None = None) -> Whiteness:
+    """The test of a fit for drift along its tracks.
+
+    Args:
+        fit: at its minimum.
+        system: of the fit, linearised there.
+        tracker: white noise, memory and jitter where the tracker has any; None: errors are taken to be white.
+    """
     stretches = fit.problem.stretches
     n, k = stretches.times.shape
     kept = stretches.used.numpy() & (fit.robust.samples >= LEAST_WEIGHT)
     rows = np.ones(system.residual.shape)  # without outliers, which pull at the fit a little and would look like drift
     rows[:, : 3 * k] = np.repeat(kept, 3, axis=1)
     system = System(system.residual * rows, system.by_start * rows[..., None], system.by_common * rows[..., None])
+    if tracker is not None:
+        system = _whitened(fit, system, kept, tracker)
     projected = system.projected()
+    if tracker is not None:  # the fit has weighted its samples as if their errors were white
+        projected[..., -1] -= projected[..., :-1] @ _common_step(fit, system)
     residual = projected[:, : 3 * k, -1].reshape(n, k, 3)
     taken = _absorbed(fit, system, projected[..., :-1]).reshape(n, k, 3, -1)
     sums, spreads, p_values, products = [], [], [], []
@@ -73,6 +86,51 @@ def whiteness(fit: Fit, system: System) -> Whiteness:
         explained=np.array(sums),
         spread=np.array(spreads),
     )
+
+
+def _whitened(fit: Fit, system: System, kept: Mask, tracker: TrackNoise) -> System:
+    """The rows of positions turned and scaled so that the errors of a tracker with a memory and jitter are white."""
+    stretches = fit.problem.stretches
+    (n, k), times = stretches.times.shape, stretches.times.numpy()
+    stated = stretches.sigmas.numpy()
+    typical = np.median(stated[stretches.used.numpy()], axis=0)
+    assert tracker.position is not None
+    white = np.where(kept[..., None], stated / typical * tracker.position, 1.0)
+    spread = np.zeros((n, k, 3, k, 3))
+    sample = np.arange(k)
+    both = kept[:, :, None] & kept[:, None, :]
+    if tracker.memory is not None and tracker.memory_time is not None:
+        lasting = np.exp(-np.abs(times[:, :, None] - times[:, None, :]) / tracker.memory_time) * both
+        for axis in range(3):
+            spread[:, :, axis, :, axis] = tracker.memory[axis] ** 2 * lasting
+    if tracker.stamp_jitter is not None:
+        way = tracker.stamp_jitter * _velocities(fit) * kept[..., None]
+        spread[:, sample, :, sample, :] += (way[..., :, None] * way[..., None, :]).swapaxes(0, 1)
+    for axis in range(3):
+        spread[:, sample, axis, sample, axis] += white[..., axis] ** 2
+    root = np.linalg.cholesky(spread.reshape(n, 3 * k, 3 * k))
+    metres = np.where(kept[..., None], fit.sigmas, 1.0).reshape(n, 3 * k, 1)
+
+    def turned(rows: Array) -> Array:
+        return np.concatenate((np.linalg.solve(root, metres * rows[:, : 3 * k]), rows[:, 3 * k :]), axis=1)
+
+    return System(turned(system.residual[..., None])[..., 0], turned(system.by_start), turned(system.by_common))
+
+
+def _velocities(fit: Fit) -> Array:
+    """(n, k, 3) m/s from one predicted sample to the next; zero where there is none."""
+    steps = np.diff(fit.problem.stretches.times.numpy(), axis=1)[..., None]
+    moved = np.diff(fit.predicted.positions, axis=1)
+    velocities = np.where(steps > 0.0, moved / np.where(steps > 0.0, steps, 1.0), 0.0)
+    return np.concatenate((velocities, velocities[:, -1:]), axis=1)
+
+
+def _common_step(fit: Fit, system: System) -> Array:
+    """(q,) by how much the unknowns that all stretches share move under the weights of another system."""
+    problem, values = fit.problem, np.array([fit.unknowns.values[name] for name in fit.problem.free])
+    away = np.concatenate((problem.centres - values, -fit.unknowns.launcher.ravel()))
+    free = np.full(len(away), np.inf)
+    return system.eliminated().common_step(problem.common_precision, problem.common_precision * away, -free, free)
 
 
 def _summed(residual: Array, taken: Array, kept: Mask, kernel: Array) -> tuple[float, float, float]:

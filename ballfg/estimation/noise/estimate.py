@@ -101,14 +101,11 @@ def estimate_noise(
     """
     parts = [part for track in tracks if len(part := _first_part(track)) >= LEAST_SAMPLES]
     own_sigmas = any(part.sigmas is not None for part in parts)
-    plain = replace(settings, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0)
-    if not model.measures_plainly:  # of measured positions as they happened
-        inverse = InvertMeasurement(Smoother, model, surfaces, plain)
-        parts, model = [inverse.undo(part).track for part in parts], plainly_measured(model)
-    linear = linearise(Smoother(model, surfaces, plain), parts, watch)
+    linear = linearised(model, surfaces, settings, parts, watch)
     if linear is None:
         return None
-    forecaster = _forecaster(linear, parts, settings)
+    biased = settings.has_memory or not tracker_known
+    forecaster = _forecaster(linear, parts, settings, biased)
     if not len(forecaster.starts):
         return None
     parameters = parameters_of(settings, linear, position_known or own_sigmas, tracker_known)
@@ -129,6 +126,25 @@ def estimate_noise(
     )
 
 
+def linearised(
+    model: BallModel, surfaces: Surfaces, settings: Settings, tracks: Sequence[Track], watch: Watch = unwatched
+) -> LinearTracks | None:
+    """Tracks about their estimates with white noise alone; None where all are short.
+
+    Args:
+        model: the ball, and how it is measured.
+        surfaces: what it may bounce on.
+        settings: of which memory and jitter play no part.
+        tracks: measured.
+        watch: told of each track.
+    """
+    plain = replace(settings, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0)
+    if not model.measures_plainly:  # of measured positions as they happened
+        inverse = InvertMeasurement(Smoother, model, surfaces, plain)
+        tracks, model = [inverse.undo(track).track for track in tracks], plainly_measured(model)
+    return linearise(Smoother(model, surfaces, plain), tracks, watch)
+
+
 def spread_over(tracks: Iterable[T], count: int, most: int = MOST_TRACKS) -> list[T]:
     """Up to `most` tracks, evenly from the first `count` of a stream."""
     chosen = set(np.linspace(0, count - 1, min(most, count)).round().astype(int).tolist()) if count else set()
@@ -145,7 +161,7 @@ def _first_part(track: Track) -> Track:
     return track.until(float(track.times[0]) + LONGEST_PART) if track.duration > LONGEST_PART else track
 
 
-def _forecaster(linear: LinearTracks, parts: Sequence[Track], settings: Settings) -> Forecaster:
+def _forecaster(linear: LinearTracks, parts: Sequence[Track], settings: Settings, biased: bool) -> Forecaster:
     """Forecasts that start where a robot would use them, or earlier in tracks that are too short for that."""
     typical = float(np.median([part.duration for part in parts]))
     return Forecaster(
@@ -153,6 +169,7 @@ def _forecaster(linear: LinearTracks, parts: Sequence[Track], settings: Settings
         settings.velocity_prior,
         earliest=min(EARLIEST_START, EARLIEST_SHARE * typical),
         every=min(START_EVERY, EVERY_SHARE * typical),
+        biased=biased,
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.estimation.noise.linear_filter import BIAS_DIM, Filtered, LinearFilter, Noise, half_square
+from ballfg.estimation.noise.linear_filter import Filtered, LinearFilter, Noise, half_square
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 
 HORIZONS: Final = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
@@ -62,6 +62,7 @@ class Forecaster:
         velocity_prior: m/s, standard deviation per axis at the start of a track.
         earliest: s after the first sample, of the first start of a forecast.
         every: s between starts.
+        biased: whether the noise may have a memory.
 
     Attributes:
         starts: (r, 2) track and sample from which forecasts are made.
@@ -73,8 +74,10 @@ class Forecaster:
         velocity_prior: float,
         earliest: float = EARLIEST_START,
         every: float = START_EVERY,
+        *,
+        biased: bool = True,
     ) -> None:
-        self.tracks, self.filter = tracks, LinearFilter(tracks, velocity_prior)
+        self.tracks, self.filter = tracks, LinearFilter(tracks, velocity_prior, biased=biased)
         self.count, self.samples = tracks.times.shape
         self.starts = self._starts(earliest, every)
         self._plan = self._scored()
@@ -121,7 +124,7 @@ class Forecaster:
         """(t,) summed scores of forecasts, coordinates inside their 90 % intervals, and the number of forecasts."""
         observe, (track, start) = self.filter.measure, self.starts.T
         mean, covariance = filtered.means[track, start], filtered.covariances[track, start]
-        departures = torch.nn.functional.pad(self.tracks.departures, (0, BIAS_DIM))
+        departures = torch.nn.functional.pad(self.tracks.departures, (0, self.filter.biases))
         intervals = (start[:, None] + torch.arange(len(self._plan))).clamp(max=self.samples - 2)
         steps, added = (x[track[:, None], intervals].unbind(1) for x in (transitions, gathered))
         total, inside, count = torch.zeros(self.count, dtype=torch.float64), 0.0, 0

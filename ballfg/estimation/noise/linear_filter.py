@@ -66,27 +66,31 @@ class LinearFilter:
     Args:
         tracks: linearised.
         velocity_prior: m/s, standard deviation per axis at the start of a track.
+        biased: whether the noise may have a memory; three numbers of the state, and time, are spared if not.
     """
 
-    def __init__(self, tracks: LinearTracks, velocity_prior: float) -> None:
+    def __init__(self, tracks: LinearTracks, velocity_prior: float, *, biased: bool = True) -> None:
         self.tracks, self.velocity_prior = tracks, velocity_prior
         self.count, self.samples = tracks.times.shape
         self.own = tracks.transitions.shape[-1]
-        self.width = self.own + BIAS_DIM
+        self.biases = BIAS_DIM if biased else 0
+        self.width = self.own + self.biases
         self.measure = torch.zeros((3, self.width), dtype=torch.float64)
-        self.measure[:, POSITION] = self.measure[:, self.own :] = torch.eye(3, dtype=torch.float64)
+        self.measure[:, POSITION] = torch.eye(3, dtype=torch.float64)
+        self.measure[:, self.own :] = torch.eye(3, dtype=torch.float64)[:, : self.biases]
 
     def motion(self, noise: Noise) -> tuple[Tensor, Tensor]:
         """(t, n - 1, w, w) transitions and covariances gathered, of state, coefficients and biases."""
-        decay = torch.exp(-torch.diff(self.tracks.times, dim=1) / noise.memory_time[:, None])
-        axes = torch.arange(self.own, self.width)
         shape = (self.count, self.samples - 1, self.width, self.width)
         transitions, gathered = (torch.zeros(shape, dtype=torch.float64) for _ in range(2))
         transitions[..., : self.own, : self.own] = self.tracks.transitions
-        transitions[..., axes, axes] = decay[..., None]
         process = noise.process.square().expand(self.count, -1)
         gathered[..., :STATE_DIM, :STATE_DIM] = torch.einsum("tk,tnkij->tnij", process, self.tracks.kicks)
-        gathered[..., axes, axes] = noise.memory[:, None, :] * (1.0 - decay.square())[..., None]
+        if self.biases:
+            decay = torch.exp(-torch.diff(self.tracks.times, dim=1) / noise.memory_time[:, None])
+            axes = torch.arange(self.own, self.width)
+            transitions[..., axes, axes] = decay[..., None]
+            gathered[..., axes, axes] = noise.memory[:, None, :] * (1.0 - decay.square())[..., None]
         return transitions, gathered
 
     def measured(self, noise: Noise) -> Tensor:
@@ -95,14 +99,18 @@ class LinearFilter:
         along = noise.stamp_jitter[:, None, None, None] * way[..., :, None] * way[..., None, :]
         return along + torch.diag_embed((noise.position[:, None, :] * self.tracks.white).square())
 
+    def losses(self, noise: Noise) -> Tensor:
+        """(t,) negative logarithms of the marginal likelihood of each track."""
+        return self.run(noise, *self.motion(noise), self.measured(noise)).following
+
     def run(self, noise: Noise, transitions: Tensor, gathered: Tensor, measured: Tensor) -> Filtered:
         """The filter over all samples, with what `motion` and `measured` make of the noise."""
         tracks, observe = self.tracks, self.measure
         prior = tracks.prior_variances(noise.spin_prior, noise.spin_label, noise.coefficients, self.velocity_prior)
-        covariance = torch.diag_embed(torch.cat((prior, noise.memory.expand(self.count, BIAS_DIM)), dim=1))
-        mean = torch.cat((tracks.starts, torch.zeros((self.count, BIAS_DIM), dtype=torch.float64)), dim=1)
+        covariance = torch.diag_embed(torch.cat((prior, noise.memory.expand(self.count, -1)[:, : self.biases]), dim=1))
+        mean = torch.cat((tracks.starts, torch.zeros((self.count, self.biases), dtype=torch.float64)), dim=1)
         unit = torch.eye(self.width, dtype=torch.float64)
-        departures = torch.nn.functional.pad(tracks.departures, (0, BIAS_DIM))
+        departures = torch.nn.functional.pad(tracks.departures, (0, self.biases))
         total, nexts = torch.zeros(self.count, dtype=torch.float64), 0
         means, covariances = [], []
         # taken apart once: the derivative of an index would fill a tensor of the whole size at every step

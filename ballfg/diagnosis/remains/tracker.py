@@ -1,0 +1,85 @@
+"""Memory of the tracker and jitter of the stamps as findings, once the effects have been found.
+
+A memory would take up any effect that bends flights slowly, so effects are searched first. What they leave is asked
+for errors that last from sample to sample and for stamps that err, by both halves of the tracks.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout
+from ballfg.diagnosis.result import Finding, Value
+from ballfg.dynamics import AnalyticModel
+from ballfg.estimation import dataset_settings, spread_over
+from ballfg.estimation.noise.estimate import linearised
+from ballfg.estimation.noise.tracker import JITTER, MEMORY, NUMBERS, TrackerPart, tracker_noise
+from ballfg.tracks import Track, TrackNoise
+
+MOST_TRACKS = 25
+"""Tracks of each half that are asked, evenly spread."""
+LONGEST_PART, MOST_SAMPLES = 1.0, 120
+"""s and samples of a track that are asked: computing time grows with them."""
+SENTENCES = {
+    MEMORY: "The tracker's errors last from sample to sample: a part of them fades over the memory's time.",
+    JITTER: "Stamps err: each sample was taken a little before or after the moment that is written.",
+}
+DECIDE = {
+    MEMORY: "Track a ball at rest, or one on a straight rail: its measured positions wander together for that time.",
+    JITTER: "Film a clock, or take stamps from the camera's own exposures: they lie evenly where arrival times do not.",
+}
+UNITS = {MEMORY: "m", JITTER: "s"}
+"""Of `sigma`."""
+
+
+@dataclass(frozen=True)
+class Tracker:
+    """What tracks show of their tracker: findings, and the noise of its samples where that is not white.
+
+    The noise has a memory and jitter that are declared, too.
+    """
+
+    findings: tuple[Finding, ...] = ()
+    noise: TrackNoise | None = None
+
+
+def look_at_tracker(model: AnalyticModel, holdout: Holdout) -> Tracker:
+    """The memory and jitter that both halves show beside a corrected model; model: with its noise about the tracks."""
+    settings = dataset_settings(holdout.dataset, model)
+    halves = [_parts(half) for half in (holdout.search_tracks, holdout.held_out_tracks)]
+    tracks = [track for half in halves for track in half]
+    linear = linearised(model, holdout.surfaces, settings, tracks)
+    if linear is None:
+        return Tracker()
+    own = any(track.sigmas is not None for track in tracks)
+    held_out = linear.numbers >= len(halves[0])
+    found = tracker_noise(linear, held_out, settings, None if own else holdout.dataset.info.position_noise)
+    noise, declared = found.noise, settings.has_memory or settings.stamp_jitter > 0.0
+    if settings.has_memory:
+        noise = replace(noise, memory=settings.memory, memory_time=settings.memory_time)
+    if settings.stamp_jitter > 0.0:
+        noise = replace(noise, stamp_jitter=settings.stamp_jitter)
+    return Tracker(tuple(_finding(part) for part in found.parts), noise if found.parts or declared else None)
+
+
+def _parts(half: Sequence[EvaluationTrack]) -> list[Track]:
+    tracks = [part.track for part in spread_over(half, len(half), MOST_TRACKS)]
+    return [t.until(float(min(t.times[0] + LONGEST_PART, t.times[: MOST_SAMPLES + 1][-1]))) for t in tracks]
+
+
+def _finding(part: TrackerPart) -> Finding:
+    name, searched = part.evidence.name, ~part.held_out
+    units = {"sigma": UNITS[name], "time": "s"}
+    return Finding(
+        name=name,
+        kind="measurement",
+        parameters={key: Value(value, sigma, units[key]) for key, (value, sigma) in part.values.items()},
+        p_value=part.evidence.p_value,
+        delta_bic=len(NUMBERS[name]) * float(np.log(searched.sum())) - 2.0 * float(part.gains[searched].sum()),
+        indistinguishable_from=(),
+        held_out_gain=float(part.gains[part.held_out].mean()),
+        held_out_p=part.evidence.halves[1],
+        sentence=SENTENCES[name],
+        decide=DECIDE[name],
+    )

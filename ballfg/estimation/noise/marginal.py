@@ -1,0 +1,116 @@
+"""The marginal likelihood of linearised tracks: the density of each next sample, given those before it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+
+from ballfg.arrays import Array
+from ballfg.estimation.noise.linear_filter import LinearFilter, Noise
+from ballfg.estimation.noise.parameters import Parameter, tensors_of
+from ballfg.estimation.settings import Settings
+
+MOST_STEPS: Final = 30
+DIFFERENCE: Final = 0.002
+"""Step of a logarithm for the second derivatives behind the error bars."""
+
+
+class MarginalFit:
+    """The noise that makes the next samples of tracks most probable.
+
+    Args:
+        tracks: the filter of the tracks.
+        settings: values of what is not among the parameters.
+        parameters: the numbers to estimate.
+        begin: logarithms of numbers, by name and axis, at which the search begins; others at their prior medians.
+        tolerance: largest derivative at the minimum, by numbers in their standard deviations.
+
+    Attributes:
+        logs: (k,) their logarithms.
+        losses: (t,) negative logarithm of the density of each track there.
+    """
+
+    def __init__(
+        self,
+        tracks: LinearFilter,
+        settings: Settings,
+        parameters: list[Parameter],
+        begin: Mapping[tuple[str, int | None], float] = MappingProxyType({}),
+        *,
+        tolerance: float = 0.2,
+    ) -> None:
+        self.tracks, self.settings, self.parameters = tracks, settings, parameters
+        self.start = np.log([p.start for p in parameters])
+        self.precision = np.array([p.spread**-2 for p in parameters])
+        first = [begin.get((p.name, p.axis), log) for p, log in zip(parameters, self.start.tolist(), strict=True)]
+        self.logs = np.array(first)
+        self.losses, self.gradients = self.at(self.logs)
+        self._minimise(tolerance)
+
+    @property
+    def known(self) -> dict[tuple[str, int | None], float]:
+        """The logarithms by name and axis."""
+        return {(p.name, p.axis): log for p, log in zip(self.parameters, self.logs.tolist(), strict=True)}
+
+    def values(self, name: str) -> Array:
+        """The values of a number along all its axes; (0,) if it is not estimated."""
+        return np.exp([log for p, log in zip(self.parameters, self.logs, strict=True) if p.name == name])
+
+    def at(self, logs: Array) -> tuple[Array, Array]:
+        """(t,) losses of the tracks at some logarithms, and (t, k) their derivatives."""
+        rows = torch.tensor(np.tile(logs, (self.tracks.count, 1)), dtype=torch.float64, requires_grad=True)
+        losses = self.tracks.losses(tensors_of(self.parameters, rows, self.settings))
+        (gradients,) = torch.autograd.grad(losses.sum(), rows)
+        return losses.detach().numpy(), gradients.numpy()
+
+    def noise(self) -> Noise:
+        """The noise found, one row for each track."""
+        return tensors_of(self.parameters, torch.from_numpy(np.tile(self.logs, (self.tracks.count, 1))), self.settings)
+
+    def covariance(self) -> Array:
+        """(k, k) of the logarithms, from the scatter of the tracks' gradients (the sandwich of P. J. Huber, 1967)."""
+        size, total = len(self.logs), self.gradients.sum(axis=0)
+        hessian = np.empty((size, size))
+        for k in range(size):
+            step = np.zeros(size)
+            step[k] = DIFFERENCE
+            hessian[k] = (self.at(self.logs + step)[1].sum(axis=0) - total) / DIFFERENCE
+        values, vectors = np.linalg.eigh(0.5 * (hessian + hessian.T) + np.diag(self.precision))
+        inverse = (vectors / np.maximum(values, self.precision.min())) @ vectors.T
+        return np.asarray(inverse @ (self._scatter() + np.diag(self.precision)) @ inverse)
+
+    def _scatter(self) -> Array:
+        """(k, k) squares of the tracks' gradients about their mean, summed."""
+        away = self.gradients - self.gradients.mean(axis=0)
+        return np.asarray(away.T @ away * len(away) / (len(away) - 1))
+
+    def _objective(self, losses: Array, gradients: Array, logs: Array) -> tuple[float, Array]:
+        """Negative log posterior and its (k,) derivatives."""
+        away = logs - self.start
+        value = float(losses.sum()) + 0.5 * float(self.precision @ away**2)
+        return value, gradients.sum(axis=0) + self.precision * away
+
+    def _minimise(self, tolerance: float) -> None:
+        """Move to the minimum of the negative log posterior.
+
+        The search is in units in which the scatter of the tracks' gradients, which stands for the second derivatives
+        (Berndt, Hall, Hall and Hausman 1974), is one.
+        """
+        root = np.linalg.cholesky(self._scatter() + np.diag(self.precision))
+        turn = np.linalg.inv(root).T
+        begin = self.logs
+
+        def told(way: Array) -> tuple[float, Array]:
+            logs = begin + turn @ way
+            value, gradient = self._objective(*self.at(logs), logs)
+            return value, turn.T @ gradient
+
+        options = {"gtol": tolerance, "maxiter": MOST_STEPS}
+        found = minimize(told, np.zeros(len(begin)), jac=True, method="BFGS", options=options)
+        self.logs = begin + turn @ found.x
+        self.losses, self.gradients = self.at(self.logs)

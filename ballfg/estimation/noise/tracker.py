@@ -1,0 +1,236 @@
+"""Does a tracker have a memory, do stamps jitter, and by how much: tests and sizes from linearised tracks.
+
+Forecasts decide how wide intervals are, but hardly tell how long a tracker's errors last; the density of the next
+samples does. Whether there is a memory is asked of the likelihood without it: its derivative by the variance of the
+memory (score test, C. R. Rao 1948), cleared of what other parts of the noise explain, scatters about zero from track to
+track. The same for jitter. The scatter is the tracks' own, so that noise of another shape does not make a name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import torch
+from scipy import stats
+
+from ballfg.arrays import Array, Mask
+from ballfg.estimation.noise.linear_filter import LinearFilter
+from ballfg.estimation.noise.linear_tracks import LinearTracks
+from ballfg.estimation.noise.marginal import MarginalFit
+from ballfg.estimation.noise.parameters import Parameter, parameters_of
+from ballfg.estimation.settings import Settings
+from ballfg.tracks import TrackNoise
+
+MEMORY: Final = "tracker_memory"
+JITTER: Final = "stamp_jitter"
+NUMBERS: Final = {MEMORY: ("memory", "memory_time"), JITTER: ("stamp_jitter",)}
+"""Fields of `TrackNoise` for each part of a tracker's noise."""
+TIMES: Final = (0.005, 0.01, 0.02, 0.04)
+"""s. Memories that are looked for; the score falls little between neighbours."""
+LONGEST_TIME: Final = 0.06
+"""s. Errors that last longer may be those of the motion, and are no memory."""
+CANDIDATES: Final = len(TIMES) + 1
+ALWAYS: Final = ("position", "acceleration")
+"""Numbers that act from sample to sample as well: those of the white part, and of forces that the model lacks."""
+FOUND, CONFIRMED = 0.002, 0.05
+"""Probabilities by chance below which a part is found, all tracks and candidates counted; below which a half agrees."""
+COARSE: Final = 1.0
+"""Tolerance of fits that only answer whether a part is there."""
+LEAST_TRACKS: Final = 5
+"""Tracks of a half, fewer of which do not tell how much scores scatter."""
+JITTER_UNIT: Final = 1e-3
+"""s. The square of this jitter is the unit of its score."""
+STATED_SPREAD: Final = 0.02
+"""Standard deviation of the logarithm of a white noise that is stated and believed."""
+AGREES: Final = 11.3
+"""Chi-square of three numbers (99 %) up to which the white noise that is stated is believed."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """How clearly tracks show a part of a tracker's noise.
+
+    Attributes:
+        name: of the part.
+        time: s, of a memory; 0 for jitter.
+        p_value: probability of such a score of all tracks by chance, all candidates counted.
+        halves: the same of each half, for this candidate alone.
+    """
+
+    name: str
+    time: float
+    p_value: float
+    halves: tuple[float, float]
+
+    @property
+    def clear(self) -> bool:
+        """Whether both halves show it."""
+        return self.p_value < FOUND and max(self.halves) < CONFIRMED
+
+
+@dataclass(frozen=True)
+class TrackerPart:
+    """A part of a tracker's noise that both halves of the tracks show.
+
+    Attributes:
+        evidence: of both halves.
+        values: value and standard deviation of `sigma` (m, or s for jitter), and of a memory's `time` (s).
+        gains: (t,) log likelihood that it adds to each track.
+        held_out: (t,) bool, tracks of the half that confirms.
+    """
+
+    evidence: Evidence
+    values: dict[str, tuple[float, float]]
+    gains: Array
+    held_out: Mask
+
+
+@dataclass(frozen=True)
+class TrackerNoise:
+    """All parts that were found, and the tracker's noise with them: white part, memory and jitter."""
+
+    parts: tuple[TrackerPart, ...]
+    noise: TrackNoise
+
+
+def tracker_noise(
+    tracks: LinearTracks, held_out: Mask, settings: Settings, stated: float | None = None
+) -> TrackerNoise:
+    """Parts of the tracker's noise that both halves of the tracks show, with their sizes from all tracks.
+
+    Args:
+        tracks: linearised.
+        held_out: (t,) bool, those of the half that confirms.
+        settings: all other noise; a memory or jitter in them is known and is not looked for.
+        stated: m, white noise of a dataset that states it. It is believed where the tracks do not contradict it.
+    Returns: no parts where a half has fewer than `LEAST_TRACKS` tracks.
+    """
+    open_parts = {MEMORY: not settings.has_memory, JITTER: settings.stamp_jitter == 0.0}
+    asked = [name for name, is_open in open_parts.items() if is_open]
+    if min(held_out.sum(), (~held_out).sum()) < LEAST_TRACKS:
+        white = np.array(settings.position_noise) * settings.position_scale
+        return TrackerNoise((), TrackNoise(position=(white[0], white[1], white[2])))
+    full, lean = (LinearFilter(tracks, settings.velocity_prior, biased=b) for b in (True, settings.has_memory))
+    fits, found = [MarginalFit(lean, settings, _parameters(settings, tracks, ()), tolerance=COARSE)], list[Evidence]()
+    while asked:
+        evidence = [e for name in asked for e in _evidence(full, fits[-1], name, held_out)]
+        best = min(evidence, key=lambda e: e.p_value)
+        if not best.clear:
+            break
+        asked.remove(best.name)
+        needed = full if best.name == MEMORY or fits[-1].tracks is full else lean
+        numbers = _parameters(settings, tracks, [*found, best])
+        fit = MarginalFit(needed, settings, numbers, fits[-1].known, tolerance=COARSE)
+        if best.name == MEMORY and fit.values("memory_time") > LONGEST_TIME:
+            continue
+        fits.append(fit)
+        found.append(best)
+    if not found:
+        return TrackerNoise((), _noise_of(fits[0]))
+    return _sizes(fits, found, held_out, settings, stated)
+
+
+def _parameters(settings: Settings, tracks: LinearTracks, parts: Iterable[Evidence]) -> list[Parameter]:
+    """The numbers that act from sample to sample, with those of some parts."""
+    times = {part.name: part.time for part in parts}
+    names = [*ALWAYS, *(number for name in times for number in NUMBERS[name])]
+    found = [p for p in parameters_of(settings, tracks, position_known=False) if p.name in names]
+    return [
+        replace(p, start=times[MEMORY])
+        if p.name == "memory_time"
+        else replace(p, start=JITTER_UNIT)
+        if p.name == "stamp_jitter"
+        else p
+        for p in found
+    ]
+
+
+def _evidence(full: LinearFilter, fit: MarginalFit, name: str, held_out: Mask) -> list[Evidence]:
+    """The score tests of a part that a fit is without."""
+    times = TIMES if name == MEMORY else (0.0,)
+    found = []
+    for time in times:
+        score = _score(full if name == MEMORY else fit.tracks, fit, name, time)
+        score = _cleared(score, fit.gradients)
+        freedom = (len(score) - fit.gradients.shape[1]) / len(score)
+        whole, *halves = (_p_value(score[some], freedom) for some in (slice(None), ~held_out, held_out))
+        found.append(Evidence(name, time, min(1.0, CANDIDATES * whole), (halves[0], halves[1])))
+    return found
+
+
+def _cleared(scores: Array, others: Array) -> Array:
+    """Scores (t,) or (t, m) of tracks without what the scores (t, k) of other numbers explain of them."""
+    return np.asarray(scores - others @ np.linalg.lstsq(others, scores, rcond=None)[0])
+
+
+def _score(tracks: LinearFilter, fit: MarginalFit, name: str, time: float) -> Array:
+    """(t,) derivative of each track's log likelihood by the variance of a part, where that is zero."""
+    noise = fit.noise()
+    variance = torch.zeros(fit.tracks.count, dtype=torch.float64, requires_grad=True)
+    if name == MEMORY:
+        white = noise.position.mean() * torch.tensor(fit.settings.position_noise).square()
+        noise = replace(noise, memory=variance[:, None] * white, memory_time=torch.full_like(variance, time).detach())
+    else:
+        noise = replace(noise, stamp_jitter=variance * JITTER_UNIT**2)
+    (gradient,) = torch.autograd.grad(tracks.losses(noise).sum(), variance)
+    return np.asarray(-gradient.numpy())
+
+
+def _p_value(score: Array, freedom: float) -> float:
+    """One-sided; freedom: share of the scatter that is left after other numbers took theirs."""
+    spread = np.sqrt(len(score) * score.var(ddof=1) / max(freedom, 0.1))
+    return float(stats.t.sf(score.sum() / spread, len(score) - 1))
+
+
+def _sizes(
+    fits: list[MarginalFit], found: list[Evidence], held_out: Mask, settings: Settings, stated: float | None
+) -> TrackerNoise:
+    """The parts found with their sizes and error bars; each of the fits has one part more than the one before."""
+    last = _settled(fits[-1], settings, stated)
+    covariance, parts = last.covariance(), []
+    for evidence, before, after in zip(found, fits[:-1], fits[1:], strict=True):
+        values = {"sigma": _size(last, covariance, NUMBERS[evidence.name][0])}
+        if evidence.name == MEMORY:
+            values["time"] = _size(last, covariance, "memory_time")
+        parts.append(TrackerPart(evidence, values, before.losses - after.losses, held_out))
+    return TrackerNoise(tuple(parts), _noise_of(last))
+
+
+def _noise_of(fit: MarginalFit) -> TrackNoise:
+    white, memory, time, jitter = (
+        fit.values(n).tolist() for n in ("position", "memory", "memory_time", "stamp_jitter")
+    )
+    return TrackNoise(
+        position=(white[0], white[1], white[2]),
+        memory=(memory[0], memory[1], memory[2]) if memory else None,
+        memory_time=time[0] if time else None,
+        stamp_jitter=jitter[0] if jitter else None,
+    )
+
+
+def _settled(fit: MarginalFit, settings: Settings, stated: float | None) -> MarginalFit:
+    """The same fit to the end, with the white noise that is stated unless the tracks contradict it.
+
+    Where errors last no longer than a frame, white noise and memory are told apart by the white noise alone.
+    """
+    if stated is not None:
+        sure = [replace(p, start=stated, spread=STATED_SPREAD) if p.name == "position" else p for p in fit.parameters]
+        believed = MarginalFit(fit.tracks, settings, sure, {n: v for n, v in fit.known.items() if n[0] != "position"})
+        rows = [k for k, p in enumerate(sure) if p.name == "position"]
+        others = np.delete(believed.gradients, rows, axis=1)
+        score = _cleared(believed.gradients[:, rows], others)
+        total = score.sum(axis=0)
+        if float(total @ np.linalg.solve(score.T @ score, total)) < AGREES:
+            return believed
+    return MarginalFit(fit.tracks, settings, fit.parameters, fit.known)
+
+
+def _size(fit: MarginalFit, covariance: Array, name: str) -> tuple[float, float]:
+    """A number and its standard deviation; of a number along three axes the root mean square."""
+    rows, values = [k for k, p in enumerate(fit.parameters) if p.name == name], fit.values(name)
+    size = float(np.sqrt((values**2).mean()))
+    weights = values**2 / (values**2).sum()  # derivative of the size's logarithm by those of the values
+    return size, size * float(np.sqrt(weights @ covariance[np.ix_(rows, rows)] @ weights))

@@ -1,0 +1,64 @@
+"""Whiteness along tracks whose tracker has a memory: an alarm without its name, none with it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from ballfg.diagnosis.remains.generic import ALARM, generic_tests
+from ballfg.diagnosis.remains.whiteness import whiteness
+from ballfg.tracks import TrackNoise
+from tests.diagnosis.conftest import POSITION_NOISE
+
+MEMORY, TIME, JITTER = 0.003, 0.02, 0.001
+TRACKER = TrackNoise(position=(POSITION_NOISE,) * 3, memory=(MEMORY,) * 3, memory_time=TIME)
+
+
+def wandering(stretches, seed):
+    """The stretches with errors that last beside their white ones."""
+    rng = np.random.default_rng(seed)
+    times = stretches.times.numpy()
+    apart = np.abs(times[:, :, None] - times[:, None, :])
+    root = np.linalg.cholesky(np.exp(-apart / TIME))
+    errors = MEMORY * root @ rng.standard_normal((*times.shape, 3))
+    return replace(stretches, positions=stretches.positions + torch.from_numpy(errors))
+
+
+@pytest.fixture(scope="module")
+def lasting(make_ball, make_launches, make_shots, make_fit):
+    return make_fit(make_ball(), wandering(make_shots(make_ball(), make_launches(12, 81), 81).stretches, 3))
+
+
+def test_a_memory_is_an_alarm_until_it_is_known(lasting):
+    system = lasting.linearised()
+    assert whiteness(lasting, system).p_value < 1e-6
+    assert whiteness(lasting, system, TRACKER).p_value > 0.01
+    (time,) = [t for t in generic_tests(lasting, tracker=TRACKER) if t.name == "time"]
+    assert time.p_value > ALARM
+
+
+def test_a_tracker_that_is_taken_to_be_white_changes_nothing(calm_fit):
+    system = calm_fit.linearised()
+    plain, same = whiteness(calm_fit, system), whiteness(calm_fit, system, TrackNoise(position=(POSITION_NOISE,) * 3))
+    np.testing.assert_allclose(same.explained / same.spread, plain.explained / plain.spread, atol=0.2)
+
+
+def test_jitter_alone_is_no_drift(make_ball, make_launches, make_shots, make_fit):
+    stretches = make_shots(make_ball(), make_launches(12, 82), 82).stretches
+    late = JITTER * torch.from_numpy(np.random.default_rng(4).standard_normal(stretches.times.shape))
+    steps = torch.diff(stretches.positions, dim=1) / torch.diff(stretches.times, dim=1)[..., None]
+    velocities = torch.cat((steps, steps[:, -1:]), dim=1)
+    moved = replace(stretches, positions=stretches.positions + late[..., None] * velocities)
+    fit = make_fit(make_ball(), moved)
+    tracker = TrackNoise(position=(POSITION_NOISE,) * 3, stamp_jitter=JITTER)
+    assert whiteness(fit, fit.linearised(), tracker).p_value > 0.01
+
+
+def test_a_force_that_is_lacking_stays_a_pattern(make_ball, make_launches, make_shots, make_fit):
+    """A known memory takes up a force no more than it explains."""
+    windy = make_ball(wind={"x": 0.0, "y": 0.9, "z": 0.0})
+    fit = make_fit(make_ball(), wandering(make_shots(windy, make_launches(12, 83), 83).stretches, 5))
+    assert min(t.p_value for t in generic_tests(fit, tracker=TRACKER)) < ALARM
