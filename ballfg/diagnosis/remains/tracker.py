@@ -19,7 +19,7 @@ from ballfg.tracks import Track, TrackNoise
 
 MOST_TRACKS = 25
 """Tracks of each half that are asked, evenly spread."""
-LONGEST_PART, MOST_SAMPLES = 1.0, 120
+LONGEST_PART, MOST_SAMPLES = 1.0, 100
 """s and samples of a track that are asked: computing time grows with them."""
 SENTENCES = {
     MEMORY: "The tracker's errors last from sample to sample: a part of them fades over the memory's time.",

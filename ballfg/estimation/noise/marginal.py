@@ -15,7 +15,6 @@ from ballfg.estimation.noise.linear_filter import LinearFilter, Noise
 from ballfg.estimation.noise.parameters import Parameter, tensors_of
 from ballfg.estimation.settings import Settings
 
-MOST_STEPS: Final = 30
 DIFFERENCE: Final = 0.002
 """Step of a logarithm for the second derivatives behind the error bars."""
 
@@ -29,6 +28,7 @@ class MarginalFit:
         parameters: the numbers to estimate.
         begin: logarithms of numbers, by name and axis, at which the search begins; others at their prior medians.
         tolerance: largest derivative at the minimum, by numbers in their standard deviations.
+        most: evaluations after which the search ends; where the likelihood is flat it does not get far.
 
     Attributes:
         logs: (k,) their logarithms.
@@ -43,6 +43,7 @@ class MarginalFit:
         begin: Mapping[tuple[str, int | None], float] = MappingProxyType({}),
         *,
         tolerance: float = 0.2,
+        most: int = 40,
     ) -> None:
         self.tracks, self.settings, self.parameters = tracks, settings, parameters
         self.start = np.log([p.start for p in parameters])
@@ -50,7 +51,7 @@ class MarginalFit:
         first = [begin.get((p.name, p.axis), log) for p, log in zip(parameters, self.start.tolist(), strict=True)]
         self.logs = np.array(first)
         self.losses, self.gradients = self.at(self.logs)
-        self._minimise(tolerance)
+        self._minimise(tolerance, most)
 
     @property
     def known(self) -> dict[tuple[str, int | None], float]:
@@ -95,7 +96,7 @@ class MarginalFit:
         value = float(losses.sum()) + 0.5 * float(self.precision @ away**2)
         return value, gradients.sum(axis=0) + self.precision * away
 
-    def _minimise(self, tolerance: float) -> None:
+    def _minimise(self, tolerance: float, most: int) -> None:
         """Move to the minimum of the negative log posterior.
 
         The search is in units in which the scatter of the tracks' gradients, which stands for the second derivatives
@@ -110,7 +111,7 @@ class MarginalFit:
             value, gradient = self._objective(*self.at(logs), logs)
             return value, turn.T @ gradient
 
-        options = {"gtol": tolerance, "maxiter": MOST_STEPS}
-        found = minimize(told, np.zeros(len(begin)), jac=True, method="BFGS", options=options)
+        options = {"gtol": tolerance, "ftol": 0.0, "maxfun": most, "maxcor": len(begin)}
+        found = minimize(told, np.zeros(len(begin)), jac=True, method="L-BFGS-B", options=options)
         self.logs = begin + turn @ found.x
         self.losses, self.gradients = self.at(self.logs)

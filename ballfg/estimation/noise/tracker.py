@@ -37,8 +37,10 @@ ALWAYS: Final = ("position", "acceleration")
 """Numbers that act from sample to sample as well: those of the white part, and of forces that the model lacks."""
 FOUND, CONFIRMED = 0.002, 0.05
 """Probabilities by chance below which a part is found, all tracks and candidates counted; below which a half agrees."""
-COARSE: Final = 1.0
-"""Tolerance of fits that only answer whether a part is there."""
+COARSE, MOST_COARSE = 1.0, 15
+"""Tolerance and most evaluations of fits that only answer whether a part is there."""
+KNOWN: Final = 2.5
+"""Standard deviations by which every number of a part must differ from zero, or it has no name."""
 LEAST_TRACKS: Final = 5
 """Tracks of a half, fewer of which do not tell how much scores scatter."""
 JITTER_UNIT: Final = 1e-3
@@ -114,7 +116,10 @@ def tracker_noise(
         white = np.array(settings.position_noise) * settings.position_scale
         return TrackerNoise((), TrackNoise(position=(white[0], white[1], white[2])))
     full, lean = (LinearFilter(tracks, settings.velocity_prior, biased=b) for b in (True, settings.has_memory))
-    fits, found = [MarginalFit(lean, settings, _parameters(settings, tracks, ()), tolerance=COARSE)], list[Evidence]()
+    fits, found = (
+        [MarginalFit(lean, settings, _parameters(settings, tracks, ()), tolerance=COARSE, most=MOST_COARSE)],
+        list[Evidence](),
+    )
     while asked:
         evidence = [e for name in asked for e in _evidence(full, fits[-1], name, held_out)]
         best = min(evidence, key=lambda e: e.p_value)
@@ -123,13 +128,11 @@ def tracker_noise(
         asked.remove(best.name)
         needed = full if best.name == MEMORY or fits[-1].tracks is full else lean
         numbers = _parameters(settings, tracks, [*found, best])
-        fit = MarginalFit(needed, settings, numbers, fits[-1].known, tolerance=COARSE)
+        fit = MarginalFit(needed, settings, numbers, fits[-1].known, tolerance=COARSE, most=MOST_COARSE)
         if best.name == MEMORY and fit.values("memory_time") > LONGEST_TIME:
             continue
         fits.append(fit)
         found.append(best)
-    if not found:
-        return TrackerNoise((), _noise_of(fits[0]))
     return _sizes(fits, found, held_out, settings, stated)
 
 
@@ -188,7 +191,12 @@ def _p_value(score: Array, freedom: float) -> float:
 def _sizes(
     fits: list[MarginalFit], found: list[Evidence], held_out: Mask, settings: Settings, stated: float | None
 ) -> TrackerNoise:
-    """The parts found with their sizes and error bars; each of the fits has one part more than the one before."""
+    """The parts found with their sizes and error bars; each of the fits has one part more than the one before.
+
+    Where numbers are hardly known, the part that was found last has no name after all.
+    """
+    if not found:
+        return TrackerNoise((), _noise_of(fits[0]))
     last = _settled(fits[-1], settings, stated)
     covariance, parts = last.covariance(), []
     for evidence, before, after in zip(found, fits[:-1], fits[1:], strict=True):
@@ -196,6 +204,8 @@ def _sizes(
         if evidence.name == MEMORY:
             values["time"] = _size(last, covariance, "memory_time")
         parts.append(TrackerPart(evidence, values, before.losses - after.losses, held_out))
+    if any(value < KNOWN * sigma for part in parts for value, sigma in part.values.values()):
+        return _sizes(fits[:-1], found[:-1], held_out, settings, stated)
     return TrackerNoise(tuple(parts), _noise_of(last))
 
 
