@@ -167,3 +167,11 @@ def print_outcome(statuses: Counter[str], doubts: list[str]) -> None:
     print_notes(doubts[:MOST_DOUBTS])
     if len(doubts) > MOST_DOUBTS:
         print_notes([f"the same doubts about {len(doubts) - MOST_DOUBTS} more tracks"])
+
+
+def print_outside(shares: list[float]) -> None:
+    """Prints how much of the tracks lies outside of a network's training data; nothing without shares, 0 to 1 each."""
+    if shares:
+        far = sum(share > 0.5 for share in shares)
+        mean = 100 * sum(shares) / len(shares)
+        print(f"  outside of the network's training data: {mean:.0f} % on average, {far} tracks for the greater part")
