@@ -142,7 +142,9 @@ def open_model(data: Dataset | SightedDataset, model: Path | None) -> BallModel:
     if model is None:
         notes += [note for note in (nominal_note(data.ball), *unused_model(data.path, data.ball)) if note]
     print_notes(notes)
-    return nominal_model(data.ball) if model is None else load_model(model, radius=data.ball.radius)
+    if model is None:
+        return nominal_model(data.ball)
+    return load_model(model, radius=data.ball.radius, room=data.info.name)
 
 
 def check_out(out: Path, dataset: Path) -> None:

@@ -8,6 +8,8 @@ from itertools import islice
 import numpy as np
 
 from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.networks.fading import DOUBT
+from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.dynamics.trained import Trained
 from ballfg.estimation.launcher import Launcher
@@ -126,6 +128,8 @@ def tracks_settings(
 
     The first parts of tracks make the acceleration noise too large. A network knows it from whole tracks, as far as
     they flew like these: the noise is the geometric mean of both, weighted with the share inside of its training data.
+    What the parts do not tell is, by the same share, as in the training or as usual. Outside, a correction of the usual
+    size is missing: it widens bounces.
 
     Args:
         model: the ball.
@@ -135,15 +139,43 @@ def tracks_settings(
         position_known: whether the white noise of positions is stated.
         watch: told of each track, and of each step of the search.
     """
-    found = estimate_noise(model, surfaces, settings, parts, position_known=position_known, errors=False, watch=watch)
-    if found is None:
-        return None
-    outside = outside_share(model, [Smoother(model, surfaces, found.settings).estimate(part).states for part in parts])
-    if outside is None:
-        return found.settings
+    doubts = {name: sigma for name, sigma in settings.coefficients.items() if name.startswith(DOUBT)}
+    plain = replace(settings, coefficients={n: s for n, s in settings.coefficients.items() if n not in doubts})
+    outside = outside_share(model, [Smoother(model, surfaces, plain).estimate(part).states for part in parts])
+    begun = plain if outside is None else with_usual_noise(plain, outside)
+    found = estimate_noise(model, surfaces, begun, parts, position_known=position_known, errors=False, watch=watch)
+    if found is None or outside is None:
+        return None if found is None else found.settings
     known, shown = settings.process.acceleration, found.settings.process.acceleration
-    acceleration = float(known ** (1.0 - outside) * shown**outside)
-    return replace(found.settings, process=replace(found.settings.process, acceleration=acceleration))
+    acceleration = _between(known, shown, outside)
+    process = widened(replace(found.settings.process, acceleration=acceleration), model, outside)
+    return replace(found.settings, process=process, coefficients={**found.settings.coefficients, **doubts})
+
+
+def widened(process: ProcessNoise, model: BallModel, outside: float) -> ProcessNoise:
+    """Process noise with what a network's correction does in training, by the share of flights outside of it."""
+    if not isinstance(model, LearnedModel) or model.fading is None:
+        return process
+    kick = outside * float(model.fading.velocity) / np.sqrt(3.0)
+    return replace(process, contact_velocity=float(np.hypot(process.contact_velocity, kick)))
+
+
+def with_usual_noise(settings: Settings, share: float) -> Settings:
+    """Settings whose process noise and spin prior move to those of measured tracks, by a share from 0 to 1."""
+    usual = Settings(process=MEASURED)
+    process = {
+        name: _between(getattr(settings.process, name), getattr(MEASURED, name), share) for name in PROCESS_NOISE
+    }
+    return replace(
+        settings,
+        process=replace(settings.process, **process),
+        spin_prior=_between(settings.spin_prior, usual.spin_prior, share),
+    )
+
+
+def _between(one: float, other: float, share: float) -> float:
+    """From one number (share 0) to another (share 1) on a logarithmic scale; both not negative."""
+    return float(one ** (1.0 - share) * other**share)
 
 
 @lru_cache(maxsize=8)

@@ -60,7 +60,8 @@ def run_trained(results: Results, folders: Sequence[Path], plan: TrainedPlan, jo
             for k, dataset in enumerate(datasets):
                 if k in pair:
                     continue
-                model = load_model(Path(folder) / "run" / "model.yaml", radius=dataset.ball.radius)
+                file = Path(folder) / "run" / "model.yaml"
+                model = load_model(file, radius=dataset.ball.radius, room=dataset.info.name)
                 judged = _judged(model.requires_grad_(False), dataset, jobs)
                 case = f"{names[pair[0]]} + {names[pair[1]]} -> {names[k]}"
                 _add(results, case, TRAINED, judged)
@@ -91,7 +92,7 @@ def _judged(model: BallModel, dataset: Dataset, jobs: int) -> Judged:
 
 
 def _median(judged: Judged) -> float:
-    """m."""
+    """Median over tracks of the root mean square error, m."""
     return float(np.median(judged.rmse_by_track()))
 
 

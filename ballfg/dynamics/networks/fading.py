@@ -15,6 +15,9 @@ from ballfg.state import SPIN, VELOCITY, VZ
 
 DOUBT: Final = "fading."
 """What the names of the doubts start with in a `LearnedModel`."""
+ABROAD: Final = 0.5
+"""Share of a correction that is used in a room that had no part in the training: two rooms do not tell which part of a
+correction is the ball's and which is theirs. Whichever it is, at least half of it is right."""
 DOUBTS: Final = tuple(Coefficient(name, 0.0, 1.0, "1", -3.0, 3.0, varies=True) for name in ("flight", "contact"))
 """Unknown shares, about zero, of the correction that stands outside of the training data."""
 
@@ -31,11 +34,13 @@ class Fading(nn.Module):
         flight, contact: () the unknown shares; zero.
         acceleration: () m/s^2, usual size of the correction of a flight.
         velocity: () m/s, of the correction of a contact; that of the spin counts as velocity of the ball's surface.
+        strength: share of the correction that is used where its weight is one; 1, or `ABROAD`.
     """
 
     def __init__(self, flying: FeatureDensity, bouncing: FeatureDensity, radius: float) -> None:
         super().__init__()
         self.flying, self.bouncing, self.radius = flying, bouncing, radius
+        self.strength = 1.0
         self.flight = nn.Parameter(torch.zeros((), dtype=torch.float64), requires_grad=False)
         self.contact = nn.Parameter(torch.zeros((), dtype=torch.float64), requires_grad=False)
         self.register_buffer("acceleration", torch.zeros((), dtype=torch.float64))
@@ -73,13 +78,13 @@ class Fading(nn.Module):
         """The correction (..., 3) m/s^2 of states (..., 9), faded, with the unknown share of the rest."""
         weight = self.inside(state)
         limited = _limited(correction, correction.square().sum(-1, keepdim=True), self.acceleration)
-        return weight * correction + (1.0 - weight) * self.flight * limited
+        return self.strength * weight * correction + (1.0 - weight) * self.flight * limited
 
     def at_contact(self, state: Tensor, change: Tensor) -> Tensor:
         """The change (..., 9) that corrects a bounce from states (..., 9), faded, with an unknown share of the rest."""
         weight = self.bouncing(contact_frame(state, self.radius).features)
         limited = _limited(change, self._square(change), self.velocity)
-        return weight * change + (1.0 - weight) * self.contact * limited
+        return self.strength * weight * change + (1.0 - weight) * self.contact * limited
 
     def _square(self, change: Tensor) -> Tensor:
         """(..., 1) m^2/s^2 of changes (..., 9)."""

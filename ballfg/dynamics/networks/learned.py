@@ -101,7 +101,7 @@ class LearnedModel(BallModel):
         base_acceleration, base_spin_rate = self.base.rates(state)
         if self.fading is not None:
             acceleration = self.fading.in_flight(state, acceleration)
-            spin_rate = None if spin_rate is None else self.fading.inside(state) * spin_rate
+            spin_rate = None if spin_rate is None else self.fading.strength * self.fading.inside(state) * spin_rate
         if spin_rate is not None and base_spin_rate is not None:
             spin_rate = base_spin_rate + spin_rate
         return base_acceleration + acceleration, base_spin_rate if spin_rate is None else spin_rate
