@@ -213,7 +213,9 @@ def _model(model: Model, source: Tracks | None) -> BallModel:
     ball = TABLE_TENNIS if source is None else source.ball
     if model is None:
         return nominal_model(ball)
-    return load_model(Path(model), radius=ball.radius) if isinstance(model, str | PathLike) else model
+    if not isinstance(model, str | PathLike):
+        return model
+    return load_model(Path(model), radius=ball.radius, room=None if source is None else source.info.name)
 
 
 def _opened(measured: object) -> Track | Tracks:

@@ -154,6 +154,9 @@ def loop(
 def intervals(
     data: Datasets = None,
     tracks: Annotated[int | None, typer.Option(min=4, help="Number of tracks of each --data, the first ones.")] = None,
+    trained: Annotated[
+        bool, typer.Option("--trained", help="Train a network on each pair of --data and judge it on the others.")
+    ] = False,
     out: Out = Path("results"),
     quick: Quick = False,
     seed: Seed = 0,
@@ -162,14 +165,23 @@ def intervals(
     """Coverage of 90 % prediction intervals, with the noise as usual and with the noise that tracks show.
 
     Of each track 0.25 s are seen and the next 0.3 s predicted. Without --data: simulated trackers with a memory and
-    jittering stamps, and the true model. With --data: measured tracks and the nominal model.
+    jittering stamps, and the true model. With --data: measured tracks and the nominal model; with --trained too:
+    networks in rooms that had no part in their training.
 
     Example: ballfg-bench intervals --data data/aimy --data data/ballgun --out results/intervals
     """
-    from ballfg.benchmarks.intervals.suite import FULL, QUICK, run_intervals
+    from ballfg.benchmarks.intervals import suite
+    from ballfg.benchmarks.intervals import trained as networks
 
-    results = _start("intervals", data or [], quick, seed, [] if tracks is None else ["--tracks", str(tracks)])
-    run_intervals(results, [_open(one) for one in data or []], QUICK if quick else FULL, jobs, tracks)
+    more = [*([] if tracks is None else ["--tracks", str(tracks)]), *(["--trained"] if trained else [])]
+    results = _start("intervals", data or [], quick, seed, more)
+    if trained:
+        if tracks is not None:
+            raise typer.BadParameter("networks are judged on all tracks. Leave it out.", param_hint="--tracks")
+        networks.run_trained(results, data or [], networks.QUICK if quick else networks.FULL, jobs)
+    else:
+        datasets = [_open(one) for one in data or []]
+        suite.run_intervals(results, datasets, suite.QUICK if quick else suite.FULL, jobs, tracks)
     _finish(results, _folder(out), [])
 
 

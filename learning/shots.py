@@ -29,6 +29,7 @@ class Shot:
         segmentation: events of the observed part.
         settings: of the estimator, before anything is learned.
         surfaces: what the ball may bounce on.
+        room: name of the dataset.
     """
 
     track: Track
@@ -37,6 +38,7 @@ class Shot:
     segmentation: Segmentation
     settings: Settings
     surfaces: Surfaces
+    room: str = ""
 
     @property
     def name(self) -> str:

@@ -167,7 +167,7 @@ def _shots(
                 reasons[f"{dataset.info.name}: {shot}"] += 1
             else:
                 kept[k] = len(shots)
-                shots.append(shot)
+                shots.append(replace(shot, room=dataset.info.name))
     for reason, count in reasons.items():
         print(f"note: {count} tracks of {reason}", file=sys.stderr)
     return shots, kept

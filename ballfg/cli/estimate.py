@@ -44,15 +44,17 @@ def estimate(
 
     From detections, the smoother and the online estimator use every camera's pixels at its own stamp; the stamps of the
     table are then true times, with the cameras' time offsets subtracted. The other methods use roughly triangulated
-    positions.
+    positions. A network that knows where it was trained adds the column outside: 0 there, 1 far from it.
 
     Example: ballfg estimate data/aimy --method smoother --out states.csv
     """
     from ballfg.estimation import estimate_tracks, has_positions
+    from ballfg.estimation.outside import outside_of
     from ballfg.tracks import TableWriter
 
     statuses: Counter[str] = Counter()
     doubts: list[str] = []
+    outside: list[float] = []
     rows = hits = 0
     with TableWriter(out) as table:
         inputs.check_out(out, dataset)
@@ -62,12 +64,15 @@ def estimate(
         count = len(opened.dataset)
         estimates = estimate_tracks(opened.estimator(method), opened.dataset, count, jobs)
         for result in progress(estimates, count, "tracks estimated"):
-            table.write(_columns(result))
+            share = outside_of(opened.model, result.states)
+            table.write(_columns(result) | ({} if share is None else {"outside": share}))
+            outside += [] if share is None else [float(share.mean())]
             statuses[result.status.value] += 1
             doubts += [f"track {result.name!r}: {note}" for note in result.notes]
             rows, hits = rows + len(result.times), hits + len(result.hits)
     print(f"{out}: {rows} states of {count} tracks by {method}; {hits} hits found")
     inputs.print_outcome(statuses, doubts)
+    inputs.print_outside(outside)
 
 
 def _columns(result: Estimate) -> dict[str, str | np.ndarray]:

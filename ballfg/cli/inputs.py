@@ -149,7 +149,9 @@ def open_model(data: Dataset | SightedDataset, model: Path | None) -> BallModel:
     if model is None:
         notes += [note for note in (nominal_note(data.ball), *unused_model(data.path, data.ball)) if note]
     print_notes(notes)
-    return nominal_model(data.ball) if model is None else load_model(model, radius=data.ball.radius)
+    if model is None:
+        return nominal_model(data.ball)
+    return load_model(model, radius=data.ball.radius, room=data.info.name)
 
 
 def check_out(out: Path, dataset: Path) -> None:
@@ -174,3 +176,11 @@ def print_outcome(statuses: Counter[str], doubts: list[str]) -> None:
     print_notes(doubts[:MOST_DOUBTS])
     if len(doubts) > MOST_DOUBTS:
         print_notes([f"the same doubts about {len(doubts) - MOST_DOUBTS} more tracks"])
+
+
+def print_outside(shares: list[float]) -> None:
+    """Prints how much of the tracks lies outside of a network's training data; nothing without shares, 0 to 1 each."""
+    if shares:
+        far = sum(share > 0.5 for share in shares)
+        mean = 100 * sum(shares) / len(shares)
+        print(f"  outside of the network's training data: {mean:.0f} % on average, {far} tracks for the greater part")

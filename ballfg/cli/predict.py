@@ -40,7 +40,8 @@ def predict(
 ) -> None:
     """Positions at every stamp after the observed part, with the standard deviation of a measurement there.
 
-    These are the positions that will be measured: measurement effects of the model file are included.
+    These are the positions that will be measured: measurement effects of the model file are included. A network that
+    knows where it was trained adds the column outside: 0 there, 1 far from it.
 
     Example: ballfg predict data/ballgun --observe 0.25 --out predictions.csv
     """
@@ -69,6 +70,7 @@ def predict(
             outcome.add(result, plain.sigmas)
     print(f"{out}: {outcome.rows} positions of {count} tracks, from the first {observe:g} s of each by {method}")
     outcome.print(observe)
+    inputs.print_outside(outcome.outside)
     if scales is not None:
         _print_conformal(scales, outcome)
         if save_conformal is not None:
@@ -139,6 +141,7 @@ class _Outcome:
     finite: int = 0
     statuses: Counter[str] = field(default_factory=Counter)
     doubts: list[str] = field(default_factory=list)
+    outside: list[float] = field(default_factory=list)
 
     def add(self, result: TrackPrediction, own_sigmas: np.ndarray) -> None:
         """Counts a track; coordinates in 90 % intervals are counted where the interval is finite."""
@@ -155,6 +158,8 @@ class _Outcome:
         self.held += int((finite & (errors <= HALF_WIDTH * result.sigmas)).sum())
         self.held_by_own += int((finite & (errors <= HALF_WIDTH * own_sigmas)).sum())
         self.statuses[result.status.value] += 1
+        if result.outside is not None and len(result.outside):
+            self.outside.append(float(result.outside.mean()))
         self.doubts += [f"track {result.name!r}: {note}" for note in result.estimate.notes]
 
     def print(self, observe: float) -> None:
@@ -171,4 +176,4 @@ def _columns(result: TrackPrediction) -> dict[str, str | np.ndarray]:
     columns: dict[str, str | np.ndarray] = {"trajectory": result.name, "t": result.times}
     columns |= dict(zip(("x", "y", "z"), result.positions.T, strict=True))
     columns |= dict(zip(("sigma_x", "sigma_y", "sigma_z"), result.sigmas.T, strict=True))
-    return columns
+    return columns if result.outside is None else columns | {"outside": result.outside}

@@ -70,6 +70,10 @@ class AugmentedModel(BallModel):
         """(2,) or (..., 2) slope of the surfaces; None: they are horizontal."""
         return None if self._level else self.bound(state).surface_slope(state[..., :STATE_DIM])
 
+    def inside(self, state: Tensor) -> Tensor | None:
+        """(...) as the model: a weight that no coefficient changes."""
+        return self.model.inside(state[..., :STATE_DIM])
+
     @property
     def measures_plainly(self) -> bool:
         """As the model."""

@@ -117,6 +117,10 @@ class BallModel(nn.Module, ABC):
         slope = self.surface_slope(state)
         return acceleration[..., Z] if slope is None else acceleration[..., Z] - climb(slope, acceleration)
 
+    def inside(self, state: Tensor) -> Tensor | None:
+        """(...) from 1 where a learned model was trained to 0 far from there, of states (..., 9); None: not told."""
+        return None
+
     def save(self, path: str | Path) -> None:
         """Write a model file, as `save_model`."""
         from ballfg.dynamics.model_file import save_model

@@ -12,6 +12,7 @@ from ballfg.dynamics.analytic import AnalyticModel, after_needs
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import effect_class
 from ballfg.dynamics.model import THIN_SHELL, BallModel
+from ballfg.dynamics.networks.fading import ABROAD
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.networks.learned_file import has_learned_part, read_learned, remove_others, write_learned
 from ballfg.dynamics.variation import Variation
@@ -26,13 +27,17 @@ NOISE: Final = "noise"
 """Entry of the section `measurement` that is no effect: how far tracks scatter about the model."""
 
 
-def load_model(path: str | Path, *, radius: float = 0.02, inertia_factor: float = THIN_SHELL) -> BallModel:
+def load_model(
+    path: str | Path, *, radius: float = 0.02, inertia_factor: float = THIN_SHELL, room: str | None = None
+) -> BallModel:
     """Read a model file.
 
     Args:
         path: YAML file with the sections `flight`, `bounce`, `measurement`, `variations`, `learned` (docs/models.md).
         radius: m, of the ball, usually from the dataset.
         inertia_factor: moment of inertia divided by m R^2.
+        room: name of the dataset that the model is used with. In one that had no part in its training a network that
+            fades keeps half of its correction. None: as trained.
     Returns: the analytic model where `learned` is null; else what the folder holds, a `LearnedModel` or an analytic
         model with what was learned beside it (`trained`).
     Raises:
@@ -52,7 +57,11 @@ def load_model(path: str | Path, *, radius: float = 0.02, inertia_factor: float 
     analytic = model_from_dict(
         {**content, "learned": None}, radius=radius, inertia_factor=inertia_factor, where=str(path)
     )
-    return read_learned(path.parent / learned, analytic)
+    model = read_learned(path.parent / learned, analytic)
+    abroad = room is not None and model.trained is not None and model.trained.is_foreign(room)
+    if abroad and isinstance(model, LearnedModel) and model.fading is not None:
+        model.fading.strength = ABROAD
+    return model
 
 
 def model_from_dict(

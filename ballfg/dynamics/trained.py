@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
+from ballfg.tracks import TrackNoise
 
 
 @dataclass(frozen=True)
@@ -17,6 +18,8 @@ class Trained:
         position_scale: standard deviation of a measured position in multiples of what its dataset says.
         launcher: spin of a launch from its settings; None: not learned.
         spin_noise: rad/s, standard deviation per axis of the launcher's spin; None: not learned.
+        rooms: names of the datasets that trained; none: not known.
+        elsewhere: noise of motion, bounces and spins that whole tracks showed in training, for use in other rooms.
 
     Raises: ValueError: if a noise is negative or not finite, or zero where that makes an estimate impossible.
     """
@@ -25,6 +28,12 @@ class Trained:
     position_scale: float = 1.0
     launcher: SpinEmbedding | None = None
     spin_noise: float | None = None
+    rooms: tuple[str, ...] = ()
+    elsewhere: TrackNoise | None = None
+
+    def is_foreign(self, room: str) -> bool:
+        """Whether a room, by the name of its dataset, had no part in a training whose rooms are known."""
+        return self.elsewhere is not None and room not in self.rooms
 
     def __post_init__(self) -> None:
         for name, value in self.process_noise.items():

@@ -1,5 +1,6 @@
 """Settings and surfaces for a dataset: what it states of noise and table, else what its tracks show of them."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from itertools import islice
@@ -7,6 +8,8 @@ from itertools import islice
 import numpy as np
 
 from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.networks.fading import DOUBT
+from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.dynamics.trained import Trained
 from ballfg.estimation.launcher import Launcher
@@ -14,11 +17,13 @@ from ballfg.estimation.measurement.position_noise import estimate_position_noise
 from ballfg.estimation.noise.estimate import estimate_noise, spread_over
 from ballfg.estimation.noise.parameters import with_noise
 from ballfg.estimation.observations.sighted_dataset import SightedDataset
+from ballfg.estimation.outside import outside_share
 from ballfg.estimation.settings import MEASURED, Settings
+from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.estimation.table_extent import TableExtent, find_table_extent
 from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
 from ballfg.progress import Watch, unwatched
-from ballfg.tracks import Dataset, DatasetInfo
+from ballfg.tracks import Dataset, DatasetInfo, Track
 
 TRACKS_FOR_NOISE = 50
 """How many tracks the measurement noise is estimated from, when a dataset does not state it."""
@@ -39,8 +44,10 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
 
     The position noise is the dataset's; where it states none, it is estimated from the scatter of the first tracks
     about short polynomials. The coefficients of an analytic model are estimated with each track, within their priors; a
-    trained model is taken as it is, with the noise and the launcher that were learned together with it. Where the
-    dataset or the model states more of the noise, that holds, the model's before the dataset's.
+    trained model is taken as it is, with the noise and the launcher that were learned together with it. In a room that
+    had no part in the training, by the name of the dataset, the coefficients of what a network corrects are estimated
+    again, and the noise of motion and bounces is that of the tracks about them. Where the dataset or the model states
+    more of the noise, that holds, the model's before the dataset's.
     """
     info, trained = dataset.info, model.trained
     if info.position_noise is not None:
@@ -51,6 +58,9 @@ def dataset_settings(dataset: Dataset | SightedDataset, model: BallModel) -> Set
         noise = _noise_of(dataset)
     if trained is None:
         settings = Settings.for_measured(model, position_noise=noise)
+    elif trained.elsewhere is not None and trained.is_foreign(info.name):
+        settings = Settings.for_measured(model, position_noise=noise, launcher=launcher_of(info, model))
+        settings = with_noise(settings, trained.elsewhere)
     else:
         settings = Settings(
             position_noise=noise,
@@ -74,13 +84,15 @@ def fitted_settings(
 
     Args:
         dataset: a few of its tracks are estimated once (`estimate_noise`); with fewer than `LEAST_TRACKS` of them, or
-            where cameras saw the ball, or with a trained model, the settings are those of `dataset_settings`.
+            where cameras saw the ball, or with a trained model in its rooms, the settings are those of
+            `dataset_settings`.
         model: the ball.
         observed: s from the start of each track that may be looked at.
         watch: told of each track, and of each step of the search.
     """
     settings = dataset_settings(dataset, model)
-    stated = dataset.info.noise is not None or model.noise is not None or model.trained is not None
+    at_home = model.trained is not None and not model.trained.is_foreign(dataset.info.name)
+    stated = dataset.info.noise is not None or model.noise is not None or at_home
     if stated or dataset.rough or len(dataset) < LEAST_TRACKS:
         return settings
     values = tuple(float(p.detach()) for p in model.parameters() if p.numel() == 1)
@@ -99,16 +111,71 @@ def _fitted(dataset: Dataset | SightedDataset, model: BallModel, observed: float
     """The settings with the noise that the tracks show; None where they show none."""
     tracks = spread_over(dataset, min(len(dataset), TRACKS_FOR_TABLE), QUICK_TRACKS)
     parts = [track.until(float(track.times[0]) + observed) for track in tracks] if np.isfinite(observed) else tracks
-    found = estimate_noise(
-        model,
-        dataset_surfaces(dataset),
-        dataset_settings(dataset, model),
-        parts,
-        position_known=dataset.info.position_noise is not None,
-        errors=False,
-        watch=watch,
+    surfaces, before = dataset_surfaces(dataset), dataset_settings(dataset, model)
+    known = dataset.info.position_noise is not None
+    return tracks_settings(model, surfaces, before, parts, known, watch)
+
+
+def tracks_settings(
+    model: BallModel,
+    surfaces: Surfaces,
+    settings: Settings,
+    parts: Sequence[Track],
+    position_known: bool,
+    watch: Watch = unwatched,
+) -> Settings | None:
+    """The settings with the noise that parts of tracks show; None where they show none.
+
+    The first parts of tracks make the acceleration noise too large. A network knows it from whole tracks, as far as
+    they flew like these: the noise is the geometric mean of both, weighted with the share inside of its training data.
+    What the parts do not tell is, by the same share, as in the training or as usual. Outside, a correction of the usual
+    size is missing: it widens bounces.
+
+    Args:
+        model: the ball.
+        surfaces: what it may bounce on.
+        settings: before; of a trained model, with the noise of its training.
+        parts: of tracks.
+        position_known: whether the white noise of positions is stated.
+        watch: told of each track, and of each step of the search.
+    """
+    doubts = {name: sigma for name, sigma in settings.coefficients.items() if name.startswith(DOUBT)}
+    plain = replace(settings, coefficients={n: s for n, s in settings.coefficients.items() if n not in doubts})
+    outside = outside_share(model, [Smoother(model, surfaces, plain).estimate(part).states for part in parts])
+    begun = plain if outside is None else with_usual_noise(plain, outside)
+    found = estimate_noise(model, surfaces, begun, parts, position_known=position_known, errors=False, watch=watch)
+    if found is None or outside is None:
+        return None if found is None else found.settings
+    known, shown = settings.process.acceleration, found.settings.process.acceleration
+    acceleration = _between(known, shown, outside)
+    process = widened(replace(found.settings.process, acceleration=acceleration), model, outside)
+    return replace(found.settings, process=process, coefficients={**found.settings.coefficients, **doubts})
+
+
+def widened(process: ProcessNoise, model: BallModel, outside: float) -> ProcessNoise:
+    """Process noise with what a network's correction does in training, by the share of flights outside of it."""
+    if not isinstance(model, LearnedModel) or model.fading is None:
+        return process
+    kick = outside * float(model.fading.velocity) / np.sqrt(3.0)
+    return replace(process, contact_velocity=float(np.hypot(process.contact_velocity, kick)))
+
+
+def with_usual_noise(settings: Settings, share: float) -> Settings:
+    """Settings whose process noise and spin prior move to those of measured tracks, by a share from 0 to 1."""
+    usual = Settings(process=MEASURED)
+    process = {
+        name: _between(getattr(settings.process, name), getattr(MEASURED, name), share) for name in PROCESS_NOISE
+    }
+    return replace(
+        settings,
+        process=replace(settings.process, **process),
+        spin_prior=_between(settings.spin_prior, usual.spin_prior, share),
     )
-    return None if found is None else found.settings
+
+
+def _between(one: float, other: float, share: float) -> float:
+    """From one number (share 0) to another (share 1) on a logarithmic scale; both not negative."""
+    return float(one ** (1.0 - share) * other**share)
 
 
 @lru_cache(maxsize=8)

@@ -16,6 +16,7 @@ from ballfg.arrays import Array
 from ballfg.estimation.batch import estimate_tracks
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.measurement.as_measured import measured_positions, true_times
+from ballfg.estimation.outside import outside_of
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import sample_sigmas, total_sigmas
 from ballfg.prediction.belief import Belief
@@ -45,6 +46,7 @@ class TrackPrediction:
         measured: (k, 3) m, what the track has at those stamps.
         estimate: from the observed part.
         conformal: by which the sigmas were scaled; None where they are the model's own.
+        outside: (k,) from 0 where a network was trained to 1 far from there; None for a model that does not tell.
     """
 
     name: str
@@ -54,6 +56,7 @@ class TrackPrediction:
     measured: Array
     estimate: Estimate
     conformal: ConformalScales | None = None
+    outside: Array | None = None
 
     def __repr__(self) -> str:
         return f"TrackPrediction({self.name!r}, {len(self.times)} positions, {self.status.name.lower()})"
@@ -154,16 +157,23 @@ def _predict_alike(
     belief = Belief.of(estimator.model, [e.last for e in estimates], estimator.settings.coefficients)
     belief = replace(belief, time=torch.tensor(ends, dtype=torch.float64))
     positions, velocities, variances = (np.zeros((*times.shape, 3)) for _ in range(3))
+    outside: Array | None = None
     for k, predicted in enumerate(propagator.walk(belief, torch.from_numpy(times)) if times.size else ()):
         velocities[:, k] = predicted.mean[:, VELOCITY].numpy()
         positions[:, k] = measured_positions(predicted.model, predicted.mean, estimator.surfaces).numpy()
+        share = outside_of(predicted.model, predicted.mean)
+        if share is not None:
+            outside = np.zeros(times.shape) if outside is None else outside
+            outside[:, k] = share
         variances[:, k] = torch.diagonal(predicted.covariance, dim1=-2, dim2=-1)[:, POSITION].numpy()
     for i, (track, result, mask) in enumerate(zip(tracks, estimates, later, strict=True)):
         k = int(mask.sum())
         white = sample_sigmas(estimator.settings, len(track), track.sigmas)[mask]
         noise = total_sigmas(estimator.settings, white, velocities[i, :k])
         sigmas = np.sqrt(variances[i, :k] + noise**2)
-        yield TrackPrediction(track.name, track.times[mask], positions[i, :k], sigmas, track.positions[mask], result)
+        left = None if outside is None else outside[i, :k]
+        ahead = track.times[mask], positions[i, :k], sigmas, track.positions[mask]
+        yield TrackPrediction(track.name, *ahead, result, outside=left)
 
 
 def _later(track: Track, end: float, horizon: float) -> NDArray[np.bool_]:

@@ -60,15 +60,16 @@ def run_intervals(
 def _measured(results: Results, dataset: Dataset, method: str, first: int | None, jobs: int) -> None:
     tracks = list(dataset)[:first]
     model = nominal_model(dataset.ball)
-    # the table's ends are known only where they are stated: others would come from the predicted parts
-    surfaces = (
-        Surfaces.table_tennis(dataset.info.table_height)
-        if dataset.info.table_extent is None
-        else dataset_surfaces(dataset)
-    )
+    surfaces = known_surfaces(dataset)
     known = dataset.info.position_noise is not None
     judged = judged_both_ways(method, model, surfaces, dataset_settings(dataset, model), tracks, jobs, known)
     _add(results, dataset.info.name, method, judged)
+
+
+def known_surfaces(dataset: Dataset) -> Surfaces:
+    """The table, with its ends only where they are stated: others would come from the predicted parts."""
+    stated = dataset.info.table_extent is not None
+    return dataset_surfaces(dataset) if stated else Surfaces.table_tennis(dataset.info.table_height)
 
 
 def _simulated(results: Results, number: int, tracks: int, jobs: int) -> None:

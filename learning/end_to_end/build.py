@@ -43,6 +43,7 @@ def build_end_to_end(config: TrainConfig) -> Prepared:
         anchor=Anchor(model, data.analytic, config.seed) if config.loss.anchor > 0.0 else None,
         coefficient_step=config.optimizer.coefficient_step,
         noise_step=config.optimizer.noise_step,
+        fades=data.train,
     )
     return Prepared(trainee, data.train, data.validation)
 

@@ -14,14 +14,16 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
-from ballfg.dynamics import BallModel, save_model
+from ballfg.dynamics import AnalyticModel, BallModel, save_model
 from ballfg.dynamics.motion.paths import paths
+from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.dynamics.trained import Trained
 from ballfg.factors.graph import LevenbergMarquardt
 from ballfg.factors.loss import Loss
 from ballfg.learning.augment import augmentation
 from ballfg.learning.config.training import LossConfig
+from ballfg.learning.end_to_end.elsewhere import fading_of, noise_elsewhere, training_states
 from ballfg.learning.end_to_end.learnables import Learnables
 from ballfg.learning.end_to_end.pretrain import Anchor
 from ballfg.learning.end_to_end.solving import TRAINING, BatchSolver, Pose, Solved
@@ -33,6 +35,7 @@ from ballfg.learning.run.run_folder import MODEL
 from ballfg.learning.shots import Shot
 from ballfg.learning.trainee import BatchLoss, Trainee
 from ballfg.state import POSITION, STATE_DIM
+from ballfg.tracks import TrackNoise
 
 LOSS_UNIT: Final = 0.01
 """m. Squared errors are divided by its square, so that losses are of order one."""
@@ -90,6 +93,7 @@ class EndToEnd(Trainee):
         anchor: Anchor | None = None,
         coefficient_step: float = COEFFICIENT_STEP,
         noise_step: float = NOISE_STEP,
+        fades: Sequence[int] = (),
     ) -> None:
         self.module = learnables
         self.learnables = learnables
@@ -103,6 +107,7 @@ class EndToEnd(Trainee):
         self.anchor = anchor
         self.coefficient_step = coefficient_step
         self.noise_step = noise_step
+        self.fades = tuple(fades)
         scale = None if loss.position_scale is None else loss.position_scale / LOSS_UNIT
         self.point_loss = Loss() if scale is None else Loss("huber", scale)
 
@@ -232,7 +237,8 @@ class EndToEnd(Trainee):
         self.solver.warm.take(memory)
 
     def trained_model(self) -> BallModel:
-        """The model with the noise and the launcher that were learned with it."""
+        """The model with the noise and the launcher that were learned with it, and what it needs in other rooms."""
+        elsewhere = self._faded()
         noise, settings = self.learnables.noise, self.shots[0].settings
         launcher = settings.launcher
         first_spin = settings.spin_label_noise if launcher is None else launcher.sigma
@@ -241,8 +247,26 @@ class EndToEnd(Trainee):
             position_scale=noise.position_scale(),
             launcher=self.learnables.embedding,
             spin_noise=first_spin * noise.spin_scale() if noise.learned or launcher is not None else None,
+            rooms=tuple(dict.fromkeys(self.shots[number].room for number in self.fades)) if elsewhere else (),
+            elsewhere=elsewhere,
         )
         return self.learnables.model
+
+    def _faded(self) -> TrackNoise | None:
+        """Let the correction of a residual network fade outside of the shots that trained.
+
+        Returns: the noise in their rooms; None where nothing fades.
+        """
+        model = self.learnables.model
+        if not (self.fades and isinstance(model, LearnedModel) and isinstance(model.base, AnalyticModel)):
+            return None
+        model.fading = None
+        solved, _ = self.solver(self.fades, {})
+        states = training_states(model, self.shots, solved)
+        if not states:
+            return None
+        model.fading = fading_of(model, states)
+        return noise_elsewhere(model.base, [self.shots[number] for number in self.fades])
 
     def export(self, folder: Path) -> Path:
         """Write the trained model. Returns: its file, for `--model` of other commands."""

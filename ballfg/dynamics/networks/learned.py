@@ -10,6 +10,7 @@ from ballfg.dynamics.effects.bounce import TableHeight
 from ballfg.dynamics.measurement import Later
 from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
 from ballfg.dynamics.networks.architecture import Architecture
+from ballfg.dynamics.networks.fading import DOUBT, DOUBTS, Fading
 from ballfg.dynamics.networks.layers import NetworkKind
 from ballfg.dynamics.networks.learned_parts import (
     START_RESTITUTION,
@@ -23,7 +24,8 @@ from ballfg.state import POSITION, SPIN, VZ
 START_OFFSET: Final = -0.003
 """m by which an untrained model takes surfaces to lie above their declared heights: as in the nominal model."""
 
-_BASE = "base."
+BASE: Final = "base."
+"""What the names of the base's coefficients start with."""
 
 
 class LearnedModel(BallModel):
@@ -37,6 +39,7 @@ class LearnedModel(BallModel):
         flight: network of the rates.  contact: network of the bounce.
         base: the model that is corrected, or None.
         offset: () m by which surfaces lie above their declared heights; the base's where there is one.
+        fading: how the correction fades outside of the training data; None without a base, and before the training.
 
     Raises: ValueError: if a base is given without a residual architecture, or lacks, or has another radius.
     """
@@ -79,14 +82,16 @@ class LearnedModel(BallModel):
             generator=generator,
         )
         self.base = base
+        self.fading: Fading | None = None
         if base is None:
             self.offset = nn.Parameter(torch.tensor(START_OFFSET, dtype=torch.float64))
 
     def declared_coefficients(self) -> dict[str, Coefficient]:
-        """The base's coefficients as `base....`, or the surfaces' offset."""
+        """The base's coefficients as `base....`, with the doubts of its fading; or the surfaces' offset."""
         if self.base is None:
             return {"offset": TableHeight.coefficients[0]}
-        return {_BASE + name: c for name, c in self.base.declared_coefficients().items()}
+        doubts = {} if self.fading is None else {DOUBT + c.name: c for c in DOUBTS}
+        return {BASE + name: c for name, c in self.base.declared_coefficients().items()} | doubts
 
     def rates(self, state: Tensor) -> Rates:
         """Acceleration (..., 3) m/s^2 and angular acceleration (..., 3) rad/s^2, or None, in free flight."""
@@ -94,6 +99,9 @@ class LearnedModel(BallModel):
         if self.base is None:
             return acceleration, spin_rate
         base_acceleration, base_spin_rate = self.base.rates(state)
+        if self.fading is not None:
+            acceleration = self.fading.in_flight(state, acceleration)
+            spin_rate = None if spin_rate is None else self.fading.strength * self.fading.inside(state) * spin_rate
         if spin_rate is not None and base_spin_rate is not None:
             spin_rate = base_spin_rate + spin_rate
         return base_acceleration + acceleration, base_spin_rate if spin_rate is None else spin_rate
@@ -106,7 +114,11 @@ class LearnedModel(BallModel):
         else:
             guess = self.base.after_bounce(state)
         after: Tensor = self.contact(state, guess)
-        return after
+        return after if self.fading is None else guess + self.fading.at_contact(state, after - guess)
+
+    def inside(self, state: Tensor) -> Tensor | None:
+        """(...) weight of the correction in flight, of states (..., 9); None if it does not fade."""
+        return None if self.fading is None else self.fading.inside(state).squeeze(-1)
 
     def surface_offset(self, state: Tensor) -> Tensor | float:
         """(...) m by which surfaces lie above the heights declared for them."""

@@ -19,11 +19,13 @@ from torch import Tensor
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.networks.architecture import Architecture
+from ballfg.dynamics.networks.fading import Fading
 from ballfg.dynamics.networks.learned import LearnedModel, build
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.dynamics.trained import Trained
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.whole_folder import whole_folder
+from ballfg.tracks import TrackNoise
 
 CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
 _MODEL, _LAUNCHER, _BASE = "model.", "launcher.", "base."
@@ -45,11 +47,19 @@ class _TrainedConfig(_Section):
     position_scale: float
     spin_noise: float | None
     launcher: _LauncherConfig | None
+    rooms: Annotated[tuple[str, ...], Field(strict=False)] = ()
+    elsewhere: dict[str, Any] | None = None
+
+
+class _FadingConfig(_Section):
+    flight_centres: Annotated[int, Field(ge=0)]
+    contact_centres: Annotated[int, Field(ge=0)]
 
 
 class _Config(_Section):
     architecture: Architecture | None
     trained: _TrainedConfig | None
+    fading: _FadingConfig | None = None
 
 
 def has_learned_part(model: BallModel) -> bool:
@@ -103,12 +113,14 @@ def read_learned(folder: Path, analytic: AnalyticModel) -> BallModel:
 
 def _config(model: BallModel) -> _Config:
     architecture = model.architecture if isinstance(model, LearnedModel) else None
+    fading = _fading(model)
     trained = model.trained
     if trained is None:
-        return _Config(architecture=architecture, trained=None)
+        return _Config(architecture=architecture, trained=None, fading=fading)
     launcher = trained.launcher
     return _Config(
         architecture=architecture,
+        fading=fading,
         trained=_TrainedConfig(
             process_noise=dict(trained.process_noise),
             position_scale=trained.position_scale,
@@ -116,8 +128,17 @@ def _config(model: BallModel) -> _Config:
             launcher=None
             if launcher is None
             else _LauncherConfig(labels=launcher.labels, categories=launcher.categories),
+            rooms=trained.rooms,
+            elsewhere=None if trained.elsewhere is None else trained.elsewhere.to_mapping(),
         ),
     )
+
+
+def _fading(model: BallModel) -> _FadingConfig | None:
+    if not isinstance(model, LearnedModel) or model.fading is None:
+        return None
+    sizes = [density.get_buffer("centres").shape[0] for density in (model.fading.flying, model.fading.bouncing)]
+    return _FadingConfig(flight_centres=sizes[0], contact_centres=sizes[1])
 
 
 def _tensors(model: BallModel) -> dict[str, Tensor]:
@@ -152,6 +173,10 @@ def _empty_model(config: _Config, analytic: AnalyticModel, folder: Path) -> Ball
             )
         base = analytic if architecture.residual else None
         model = build(architecture, radius=analytic.radius, inertia_factor=analytic.inertia_factor, base=base)
+        if config.fading is not None:
+            if base is None:
+                raise ValueError(f"{folder / CONFIG}: fading must have a model to fade to; make architecture residual.")
+            model.fading = Fading.empty(config.fading.flight_centres, config.fading.contact_centres, analytic.radius)
     model.noise = analytic.noise
     if model is not analytic:
         model.variations = {f"base.{name}": variation for name, variation in analytic.variations.items()}
@@ -164,7 +189,10 @@ def _trained(config: _TrainedConfig, folder: Path) -> Trained:
     given = config.launcher
     try:
         launcher = None if given is None else SpinEmbedding(given.labels, given.categories)
-        return Trained(config.process_noise, config.position_scale, launcher, config.spin_noise)
+        elsewhere = None if config.elsewhere is None else TrackNoise.from_mapping(config.elsewhere)
+        return Trained(
+            config.process_noise, config.position_scale, launcher, config.spin_noise, config.rooms, elsewhere
+        )
     except ValueError as error:
         raise ValueError(f"{folder / CONFIG}: {error}") from None
 

@@ -1,0 +1,104 @@
+"""Networks elsewhere: each pair of measured datasets trains a residual MNN, which predicts all others.
+
+The noise is that of the observed parts of the judged tracks, as in `ballfg predict`; for comparison the nominal model,
+judged in the same way. Nothing of the judged datasets is used but these parts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Final
+
+import numpy as np
+
+from ballfg.benchmarks.intervals.protocol import OBSERVED, Judged, judge
+from ballfg.benchmarks.intervals.suite import LEVEL, known_surfaces
+from ballfg.benchmarks.metrics import inside
+from ballfg.benchmarks.results import Results
+from ballfg.dynamics import BallModel, load_model, nominal_model
+from ballfg.estimation import fitted_settings
+from ballfg.learning import TrainConfig, run_training
+from ballfg.progress import progress
+from ballfg.tracks import Dataset, read_dataset
+
+NOMINAL: Final = "nominal"
+TRAINED: Final = "residual mnn+gs"
+
+
+@dataclass(frozen=True)
+class TrainedPlan:
+    """How much is trained: epochs, and pairs of datasets (None for all)."""
+
+    epochs: int
+    pairs: int | None
+
+
+FULL: Final = TrainedPlan(epochs=8, pairs=None)
+QUICK: Final = TrainedPlan(epochs=1, pairs=1)
+
+
+def run_trained(results: Results, folders: Sequence[Path], plan: TrainedPlan, jobs: int) -> None:
+    """Rows of all pairs: `a + b -> c`.
+
+    Raises: ValueError: fewer than three datasets, or two of one name.
+    """
+    datasets = [read_dataset(folder) for folder in folders]
+    names = [dataset.info.name for dataset in datasets]
+    if len(datasets) < 3 or len(set(names)) < len(names):
+        raise ValueError(f"data must be three datasets or more, of names that differ; got {names}. Repeat --data.")
+    nominal = [_judged(nominal_model(dataset.ball), dataset, jobs) for dataset in datasets]
+    for name, judged in zip(names, nominal, strict=True):
+        _add(results, name, NOMINAL, judged)
+    pairs = list(combinations(range(len(datasets)), 2))[: plan.pairs]
+    for pair in progress(pairs, len(pairs), "pairs of datasets trained and judged"):
+        with TemporaryDirectory() as folder:
+            run_training(_config([folders[k] for k in pair], plan.epochs, results.seed), Path(folder) / "run")
+            for k, dataset in enumerate(datasets):
+                if k in pair:
+                    continue
+                file = Path(folder) / "run" / "model.yaml"
+                model = load_model(file, radius=dataset.ball.radius, room=dataset.info.name)
+                judged = _judged(model.requires_grad_(False), dataset, jobs)
+                case = f"{names[pair[0]]} + {names[pair[1]]} -> {names[k]}"
+                _add(results, case, TRAINED, judged)
+                ratio = _median(judged) / _median(nominal[k])
+                results.add(case, TRAINED, "error_ratio", "1", ratio, len(judged.rmse_by_track()))
+
+
+def _config(folders: Sequence[Path], epochs: int, seed: int) -> TrainConfig:
+    return TrainConfig.model_validate(
+        {
+            "kind": "mnn+gs",
+            "seed": seed,
+            "data": [str(folder) for folder in folders],
+            "architecture": {"residual": True},
+            "launcher": {"labels": ["group"]},
+            "observe": OBSERVED,
+            "split": {"by": "alternate"},
+            "loss": {"horizon": 0.3},
+            "optimizer": {"epochs": epochs},
+            "jobs": 1,
+        }
+    )
+
+
+def _judged(model: BallModel, dataset: Dataset, jobs: int) -> Judged:
+    settings = fitted_settings(dataset, model, OBSERVED)
+    return judge(model, known_surfaces(dataset), settings, list(dataset), jobs)
+
+
+def _median(judged: Judged) -> float:
+    """Median over tracks of the root mean square error, m."""
+    return float(np.median(judged.rmse_by_track()))
+
+
+def _add(results: Results, case: str, method: str, judged: Judged) -> None:
+    count = len(judged.rmse_by_track())
+    held = 100.0 * float(inside(judged.errors, judged.sigmas, LEVEL).mean())
+    results.add(case, method, "coverage_90", "%", held, count)
+    results.add(case, method, "prediction_rmse_median", "mm", 1e3 * _median(judged), count)
+    results.add(case, method, "failed", "1", judged.failed, count)

@@ -1,0 +1,90 @@
+"""What a residual network has to know to be used in other rooms: where it was trained, and the noise there."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.paths import paths
+from ballfg.dynamics.networks.fading import Fading, states_before_contacts
+from ballfg.dynamics.networks.learned import BASE, LearnedModel
+from ballfg.estimation import estimate_noise, spread_over
+from ballfg.learning.end_to_end.solving import Solved
+from ballfg.learning.shots import Shot
+from ballfg.state import STATE_DIM
+from ballfg.tracks import TrackNoise
+
+ROOM_TRACKS: Final = 12
+"""Tracks of each room that tell its noise, in a few seconds."""
+AVERAGED: Final = ("contact_velocity", "contact_tangential", "contact_spin")
+
+
+def training_states(model: BallModel, shots: Sequence[Shot], solved: Sequence[Solved]) -> list[Tensor]:
+    """(n, 9) states at the stamps of each shot, from the estimate of its observed part."""
+    found = []
+    with torch.no_grad():
+        for one in solved:
+            shot = shots[one.number]
+            times = torch.from_numpy(shot.track.times - shot.track.times[0])
+            first = torch.from_numpy(one.solution.minimum.values.states[:1, :STATE_DIM])
+            states = paths(model, first, times[None], shot.surfaces)[0]
+            found.append(states[states.isfinite().all(-1)])
+    return found
+
+
+def fading_of(model: LearnedModel, tracks: Sequence[Tensor]) -> Fading:
+    """How the correction of a trained model fades, from the states (n, 9) of each training track."""
+    contacts = [states_before_contacts(states) for states in tracks]
+    fading = Fading.of(tracks, contacts, model.radius)
+    flying, bouncing = torch.cat(list(tracks)), torch.cat(contacts)
+    assert model.base is not None
+    with torch.no_grad():
+        guess = model.base.after_bounce(bouncing)
+        fading.measure(model.flight(flying)[0], model.contact(bouncing, guess) - guess)
+    return fading
+
+
+def noise_elsewhere(base: BallModel, shots: Sequence[Shot]) -> TrackNoise | None:
+    """The noise of motion, bounces and spins that whole tracks of the training rooms show about the analytic model.
+
+    Acceleration is the least of the rooms: tracks with hits that nobody found show more. Others are means.
+
+    Args:
+        base: the analytic model as trained.
+        shots: that trained.
+    Returns: its coefficients as the learned model names them; None where no track is long enough.
+    """
+    rooms = defaultdict(list)
+    for shot in shots:
+        rooms[shot.room].append(shot)
+    found = []
+    for members in rooms.values():
+        first = members[0]
+        settings = replace(first.settings, coefficients=coefficient_sigmas(base), launcher=None)
+        tracks = spread_over([shot.track for shot in members], len(members), ROOM_TRACKS)
+        estimate = estimate_noise(base, first.surfaces, settings, tracks, errors=False)
+        if estimate is not None:
+            found.append(estimate.settings)
+    if not found:
+        return None
+    process = [settings.process for settings in found]
+    values = {name: _mean([getattr(p, name) for p in process]) for name in AVERAGED}
+    return TrackNoise(
+        acceleration=min(p.acceleration for p in process),
+        spin_prior=_mean([settings.spin_prior for settings in found]),
+        coefficients={BASE + n: _mean([s.coefficients[n] for s in found]) for n in found[0].coefficients},
+        **values,
+    )
+
+
+def _mean(values: Sequence[float]) -> float:
+    """Geometric mean; 0 if a value is."""
+    return float(np.exp(np.mean(np.log(values)))) if min(values) > 0.0 else 0.0
