@@ -78,8 +78,8 @@ def noise_about(
     found = estimate_noise(model, dataset_surfaces(dataset), settings, some, tracker_known=True, errors=False)
     if found is None:
         return None
-    lasting = {"memory": settings.memory, "memory_time": settings.memory_time} if settings.has_memory else {}
-    return replace(found.noise, **lasting, stamp_jitter=settings.stamp_jitter or None)
+    noise = replace(found.noise, stamp_jitter=settings.stamp_jitter or None)
+    return replace(noise, memory=settings.memory, memory_time=settings.memory_time) if settings.has_memory else noise
 
 
 class Predicting:
