@@ -12,7 +12,6 @@ from ballfg.dynamics.analytic import AnalyticModel, after_needs
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import effect_class
 from ballfg.dynamics.model import THIN_SHELL, BallModel
-from ballfg.dynamics.networks.fading import ABROAD
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.networks.learned_file import has_learned_part, read_learned, remove_others, write_learned
 from ballfg.dynamics.variation import Variation
@@ -37,7 +36,8 @@ def load_model(
         radius: m, of the ball, usually from the dataset.
         inertia_factor: moment of inertia divided by m R^2.
         room: name of the dataset that the model is used with. In one that had no part in its training a network that
-            fades keeps half of its correction. None: as trained.
+            fades keeps half of its correction, or nothing where that did not help tracks held out in training. None:
+            as trained.
     Returns: the analytic model where `learned` is null; else what the folder holds, a `LearnedModel` or an analytic
         model with what was learned beside it (`trained`).
     Raises:
@@ -60,7 +60,7 @@ def load_model(
     model = read_learned(path.parent / learned, analytic)
     abroad = room is not None and model.trained is not None and model.trained.is_foreign(room)
     if abroad and isinstance(model, LearnedModel) and model.fading is not None:
-        model.fading.strength = ABROAD
+        model.fading.strength = float(model.fading.get_buffer("abroad"))
     return model
 
 

@@ -44,6 +44,7 @@ def build_end_to_end(config: TrainConfig) -> Prepared:
         coefficient_step=config.optimizer.coefficient_step,
         noise_step=config.optimizer.noise_step,
         fades=data.train,
+        held_out=data.validation,
     )
     return Prepared(trainee, data.train, data.validation)
 

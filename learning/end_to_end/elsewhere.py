@@ -11,12 +11,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ballfg.arrays import Array
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.paths import paths
-from ballfg.dynamics.networks.fading import Fading, states_before_contacts
+from ballfg.dynamics.networks.fading import ABROAD, Fading, states_before_contacts
 from ballfg.dynamics.networks.learned import BASE, LearnedModel
-from ballfg.estimation import estimate_noise, spread_over
+from ballfg.estimation import Smoother, estimate_noise, predict_tracks
+from ballfg.estimation.noise.parameters import with_noise
 from ballfg.learning.end_to_end.solving import Solved
 from ballfg.learning.shots import Shot
 from ballfg.state import STATE_DIM
@@ -24,6 +26,8 @@ from ballfg.tracks import TrackNoise
 
 ROOM_TRACKS: Final = 12
 """Tracks of each room that tell its noise, in a few seconds."""
+HORIZON: Final = 0.3
+"""s after the observed part at which a correction is judged."""
 AVERAGED: Final = ("contact_velocity", "contact_tangential", "contact_spin")
 
 
@@ -62,14 +66,11 @@ def noise_elsewhere(base: BallModel, shots: Sequence[Shot]) -> TrackNoise | None
         shots: that trained.
     Returns: its coefficients as the learned model names them; None where no track is long enough.
     """
-    rooms = defaultdict(list)
-    for shot in shots:
-        rooms[shot.room].append(shot)
     found = []
-    for members in rooms.values():
+    for members in by_room(shots):
         first = members[0]
         settings = replace(first.settings, coefficients=coefficient_sigmas(base), launcher=None)
-        tracks = spread_over([shot.track for shot in members], len(members), ROOM_TRACKS)
+        tracks = [shot.track for shot in members]
         estimate = estimate_noise(base, first.surfaces, settings, tracks, errors=False)
         if estimate is not None:
             found.append(estimate.settings)
@@ -82,6 +83,53 @@ def noise_elsewhere(base: BallModel, shots: Sequence[Shot]) -> TrackNoise | None
         spin_prior=_mean([settings.spin_prior for settings in found]),
         coefficients={BASE + n: _mean([s.coefficients[n] for s in found]) for n in found[0].coefficients},
         **values,
+    )
+
+
+def strength_abroad(model: LearnedModel, noise: TrackNoise, shots: Sequence[Shot]) -> float:
+    """Share of the correction to use in other rooms: `ABROAD` if it helps in every room that trained, else 0.
+
+    Abroad the coefficients of the base are estimated with each track, which already takes in much of what a correction
+    does. So held-out tracks are predicted in that way, with and without the correction.
+
+    Args:
+        model: that fades.
+        noise: of its training, for other rooms.
+        shots: held out.
+    """
+    if not shots or model.fading is None:
+        return 0.0
+    for members in by_room(shots):
+        settings = with_noise(replace(members[0].settings, coefficients=dict(noise.coefficients), launcher=None), noise)
+        errors = []
+        for strength in (0.0, ABROAD):
+            model.fading.strength = strength
+            errors.append(_log_errors(Smoother(model, members[0].surfaces, settings), members))
+        model.fading.strength = 1.0
+        if not np.nanmean(errors[1] - errors[0]) < 0.0:
+            return 0.0
+    return ABROAD
+
+
+def by_room(shots: Sequence[Shot]) -> list[list[Shot]]:
+    """At most `ROOM_TRACKS` shots of each room, spread over it."""
+    rooms = defaultdict(list)
+    for shot in shots:
+        rooms[shot.room].append(shot)
+    return [
+        [members[k] for k in np.unique(np.linspace(0, len(members) - 1, ROOM_TRACKS).round().astype(int))]
+        for members in rooms.values()
+    ]
+
+
+def _log_errors(smoother: Smoother, shots: Sequence[Shot]) -> Array:
+    """(n,) logarithms of the root mean square errors over the next 0.3 s; NaN where there is nothing to predict."""
+    seconds = {shot.name: float(shot.track.times[shot.observed - 1] - shot.track.times[0]) for shot in shots}
+    results = predict_tracks(
+        smoother, (shot.track for shot in shots), len(shots), lambda track: seconds[track.name], horizon=HORIZON
+    )
+    return np.array(
+        [0.5 * np.log(np.mean((r.positions - r.measured) ** 2)) if len(r.times) else np.nan for r in results]
     )
 
 

@@ -23,7 +23,7 @@ from ballfg.factors.graph import LevenbergMarquardt
 from ballfg.factors.loss import Loss
 from ballfg.learning.augment import augmentation
 from ballfg.learning.config.training import LossConfig
-from ballfg.learning.end_to_end.elsewhere import fading_of, noise_elsewhere, training_states
+from ballfg.learning.end_to_end.elsewhere import fading_of, noise_elsewhere, strength_abroad, training_states
 from ballfg.learning.end_to_end.learnables import Learnables
 from ballfg.learning.end_to_end.pretrain import Anchor
 from ballfg.learning.end_to_end.solving import TRAINING, BatchSolver, Pose, Solved
@@ -94,6 +94,7 @@ class EndToEnd(Trainee):
         coefficient_step: float = COEFFICIENT_STEP,
         noise_step: float = NOISE_STEP,
         fades: Sequence[int] = (),
+        held_out: Sequence[int] = (),
     ) -> None:
         self.module = learnables
         self.learnables = learnables
@@ -108,6 +109,7 @@ class EndToEnd(Trainee):
         self.coefficient_step = coefficient_step
         self.noise_step = noise_step
         self.fades = tuple(fades)
+        self.held_out = tuple(held_out)
         scale = None if loss.position_scale is None else loss.position_scale / LOSS_UNIT
         self.point_loss = Loss() if scale is None else Loss("huber", scale)
 
@@ -266,7 +268,11 @@ class EndToEnd(Trainee):
         if not states:
             return None
         model.fading = fading_of(model, states)
-        return noise_elsewhere(model.base, [self.shots[number] for number in self.fades])
+        noise = noise_elsewhere(model.base, [self.shots[number] for number in self.fades])
+        if noise is not None:
+            share = strength_abroad(model, noise, [self.shots[number] for number in self.held_out])
+            model.fading.abroad = torch.tensor(share, dtype=torch.float64)
+        return noise
 
     def export(self, folder: Path) -> Path:
         """Write the trained model. Returns: its file, for `--model` of other commands."""

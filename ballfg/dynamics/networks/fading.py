@@ -16,8 +16,8 @@ from ballfg.state import SPIN, VELOCITY, VZ
 DOUBT: Final = "fading."
 """What the names of the doubts start with in a `LearnedModel`."""
 ABROAD: Final = 0.5
-"""Share of a correction that is used in a room that had no part in the training: two rooms do not tell which part of a
-correction is the ball's and which is theirs. Whichever it is, at least half of it is right."""
+"""Largest share of a correction that is used in a room that had no part in the training: few rooms do not tell which
+part of a correction is the ball's and which is theirs. Whichever it is, at least half of it is right."""
 DOUBTS: Final = tuple(Coefficient(name, 0.0, 1.0, "1", -3.0, 3.0, varies=True) for name in ("flight", "contact"))
 """Unknown shares, about zero, of the correction that stands outside of the training data."""
 
@@ -34,7 +34,8 @@ class Fading(nn.Module):
         flight, contact: () the unknown shares; zero.
         acceleration: () m/s^2, usual size of the correction of a flight.
         velocity: () m/s, of the correction of a contact; that of the spin counts as velocity of the ball's surface.
-        strength: share of the correction that is used where its weight is one; 1, or `ABROAD`.
+        strength: share of the correction that is used where its weight is one; 1, in a foreign room `abroad`.
+        abroad: () that share: `ABROAD` where tracks that were held out in training predict better with it, else 0.
     """
 
     def __init__(self, flying: FeatureDensity, bouncing: FeatureDensity, radius: float) -> None:
@@ -43,6 +44,7 @@ class Fading(nn.Module):
         self.strength = 1.0
         self.flight = nn.Parameter(torch.zeros((), dtype=torch.float64), requires_grad=False)
         self.contact = nn.Parameter(torch.zeros((), dtype=torch.float64), requires_grad=False)
+        self.register_buffer("abroad", torch.tensor(ABROAD, dtype=torch.float64))
         self.register_buffer("acceleration", torch.zeros((), dtype=torch.float64))
         self.register_buffer("velocity", torch.zeros((), dtype=torch.float64))
 
