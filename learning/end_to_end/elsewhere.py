@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -77,7 +77,7 @@ def noise_elsewhere(base: BallModel, shots: Sequence[Shot]) -> TrackNoise | None
     if not found:
         return None
     process = [settings.process for settings in found]
-    values = {name: _mean([getattr(p, name) for p in process]) for name in AVERAGED}
+    values: dict[str, Any] = {name: _mean([getattr(p, name) for p in process]) for name in AVERAGED}
     return TrackNoise(
         acceleration=min(p.acceleration for p in process),
         spin_prior=_mean([settings.spin_prior for settings in found]),

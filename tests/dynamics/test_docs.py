@@ -43,9 +43,11 @@ def test_coefficient_table_is_that_of_the_registry():
 
 
 def test_model_file_example_loads():
-    (text,) = blocks("models.md", "yaml")
+    text, variations = blocks("models.md", "yaml")
     content = yaml.safe_load(text)
     assert model_to_dict(model_from_dict(content)) == content
+    content = {**content, **yaml.safe_load(variations)}
+    assert model_to_dict(model_from_dict(content))["variations"] == content["variations"]
 
 
 def test_model_code_runs(tmp_path, monkeypatch):

@@ -33,6 +33,11 @@ class FeatureDensity(nn.Module):
         edge: () density at which the weight is one half; the peak of a kernel counts as one.
     """
 
+    centres: Tensor
+    spread: Tensor
+    width: Tensor
+    edge: Tensor
+
     def __init__(self, centres: int, features: int) -> None:
         super().__init__()
         self.register_buffer("centres", torch.zeros(centres, features, dtype=torch.float64))
@@ -42,10 +47,9 @@ class FeatureDensity(nn.Module):
 
     def forward(self, features: Tensor) -> Tensor:
         """Weights (..., 1) in [0, 1) of features (..., f), smooth in them."""
-        centres: Tensor = self.centres  # type: ignore[assignment]
-        if not len(centres):
+        if not len(self.centres):
             return features.new_zeros((*features.shape[:-1], 1))
-        away = ((features / self.spread).unsqueeze(-2) - centres) / self.width
+        away = ((features / self.spread).unsqueeze(-2) - self.centres) / self.width
         density = torch.exp(-0.5 * away.square().sum(-1)).mean(-1, keepdim=True)
         weight: Tensor = density / (density + self.edge)
         return weight

@@ -38,6 +38,10 @@ class Fading(nn.Module):
         abroad: () that share: `ABROAD` where tracks that were held out in training predict better with it, else 0.
     """
 
+    abroad: Tensor
+    acceleration: Tensor
+    velocity: Tensor
+
     def __init__(self, flying: FeatureDensity, bouncing: FeatureDensity, radius: float) -> None:
         super().__init__()
         self.flying, self.bouncing, self.radius = flying, bouncing, radius
