@@ -142,7 +142,7 @@ def tracks_settings(
     doubts = {name: sigma for name, sigma in settings.coefficients.items() if name.startswith(DOUBT)}
     plain = replace(settings, coefficients={n: s for n, s in settings.coefficients.items() if n not in doubts})
     outside = outside_share(model, [Smoother(model, surfaces, plain).estimate(part).states for part in parts])
-    begun = plain if outside is None else with_usual_noise(plain, outside)
+    begun = plain if outside is None else with_usual_noise(plain, model, outside)
     found = estimate_noise(model, surfaces, begun, parts, position_known=position_known, errors=False, watch=watch)
     if found is None or outside is None:
         return None if found is None else found.settings
@@ -160,9 +160,10 @@ def widened(process: ProcessNoise, model: BallModel, outside: float) -> ProcessN
     return replace(process, contact_velocity=float(np.hypot(process.contact_velocity, kick)))
 
 
-def with_usual_noise(settings: Settings, share: float) -> Settings:
-    """Settings whose process noise and spin prior move to those of measured tracks, by a share from 0 to 1."""
-    usual = Settings(process=MEASURED)
+def with_usual_noise(settings: Settings, model: BallModel, share: float) -> Settings:
+    """Settings whose noise, but for that of positions, moves to the usual one of a model, by a share from 0 to 1."""
+    usual = Settings.for_measured(model)
+    spreads = {name: _between(s, usual.coefficients.get(name, s), share) for name, s in settings.coefficients.items()}
     process = {
         name: _between(getattr(settings.process, name), getattr(MEASURED, name), share) for name in PROCESS_NOISE
     }
@@ -170,6 +171,7 @@ def with_usual_noise(settings: Settings, share: float) -> Settings:
         settings,
         process=replace(settings.process, **process),
         spin_prior=_between(settings.spin_prior, usual.spin_prior, share),
+        coefficients=spreads,
     )
 
 

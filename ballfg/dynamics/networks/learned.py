@@ -87,10 +87,11 @@ class LearnedModel(BallModel):
             self.offset = nn.Parameter(torch.tensor(START_OFFSET, dtype=torch.float64))
 
     def declared_coefficients(self) -> dict[str, Coefficient]:
-        """The base's coefficients as `base....`, with the doubts of its fading; or the surfaces' offset."""
+        """The base's coefficients as `base....`, with the doubts of a correction that helps abroad; or the offset."""
         if self.base is None:
             return {"offset": TableHeight.coefficients[0]}
-        doubts = {} if self.fading is None else {DOUBT + c.name: c for c in DOUBTS}
+        unused = self.fading is None or not self.fading.get_buffer("abroad") > 0.0
+        doubts = {} if unused else {DOUBT + c.name: c for c in DOUBTS}
         return {BASE + name: c for name, c in self.base.declared_coefficients().items()} | doubts
 
     def rates(self, state: Tensor) -> Rates:

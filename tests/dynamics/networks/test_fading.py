@@ -193,8 +193,8 @@ def test_coefficients_are_estimated_in_foreign_rooms_only(model):
     assert abroad.coefficients["base.flight.drag.k"] == 0.02
     assert abroad.coefficients["fading.flight"] == abroad.coefficients["fading.contact"] == 1.0
     assert (abroad.process.acceleration, abroad.spin_prior) == (0.06, 25.0)
-    assert with_usual_noise(abroad, 0.0).process == abroad.process
-    assert with_usual_noise(abroad, 1.0).process.acceleration == pytest.approx(MEASURED.acceleration)
+    assert with_usual_noise(abroad, model, 0.0).process == abroad.process
+    assert with_usual_noise(abroad, model, 1.0).process.acceleration == pytest.approx(MEASURED.acceleration)
 
 
 def test_the_share_outside_is_one_less_the_weight(model):
