@@ -189,7 +189,7 @@ class SearchLoop:
             if delta_bic(search.fit, alone) >= 0.0:
                 return Outcome.SAME_PATTERN, settled
             settled = fit_problem(alone.problem, alone.unknowns, alone.noise)
-        if halves_differ(settled, hypothesis, self.holdout.held_out):
+        if not _same_change(search, hypothesis) and halves_differ(settled, hypothesis, self.holdout.held_out):
             return Outcome.CONTRADICTORY, settled
         predictive = self.predictive(settled)
         if predictive.errors.prediction_rmse_mm > WORSE * search.predictive.errors.prediction_rmse_mm:
@@ -252,3 +252,13 @@ def _worse(after: Errors, before: Errors) -> bool:
     ratio = after.prediction_rmse_mm / before.prediction_rmse_mm
     typical = float(np.median(after.by_track) / np.median(before.by_track))
     return ratio > 1.0 and not (ratio < FEW_WORSE and typical < MOST_BETTER)
+
+
+def _same_change(search: Search, hypothesis: Hypothesis) -> bool:
+    """Whether an effect changes at the track at which another one was found to change.
+
+    A new table changes several coefficients at once. Until all of them are in the model each bends to make up for the
+    others, in either half differently.
+    """
+    found = {deviation.level for deviation in search.fit.problem.deviations.values() if deviation.first}
+    return any(deviation.level in found for deviation in hypothesis.deviations().values())
