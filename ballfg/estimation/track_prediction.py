@@ -46,7 +46,7 @@ class TrackPrediction:
         measured: (k, 3) m, what the track has at those stamps.
         estimate: from the observed part.
         conformal: by which the sigmas were scaled; None where they are the model's own.
-        outside: (k,) from 0 where a network was trained to 1 far from there; None for a model that does not tell.
+        outside: (k,) share from 0, where a network was trained, to 1 far from there; None for other models.
     """
 
     name: str
