@@ -70,9 +70,11 @@ class BallModel(nn.Module, ABC):
 
     def for_track(self, track: "Track") -> Self:
         """The model with the coefficients of one track: itself, unless some of them differ between tracks."""
-        found = {name: variation.value(track) for name, variation in self.variations.items()}
-        values = {name: torch.tensor(value, dtype=torch.float64) for name, value in found.items() if value is not None}
-        return substitute(self, values) if values else self
+        model = self
+        for name, variation in self.variations.items():
+            if (value := variation.value(track)) is not None:
+                model = _with_value(model, name, value)
+        return model
 
     @functools.cached_property
     def parameter_count(self) -> int:
@@ -210,6 +212,22 @@ def substitute(module: M, values: Mapping[str, Tensor]) -> M:
             raise KeyError(head)
         clone._modules[head] = substitute(child, inner)
     clone.__dict__[_SUBSTITUTED] = substituted | {name for name in values if "." not in name}
+    return clone
+
+
+def _with_value(module: M, name: str, value: float) -> M:
+    """A copy of a module in which one scalar parameter, still a parameter, has another value; the rest is shared."""
+    clone = _shallow_copy(module)
+    head, _, rest = name.partition(".")
+    if rest:
+        child = module._modules[head]
+        assert child is not None
+        clone._modules[head] = _with_value(child, rest, value)
+    else:
+        own = module._parameters[head]
+        clone._parameters[head] = nn.Parameter(
+            torch.tensor(value, dtype=torch.float64), requires_grad=own is not None and own.requires_grad
+        )
     return clone
 
 

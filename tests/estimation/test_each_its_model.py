@@ -14,6 +14,7 @@ from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.simulation import SimulationConfig, parse_effects, simulate
 
 SETTINGS = Settings(position_noise=(0.002, 0.002, 0.002))
+UNSURE = replace(SETTINGS, coefficients={"bounce.restitution.e": 0.01, "flight.drag.k": 0.01})
 TABLE = Surfaces.table_tennis(0.0)
 METHODS = ("smoother", "online", "ekf", "sliding-window")
 
@@ -40,14 +41,15 @@ def tracks():
     return found[::2] + found[1::2]
 
 
+@pytest.mark.parametrize("settings", [SETTINGS, UNSURE], ids=["known", "unsure"])
 @pytest.mark.parametrize("method", METHODS)
-def test_every_track_is_estimated_with_its_own_values(tracks, method):
-    """The same numbers as from a model that has those values for all tracks."""
-    estimator = make_estimator(method, varied(old=0.8, new=0.95), TABLE, SETTINGS)
+def test_every_track_is_estimated_with_its_own_values(tracks, method, settings):
+    """The same numbers as from a model that has those values for all tracks; they may be the mean of a prior."""
+    estimator = make_estimator(method, varied(old=0.8, new=0.95), TABLE, settings)
     for track, estimate in zip(tracks, estimate_tracks(estimator, tracks, len(tracks), 1), strict=True):
         e = {"old": 0.8, "new": 0.95}.get(track.labels["group"])
         model = nominal_model() if e is None else with_restitution(e)
-        alone = make_estimator(method, model, TABLE, SETTINGS).estimate(track)
+        alone = make_estimator(method, model, TABLE, settings).estimate(track)
         np.testing.assert_array_equal(estimate.states, alone.states)
         predicted, expected = estimate.predict(0.3), alone.predict(0.3)
         np.testing.assert_array_equal(predicted.states, expected.states)
