@@ -37,7 +37,7 @@ class TrainedPlan:
     pairs: int | None
 
 
-FULL: Final = TrainedPlan(epochs=8, pairs=None)
+FULL: Final = TrainedPlan(epochs=4, pairs=None)
 QUICK: Final = TrainedPlan(epochs=1, pairs=1)
 
 
