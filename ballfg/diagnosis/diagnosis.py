@@ -14,7 +14,7 @@ from ballfg.diagnosis.remains.generic import ALARM, generic_tests
 from ballfg.diagnosis.remains.residuals import residuals_of
 from ballfg.diagnosis.remains.tracker import look_at_tracker
 from ballfg.diagnosis.report.wording import refusal, sentence
-from ballfg.diagnosis.result import Diagnosis, Errors, GenericTest, Unexplained, Value, Verdict
+from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, GenericTest, Unexplained, Value, Verdict
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.loop import Search, SearchLoop
 from ballfg.diagnosis.search.plausible import implausible
@@ -70,8 +70,7 @@ def diagnose(
         tell("describing what is left without a name")
         embedding, parts = holdout.launcher.embedding, holdout.search_tracks
         helped = fallback(search.fit, embedding, corrected.noise, dataset, parts, search.judged, evaluate)
-    left = sorted(alarms(tests), key=lambda test: test.name == "time")  # a place says more than a correlation
-    unexplained = Unexplained(left[0].where if left else "", share_left(tests), tests, helped)
+    unexplained = what_is_left(tests, helped)
     residuals = residuals_of(search.first)
     declared = {name: float(value.detach()) for name, value in model.named_parameters()}
     calibrated = values_of(search.fit, [name for name in search.fit.problem.free if name in declared], declared)
@@ -145,6 +144,12 @@ def alarms(tests: Sequence[GenericTest]) -> list[GenericTest]:
 def share_left(tests: Sequence[GenericTest]) -> float:
     """The largest share of a first pattern that is still there, 0 to 1."""
     return max((test.share for test in alarms(tests)), default=0.0)
+
+
+def what_is_left(tests: tuple[GenericTest, ...], helped: Fallback | None = None) -> Unexplained:
+    """The pattern that is left, in words, with all tests; helped: its description without a name."""
+    left = sorted(alarms(tests), key=lambda test: test.name == "time")  # a place says more than a correlation
+    return Unexplained(left[0].where if left else "", share_left(tests), tests, helped)
 
 
 def verdict_of(search: Search, tests: Sequence[GenericTest]) -> Verdict:

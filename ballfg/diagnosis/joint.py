@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.diagnosis import alarms, share_left, strange, verdict_of
+from ballfg.diagnosis.diagnosis import strange, verdict_of, what_is_left
 from ballfg.diagnosis.fit.fit import first_guess, fit_model, fit_problem, reachable, values_of
 from ballfg.diagnosis.fit.free import LOOSE, Deviation, declared_free
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, hold_out
@@ -26,11 +26,11 @@ from ballfg.diagnosis.remains.patterns import DRIFT
 from ballfg.diagnosis.remains.residuals import residuals_of
 from ballfg.diagnosis.report.wording import joined as listed
 from ballfg.diagnosis.report.wording import refusal, sentence
-from ballfg.diagnosis.result import Diagnosis, Errors, Unexplained
+from ballfg.diagnosis.result import Diagnosis, Errors, Finding
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.hypothesis import effects_of, has_effect, with_effects, without_effect
 from ballfg.diagnosis.search.loop import SearchLoop
-from ballfg.diagnosis.search.process_noise import PredictiveModel, calibrated_model, noise_about
+from ballfg.diagnosis.search.process_noise import PredictiveModel, calibrated_model, fitted_model, noise_about
 from ballfg.diagnosis.search.varying import Grouping, Varying
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
 from ballfg.estimation import dataset_settings
@@ -108,8 +108,7 @@ def diagnose_jointly(
     tell("looking at what is left")
     tests = tuple(test for test in generic_tests(search.fit, search.first) if test.name != DRIFT)
     verdict = verdict_of(search, tests)
-    left = sorted(alarms(tests), key=lambda test: test.name == "time")
-    unexplained = Unexplained(left[0].where if left else "", share_left(tests), tests, None)
+    unexplained = what_is_left(tests)
     declared = {name: float(value.detach()) for name, value in model.named_parameters()}
     calibrated = values_of(search.fit, [name for name in search.fit.problem.free if name in declared], declared)
     models = predicting.models(search.predictive.model)
@@ -193,12 +192,7 @@ def _first_fit(model: AnalyticModel, halves: Holdout, way: Grouping) -> Fit:
 
 def _of_a_new_room(fit: Fit, declared: AnalyticModel) -> AnalyticModel:
     """The ball's model: what all rooms share, without effects that only single rooms have."""
-    model = with_effects(fit.problem.model)
-    parameters = dict(model.named_parameters())
-    with torch.no_grad():
-        for name, value in fit.unknowns.values.items():
-            if name in parameters:
-                parameters[name].fill_(value)
+    model = fitted_model(fit)
     for deviation in fit.problem.deviations.values():
         name = deviation.coefficient.split(".")[1]
         if not has_effect(declared, name) and deviation.coefficient not in fit.problem.free:
@@ -289,9 +283,9 @@ def _pooled(by_room: dict[str, Errors]) -> Errors:
     )
 
 
-def _of_whom(findings: Sequence[object]) -> list[str]:
+def _of_whom(findings: Sequence[Finding]) -> list[str]:
     """Which effects are the ball's, and which single rooms have."""
-    names = [str(getattr(finding, "name", "")) for finding in findings]
+    names = [finding.name for finding in findings]
     own = tuple(n for n in names if n.endswith("_by_group"))
     shared = tuple(n for n in names if n not in own)
     texts = [f"{listed(shared)}: of the ball, wanted alike in all rooms."] if shared else []

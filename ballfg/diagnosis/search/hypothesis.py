@@ -69,7 +69,7 @@ class Hypothesis:
 
     def parameter(self, coefficient: str) -> str:
         """Its name among the model's parameters."""
-        return f"{self.effect.kind}.{self.name}.{coefficient}"
+        return f"{self.effect.kind}.{self.effect.name}.{coefficient}"
 
     @property
     def columns(self) -> tuple[str, ...]:

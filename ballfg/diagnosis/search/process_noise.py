@@ -37,14 +37,20 @@ class PredictiveModel:
     errors: Errors
 
 
-def calibrated_model(fit: Fit, embedding: SpinEmbedding) -> AnalyticModel:
-    """The fitted model, for estimates and predictions; embedding: names the launcher settings of the fit."""
-    model = with_effects(fit.problem.model)  # a copy
+def fitted_model(fit: Fit) -> AnalyticModel:
+    """A copy of a fit's model with the fitted coefficients; deviations, noise and launcher are not in it."""
+    model = with_effects(fit.problem.model)
     parameters = dict(model.named_parameters())
     with torch.no_grad():
         for name, value in fit.unknowns.values.items():
             if name in parameters:
                 parameters[name].fill_(value)
+    return model
+
+
+def calibrated_model(fit: Fit, embedding: SpinEmbedding) -> AnalyticModel:
+    """The fitted model, for estimates and predictions; embedding: names the launcher settings of the fit."""
+    model = fitted_model(fit)
     model.variations = fit.variations()
     unlabelled = not fit.problem.stretches.labelled.all()
     learned = SpinEmbedding(embedding.labels, embedding.categories, torch.from_numpy(fit.unknowns.launcher))

@@ -56,10 +56,10 @@ def try_varying(
     listed = varying_hypotheses(problem.model, scene_of(before), catalogue, problem.free, known)
     tell(f"testing {len(listed)} ways in which tracks may differ")
     scored = score_all(before, listed)
+    names = sorted({name for way in known for level in way.weights.values() for name in level}, key=place_of)
     refits = []
     for candidate in shortlist(scored, VARYING_ALARM):
         tell(f"fitting with {candidate.hypothesis.name}")
-        names = sorted({name for way in known for level in way.weights.values() for name in level}, key=place_of)
         closer = near(cast(Varying, candidate.hypothesis), searched, names)
         best = _placed(before, closer) if len(closer) > 1 else candidate
         same = between(cast(Varying, best.hypothesis), searched, names)

@@ -165,10 +165,6 @@ class Varying(Hypothesis):
         """The coefficient whose plausible range holds for a level."""
         return f"{self.effect.name}.{_varied(coefficient)}"
 
-    def parameter(self, coefficient: str) -> str:
-        """Its name among the unknowns of a fit."""
-        return f"{self.effect.kind}.{self.effect.name}.{coefficient}"
-
     @property
     def usual(self) -> bool:
         """No ball usually differs from track to track."""
@@ -198,7 +194,7 @@ class Varying(Hypothesis):
         return {self.grouping.named(level): level for level in self.grouping.weights}
 
     def _coefficient(self, strength: str) -> str:
-        return f"{self.effect.kind}.{self.effect.name}.{_varied(strength)}"
+        return self.parameter(_varied(strength))
 
     def added_to(self, model: AnalyticModel) -> AnalyticModel:
         """The model with the effect in it, absent for all tracks alike; the model itself where it has the effect."""
