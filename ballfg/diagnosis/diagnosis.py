@@ -61,7 +61,7 @@ def diagnose(
     evaluate = partial(_errors, holdout, jobs)
     effects = tuple(catalogue or EFFECTS.values())
     search = SearchLoop(holdout, effects, Predicting(holdout, jobs), evaluate, tell, jobs=jobs).run(model)
-    corrected, tracker, search = _with_own_noise(search, holdout, evaluate, tell)
+    corrected, tracker, search = _with_own_noise(search, holdout, evaluate, tell, jobs)
     tell("looking at what is left")
     tests = generic_tests(search.fit, search.first, tracker)
     verdict = verdict_of(search, tests)
@@ -69,7 +69,7 @@ def diagnose(
     if verdict is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in alarms(tests)):
         tell("describing what is left without a name")
         embedding, parts = holdout.launcher.embedding, holdout.search_tracks
-        helped = fallback(search.fit, embedding, corrected.noise, dataset, parts, search.judged, evaluate)
+        helped = fallback(search.fit, embedding, corrected.noise, dataset, parts, search.judged, evaluate, jobs)
     unexplained = what_is_left(tests, helped)
     residuals = residuals_of(search.first)
     declared = {name: float(value.detach()) for name, value in model.named_parameters()}
@@ -96,7 +96,11 @@ def diagnose(
 
 
 def _with_own_noise(
-    search: Search, holdout: Holdout, evaluate: Callable[[BallModel], Errors], tell: Callable[[str], None]
+    search: Search,
+    holdout: Holdout,
+    evaluate: Callable[[BallModel], Errors],
+    tell: Callable[[str], None],
+    jobs: int,
 ) -> tuple[AnalyticModel, TrackNoise | None, Search]:
     """The corrected model with its own noise, the tracker's noise if it is not white, and the search with both.
 
@@ -105,14 +109,14 @@ def _with_own_noise(
     declared, corrected = search.declared.model, search.predictive.model
     tell("looking at the noise about the corrected model")
     if search.fit is not search.first:
-        corrected.noise = noise_about(corrected, holdout.search_tracks, holdout.dataset)
+        corrected.noise = noise_about(corrected, holdout.search_tracks, holdout.dataset, jobs=jobs)
         search = replace(search, judged=evaluate(corrected))
-    tracker = look_at_tracker(corrected, holdout)
+    tracker = look_at_tracker(corrected, holdout, jobs)
     if not tracker.findings:
         return corrected, tracker.noise, search
     tell(f"{' and '.join(finding.name for finding in tracker.findings)} found")
     for model in (declared, corrected):
-        model.noise = noise_about(model, holdout.search_tracks, holdout.dataset, tracker.noise)
+        model.noise = noise_about(model, holdout.search_tracks, holdout.dataset, tracker.noise, jobs=jobs)
         if declared is corrected:
             break
     search = replace(

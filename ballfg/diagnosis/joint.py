@@ -249,7 +249,9 @@ class _Predicting:
         unknowns = replace(fit.unknowns, values=values, launcher=launcher)
         model = calibrated_model(Fit(own, unknowns, noise, fit.predicted), room.holdout.launcher.embedding)
         if room.name not in self._noise:
-            self._noise[room.name] = noise_about(model, room.holdout.search_tracks, room.holdout.dataset)
+            self._noise[room.name] = noise_about(
+                model, room.holdout.search_tracks, room.holdout.dataset, jobs=self.jobs
+            )
         model.noise = self._noise[room.name]
         return model
 

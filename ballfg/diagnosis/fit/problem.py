@@ -45,6 +45,10 @@ class Noise:
     label: float = 20.0
     spin: float = 60.0
 
+    def same_as(self, other: Self) -> bool:
+        """Whether all scales are the same numbers."""
+        return np.array_equal(self.position, other.position) and (self.label, self.spin) == (other.label, other.spin)
+
 
 @dataclass(frozen=True)
 class Problem:

@@ -5,6 +5,7 @@ A few generic terms come first, because people can read them. Only if they do no
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -16,6 +17,7 @@ from ballfg.diagnosis.result import Errors, Fallback
 from ballfg.diagnosis.search.process_noise import calibrated_model, noise_about
 from ballfg.dynamics import AnalyticModel, Architecture, BallModel, LearnedModel, SpinEmbedding, build
 from ballfg.estimation import Settings, Smoother, dataset_settings, dataset_surfaces
+from ballfg.estimation.batch import do_all
 from ballfg.estimation.measurement.as_measured import plainly_measured
 from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
 from ballfg.learning.config.training import LossConfig, OptimizerConfig, TrainConfig
@@ -49,33 +51,62 @@ def fallback(
     parts: Sequence[EvaluationTrack],
     now: Errors,
     evaluate: Callable[[BallModel], Errors],
+    jobs: int = 1,
 ) -> Fallback | None:
     """A description of the rest without a name; None if nothing predicts better.
 
     The fit before and the tracks are those of the search half, the noise is what these show about it. The errors `now`,
-    of the model so far, and those that `evaluate` gives are those on the held-out half.
+    of the model so far, and those that `evaluate` gives are those on the held-out half. With several `jobs` both kinds
+    are made at the same time; readable terms still come first.
     """
-    most = HELPS * now.prediction_rmse_mm
-    terms = sparse_terms(before)
-    if terms is not None:
-        after = fit_with_terms(before, terms)
-        model = calibrated_model(after, embedding)
-        model.noise = noise_about(model, parts, dataset, noise)
+    makers: list[Callable[[], tuple[BallModel, str] | None]] = [
+        partial(_with_terms, before, embedding, noise, dataset, parts),
+        partial(_with_network, before, embedding, noise, dataset, parts),
+    ]
+    together = do_all(makers, jobs) if jobs > 1 else (make() for make in makers)
+    for kind, made in zip(("sparse terms", "learned residual"), together, strict=False):
+        if made is None:
+            continue
+        model, words = made
         errors = evaluate(model)
-        if errors.prediction_rmse_mm < most:
-            return Fallback("sparse terms", describe(terms, after), now, errors, model)
+        if errors.prediction_rmse_mm < HELPS * now.prediction_rmse_mm:
+            return Fallback(kind, words, now, errors, model)
+    return None
+
+
+def _with_terms(
+    before: Fit,
+    embedding: SpinEmbedding,
+    noise: TrackNoise | None,
+    dataset: Dataset,
+    parts: Sequence[EvaluationTrack],
+) -> tuple[AnalyticModel, str] | None:
+    """A model with a few generic terms, and them in words."""
+    terms = sparse_terms(before)
+    if terms is None:
+        return None
+    after = fit_with_terms(before, terms)
+    model = calibrated_model(after, embedding)
+    model.noise = noise_about(model, parts, dataset, noise)
+    return model, describe(terms, after)
+
+
+def _with_network(
+    before: Fit,
+    embedding: SpinEmbedding,
+    noise: TrackNoise | None,
+    dataset: Dataset,
+    parts: Sequence[EvaluationTrack],
+) -> tuple[LearnedModel, str] | None:
+    """A model that a network corrects, and its size in words."""
     base = calibrated_model(before, embedding)
     base.noise = noise
     network = learned_residual(base, dataset, [part.track for part in parts])
     if network is None:
         return None
     network.noise = noise_about(network, parts, dataset, noise)
-    errors = evaluate(network)
-    if errors.prediction_rmse_mm >= most:
-        return None
     size = sum(p.numel() for p in (*network.flight.parameters(), *network.contact.parameters()))
-    words = f"{network.architecture.kind}, {size} parameters"
-    return Fallback("learned residual", words, now, errors, network)
+    return network, f"{network.architecture.kind}, {size} parameters"
 
 
 def describe(terms: SparseTerms, after: Fit) -> str:

@@ -44,12 +44,15 @@ class Tracker:
     noise: TrackNoise | None = None
 
 
-def look_at_tracker(model: AnalyticModel, holdout: Holdout) -> Tracker:
-    """The memory and jitter that both halves show beside a corrected model; model: with its noise about the tracks."""
+def look_at_tracker(model: AnalyticModel, holdout: Holdout, jobs: int = 1) -> Tracker:
+    """The memory and jitter that both halves show beside a corrected model.
+
+    Args: model: with its noise about the tracks.  holdout: the halves.  jobs: processes.
+    """
     settings = dataset_settings(holdout.dataset, model)
     halves = [_parts(half) for half in (holdout.search_tracks, holdout.held_out_tracks)]
     tracks = [track for half in halves for track in half]
-    linear = linearised(model, holdout.surfaces, settings, tracks)
+    linear = linearised(model, holdout.surfaces, settings, tracks, jobs=jobs)
     if linear is None:
         return Tracker()
     own = any(track.sigmas is not None for track in tracks)

@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
-import joblib
 import numpy as np
 import torch
 from scipy import stats
@@ -108,14 +107,6 @@ def refit(before: Fit, scored: Scored) -> Refit:
     after = min(tried, key=lambda fitted: fitted.cost)
     chosen = 0.0 if hypothesis.strengths else FRAME_CHOICE
     return Refit(scored, after, delta_bic(before, after) + chosen)
-
-
-def refit_all(before: Fit, scored: Sequence[Scored], jobs: int = 1) -> list[Refit]:
-    """`refit` of several hypotheses, in processes where there are several of both."""
-    if min(jobs, len(scored)) < 2:
-        return [refit(before, one) for one in scored]
-    parallel = joblib.Parallel(n_jobs=min(jobs, len(scored)))
-    return list(parallel(joblib.delayed(refit)(before, one) for one in scored))
 
 
 def _started_at(before: Fit, hypothesis: Hypothesis, problem: Problem, values: Mapping[str, float]) -> Fit:

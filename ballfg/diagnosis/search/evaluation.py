@@ -102,7 +102,11 @@ def held_out_gain(before: Fit, after: Fit, held_out: Stretches, on_before: Fit |
     """
     for fitted in (before, after):
         held_out = _reached(fitted, held_out)
-    same = on_before is not None and before.noise is after.noise and len(on_before.problem.stretches) == len(held_out)
+    same = (
+        on_before is not None
+        and before.noise.same_as(after.noise)
+        and len(on_before.problem.stretches) == len(held_out)
+    )
     old = on_before if on_before is not None and same else _on(before, held_out, after.noise)
     new = _on(after, held_out, after.noise)
     left = old.weighted_residual(old.robust)

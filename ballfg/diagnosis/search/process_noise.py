@@ -63,7 +63,12 @@ def calibrated_model(fit: Fit, embedding: SpinEmbedding) -> AnalyticModel:
 
 
 def noise_about(
-    model: BallModel, tracks: Sequence[EvaluationTrack], dataset: Dataset, tracker: TrackNoise | None = None
+    model: BallModel,
+    tracks: Sequence[EvaluationTrack],
+    dataset: Dataset,
+    tracker: TrackNoise | None = None,
+    *,
+    jobs: int = 1,
 ) -> TrackNoise | None:
     """The noise that tracks show about a calibrated model; None where they are too short to tell.
 
@@ -72,6 +77,7 @@ def noise_about(
         tracks: those that it was fitted to.
         dataset: their origin.
         tracker: memory of the tracker and jitter of the stamps, which stay; None: those that the dataset states.
+        jobs: processes.
     """
     tracker = tracker or TrackNoise()
     settings = dataset_settings(dataset, model)
@@ -82,8 +88,8 @@ def noise_about(
         memory_time=tracker.memory_time or settings.memory_time,
         stamp_jitter=tracker.stamp_jitter or settings.stamp_jitter,
     )
-    some = spread_over((part.track for part in tracks), len(tracks))
-    found = estimate_noise(model, dataset_surfaces(dataset), settings, some, tracker_known=True, errors=False)
+    some, surfaces = spread_over((part.track for part in tracks), len(tracks)), dataset_surfaces(dataset)
+    found = estimate_noise(model, surfaces, settings, some, tracker_known=True, errors=False, jobs=jobs)
     if found is None:
         return None
     noise = replace(found.noise, stamp_jitter=settings.stamp_jitter or None)
@@ -107,7 +113,7 @@ class Predicting:
         """The fitted model with that noise, and its errors on some tracks of the search half."""
         holdout, model = self.holdout, calibrated_model(fit, self.holdout.launcher.embedding)
         if not self._noise:
-            self._noise.append(noise_about(model, holdout.search_tracks, holdout.dataset))
+            self._noise.append(noise_about(model, holdout.search_tracks, holdout.dataset, jobs=self.jobs))
         (model.noise,) = self._noise
         count = len(holdout.search_tracks)
         some = spread_over(holdout.search_tracks, count, MOST_PREDICTED)

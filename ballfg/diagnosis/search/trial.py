@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import cast
 
 from ballfg.diagnosis.fit.problem import Fit
@@ -10,7 +11,7 @@ from ballfg.diagnosis.search.candidates import (
     ALARM,
     Refit,
     Scored,
-    refit_all,
+    refit,
     refit_driven,
     refit_usual,
     score_all,
@@ -23,6 +24,7 @@ from ballfg.diagnosis.search.varying import Grouping, Varying, between, near, va
 from ballfg.dynamics import Effect
 from ballfg.dynamics.effects.measurement import SpinLabelFrame
 from ballfg.dynamics.variation import place_of
+from ballfg.estimation.batch import do_all
 
 VARYING_ALARM = 0.01
 """As `ALARM`, for effects that differ between tracks: they are many, and flexible."""
@@ -64,7 +66,7 @@ def try_varying(
         best = _placed(before, closer) if len(closer) > 1 else candidate
         same = between(cast(Varying, best.hypothesis), searched, names)
         placed = [replace(best, hypothesis=h, p_value=candidate.p_value) for h in same]
-        fitted = refit_all(before, placed, jobs)
+        fitted = do_all([partial(refit, before, one) for one in placed], jobs)
         # the search half has no track between these places, so that the other half tells them apart
         refits.append(min(fitted, key=lambda r: on_others(r.fit, held_out).cost) if len(same) > 1 else fitted[0])
     return scored, sorted(refits, key=lambda r: r.delta_bic)
@@ -79,13 +81,12 @@ def try_further(
     explain most of any pattern, and stand before its cause.
     """
     names = {refitted.name for refitted in tried}
-    return sorted(
-        _refitted(before, shortlist([s for s in scored if s.hypothesis.name not in names]), tell, jobs),
-        key=lambda r: r.delta_bic,
-    )
+    tasks = _refits(before, shortlist([s for s in scored if s.hypothesis.name not in names]), tell)
+    return sorted(do_all(tasks, jobs), key=lambda r: r.delta_bic)
 
 
-def _refitted(before: Fit, leading: Sequence[Scored], tell: Callable[[str], None], jobs: int) -> list[Refit]:
+def _refits(before: Fit, leading: Sequence[Scored], tell: Callable[[str], None]) -> list[Callable[[], Refit]]:
+    """The refits to do, of every shape of the leading hypotheses."""
     shaped: list[Scored] = []
     for candidate in leading:
         tell(f"fitting with {candidate.hypothesis.name}")
@@ -94,7 +95,7 @@ def _refitted(before: Fit, leading: Sequence[Scored], tell: Callable[[str], None
             shaped += [Scored(frame, None, candidate.p_value) for frame in frames]
         else:
             shaped.append(candidate)
-    return refit_all(before, shaped, jobs)
+    return [partial(refit, before, one) for one in shaped]
 
 
 def _placed(before: Fit, closer: Sequence[Varying]) -> Scored:
@@ -123,20 +124,20 @@ def try_hypotheses(
     driven = [h for h in candidates if h.effect.multiplies_spin and unlabelled]
     scored = score_all(before, [h for h in candidates if h not in driven])
     leading = shortlist(scored)
-    refits = _refitted(before, leading, tell, jobs)
     called = {candidate.hypothesis.name for candidate in leading}
-    for place, hypothesis in enumerate([s.hypothesis for s in scored]):
-        if hypothesis.name in called or not hypothesis.usual or has_effect(model, hypothesis.name):
-            continue
-        tell(f"fitting with {hypothesis.name}, which balls usually have")
-        fitted = refit_usual(before, hypothesis)
-        if fitted.scored.p_value < ALARM:
-            scored[place] = fitted.scored
-            refits.append(fitted)
+    usual = {h.name: h for h in (s.hypothesis for s in scored) if h.usual and h.name not in called}
+    usual = {name: h for name, h in usual.items() if not has_effect(model, name)}
+    tasks = _refits(before, leading, tell)
+    for name in usual:
+        tell(f"fitting with {name}, which balls usually have")
     for hypothesis in driven:
         tell(f"fitting with {hypothesis.name} and spins that nobody labelled")
-        fitted = refit_driven(before, hypothesis)
-        scored.append(fitted.scored)
-        refits += [fitted] if fitted.scored.p_value < ALARM else []
+    tasks += [partial(refit_usual, before, h) for h in usual.values()]
+    tasks += [partial(refit_driven, before, h) for h in driven]
+    refits = do_all(tasks, jobs)
+    telling = {r.name: r.scored for r in refits if r.name in usual and r.scored.p_value < ALARM}
+    scored = [telling.get(s.hypothesis.name, s) for s in scored]
+    scored += [r.scored for r in refits if r.name in {h.name for h in driven}]
+    refits = [r for r in refits if r.name in called or r.scored.p_value < ALARM]
     ranked = sorted(scored, key=lambda s: s.explained, reverse=True)
     return ranked, sorted(refits, key=lambda r: r.delta_bic)

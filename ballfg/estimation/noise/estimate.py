@@ -14,6 +14,7 @@ from scipy.optimize import minimize
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.measurement.as_measured import plainly_measured
 from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
 from ballfg.estimation.noise.forecasts import EARLIEST_START, START_EVERY, Forecaster
@@ -82,6 +83,7 @@ def estimate_noise(
     tracker_known: bool = False,
     errors: bool = True,
     watch: Watch = unwatched,
+    jobs: int = 1,
 ) -> NoiseEstimate | None:
     """The noise that makes forecasts 20 to 300 ms ahead within the tracks most probable.
 
@@ -97,11 +99,12 @@ def estimate_noise(
         tracker_known: whether the settings' memory of the tracker and jitter of the stamps stay as they are.
         errors: whether to compute error bars, which doubles the time.
         watch: told of each track, and of each step of the search.
+        jobs: processes.
     Returns: None where no track is long enough.
     """
     parts = [part for track in tracks if len(part := _first_part(track)) >= LEAST_SAMPLES]
     own_sigmas = any(part.sigmas is not None for part in parts)
-    linear = linearised(model, surfaces, settings, parts, watch)
+    linear = linearised(model, surfaces, settings, parts, watch, jobs=jobs)
     if linear is None:
         return None
     biased = settings.has_memory or not tracker_known
@@ -127,7 +130,13 @@ def estimate_noise(
 
 
 def linearised(
-    model: BallModel, surfaces: Surfaces, settings: Settings, tracks: Sequence[Track], watch: Watch = unwatched
+    model: BallModel,
+    surfaces: Surfaces,
+    settings: Settings,
+    tracks: Sequence[Track],
+    watch: Watch = unwatched,
+    *,
+    jobs: int = 1,
 ) -> LinearTracks | None:
     """Tracks about their estimates with white noise alone; None where all are short.
 
@@ -137,12 +146,14 @@ def linearised(
         settings: of which memory and jitter play no part.
         tracks: measured.
         watch: told of each track.
+        jobs: processes.
     """
     plain = replace(settings, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0)
     if not model.measures_plainly:  # of measured positions as they happened
         inverse = InvertMeasurement(Smoother, model, surfaces, plain)
-        tracks, model = [inverse.undo(track).track for track in tracks], plainly_measured(model)
-    return linearise(Smoother(model, surfaces, plain), tracks, watch)
+        undone = map_tracks(inverse.undo, tracks, len(tracks), jobs)
+        tracks, model = [one.track for one in undone], plainly_measured(model)
+    return linearise(Smoother(model, surfaces, plain), tracks, watch, jobs=jobs)
 
 
 def spread_over(tracks: Iterable[T], count: int, most: int = MOST_TRACKS) -> list[T]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ballfg.arrays import Array
+from ballfg.estimation.batch import map_tracks
 from ballfg.estimation.segmentation import Quality
 from ballfg.estimation.settings import sample_sigmas
 from ballfg.estimation.smoother.problem import START_POSITION_SIGMA, TrackProblem, coefficient_means
@@ -101,18 +103,20 @@ class _Piece:
     labelled: bool
 
 
-def linearise(smoother: Smoother, tracks: Sequence[Track], watch: Watch = unwatched) -> LinearTracks | None:
+def linearise(
+    smoother: Smoother, tracks: Sequence[Track], watch: Watch = unwatched, *, jobs: int = 1
+) -> LinearTracks | None:
     """The tracks about what a smoother makes of them, each in its longest time between hits; None where all are short.
 
-    Args: smoother: model, surfaces and the noise to linearise with.  tracks: measured.  watch: told of each track.
+    Args:
+        smoother: model, surfaces and the noise to linearise with.
+        tracks: measured.
+        watch: told of each track.
+        jobs: processes.
     """
     pieces, numbers = [], []
-    for number, track in enumerate(watch(tracks, len(tracks), "linearising tracks")):
-        model = smoother.model.for_track(track)
-        own = smoother if model is smoother.model else Smoother(model, smoother.surfaces, smoother.settings)
-        problem = own.problem(track)
-        solution = run(own.search(problem))
-        piece = _linearised(problem, solution)
+    made = map_tracks(partial(_piece, smoother), tracks, len(tracks), jobs)
+    for number, piece in enumerate(watch(made, len(tracks), "linearising tracks")):
         if len(piece.times) >= LEAST_SAMPLES and np.isfinite(piece.errors).all():
             pieces.append(piece)
             numbers.append(number)
@@ -120,6 +124,13 @@ def linearise(smoother: Smoother, tracks: Sequence[Track], watch: Watch = unwatc
         return None
     sigmas = np.array(list(smoother.settings.coefficients.values()))
     return _side_by_side(pieces, np.array(numbers), torch.from_numpy(sigmas))
+
+
+def _piece(smoother: Smoother, track: Track) -> _Piece:
+    model = smoother.model.for_track(track)
+    own = smoother if model is smoother.model else Smoother(model, smoother.surfaces, smoother.settings)
+    problem = own.problem(track)
+    return _linearised(problem, run(own.search(problem)))
 
 
 def _linearised(problem: TrackProblem, solution: Solution) -> _Piece:
