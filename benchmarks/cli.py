@@ -157,6 +157,9 @@ def intervals(
     trained: Annotated[
         bool, typer.Option("--trained", help="Train a network on each pair of --data and judge it on the others.")
     ] = False,
+    diagnosed: Annotated[
+        bool, typer.Option("--diagnosed", help="Predict new simulated tracks with the model of a diagnosis.")
+    ] = False,
     out: Out = Path("results"),
     quick: Quick = False,
     seed: Seed = 0,
@@ -173,7 +176,10 @@ def intervals(
     from ballfg.benchmarks.intervals import suite
     from ballfg.benchmarks.intervals import trained as networks
 
+    if diagnosed and data:
+        raise typer.BadParameter("it is for simulated tracks. Leave out --data.", param_hint="--diagnosed")
     more = [*([] if tracks is None else ["--tracks", str(tracks)]), *(["--trained"] if trained else [])]
+    more += ["--diagnosed"] if diagnosed else []
     results = _start("intervals", data or [], quick, seed, more)
     if trained:
         if tracks is not None:
@@ -181,7 +187,7 @@ def intervals(
         networks.run_trained(results, data or [], networks.QUICK if quick else networks.FULL, jobs)
     else:
         datasets = [_open(one) for one in data or []]
-        suite.run_intervals(results, datasets, suite.QUICK if quick else suite.FULL, jobs, tracks)
+        suite.run_intervals(results, datasets, suite.QUICK if quick else suite.FULL, jobs, tracks, diagnosed)
     _finish(results, _folder(out), [])
 
 

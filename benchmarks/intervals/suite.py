@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Final
 
 import numpy as np
 
-from ballfg.benchmarks.intervals.protocol import METHODS, OTHER_TRACKS, USUAL, Judged, judged_both_ways
+from ballfg.benchmarks.intervals.protocol import METHODS, OTHER_TRACKS, USUAL, Judged, judge, judged_both_ways
 from ballfg.benchmarks.metrics import inside
 from ballfg.benchmarks.results import Results
-from ballfg.dynamics import load_model, nominal_model
+from ballfg.diagnosis import diagnose
+from ballfg.dynamics import BallModel, load_model, nominal_model
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation import dataset_settings, dataset_surfaces
 from ballfg.progress import progress
@@ -27,6 +28,9 @@ JITTERS: Final = (0.0, 0.0005, 0.001, 0.002)
 MOST_JITTER: Final = 0.15
 """Share of a frame; the simulator refuses more, because stamps would change places."""
 DROPS: Final = (0.0, 0.05, 0.2)
+OTHER_SEED: Final = 1000
+"""Added to a setting's seed: tracks that its diagnosis has not seen."""
+DIAGNOSED: Final = "model from diagnose"
 
 
 @dataclass(frozen=True)
@@ -42,11 +46,22 @@ QUICK: Final = Plan(settings=2, tracks=16)
 
 
 def run_intervals(
-    results: Results, datasets: Sequence[Dataset], plan: Plan, jobs: int, first: int | None = None
+    results: Results,
+    datasets: Sequence[Dataset],
+    plan: Plan,
+    jobs: int,
+    first: int | None = None,
+    diagnosed: bool = False,
 ) -> None:
     """Rows for measured datasets, or for simulated ones where there are none.
 
-    Args: first: how many tracks of a measured dataset are used, the first ones; None for all.
+    Args:
+        results: to add to.
+        datasets: measured ones.
+        plan: how much is simulated.
+        jobs: processes.
+        first: how many tracks of a measured dataset are used, the first ones; None for all.
+        diagnosed: whether simulated tracks are predicted with the model that a diagnosis of others made.
     """
     if datasets:
         work = [(dataset, method) for dataset in datasets for method in METHODS]
@@ -54,7 +69,8 @@ def run_intervals(
             _measured(results, dataset, method, first, jobs)
         return
     for number in progress(range(plan.settings), plan.settings, "simulated settings judged"):
-        _simulated(results, number, plan.tracks, jobs)
+        config = simulated_config(results.seed, number, plan.tracks)
+        (_diagnosed if diagnosed else _simulated)(results, config, jobs)
 
 
 def _measured(results: Results, dataset: Dataset, method: str, first: int | None, jobs: int) -> None:
@@ -72,23 +88,48 @@ def known_surfaces(dataset: Dataset) -> Surfaces:
     return dataset_surfaces(dataset) if stated else Surfaces.table_tennis(dataset.info.table_height)
 
 
-def _simulated(results: Results, number: int, tracks: int, jobs: int) -> None:
-    config = simulated_config(results.seed, number, tracks)
-    noise = config.noise
+def _simulated(results: Results, config: SimulationConfig, jobs: int) -> None:
     with TemporaryDirectory() as folder:
-        path = Path(folder) / "shots"
-        write_simulation(path, config)
-        dataset = read_dataset(path)
-        model = load_model(path / "model.yaml", radius=dataset.ball.radius)
+        dataset, model = _written(Path(folder) / "shots", config)
         settings, surfaces = dataset_settings(dataset, model), dataset_surfaces(dataset)
-        case = (
-            f"{config.rate:g} Hz, {1e3 * noise.position:.1f} mm, memory {1e3 * noise.memory:.1f} mm "
-            f"{1e3 * noise.memory_time:g} ms, jitter {1e3 * noise.jitter:.2f} ms, {100 * noise.dropout:g} % dropped"
-            f"{', labels' if config.spin_labels else ''}"
-        )
         for method in (USUAL, OTHER_TRACKS):
             judged = judged_both_ways(method, model, surfaces, settings, list(dataset), jobs, position_known=True)
-            _add(results, case, method, judged)
+            _add(results, _case(config), method, judged)
+
+
+def _diagnosed(results: Results, config: SimulationConfig, jobs: int) -> None:
+    """New tracks, predicted with the model that a diagnosis of as many others has written; and the names it found."""
+    with TemporaryDirectory() as folder:
+        dataset, model = _written(Path(folder) / "shots", config)
+        others, _ = _written(Path(folder) / "others", replace(config, seed=config.seed + OTHER_SEED))
+        diagnosis = diagnose(dataset, model, jobs=jobs)
+        found, surfaces = diagnosis.model, dataset_surfaces(others)
+        judged = judge(found, surfaces, dataset_settings(others, found), list(others), jobs)
+    _add(results, _case(config), DIAGNOSED, judged)
+    named = {finding.name: finding for finding in diagnosis.findings}
+    planted = {"tracker_memory": config.noise.memory_time if config.noise.memory else 0.0}
+    planted["stamp_jitter"] = config.noise.jitter
+    for name, truth in planted.items():
+        results.add(_case(config), DIAGNOSED, f"{name}_planted", "ms", 1e3 * truth, 1)
+        value = named[name].parameters["time" if name == "tracker_memory" else "sigma"].value if name in named else 0.0
+        results.add(_case(config), DIAGNOSED, f"{name}_found", "ms", 1e3 * value, 1)
+    results.add(_case(config), DIAGNOSED, "false_names", "1", len(set(named) - set(planted)), 1)
+
+
+def _written(path: Path, config: SimulationConfig) -> tuple[Dataset, BallModel]:
+    """A simulated dataset and its true model."""
+    write_simulation(path, config)
+    dataset = read_dataset(path)
+    return dataset, load_model(path / "model.yaml", radius=dataset.ball.radius)
+
+
+def _case(config: SimulationConfig) -> str:
+    noise = config.noise
+    return (
+        f"{config.rate:g} Hz, {1e3 * noise.position:.1f} mm, memory {1e3 * noise.memory:.1f} mm "
+        f"{1e3 * noise.memory_time:g} ms, jitter {1e3 * noise.jitter:.2f} ms, {100 * noise.dropout:g} % dropped"
+        f"{', labels' if config.spin_labels else ''}"
+    )
 
 
 def simulated_config(seed: int, number: int, tracks: int) -> SimulationConfig:
