@@ -30,19 +30,31 @@ MOST_JITTER: Final = 0.15
 DROPS: Final = (0.0, 0.05, 0.2)
 OTHER_SEED: Final = 1000
 """Added to a setting's seed: tracks that its diagnosis has not seen."""
+PLANTED_SEED: Final = 500
 DIAGNOSED: Final = "model from diagnose"
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How much is run: number of simulated settings, and tracks in each."""
+    """How much is run: number of simulated settings, tracks in each, how often each planted tracker is diagnosed."""
 
     settings: int
     tracks: int
+    planted: int
 
 
-FULL: Final = Plan(settings=20, tracks=50)
-QUICK: Final = Plan(settings=2, tracks=16)
+FULL: Final = Plan(settings=20, tracks=50, planted=3)
+QUICK: Final = Plan(settings=2, tracks=16, planted=0)
+PLANTED: Final = (
+    MeasurementNoise(position=0.002, memory=0.002, memory_time=0.005),
+    MeasurementNoise(position=0.002, memory=0.002, memory_time=0.01),
+    MeasurementNoise(position=0.002, memory=0.002, memory_time=0.02),
+    MeasurementNoise(position=0.002, jitter=0.0005),
+    MeasurementNoise(position=0.002, jitter=0.001),
+    MeasurementNoise(position=0.002, jitter=0.002),
+)
+"""Trackers that a diagnosis should name: one memory, or one jitter."""
+PLANTED_RATE: Final = 120.0
 
 
 def run_intervals(
@@ -68,8 +80,11 @@ def run_intervals(
         for dataset, method in progress(work, len(work), "sets judged"):
             _measured(results, dataset, method, first, jobs)
         return
-    for number in progress(range(plan.settings), plan.settings, "simulated settings judged"):
-        config = simulated_config(results.seed, number, plan.tracks)
+    configs = [simulated_config(results.seed, number, plan.tracks) for number in range(plan.settings)]
+    if diagnosed:
+        repeats = range(len(PLANTED) * plan.planted)
+        configs += [planted_config(results.seed, number, plan.tracks) for number in repeats]
+    for config in progress(configs, len(configs), "simulated settings judged"):
         (_diagnosed if diagnosed else _simulated)(results, config, jobs)
 
 
@@ -99,21 +114,22 @@ def _simulated(results: Results, config: SimulationConfig, jobs: int) -> None:
 
 def _diagnosed(results: Results, config: SimulationConfig, jobs: int) -> None:
     """New tracks, predicted with the model that a diagnosis of as many others has written; and the names it found."""
+    case = f"{_case(config)}, seed {config.seed}"
     with TemporaryDirectory() as folder:
         dataset, model = _written(Path(folder) / "shots", config)
         others, _ = _written(Path(folder) / "others", replace(config, seed=config.seed + OTHER_SEED))
         diagnosis = diagnose(dataset, model, jobs=jobs)
         found, surfaces = diagnosis.model, dataset_surfaces(others)
         judged = judge(found, surfaces, dataset_settings(others, found), list(others), jobs)
-    _add(results, _case(config), DIAGNOSED, judged)
+    _add(results, case, DIAGNOSED, judged)
     named = {finding.name: finding for finding in diagnosis.findings}
     planted = {"tracker_memory": config.noise.memory_time if config.noise.memory else 0.0}
     planted["stamp_jitter"] = config.noise.jitter
     for name, truth in planted.items():
-        results.add(_case(config), DIAGNOSED, f"{name}_planted", "ms", 1e3 * truth, 1)
+        results.add(case, DIAGNOSED, f"{name}_planted", "ms", 1e3 * truth, 1)
         value = named[name].parameters["time" if name == "tracker_memory" else "sigma"].value if name in named else 0.0
-        results.add(_case(config), DIAGNOSED, f"{name}_found", "ms", 1e3 * value, 1)
-    results.add(_case(config), DIAGNOSED, "false_names", "1", len(set(named) - set(planted)), 1)
+        results.add(case, DIAGNOSED, f"{name}_found", "ms", 1e3 * value, 1)
+    results.add(case, DIAGNOSED, "false_names", "1", len(set(named) - set(planted)), 1)
 
 
 def _written(path: Path, config: SimulationConfig) -> tuple[Dataset, BallModel]:
@@ -145,6 +161,16 @@ def simulated_config(seed: int, number: int, tracks: int) -> SimulationConfig:
     )
     return SimulationConfig(
         tracks=tracks, rate=rate, seed=seed + number, noise=noise, spin_labels=bool(rng.integers(2))
+    )
+
+
+def planted_config(seed: int, number: int, tracks: int) -> SimulationConfig:
+    """One of the planted trackers, at a rate at which its jitter leaves the stamps in order; again with other shots."""
+    noise = PLANTED[number % len(PLANTED)]
+    rate = min(PLANTED_RATE, MOST_JITTER / noise.jitter) if noise.jitter else PLANTED_RATE
+    labels = number // len(PLANTED) % 2 == 0
+    return SimulationConfig(
+        tracks=tracks, rate=rate, seed=seed + PLANTED_SEED + number, noise=noise, spin_labels=labels
     )
 
 
