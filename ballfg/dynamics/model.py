@@ -215,6 +215,11 @@ def substitute(module: M, values: Mapping[str, Tensor]) -> M:
     return clone
 
 
+def is_substituted(module: nn.Module) -> bool:
+    """Whether `substitute` made a module."""
+    return any(_SUBSTITUTED in part.__dict__ for part in module.modules())
+
+
 def _with_value(module: M, name: str, value: float) -> M:
     """A copy of a module in which one scalar parameter, still a parameter, has another value; the rest is shared."""
     clone = _shallow_copy(module)

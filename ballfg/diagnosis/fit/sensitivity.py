@@ -14,11 +14,13 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.dual import dual_level, make_dual
-from ballfg.diagnosis.fit.shooting import Trajectories, shoot
+from ballfg.diagnosis.fit.moved_shot import Coefficients, shoot_compiled
+from ballfg.diagnosis.fit.shooting import shoot
 from ballfg.diagnosis.fit.stretches import Stretches
-from ballfg.diagnosis.fit.tangents import RepeatedMotion
+from ballfg.diagnosis.fit.tangents import MovedArc, RepeatedMotion
 from ballfg.dynamics import BallModel, substitute
-from ballfg.state import POSITION, SPIN, STATE_DIM
+from ballfg.dynamics.compiled.functions import CompiledModel, compiled
+from ballfg.state import SPIN, STATE_DIM
 
 MOST_ROWS = 3000
 """Rows of one forward pass. More rows take several passes; a row needs some 50 kB of memory."""
@@ -49,10 +51,21 @@ def predict(model: BallModel, stretches: Stretches, starts: Array, values: Mappi
 
     Args: values: those of some coefficients, the same for all stretches or (n,) one for each.
     """
+    functions, n = compiled(model), len(stretches)
     with torch.no_grad():
-        valued = with_values(model, values, len(stretches))
-        positions, labels, motion = _measured(valued, stretches, torch.from_numpy(starts))
-    return Predicted(positions.numpy(), labels.numpy(), motion.contacts.numpy())
+        valued, state = with_values(model, values, n), torch.from_numpy(starts)
+        times = _true_times(valued, stretches)
+        if functions is None:
+            motion = shoot(valued, state, stretches.heights, stretches.contacts, times[-1])
+            states, contacts = motion.states, motion.contacts
+        else:
+            known, still = _coefficients(model, stretches, values, []), np.zeros((*starts.shape, 0))
+            shot = shoot_compiled(functions, known, starts, still, stretches.heights, stretches.contacts, times[-1])
+            parts = 1 if model.measures_plainly else 3
+            states, contacts = RepeatedMotion(shot.arcs, n, 0, parts).plain_states, shot.contacts
+        positions = valued.measured(states(times), partial(_later, states, times)).transpose(0, 1)
+        labels = valued.labelled(state[:, SPIN])
+    return Predicted(positions.numpy(), labels.numpy(), contacts.numpy())
 
 
 def with_values(model: BallModel, values: Mapping[str, float | Array], count: int) -> BallModel:
@@ -94,6 +107,10 @@ def sensitivity(
     """
     wanted = [_Direction(component=number) for number in range(STATE_DIM if by_start else 0)]
     wanted += [_Direction(None, name, shape) for name, shape in zip(names, shapes or [{}] * len(names), strict=True)]
+    # a fit takes many steps with one model, a score test one look at each of many
+    functions = compiled(model) if by_start and not shapes else None
+    if functions is not None:
+        return _compiled_derivatives(functions, model, stretches, starts, values, wanted)
     size = max(1, most_rows // len(stretches))
     parts = [
         _derivatives(model, stretches, starts, values, wanted[first : first + size])
@@ -103,6 +120,32 @@ def sensitivity(
     return Sensitivity(np.concatenate(positions, axis=-1), np.concatenate(labels, axis=-1))
 
 
+def _compiled_derivatives(
+    functions: CompiledModel,
+    model: BallModel,
+    stretches: Stretches,
+    starts: Array,
+    values: Mapping[str, float | Array],
+    wanted: Sequence[_Direction],
+) -> Sensitivity:
+    """All derivatives with the motion in machine code; measurement effects stay in torch."""
+    n, d = len(stretches), len(wanted)
+    moved = np.zeros((*starts.shape, d))
+    for block, direction in enumerate(wanted):
+        if direction.component is not None:
+            moved[:, direction.component, block] = 1.0
+    with torch.no_grad():
+        times = _true_times(with_values(model, values, n), stretches)
+    known = _coefficients(model, stretches, values, wanted)
+    shot = shoot_compiled(functions, known, starts, moved, stretches.heights, stretches.contacts, times[-1])
+    motion = RepeatedMotion(shot.arcs, n, d, 1 if model.measures_plainly else 3)
+    if model.measures_plainly:
+        return Sensitivity(motion.states(times)[1].numpy(), moved[:, SPIN])
+    with dual_level():
+        repeated, dual, state = _repeated(model, stretches, starts, values, wanted)
+        return Sensitivity(*_measured(dual, motion, _true_times(dual, repeated), state))
+
+
 def _derivatives(
     model: BallModel,
     stretches: Stretches,
@@ -110,6 +153,24 @@ def _derivatives(
     values: Mapping[str, float | Array],
     wanted: Sequence[_Direction],
 ) -> Sensitivity:
+    with dual_level():
+        repeated, dual, state = _repeated(model, stretches, starts, values, wanted)
+        times = _true_times(dual, repeated)
+        motion = shoot(dual, state, repeated.heights, repeated.contacts, times[-1].detach())
+        d = len(wanted)
+        arcs = [MovedArc.of_dual(arc, d) for arc in motion.arcs]
+        moved = RepeatedMotion(arcs, len(stretches), d, 1 if model.measures_plainly else 3)
+        return Sensitivity(*_measured(dual, moved, times, state))
+
+
+def _repeated(
+    model: BallModel,
+    stretches: Stretches,
+    starts: Array,
+    values: Mapping[str, float | Array],
+    wanted: Sequence[_Direction],
+) -> tuple[Stretches, BallModel, Tensor]:
+    """Stretches, model and first states (d n, 9), repeated direction by direction, as dual numbers."""
     n, d = len(stretches), len(wanted)
     repeated = stretches.take(np.tile(np.arange(n), d))
     state = torch.from_numpy(np.tile(starts, (d, 1)))
@@ -124,23 +185,32 @@ def _derivatives(
             tangents[direction.name][rows] = 1.0
         for name, value in direction.values.items():
             primals[name][rows] = value
-    with dual_level():
-        columns = {name: make_dual(primals[name], tangents[name]) for name in values}
-        positions, labels = _moved(substitute(model, columns), repeated, make_dual(state, state_tangent), d)
-    return Sensitivity(positions, labels)
+    columns = {name: make_dual(primals[name], tangents[name]) for name in values}
+    return repeated, substitute(model, columns), make_dual(state, state_tangent)
 
 
-def _moved(model: BallModel, stretches: Stretches, starts: Tensor, directions: int) -> tuple[Array, Array]:
-    """Derivatives (n, k, 3, d) of measured positions and (n, 3, d) of labels; stretches repeated for d directions."""
-    times = _true_times(model, stretches)
-    motion = shoot(model, starts, stretches.heights, stretches.contacts, times[-1].detach())
-    repeated = RepeatedMotion(motion, directions, positions_only=model.measures_plainly)
+def _coefficients(
+    model: BallModel, stretches: Stretches, values: Mapping[str, float | Array], wanted: Sequence[_Direction]
+) -> Coefficients:
+    """All coefficients of a model for each stretch, and which of them moves in which direction."""
+    n, own = len(stretches), {name: p for name, p in model.named_parameters() if p.dim() == 0}
+    known = {name: np.full(n, float(p.detach())) for name, p in own.items()}
+    known |= {name: np.array(np.broadcast_to(value, n), dtype=np.float64) for name, value in values.items()}
+    moving: dict[str, Array] = {}
+    for block, direction in enumerate(wanted):
+        if direction.name is not None:
+            moving.setdefault(direction.name, np.zeros((n, len(wanted))))[:, block] = 1.0
+    return Coefficients(known, moving)
+
+
+def _measured(model: BallModel, motion: RepeatedMotion, times: Tensor, starts: Tensor) -> tuple[Array, Array]:
+    """Derivatives (n, k, 3, d) of measured positions and (n, 3, d) of labels; all given as dual numbers."""
     if model.measures_plainly:
-        positions = repeated.states(times)[1][:, :, POSITION].numpy()
+        positions = motion.states(times)[1].numpy()
     else:
-        measured = model.measured(repeated.dual_states(times), partial(_later, repeated.dual_states, times))
-        positions = _by_direction(_tangent(measured).transpose(0, 1), directions)
-    return positions, _by_direction(_tangent(model.labelled(starts[:, SPIN])), directions)
+        measured = model.measured(motion.dual_states(times), partial(_later, motion.dual_states, times))
+        positions = _by_direction(_tangent(measured).transpose(0, 1), motion.directions)
+    return positions, _by_direction(_tangent(model.labelled(starts[:, SPIN])), motion.directions)
 
 
 def _by_direction(tangent: Tensor, directions: int) -> Array:
@@ -162,11 +232,3 @@ def _true_times(model: BallModel, stretches: Stretches) -> Tensor:
 def _later(states: Callable[[Tensor], Tensor], times: Tensor, delay: Tensor | float) -> Tensor:
     shift = delay.squeeze(-1) if isinstance(delay, Tensor) and delay.dim() else delay
     return states(times + shift)
-
-
-def _measured(model: BallModel, stretches: Stretches, starts: Tensor) -> tuple[Tensor, Tensor, Trajectories]:
-    """Positions (r, k, 3) and labels (r, 3) as they are measured, and the motion behind them."""
-    times = _true_times(model, stretches)
-    motion = shoot(model, starts, stretches.heights, stretches.contacts, times[-1])
-    positions = model.measured(motion.states(times), partial(_later, motion.states, times))
-    return positions.transpose(0, 1), model.labelled(starts[:, SPIN]), motion

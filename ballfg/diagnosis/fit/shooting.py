@@ -106,12 +106,18 @@ def shoot(model: BallModel, start: Tensor, heights: Tensor, guesses: Tensor, end
     return Trajectories(tuple(arcs), contacts)
 
 
-def _fly_arc(model: BallModel, rows: Tensor, state: Tensor, begun: Tensor, duration: Tensor) -> Arc:
+def steps_of_arc(state: Tensor, duration: Tensor) -> tuple[int, Tensor]:
+    """Number of equal steps for arcs of some durations (m,) s from states (m, 9), and their lengths (m,) s."""
     duration = duration.clamp_min(LEAST_ARC)
     fastest = float(state[:, VELOCITY].detach().square().sum(-1).nan_to_num(nan=0.0).max().sqrt())
     longest = min(LONGEST_STEP, max(MAX_STEP, LONGEST_WAY / max(fastest, 1.0)))
     count = max(1, math.ceil(float(duration.max()) / longest))
-    step = (duration / count).unsqueeze(-1)
+    return count, duration / count
+
+
+def _fly_arc(model: BallModel, rows: Tensor, state: Tensor, begun: Tensor, duration: Tensor) -> Arc:
+    count, lengths = steps_of_arc(state, duration)
+    step = lengths.unsqueeze(-1)
     nodes, slopes = [state], [derivative(model.rates, state)]
     for _ in range(count):
         state = rk4_step(model.rates, state, step, slopes[-1])

@@ -16,7 +16,7 @@ from ballfg.diagnosis.remains.sparse import SparseTerms, fit_with_terms, sparse_
 from ballfg.diagnosis.result import Errors, Fallback
 from ballfg.diagnosis.search.process_noise import calibrated_model, noise_about
 from ballfg.dynamics import AnalyticModel, Architecture, BallModel, LearnedModel, SpinEmbedding, build
-from ballfg.estimation import Settings, Smoother, dataset_settings, dataset_surfaces
+from ballfg.estimation import Settings, Smoother, dataset_settings, dataset_surfaces, spread_over
 from ballfg.estimation.batch import do_all
 from ballfg.estimation.measurement.as_measured import plainly_measured
 from ballfg.estimation.measurement.invert_measurement import InvertMeasurement
@@ -37,8 +37,10 @@ VALIDATES = 5
 """One track of so many decides at which epoch the network is best."""
 LEAST_LEARNED = 10
 """From fewer shots no network learns to predict others."""
+MOST_LEARNED = 20
+"""Tracks that a network learns from, evenly spread."""
 EPOCHS = 30
-"""Epochs of the training: about a minute for 25 tracks."""
+"""Epochs of the training: half a minute."""
 POSITION_SCALE = 0.03
 """m, prediction error beyond which a track's part in the loss grows only linearly, so that no few tracks dominate."""
 
@@ -101,7 +103,7 @@ def _with_network(
     """A model that a network corrects, and its size in words."""
     base = calibrated_model(before, embedding)
     base.noise = noise
-    network = learned_residual(base, dataset, [part.track for part in parts])
+    network = learned_residual(base, dataset, [p.track for p in spread_over(parts, len(parts), MOST_LEARNED)])
     if network is None:
         return None
     network.noise = noise_about(network, parts, dataset, noise)

@@ -64,7 +64,7 @@ RANGES: Final[dict[str, Range]] = (
         "distortion.k": Range(-0.05, 0.05, _CAMERAS),
         "time_scale.s": Range(-0.8, 0.9, "cameras of 30 to 240 Hz taken for one another"),
         "counted_frames.missing": Range(0.0, 6.0, "of seven frames one is kept"),
-        "radial_bias.offset": Range(-0.1, 0.1, _CAMERAS),
+        "radial_bias.offset": Range(-0.02, 0.02, "a camera sees the surface, which lies one radius before the centre"),
     }
 )
 """By effect and coefficient, in the coefficient's unit."""

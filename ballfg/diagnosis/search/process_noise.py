@@ -23,6 +23,8 @@ from ballfg.tracks import Dataset, TrackNoise
 
 MOST_PREDICTED = 15
 """Tracks of the search half that are predicted to see whether an effect misleads, evenly spread."""
+MOST_FOR_NOISE = 25
+"""Tracks that the noise is estimated from, evenly spread; more move no number by more than its error bar."""
 LEAST_SPIN_SIGMA = 1.0
 """rad/s. A launcher is not taken to repeat its spin better than that."""
 SPREAD = 0.3
@@ -88,7 +90,7 @@ def noise_about(
         memory_time=tracker.memory_time or settings.memory_time,
         stamp_jitter=tracker.stamp_jitter or settings.stamp_jitter,
     )
-    some, surfaces = spread_over((part.track for part in tracks), len(tracks)), dataset_surfaces(dataset)
+    some, surfaces = spread_over((p.track for p in tracks), len(tracks), MOST_FOR_NOISE), dataset_surfaces(dataset)
     found = estimate_noise(model, surfaces, settings, some, tracker_known=True, errors=False, jobs=jobs)
     if found is None:
         return None

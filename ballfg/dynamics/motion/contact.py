@@ -12,25 +12,19 @@ import torch
 from torch import Tensor
 
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import MAX_STEP, batch_jacobian, derivative, fly, fly_jacobian, rk4_step
+from ballfg.dynamics.motion.integrate import batch_jacobian, derivative, fly, fly_jacobian, rk4_step
+from ballfg.dynamics.motion.limits import (
+    BEYOND,
+    GAP_TOLERANCE,
+    LEAST_FALL,
+    LONGEST_FALL,
+    MAX_STEP,
+    MIN_SPEED,
+    SEARCH_STEPS,
+    TIME_TOLERANCE,
+    TYPICAL_JERK,
+)
 from ballfg.state import Z
-
-SEARCH_STEPS = 12
-"""Upper bound on the search from a guess; one or two are enough for a contact within 20 ms."""
-TIME_TOLERANCE = 1e-13
-"""s. The search stops when the bound on every contact time's error is below."""
-GAP_TOLERANCE = 1e-10
-"""m. A grazing ball whose search stalled this close to the surface has touched it."""
-TYPICAL_JERK = 60.0
-"""m/s^3, in the bound on the search's error."""
-LEAST_FALL = 1.0
-"""m/s^2. The search takes a ball to fall at least as fast as this."""
-LONGEST_FALL = 20.0
-"""s. A contact further away counts as none."""
-BEYOND = 0.3
-"""s. A contact that lies further away than its interval's length and this is no continuation of it any more: NaN."""
-MIN_SPEED = 1e-6
-"""m/s. Least normal speed that a Newton step divides by; a ball that grazes more gently is at its apex."""
 
 
 def contact_time(
@@ -155,6 +149,11 @@ def fly_through_jacobian(
     Args: as for `fly_through`.
     Returns: state after dt (n, 9), contact times (n, k) s, Jacobian (n, 9, 9); detached from any graph.
     """
+    from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
+
+    functions = motion.functions_of(model)
+    if functions is not None:
+        return motion.fly_through_jacobian(model, functions, state, dt, heights)
     state = state.detach()
     jacobian = torch.eye(state.shape[-1], dtype=state.dtype).expand(*state.shape, -1)
     elapsed = torch.zeros_like(dt)

@@ -13,11 +13,8 @@ import torch
 from torch import Tensor
 
 from ballfg.dynamics.model import BallModel, Rates
+from ballfg.dynamics.motion.limits import MAX_STEP
 from ballfg.state import POSITION, SPIN, VELOCITY
-
-MAX_STEP = 0.02
-"""s. Longer intervals are cut into equal steps. The error of a step of 0.02 s is 2e-9 m at 6 m/s, 2e-7 m at
-20 m/s."""
 
 HEAVY = 300_000
 """Parameters times states from which arithmetic, not the number of torch calls, decides what a Jacobian costs."""
@@ -98,6 +95,11 @@ def fly_jacobian(model: BallModel, state: Tensor, dt: Tensor) -> tuple[Tensor, T
     Args: model: the ball.  state: (n, 9).  dt: (n,) s.
     Returns: state after dt (n, 9) and Jacobian (n, 9, 9); both detached from any graph.
     """
+    from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
+
+    functions = motion.functions_of(model)
+    if functions is not None:
+        return motion.fly_jacobian(model, functions, state, dt)
     state = state.detach()
     steps = step_count(dt)
     h = (dt.detach() / steps).unsqueeze(-1)

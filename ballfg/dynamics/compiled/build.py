@@ -1,0 +1,85 @@
+"""From a scalar program to a compiled function, kept on disk under the hash of its source."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import cache, lru_cache
+from pathlib import Path
+from types import ModuleType
+from typing import Any, Final
+
+from numba import njit
+
+HEADER: Final = '''"""Generated from a model of a ball; safe to delete."""
+import math
+
+from numba import njit, types
+
+ONE, TWO = types.Array(types.float64, 1, "C"), types.Array(types.float64, 2, "C")
+
+
+@njit(types.void(ONE, ONE, TWO, TWO, ONE, TWO), error_model="numpy", cache=True)
+'''
+"""What comes before `compute` in a file. Without numpy's error model every division would be checked for a zero."""
+
+
+def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Numba's compiler for one signature; kept on disk where any folder for that can be written to."""
+
+    def compile_one(function: Callable[..., Any]) -> Any:
+        try:
+            return njit(signature, error_model="numpy", cache=True)(function)
+        except RuntimeError:  # no folder: compiled anew by every process
+            return njit(signature, error_model="numpy")(function)
+
+    return compile_one
+
+
+def built(source: str) -> Any:
+    """The compiled `compute` of some source."""
+    return _built(HEADER + source)
+
+
+@cache
+def _built(text: str) -> Any:
+    name = f"ballfg_compiled_{hashlib.sha256(text.encode()).hexdigest()[:20]}"
+    path = cache_folder() / f"{name}.py"
+    if not path.exists():
+        _write(path, text)
+    return _imported(name, path).compute
+
+
+@lru_cache(maxsize=1)
+def cache_folder() -> Path:
+    """The folder of compiled functions: `BALLFG_CACHE`, else the user's cache, else a temporary one."""
+    base = os.environ.get("BALLFG_CACHE") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    folder = Path(base) / "ballfg"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            pass
+    except OSError:
+        folder = Path(tempfile.mkdtemp(prefix="ballfg-"))
+    return folder
+
+
+def _write(path: Path, text: str) -> None:
+    """At once: another process never reads half a file."""
+    with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".part", delete=False) as file:
+        file.write(text)
+    os.replace(file.name, path)
+
+
+def _imported(name: str, path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(name, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    spec.loader.exec_module(module)
+    return module

@@ -1,0 +1,164 @@
+"""Machine code that finds contacts with surfaces and moves balls through them, by the rules of `motion.contact`."""
+
+import math
+
+import numpy as np
+
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.flight import fly_one, slope_at
+from ballfg.dynamics.compiled.signatures import COUNT, FUNCTION, NOTHING, ONE, REAL, THREE, TWO, several
+from ballfg.dynamics.motion.limits import (
+    GAP_TOLERANCE,
+    LEAST_FALL,
+    MAX_STEP,
+    MIN_SPEED,
+    SEARCH_STEPS,
+    TIME_TOLERANCE,
+    TYPICAL_JERK,
+)
+
+LEAST = 1e-300
+"""Keeps a division by zero away."""
+
+
+@machine_code(several(REAL, 3)(FUNCTION, FUNCTION, ONE, ONE, ONE, REAL, REAL))
+def _approach(rates, surface, x, c, s, height, radius):
+    """Gap (m) of a state to a surface, its rate (m/s) and the acceleration (m/s^2) with which it closes."""
+    none, a, o = np.empty((9, 0)), np.empty(6), np.empty(3)
+    rates(x, c, none, np.empty((len(c), 0)), a, np.empty((6, 0)))
+    surface(x, s, none, np.empty((len(s), 0)), o, np.empty((3, 0)))
+    gap = x[2] - height - o[0] - radius
+    rate = x[5] - o[1] * x[3] - o[2] * x[4]
+    return gap, rate, -(a[2] - o[1] * a[0] - o[2] * a[1])
+
+
+@machine_code(COUNT(ONE))
+def _common_steps(durations):
+    """The number of steps that the longest of some durations needs; those that are no numbers need none."""
+    longest = 0.0
+    for duration in durations:
+        if abs(duration) > longest:
+            longest = abs(duration)
+    return max(1, math.ceil(longest / MAX_STEP - 1e-9))
+
+
+@machine_code(NOTHING(FUNCTION, FUNCTION, TWO, TWO, TWO, ONE, REAL, ONE, ONE))
+def _search(rates, surface, state, c, s, heights, radius, longest, tau):
+    """Times (s) of contacts near tau, in place: each step solves the parabola through the motion there. NaN: none.
+
+    All rows take the same number of integration steps, as they do in torch: a time is exact for its steps.
+    """
+    m = len(tau)
+    lost, arrived, none = np.isnan(tau), np.zeros(m, dtype=np.bool_), np.empty((9, 0))
+    nonec, at = np.empty((c.shape[1], 0)), np.empty(9)
+    tau[lost] = 0.0
+    for _ in range(SEARCH_STEPS):
+        steps = _common_steps(tau)
+        for r in range(m):
+            at[:] = state[r]
+            if tau[r] != 0.0:
+                fly_one(rates, at, c[r], none, nonec, tau[r], steps)
+            gap, rate, fall = _approach(rates, surface, at, c[r], s[r], heights[r], radius)
+            used = max(fall, LEAST_FALL)
+            square = rate * rate + 2.0 * used * gap
+            root = math.sqrt(max(square, 0.0))
+            comes = rate < 0.0 and square > 0.0
+            move = 2.0 * gap / max(root - rate, LEAST) if comes else (rate + root) / used
+            error = (TYPICAL_JERK / 6.0 * abs(move) + abs(used - fall) / 2.0) * move * move
+            settled = abs(gap) < GAP_TOLERANCE and abs(move) < MIN_SPEED
+            arrived[r] = (comes and error < TIME_TOLERANCE * abs(rate)) or settled
+            if lost[r] or not abs(tau[r] + move) <= longest[r]:
+                lost[r], tau[r] = True, 0.0
+            else:
+                tau[r] += move
+        if (arrived | lost).all():
+            break
+    for r in range(m):
+        if lost[r] or not arrived[r]:
+            tau[r] = np.nan
+
+
+@machine_code(REAL(FUNCTION, FUNCTION, ONE, ONE, ONE, REAL, REAL, REAL))
+def _scan(rates, surface, state, c, s, height, radius, longest):
+    """Time (s) within one step of the contact, by small steps; NaN where the ball turns before it gets there."""
+    none, nonec, at = np.empty((9, 0)), np.empty((len(c), 0)), state.copy()
+    gap, rate, _ = _approach(rates, surface, at, c, s, height, radius)
+    forward = not (gap < 0.0 and rate < 0.0)
+    step = MAX_STEP if forward else -MAX_STEP
+    for i in range(math.ceil(longest / MAX_STEP)):
+        before = gap
+        fly_one(rates, at, c, none, nonec, step, 1)
+        gap, rate, _ = _approach(rates, surface, at, c, s, height, radius)
+        if not math.isfinite(gap + rate):
+            return np.nan
+        if (before >= 0.0 and gap < 0.0) if forward else gap >= 0.0:
+            return i * step if forward else (i + 1) * step
+        if gap < 0.0 and (rate < 0.0) == forward:
+            return np.nan
+    return np.nan
+
+
+@machine_code(
+    NOTHING(
+        FUNCTION,
+        FUNCTION,
+        FUNCTION,
+        TWO,
+        THREE,
+        TWO,
+        THREE,
+        TWO,
+        THREE,
+        TWO,
+        THREE,
+        ONE,
+        ONE,
+        REAL,
+        ONE,
+        TWO,
+        TWO,
+        THREE,
+    ),
+)
+def contacts(
+    rates, impact, surface, start, startt, c, ct, b, bt, s, st, heights, longest, radius, tau, taut, after, aftert
+):
+    """The next contacts of m falling balls, near their states (m, 9).
+
+    Args:
+        start (m, 9), startt (m, 9, d): states and tangents.
+        c, b, s: coefficients of rates, impact and surface, (m, p) with tangents (m, p, d).
+        heights (m,) m, longest (m,) s: of the surfaces, and how far to look.  radius: m, of the ball.
+    Writes: time to the contact tau (m,) s and the state after it (m, 9), with tangents; NaN where there is none.
+    """
+    d = startt.shape[2]
+    x, xt, k, kt, a, at = np.empty(9), np.empty((9, d)), np.empty(9), np.empty((9, d)), np.empty(6), np.empty((6, d))
+    o, ot = np.empty(3), np.empty((3, d))
+    tau[:] = 0.0
+    _search(rates, surface, start, c, s, heights, radius, longest, tau)
+    if np.isnan(tau).any():
+        near = np.full(len(tau), np.nan)
+        for r in range(len(tau)):
+            if math.isnan(tau[r]):
+                near[r] = _scan(rates, surface, start[r], c[r], s[r], heights[r], radius, longest[r])
+        _search(rates, surface, start, c, s, heights, radius, longest, near)
+        for r in range(len(tau)):
+            if math.isnan(tau[r]):
+                tau[r] = near[r]
+    steps = _common_steps(tau)
+    for r in range(len(start)):
+        found = tau[r]
+        if math.isnan(found):
+            after[r], aftert[r], taut[r] = np.nan, 0.0, 0.0
+            continue
+        x[:] = start[r]
+        xt[:] = startt[r]
+        fly_one(rates, x, c[r], xt, ct[r], found, steps)
+        slope_at(rates, x, c[r], xt, ct[r], k, kt, a, at)
+        surface(x, s[r], xt, st[r], o, ot)
+        speed = min(x[5] - o[1] * x[3] - o[2] * x[4], -MIN_SPEED)
+        for q in range(d):  # at the contact the gap is zero: d gap + rate d tau = 0
+            taut[r, q] = -(xt[2, q] - ot[0, q]) / speed
+            for i in range(9):
+                xt[i, q] += k[i] * taut[r, q]
+        impact(x, b[r], xt, bt[r], after[r], aftert[r])

@@ -1,0 +1,184 @@
+"""The functions of a ball model as machine code: rates, impact and surface, each with its tangents."""
+
+from __future__ import annotations
+
+import warnings
+import weakref
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from typing import Any, Final
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from ballfg.dynamics.compiled.build import built
+from ballfg.dynamics.compiled.source import function_source
+from ballfg.dynamics.compiled.trace import trace
+from ballfg.dynamics.model import BallModel, is_substituted, substitute
+from ballfg.state import STATE_DIM
+
+VALUES_AGREE: Final = 1e-12
+"""Relative difference up to which a compiled value is that of torch."""
+SLOPES_AGREE: Final = 1e-10
+"""As `VALUES_AGREE`, of derivatives."""
+
+
+@dataclass(frozen=True)
+class Function:
+    """A compiled function of a state and some coefficients.
+
+    Attributes:
+        compute: `compute(x, c, xt, ct, y, yt)`: state x (9,), coefficients c (p,), tangents xt (9, d) and ct (p, d);
+            writes the result y (m,) and its tangents yt (m, d).
+        names: of the p coefficients that matter, as in `model.named_parameters()`.
+        size: m.
+    """
+
+    compute: Any
+    names: tuple[str, ...]
+    size: int
+
+
+@dataclass(frozen=True)
+class CompiledModel:
+    """The functions of a ball model.
+
+    Attributes:
+        rates: of the velocity, then of the spin, (6,).
+        impact: state after an impact, (9,).
+        surface: offset of surfaces above their declared heights in m, and their slopes along x and y, (3,).
+        radius: m, of the ball.
+    """
+
+    rates: Function
+    impact: Function
+    surface: Function
+    radius: float
+
+
+_OF_TORCH: Final = frozenset(vars(nn.Module()))
+"""What every module has; its parameters, buffers and parts are looked at by themselves."""
+_BESIDE: Final = frozenset({"trained", "noise", "variations", "measurement"})
+"""What a ball model carries beside its motion."""
+
+
+class NotTheSameError(Exception):
+    """Compiled code that does not give what torch gives."""
+
+
+class NotComparableError(Exception):
+    """A module of which nobody can say whether another one computes the same."""
+
+
+_by_model: weakref.WeakKeyDictionary[BallModel, CompiledModel | None] = weakref.WeakKeyDictionary()
+_by_structure: dict[Hashable, CompiledModel | None] = {}
+
+
+def compiled(model: BallModel) -> CompiledModel | None:
+    """The functions of a model, whose scalar parameters they take as arguments; None where one cannot be compiled.
+
+    Args: model: without substituted parameters. Its structure must not change afterwards.
+    """
+    if model not in _by_model:
+        try:
+            key = _structure(model)
+        except NotComparableError:
+            _by_model[model] = _compiled(model)
+        else:
+            if key not in _by_structure:
+                _by_structure[key] = _compiled(model)
+            _by_model[model] = _by_structure[key]
+    return _by_model[model]
+
+
+def _structure(module: nn.Module) -> Hashable:
+    """What decides which functions a module computes, but for its parameters; copies of a model share it.
+
+    Raises: NotComparableError: if the module has attributes that cannot be compared.
+    """
+    own = {name: _plain(value) for name, value in vars(module).items() if name not in _OF_TORCH | _BESIDE}
+    parts = tuple((name, _structure(child)) for name, child in module.named_children() if name not in _BESIDE)
+    buffers = tuple((name, tuple(b.reshape(-1).tolist())) for name, b in module.named_buffers(recurse=False))
+    parameters = tuple(name for name, _ in module.named_parameters(recurse=False))
+    return type(module), tuple(sorted(own.items())), parameters, buffers, parts
+
+
+def _plain(value: object) -> Hashable:
+    if isinstance(value, tuple):
+        return tuple(_plain(part) for part in value)
+    if isinstance(value, (int, float, str, bool, type(None))):
+        return value
+    raise NotComparableError
+
+
+def _compiled(model: BallModel) -> CompiledModel | None:
+    if any(parameter.dim() for parameter in model.parameters()) or is_substituted(model):  # more than scalars
+        return None
+    functions = (_rates, _impact, _surface)
+    try:
+        return CompiledModel(*(_function(model, function) for function in functions), radius=model.radius)
+    except Exception as error:  # a user's own effect may do anything, and torch runs it all the same
+        warnings.warn(f"{type(model).__name__} runs in torch, and so more slowly: {error}", stacklevel=2)
+        return None
+
+
+def _rates(model: BallModel, state: Tensor) -> Tensor:
+    acceleration, spin_rate = model.rates(state)
+    return torch.cat((acceleration, torch.zeros_like(acceleration) if spin_rate is None else spin_rate), dim=-1)
+
+
+def _impact(model: BallModel, state: Tensor) -> Tensor:
+    return model.after_bounce(state)
+
+
+def _surface(model: BallModel, state: Tensor) -> Tensor:
+    offset, slope = model.surface_offset(state), model.surface_slope(state)
+    if not isinstance(offset, Tensor):
+        offset = state.new_full(state.shape[:-1], offset)
+    slope = state.new_zeros((*state.shape[:-1], 2)) if slope is None else slope.expand(*state.shape[:-1], 2)
+    return torch.cat((offset.expand(state.shape[:-1]).unsqueeze(-1), slope), dim=-1)
+
+
+def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -> Function:
+    scalars = [name for name, parameter in model.named_parameters() if parameter.dim() == 0]
+
+    def of_vectors(state: Tensor, coefficients: Tensor) -> Tensor:
+        values = {name: coefficients[i] for i, name in enumerate(scalars)}
+        return function(substitute(model, values), state)
+
+    program, (state, coefficients), outputs = trace(of_vectors, [STATE_DIM, len(scalars)])
+    needed = set(program.needed(outputs))
+    used = [(name, number) for name, number in zip(scalars, coefficients, strict=True) if number in needed]
+    source = function_source(program, outputs, state, [number for _, number in used])
+    made = Function(built(source), tuple(name for name, _ in used), len(outputs))
+    _compare(model, function, made)
+    return made
+
+
+def _compare(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], made: Function) -> None:
+    """Hold a compiled function against torch at a few states.
+
+    Raises: NotTheSameError: if they differ.
+    """
+    rng, p = np.random.default_rng(0), len(made.names)
+    parameters = dict(model.named_parameters())
+    own = np.array([float(parameters[name].detach()) for name in made.names])
+    for _ in range(4):
+        state = rng.normal(size=STATE_DIM) * np.repeat((1.0, 5.0, 100.0), 3)
+        coefficients = own + 0.05 * rng.normal(size=p)
+        tangents = np.eye(STATE_DIM + p)
+        x, c = torch.from_numpy(state), torch.from_numpy(coefficients)
+
+        def of_both(x: Tensor, c: Tensor) -> Tensor:
+            values = {name: c[i] for i, name in enumerate(made.names)}
+            return function(substitute(model, values), x)
+
+        right = of_both(x, c).detach().numpy()
+        rows = torch.cat([j.reshape(made.size, -1) for j in torch.autograd.functional.jacobian(of_both, (x, c))], dim=1)
+        y, yt = np.zeros(made.size), np.zeros((made.size, STATE_DIM + p))
+        made.compute(state, coefficients, tangents[:STATE_DIM].copy(), tangents[STATE_DIM:].copy(), y, yt)
+        for got, wanted, limit in ((y, right, VALUES_AGREE), (yt, rows.numpy(), SLOPES_AGREE)):
+            scale = np.maximum(1.0, np.abs(wanted))
+            if not (np.abs(got - wanted) <= limit * scale).all():
+                raise NotTheSameError(f"compiled {function.__name__} of {type(model).__name__} differs from torch")

@@ -1,0 +1,117 @@
+"""Flight and contacts of a batch with their Jacobians, in machine code."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ballfg.arrays import Array
+from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.compiled.contacts import contacts
+from ballfg.dynamics.compiled.flight import fly_rows
+from ballfg.dynamics.compiled.functions import CompiledModel, Function, compiled
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.integrate import step_count
+from ballfg.dynamics.motion.limits import BEYOND
+from ballfg.state import STATE_DIM
+
+
+class Moving:
+    """Balls with the derivatives of their states by where they began, as machine code moves them.
+
+    Args:
+        model: the ball; coefficients that travel with the states are columns of theirs.
+        functions: of the model.
+        states: (n, 9 + p).
+
+    Attributes:
+        states: (n, 9) where the balls are.
+        moved: (n, 9, 9 + p) derivatives by the states they began with.
+        elapsed, slower: (n,) s so far, and (n, 9 + p) its derivatives: contacts come sooner or later.
+    """
+
+    def __init__(self, model: BallModel, functions: CompiledModel, states: Tensor) -> None:
+        n, width = states.shape
+        names = model.names if isinstance(model, AugmentedModel) else ()
+        inner = model.model if isinstance(model, AugmentedModel) else model
+        self.functions, self.travelling = functions, states.numpy()[:, STATE_DIM:]
+        self.states = np.array(states.numpy()[:, :STATE_DIM], order="C")  # moved in place
+        self.moved = np.tile(np.eye(STATE_DIM, width), (n, 1, 1))
+        self.elapsed, self.slower = np.zeros(n), np.zeros((n, width))
+        self._places = {name: k for k, name in enumerate(names)}
+        self._values = {name: p for name, p in inner.named_parameters() if p.dim() == 0}
+        self._known: dict[tuple[str, ...], tuple[Array, Array]] = {}
+
+    def fly(self, dt: Array) -> None:
+        """Move on by dt (n,) s, less what has elapsed."""
+        left, earlier = np.ascontiguousarray(dt - self.elapsed), -self.slower
+        steps = step_count(torch.from_numpy(left))
+        rates = self.functions.rates
+        fly_rows(rates.compute, self.states, self.moved, *self._coefficients(rates), left, earlier, steps)
+
+    def bounce(self, height: Array, longest: Array) -> None:
+        """Move on through the next contact with surfaces at some heights (n,) m; NaN where there is none."""
+        n, _, width = self.moved.shape
+        functions = (self.functions.rates, self.functions.impact, self.functions.surface)
+        given = [array for function in functions for array in self._coefficients(function)]
+        tau, slower = np.empty(n), np.empty((n, width))
+        after, moved = np.empty_like(self.states), np.empty_like(self.moved)
+        computes = (function.compute for function in functions)
+        radius = self.functions.radius
+        contacts(*computes, self.states, self.moved, *given, height, longest, radius, tau, slower, after, moved)
+        self.states, self.moved = after, moved
+        self.elapsed, self.slower = self.elapsed + tau, self.slower + slower
+
+    def results(self) -> tuple[Tensor, Tensor]:
+        """States (n, 9 + p) and Jacobians (n, 9 + p, 9 + p)."""
+        n, _, width = self.moved.shape
+        jacobian = np.zeros((n, width, width))
+        jacobian[:, :STATE_DIM] = self.moved
+        own = np.arange(STATE_DIM, width)
+        jacobian[:, own, own] = 1.0
+        states = np.concatenate((self.states, self.travelling), axis=1)
+        return torch.from_numpy(states), torch.from_numpy(jacobian)
+
+    def _coefficients(self, function: Function) -> tuple[Array, Array]:
+        """(n, p) of a function for each ball, and (n, p, 9 + p) how they move."""
+        if function.names not in self._known:
+            n, _, width = self.moved.shape
+            values, moved = np.empty((n, len(function.names))), np.zeros((n, len(function.names), width))
+            for place, name in enumerate(function.names):
+                if name in self._places:
+                    values[:, place] = self.travelling[:, self._places[name]]
+                    moved[:, place, STATE_DIM + self._places[name]] = 1.0
+                else:
+                    values[:, place] = float(self._values[name].detach())
+            self._known[function.names] = values, moved
+        return self._known[function.names]
+
+
+def functions_of(model: BallModel) -> CompiledModel | None:
+    """The functions of a model, with or without coefficients that travel with the state."""
+    return compiled(model.model if isinstance(model, AugmentedModel) else model)
+
+
+def fly_jacobian(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
+    """As `integrate.fly_jacobian`."""
+    moving = Moving(model, functions, state.detach())
+    moving.fly(dt.detach().numpy())
+    return moving.results()
+
+
+def fly_through_jacobian(
+    model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, heights: Sequence[Tensor | float]
+) -> tuple[Tensor, Tensor, Tensor]:
+    """As `contact.fly_through_jacobian`."""
+    moving, whole = Moving(model, functions, state.detach()), dt.detach().numpy()
+    times = []
+    for height in heights:
+        level = np.full(whole.shape, height, dtype=np.float64)
+        moving.bounce(level, np.abs(whole) + BEYOND)
+        times.append(torch.from_numpy(moving.elapsed))
+    moving.fly(whole)
+    after, jacobian = moving.results()
+    return after, torch.stack(times, dim=-1) if times else dt.new_zeros((*dt.shape, 0)), jacobian

@@ -1,0 +1,22 @@
+"""Types of what machine code takes."""
+
+from typing import Any, Final
+
+from numba import types
+
+ONE: Final[Any] = types.Array(types.float64, 1, "C")
+TWO: Final[Any] = types.Array(types.float64, 2, "C")
+THREE: Final[Any] = types.Array(types.float64, 3, "C")
+FOUR: Final[Any] = types.Array(types.float64, 4, "C")
+COUNTS: Final[Any] = types.Array(types.int64, 1, "C")
+REAL: Final[Any] = types.float64
+COUNT: Final[Any] = types.int64
+FLAG: Final[Any] = types.boolean
+NOTHING: Final[Any] = types.void
+FUNCTION: Final[Any] = types.FunctionType(types.void(ONE, ONE, TWO, TWO, ONE, TWO))
+"""A compiled function of a model, `compute(x, c, xt, ct, y, yt)`."""
+
+
+def several(kind: Any, count: int) -> Any:
+    """A tuple of so many results of one kind."""
+    return types.UniTuple(kind, count)

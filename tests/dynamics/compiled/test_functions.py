@@ -1,0 +1,135 @@
+"""Compiled functions of models against torch: every effect, effects of users, and what cannot be compiled."""
+
+import copy
+import warnings
+
+import numpy as np
+import pytest
+import torch
+
+from ballfg.diagnosis.search.hypothesis import has_effect, with_effects
+from ballfg.dynamics import EFFECTS, AnalyticModel, Architecture, build, nominal_model, substitute
+from ballfg.dynamics.compiled import functions
+from ballfg.dynamics.compiled.functions import compiled
+from ballfg.dynamics.compiled.motion import fly_jacobian, fly_through_jacobian, functions_of
+from ballfg.dynamics.effect import Coefficient, FlightEffect
+from ballfg.dynamics.effects.registry import GENERIC
+from ballfg.dynamics.motion.contact import fly_through
+from ballfg.dynamics.motion.integrate import fly
+
+MOTION = {name: effect for name, effect in {**EFFECTS, **GENERIC}.items() if effect.kind != "measurement"}
+
+
+def model_with(*effects):
+    nominal = nominal_model()
+    model = with_effects(nominal, *(e() for e in effects if not has_effect(nominal, e.name)))
+    rng = np.random.default_rng(1)
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter += 0.02 * rng.normal()
+    return model.requires_grad_(False)
+
+
+def states(count=12):
+    rng = np.random.default_rng(2)
+    made = rng.normal(size=(count, 9)) * np.repeat((0.5, 3.0, 100.0), 3)
+    made[:, 2], made[:, 5] = 1.0, -2.0 - np.abs(made[:, 5])
+    return torch.from_numpy(made)
+
+
+def agree(model) -> None:
+    """Flights and bounces, and their Jacobians, are those that autograd finds for torch's own motion."""
+    state, dt = states(), torch.full((12,), 0.031, dtype=torch.float64)
+    known = functions_of(model)
+    assert known is not None
+    after, jacobian = fly_jacobian(model, known, state, dt)
+    torch.testing.assert_close(after, fly(model, state, dt), rtol=1e-12, atol=1e-12)
+    right = torch.autograd.functional.jacobian(lambda x: fly(model, x, dt).sum(0), state).transpose(0, 1)
+    torch.testing.assert_close(jacobian, right, rtol=1e-10, atol=1e-10)
+    dt = torch.full((12,), 0.15, dtype=torch.float64)
+    after, times, jacobian = fly_through_jacobian(model, known, state, dt, (0.76,))
+    whole, when = fly_through(model, state, dt, (0.76,))
+    torch.testing.assert_close(times, when, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(after, whole, rtol=1e-10, atol=1e-10)
+    right = torch.autograd.functional.jacobian(lambda x: fly_through(model, x, dt, (0.76,))[0].sum(0), state)
+    torch.testing.assert_close(
+        jacobian, right.transpose(0, 1), rtol=1e-5, atol=1e-5
+    )  # the rate at a contact is the true one
+
+
+@pytest.mark.parametrize("name", MOTION)
+def test_every_effect(name) -> None:
+    agree(model_with(MOTION[name]))
+
+
+def test_many_effects_together() -> None:
+    agree(model_with(*(effect for name, effect in EFFECTS.items() if name in MOTION)))
+
+
+class Pull(FlightEffect):
+    """A force that a user wrote, with a number that is no coefficient."""
+
+    name = "pull"
+    sentence = decide = "Only a test."
+    coefficients = (Coefficient("k", 0.3, 0.1, "m/s^2", -5.0, 5.0),)
+
+    def __init__(self, power: float) -> None:
+        super().__init__()
+        self.power = power
+
+    def acceleration(self, flight):
+        return self.k * torch.tanh(flight.position) ** self.power
+
+
+class Rounded(Pull):
+    """A force that asks torch for what no rule covers."""
+
+    name = "rounded"
+
+    def acceleration(self, flight):
+        return self.k * torch.special.i0(flight.position)
+
+
+def ball(effect):
+    return AnalyticModel([EFFECTS["gravity"](), effect, EFFECTS["restitution"]()]).requires_grad_(False)
+
+
+def test_an_effect_of_a_user_and_its_own_numbers() -> None:
+    for power in (2, 3):
+        agree(ball(Pull(power)))
+
+
+def test_what_no_rule_covers_runs_in_torch_and_says_so() -> None:
+    model = ball(Rounded(2))
+    with pytest.warns(UserWarning, match="runs in torch.*i0"):
+        assert compiled(model) is None
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert compiled(model) is None  # said once
+        assert compiled(copy.deepcopy(model)) is None
+
+
+def test_copies_share_functions_and_take_their_own_coefficients() -> None:
+    model = nominal_model().requires_grad_(False)
+    other = copy.deepcopy(model)
+    assert compiled(other) is compiled(model)
+    with torch.no_grad():
+        dict(other.named_parameters())["flight.drag.k"].fill_(0.4)
+    agree(other)
+
+
+def test_networks_and_substituted_coefficients_stay_in_torch() -> None:
+    assert compiled(build(Architecture.of("mnn+gs", residual=True), radius=0.02, base=nominal_model(), seed=0)) is None
+    rows = torch.full((12, 1), 0.1, dtype=torch.float64)
+    assert compiled(substitute(nominal_model(), {"flight.drag.k": rows})) is None
+
+
+def test_code_that_differs_from_torch_is_refused(monkeypatch) -> None:
+    right = functions.function_source
+
+    def wrong(*args):
+        return right(*args).replace("y[0] = ", "y[0] = 1e-6 + ")
+
+    monkeypatch.setattr(functions, "function_source", wrong)
+    with pytest.warns(UserWarning, match="differs from torch"):
+        assert compiled(ball(Pull(5))) is None
