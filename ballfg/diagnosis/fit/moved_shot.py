@@ -7,7 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.diagnosis.fit.shooting import steps_of_arc
 from ballfg.diagnosis.fit.tangents import MovedArc
 from ballfg.dynamics.compiled.contacts import contacts
@@ -23,7 +23,7 @@ class Coefficients:
     values: Mapping[str, Array]
     tangents: Mapping[str, Array]
 
-    def of(self, function: Function, rows: Array, directions: int) -> tuple[Array, Array]:
+    def of(self, function: Function, rows: Index, directions: int) -> tuple[Array, Array]:
         """Those of some rows for a compiled function: (m, p) and (m, p, d)."""
         m, p = len(rows), len(function.names)
         values, tangents = np.empty((m, p)), np.zeros((m, p, directions))
@@ -63,7 +63,7 @@ def shoot_compiled(
         ends: (n,) s, how long to fly.
     """
     n, _, d = moved.shape
-    rows, begun, began = np.arange(n), np.zeros(n), np.zeros((n, d))
+    rows, begun, began = np.arange(n, dtype=np.int64), np.zeros(n), np.zeros((n, d))
     met = np.concatenate((heights.numpy(), np.full((n, 1), np.nan)), axis=1)
     about = np.concatenate((guesses.numpy(), np.full((n, 1), np.nan)), axis=1)
     found, arcs = np.full(heights.shape, np.nan), list[MovedArc]()
@@ -93,7 +93,7 @@ def shoot_compiled(
 def _flown(
     model: CompiledModel,
     coefficients: Coefficients,
-    rows: Array,
+    rows: Index,
     start: Array,
     moved: Array,
     begun: Array,

@@ -115,9 +115,9 @@ def _plain(value: object) -> Hashable:
 def _compiled(model: BallModel) -> CompiledModel | None:
     if any(parameter.dim() for parameter in model.parameters()) or is_substituted(model):  # more than scalars
         return None
-    functions = (_rates, _impact, _surface)
     try:
-        return CompiledModel(*(_function(model, function) for function in functions), radius=model.radius)
+        rates, impact, surface = (_function(model, function) for function in (_rates, _impact, _surface))
+        return CompiledModel(rates, impact, surface, model.radius)
     except Exception as error:  # a user's own effect may do anything, and torch runs it all the same
         warnings.warn(f"{type(model).__name__} runs in torch, and so more slowly: {error}", stacklevel=2)
         return None

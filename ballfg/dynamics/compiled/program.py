@@ -15,7 +15,7 @@ Number = int
 """The place of a scalar in its program."""
 
 COMMUTATIVE: Final = frozenset({"add", "mul", "minimum", "maximum"})
-FOLDED: Final = {
+FOLDED: Final[dict[str, Callable[..., float]]] = {
     "add": lambda a, b: a + b,
     "sub": lambda a, b: a - b,
     "mul": lambda a, b: a * b,
