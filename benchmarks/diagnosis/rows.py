@@ -8,7 +8,7 @@ from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.ideal import Ideal
 from ballfg.benchmarks.diagnosis.power_curve import Curve, power_curve
 from ballfg.benchmarks.diagnosis.record import Record
-from ballfg.benchmarks.diagnosis.verdicts import alarmed, complete, named, right
+from ballfg.benchmarks.diagnosis.verdicts import alarmed, complete, false_names, named, right
 from ballfg.benchmarks.metrics import median_and_range, share
 from ballfg.benchmarks.results import Results
 from ballfg.diagnosis.result import Verdict
@@ -148,10 +148,11 @@ def _add_silence(results: Results, cases: Sequence[Case], records: Records) -> N
         f"at most {FEW_TRACKS} tracks": [c for c in cases if c.recording.tracks <= FEW_TRACKS],
     }
     for line, chosen in kinds.items():
-        done = [records.get(case.name) for case in chosen]
-        by_name = [record is None or bool(record.found) for record in done]
+        done = [(records.get(case.name), case.recording) for case in chosen]
+        by_name = [record is None or bool(false_names(record, recording)) for record, recording in done]
+        any_alarm = [record is None or alarmed(record, recording) for record, recording in done]
         _add_share(results, "silence", "effect named", line, by_name)
-        _add_share(results, "silence", "any alarm", line, [record is None or alarmed(record) for record in done])
+        _add_share(results, "silence", "any alarm", line, any_alarm)
 
 
 def _add_repair(results: Results, cases: Sequence[Case], records: Records) -> None:

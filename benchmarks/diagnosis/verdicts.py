@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 
+from ballfg.benchmarks.diagnosis.cases import Recording
 from ballfg.benchmarks.diagnosis.effects import PLANTS
 from ballfg.benchmarks.diagnosis.record import Found, Record
 from ballfg.diagnosis.result import Outcome, Verdict
@@ -44,6 +45,11 @@ def complete(record: Record, planted: tuple[str, ...]) -> bool:
     return every and all(is_one_of(found, planted) for found in record.found)
 
 
-def alarmed(record: Record) -> bool:
-    """Whether a dataset that lacks nothing was said to lack something, by name or without one."""
-    return bool(record.found) or record.verdict != Verdict.NOTHING.value
+def false_names(record: Record, recording: Recording) -> list[str]:
+    """Names found in a dataset whose model lacks nothing; jitter of the stamps is one only where there is none."""
+    return [found.name for found in record.found if found.name != "stamp_jitter" or not recording.jitter]
+
+
+def alarmed(record: Record, recording: Recording) -> bool:
+    """Whether a dataset whose model lacks nothing was said to lack something, by name or without one."""
+    return bool(false_names(record, recording)) or record.verdict == Verdict.UNEXPLAINED.value

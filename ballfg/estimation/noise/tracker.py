@@ -47,6 +47,8 @@ JITTER_UNIT: Final = 1e-3
 """s. The square of this jitter is the unit of its score."""
 STATED_SPREAD: Final = 0.02
 """Standard deviation of the logarithm of a white noise that is stated and believed."""
+FAR: Final = 4.0
+"""Times `STATED_SPREAD` from the stated white noise at which tracks contradict it, however their scores scatter."""
 AGREES: Final = 11.3
 """Chi-square of three numbers (99 %) up to which the white noise that is stated is believed."""
 
@@ -233,7 +235,8 @@ def _settled(fit: MarginalFit, settings: Settings, stated: float | None) -> Marg
         others = np.delete(believed.gradients, rows, axis=1)
         score = _cleared(believed.gradients[:, rows], others)
         total = score.sum(axis=0)
-        if float(total @ np.linalg.solve(score.T @ score, total)) < AGREES:
+        away = np.abs(np.log(believed.values("position") / stated)).max() / STATED_SPREAD
+        if away < FAR and float(total @ np.linalg.solve(score.T @ score, total)) < AGREES:
             return believed
     return MarginalFit(fit.tracks, settings, fit.parameters, fit.known)
 

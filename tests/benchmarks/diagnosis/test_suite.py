@@ -93,9 +93,13 @@ def test_a_pair_is_complete_if_both_are_found_and_nothing_else() -> None:
 
 
 def test_an_alarm_is_a_name_or_another_verdict() -> None:
-    assert not alarmed(record(verdict="nothing lacking"))
-    assert alarmed(record(verdict="unexplained"))
-    assert alarmed(record(("wind",), verdict="nothing lacking"))
+    even, jittering = Recording(), Recording(jitter=0.0003)
+    assert not alarmed(record(verdict="nothing lacking"), even)
+    assert alarmed(record(verdict="unexplained"), even)
+    assert alarmed(record(("wind",)), jittering)
+    assert alarmed(record(("stamp_jitter",)), even)
+    assert not alarmed(record(("stamp_jitter",)), jittering)
+    assert alarmed(record(("stamp_jitter",), verdict="unexplained"), jittering)
 
 
 def test_a_record_keeps_what_counts_and_returns_from_its_file(tmp_path: Path) -> None:

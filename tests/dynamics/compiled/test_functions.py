@@ -23,10 +23,10 @@ MOTION = {name: effect for name, effect in {**EFFECTS, **GENERIC}.items() if eff
 def model_with(*effects):
     nominal = nominal_model()
     model = with_effects(nominal, *(e() for e in effects if not has_effect(nominal, e.name)))
-    rng = np.random.default_rng(1)
+    rng, declared = np.random.default_rng(1), model.declared_coefficients()
     with torch.no_grad():
-        for parameter in model.parameters():
-            parameter += 0.02 * rng.normal()
+        for name, parameter in model.named_parameters():
+            parameter += 0.2 * declared[name].sigma * rng.normal()
     return model.requires_grad_(False)
 
 
