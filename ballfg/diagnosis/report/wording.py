@@ -4,6 +4,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 from ballfg.diagnosis.result import Finding, Outcome, Refusal, Unexplained, Value, Verdict
+from ballfg.estimation.noise.tracker import NUMBERS
 
 NONE = "–"
 """Stands for a missing number."""
@@ -79,14 +80,27 @@ def refusal(refused: Refusal) -> str:
 
 
 def sentence(verdict: Verdict, findings: Sequence[Finding], left: Unexplained) -> str:
-    """The answer of a diagnosis in one sentence."""
+    """The answer of a diagnosis in one sentence; in a second one what was found of the tracker's noise."""
     if verdict is Verdict.NOTHING:
         return "Nothing is lacking that these tracks could show: what the model leaves is noise."
-    names = [" or ".join((f.name, *f.indistinguishable_from)) for f in findings]
-    named = joined(tuple(f"{n} ({listed(f.parameters)})" for n, f in zip(names, findings, strict=True)))
+    effects = [f for f in findings if f.name not in NUMBERS]
+    tracker = [f for f in findings if f.name in NUMBERS]
+    shown = f"The measurements show {_named(tracker)}" if tracker else ""
+    if verdict is Verdict.FOUND and not effects:
+        return f"{shown}; no effect is lacking, and what is left is noise."
     if verdict is Verdict.FOUND:
-        return f"The model lacks {named}; with {'it' if len(findings) == 1 else 'them'} what is left is noise."
-    if not findings:
-        return f"Something is lacking that no effect of the catalogue explains: {left.where}."
-    share = f"{100 * left.share_of_residual:.0f} %"
-    return f"Something is lacking: {named} would explain a part; {share} of a pattern stays unexplained: {left.where}."
+        answer = (
+            f"The model lacks {_named(effects)}; with {'it' if len(effects) == 1 else 'them'} what is left is noise."
+        )
+    elif not effects:
+        answer = f"Something is lacking that no effect of the catalogue explains: {left.where}."
+    else:
+        share = f"{100 * left.share_of_residual:.0f} % of a pattern stays unexplained: {left.where}."
+        answer = f"Something is lacking: {_named(effects)} would explain a part; {share}"
+    return f"{answer} {shown}." if shown else answer
+
+
+def _named(findings: Sequence[Finding]) -> str:
+    return joined(
+        tuple(f"{' or '.join((f.name, *f.indistinguishable_from))} ({listed(f.parameters)})" for f in findings)
+    )
