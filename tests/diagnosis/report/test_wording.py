@@ -10,7 +10,7 @@ from tests.diagnosis.made_diagnosis import found
 
 WIND = replace(found().findings[0], indistinguishable_from=())
 JITTER = replace(WIND, name="stamp_jitter", parameters={"sigma": Value(0.0004, 0.00001, "s")})
-LEFT = Unexplained("flight: off everywhere", 0.4, ())
+LEFT = Unexplained("flight: off everywhere", 0.4, (), None)
 SHOWN = "The measurements show stamp_jitter (sigma 0.000400 ± 0.000010 s)"
 
 
