@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import json
 import os
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache, lru_cache
 from pathlib import Path
 from types import ModuleType
@@ -52,6 +53,23 @@ def _built(text: str) -> Any:
     if not path.exists():
         _write(path, text)
     return _imported(name, path).compute
+
+
+def write_note(about: str, note: Mapping[str, Any]) -> None:
+    """Keep a note on disk for other processes."""
+    _write(_note_path(about), json.dumps(note))
+
+
+def read_note(about: str) -> Any | None:
+    """A note that was kept; None where there is none, or none that can be read."""
+    try:
+        return json.loads(_note_path(about).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+
+
+def _note_path(about: str) -> Path:
+    return cache_folder() / f"{hashlib.sha256(about.encode()).hexdigest()[:20]}.json"
 
 
 @lru_cache(maxsize=1)

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
+import hashlib
+import sys
 import warnings
 import weakref
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ballfg.dynamics.compiled.build import built
-from ballfg.dynamics.compiled.source import function_source
-from ballfg.dynamics.compiled.trace import trace
+from ballfg.dynamics.compiled.build import built, read_note, write_note
 from ballfg.dynamics.model import BallModel, is_substituted, substitute
 from ballfg.state import STATE_DIM
 
@@ -84,10 +86,10 @@ def compiled(model: BallModel) -> CompiledModel | None:
         try:
             key = _structure(model)
         except NotComparableError:
-            _by_model[model] = _compiled(model)
+            _by_model[model] = _compiled(model, None)
         else:
             if key not in _by_structure:
-                _by_structure[key] = _compiled(model)
+                _by_structure[key] = _compiled(model, key)
             _by_model[model] = _by_structure[key]
     return _by_model[model]
 
@@ -101,7 +103,13 @@ def _structure(module: nn.Module) -> Hashable:
     parts = tuple((name, _structure(child)) for name, child in module.named_children() if name not in _BESIDE)
     buffers = tuple((name, tuple(b.reshape(-1).tolist())) for name, b in module.named_buffers(recurse=False))
     parameters = tuple(name for name, _ in module.named_parameters(recurse=False))
-    return type(module), tuple(sorted(own.items())), parameters, buffers, parts
+    return (
+        f"{type(module).__module__}.{type(module).__qualname__}",
+        tuple(sorted(own.items())),
+        parameters,
+        buffers,
+        parts,
+    )
 
 
 def _plain(value: object) -> Hashable:
@@ -112,11 +120,11 @@ def _plain(value: object) -> Hashable:
     raise NotComparableError
 
 
-def _compiled(model: BallModel) -> CompiledModel | None:
+def _compiled(model: BallModel, key: Hashable | None) -> CompiledModel | None:
     if any(parameter.dim() for parameter in model.parameters()) or is_substituted(model):  # more than scalars
         return None
     try:
-        rates, impact, surface = (_function(model, function) for function in (_rates, _impact, _surface))
+        rates, impact, surface = (_function(model, part, key) for part in (_rates, _impact, _surface))
         return CompiledModel(rates, impact, surface, model.radius)
     except Exception as error:  # a user's own effect may do anything, and torch runs it all the same
         warnings.warn(f"{type(model).__name__} runs in torch, and so more slowly: {error}", stacklevel=2)
@@ -140,7 +148,48 @@ def _surface(model: BallModel, state: Tensor) -> Tensor:
     return torch.cat((offset.expand(state.shape[:-1]).unsqueeze(-1), slope), dim=-1)
 
 
-def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -> Function:
+def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], key: Hashable | None) -> Function:
+    """A function, from disk where a model of this structure was traced before and torch still gives the same."""
+    files = None if key is None else _files_of(model)
+    known = None if files is None else f"{function.__name__}, {key}, {files}, torch {torch.__version__}"
+    kept = None if known is None else read_note(known)
+    if kept is not None:
+        made = Function(built(kept["source"]), tuple(kept["names"]), kept["size"])
+        try:
+            _compare(model, function, made)
+        except NotTheSameError:  # its source has changed since
+            pass
+        else:
+            return made
+    source, names, size = _traced(model, function)
+    made = Function(built(source), names, size)
+    _compare(model, function, made)
+    if known is not None:
+        write_note(known, {"source": source, "names": names, "size": size})
+    return made
+
+
+def _files_of(model: BallModel) -> str | None:
+    """Hashes of the files that define the parts of a model; None where one has no file."""
+    found = set()
+    for part in model.modules():
+        file = getattr(sys.modules.get(type(part).__module__), "__file__", None)
+        if file is None:
+            return None
+        found.add(_digest(file))
+    return ",".join(sorted(found))
+
+
+@cache
+def _digest(file: str) -> str:
+    return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:12]
+
+
+def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -> tuple[str, tuple[str, ...], int]:
+    """Source, names of the coefficients that matter, and size of the result."""
+    from ballfg.dynamics.compiled.source import function_source
+    from ballfg.dynamics.compiled.trace import trace  # torch's tracer takes a second to import
+
     scalars = [name for name, parameter in model.named_parameters() if parameter.dim() == 0]
 
     def of_vectors(state: Tensor, coefficients: Tensor) -> Tensor:
@@ -151,9 +200,7 @@ def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor])
     needed = set(program.needed(outputs))
     used = [(name, number) for name, number in zip(scalars, coefficients, strict=True) if number in needed]
     source = function_source(program, outputs, state, [number for _, number in used])
-    made = Function(built(source), tuple(name for name, _ in used), len(outputs))
-    _compare(model, function, made)
-    return made
+    return source, tuple(name for name, _ in used), len(outputs)
 
 
 def _compare(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], made: Function) -> None:
@@ -163,6 +210,8 @@ def _compare(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], 
     """
     rng, p = np.random.default_rng(0), len(made.names)
     parameters = dict(model.named_parameters())
+    if not parameters.keys() >= set(made.names):
+        raise NotTheSameError(f"compiled {function.__name__} takes coefficients that the model does not have")
     own = np.array([float(parameters[name].detach()) for name in made.names])
     for _ in range(4):
         state = rng.normal(size=STATE_DIM) * np.repeat((1.0, 5.0, 100.0), 3)

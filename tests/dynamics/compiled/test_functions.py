@@ -10,6 +10,7 @@ import torch
 from ballfg.diagnosis.search.hypothesis import has_effect, with_effects
 from ballfg.dynamics import EFFECTS, AnalyticModel, Architecture, build, nominal_model, substitute
 from ballfg.dynamics.compiled import functions
+from ballfg.dynamics.compiled.build import cache_folder
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.compiled.motion import fly_jacobian, fly_through_jacobian, functions_of
 from ballfg.dynamics.effect import Coefficient, FlightEffect
@@ -125,11 +126,24 @@ def test_networks_and_substituted_coefficients_stay_in_torch() -> None:
 
 
 def test_code_that_differs_from_torch_is_refused(monkeypatch) -> None:
-    right = functions.function_source
+    right = functions._traced
 
     def wrong(*args):
-        return right(*args).replace("y[0] = ", "y[0] = 1e-6 + ")
+        source, *rest = right(*args)
+        return source.replace("y[0] = ", "y[0] = 1e-6 + "), *rest
 
-    monkeypatch.setattr(functions, "function_source", wrong)
+    monkeypatch.setattr(functions, "_traced", wrong)
     with pytest.warns(UserWarning, match="differs from torch"):
         assert compiled(ball(Pull(5))) is None
+
+
+def test_an_effect_that_was_edited_is_traced_again(monkeypatch, tmp_path) -> None:
+    monkeypatch.setenv("BALLFG_CACHE", str(tmp_path))
+    cache_folder.cache_clear()
+    try:
+        agree(ball(Pull(7)))
+        functions._by_structure.clear()
+        monkeypatch.setattr(Pull, "acceleration", lambda self, flight: self.k * torch.sin(flight.velocity))
+        agree(ball(Pull(7)))
+    finally:
+        cache_folder.cache_clear()
