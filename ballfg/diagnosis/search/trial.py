@@ -26,8 +26,9 @@ from ballfg.dynamics.effects.measurement import SpinLabelFrame
 from ballfg.dynamics.variation import place_of
 from ballfg.estimation.batch import do_all
 
-VARYING_ALARM = 0.01
-"""As `ALARM`, for effects that differ between tracks: they are many, and flexible."""
+VARYING_ALARM = 0.001
+"""As `ALARM`, for effects that differ between tracks: they are flexible, and the best of further places near a change
+is taken, which the correction for the number of hypotheses does not count."""
 AS_GOOD = 0.97
 """Share of the best place's explained residual from which another place of a change is as good."""
 LABELLED = 0.5
