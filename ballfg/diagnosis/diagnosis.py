@@ -18,7 +18,7 @@ from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, GenericTest, Un
 from ballfg.diagnosis.search.evaluation import prediction_errors
 from ballfg.diagnosis.search.loop import Search, SearchLoop
 from ballfg.diagnosis.search.plausible import implausible
-from ballfg.diagnosis.search.process_noise import Predicting, noise_about
+from ballfg.diagnosis.search.process_noise import Predicting, calibrated_model, noise_about
 from ballfg.diagnosis.search.stamp_effects import as_declared
 from ballfg.dynamics import EFFECTS, AnalyticModel, BallModel, Effect
 from ballfg.estimation import dataset_settings
@@ -73,7 +73,9 @@ def diagnose(
     unexplained = what_is_left(tests, helped)
     residuals = residuals_of(search.first)
     declared = {name: float(value.detach()) for name, value in model.named_parameters()}
-    calibrated = values_of(search.fit, [name for name in search.fit.problem.free if name in declared], declared)
+    calibrated = values_of(search.whole, [name for name in search.whole.problem.free if name in declared], declared)
+    whole = calibrated_model(search.whole, holdout.launcher.embedding)
+    whole.noise = corrected.noise
     return Diagnosis(
         dataset=dataset.info.name,
         verdict=verdict,
@@ -87,7 +89,7 @@ def diagnose(
         calibrated=calibrated,
         noise=_noise(search.fit, holdout),
         unexplained=unexplained,
-        model=corrected if helped is None else helped.model,
+        model=whole if helped is None else helped.model,
         residuals_before=residuals,
         residuals_after=residuals if search.fit is search.first else residuals_of(search.fit),
         excluded=holdout.excluded,

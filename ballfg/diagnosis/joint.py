@@ -110,8 +110,8 @@ def diagnose_jointly(
     verdict = verdict_of(search, tests)
     unexplained = what_is_left(tests)
     declared = {name: float(value.detach()) for name, value in model.named_parameters()}
-    calibrated = values_of(search.fit, [name for name in search.fit.problem.free if name in declared], declared)
-    models = predicting.models(search.predictive.model)
+    calibrated = values_of(search.whole, [name for name in search.whole.problem.free if name in declared], declared)
+    models = predicting.models(predicting(search.whole).model)
     remarks = [*_of_whom(search.findings), *predicting.errors_by_room(search.declared.model, search.predictive.model)]
     whole = Diagnosis(
         dataset=", ".join(room.name for room in rooms),
@@ -126,7 +126,7 @@ def diagnose_jointly(
         calibrated=calibrated,
         noise={},
         unexplained=unexplained,
-        model=_of_a_new_room(search.fit, model),
+        model=_of_a_new_room(search.whole, model),
         residuals_before=residuals_of(search.first),
         residuals_after=residuals_of(search.fit),
         excluded=tuple(f"{room.name}: {line}" for room in rooms for line in room.holdout.excluded),

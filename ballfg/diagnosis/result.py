@@ -49,7 +49,7 @@ class Finding:
     Attributes:
         name: of the effect.
         kind: of the effect: `flight`, `bounce` or `measurement`.
-        parameters: its coefficients as fitted on the search half.
+        parameters: its coefficients as fitted to the tracks of both halves, once the search is over.
         p_value: of its score test, corrected for the number of candidates tested.
         delta_bic: BIC of the model with it minus BIC without; negative is better.
         indistinguishable_from: candidates that would have explained as much.
@@ -274,10 +274,10 @@ class Diagnosis:
         after: the same with the corrected model: named effects, and the fallback where there is one.
         tracks_found_on: tracks of the search half.
         tracks_judged_on: tracks of the held-out half.
-        calibrated: declared coefficients as fitted with the corrected model.
+        calibrated: declared coefficients as fitted with the corrected model to the tracks of both halves.
         noise: position noise along x, y, z as estimated (m), and as stated.
         unexplained: the pattern that is left.
-        model: the corrected model.
+        model: the corrected model. Without a fallback it is fitted to the tracks of both halves once it was judged.
         residuals_before: of the search half with the declared model.
         residuals_after: of the search half with the corrected model.
         excluded: sentences on tracks that were not used.

@@ -28,12 +28,11 @@ from ballfg.diagnosis.fit.holdout import launcher_labels
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stretches import stretches_of
 from ballfg.diagnosis.search.candidates import ALARM
-from ballfg.diagnosis.search.loop import CONFIRMED
 from ballfg.diagnosis.search.signatures import hypothesis_signatures, visible_directions
 from ballfg.estimation import Smoother, dataset_settings, dataset_surfaces
 
-LEVEL = ALARM * CONFIRMED
-"""False-alarm rate of one round of the loop: both of its tests must err."""
+LEVEL = ALARM
+"""False-alarm rate of the score tests of one round of the loop."""
 POWER = 0.9
 """Probability at which an effect counts as detectable."""
 

@@ -16,9 +16,12 @@ from ballfg.diagnosis.search.score import Score, score_tests
 from ballfg.diagnosis.search.signatures import hypothesis_signatures
 from ballfg.state import SPIN
 
-ALARM = 0.05
-"""Probability that a hypothesis passes the score tests of one round by chance. It must then also help on the held-out
-half (`loop.CONFIRMED`), so that both together happen by chance in one round of 400."""
+ALARM = 0.0025
+"""Probability that a hypothesis passes the score tests of one round by chance. They look at all tracks, since half of
+them would find only effects 1.4 times as large."""
+HALF_ALARM = 0.05
+"""As `ALARM`, for tests that need a refit and so look at the search half. The effect must then also help on the
+held-out half (`loop.CONFIRMED`), so that both together happen by chance in one round of 400."""
 MOST_REFITS = 6
 """Hypotheses that are refitted in a round."""
 FRAME_CHOICE = 2.0 * float(np.log(FRAMES - 1))
@@ -58,11 +61,11 @@ class Refit:
         return self.scored.hypothesis.name
 
 
-def score_all(before: Fit, candidates: Sequence[Hypothesis]) -> list[Scored]:
+def score_all(fitted: Fit, candidates: Sequence[Hypothesis]) -> list[Scored]:
     """Score tests of all hypotheses.
 
     Args:
-        before: the fit without any of them.
+        fitted: the fit without any of them.
         candidates: the hypotheses; those without strengths are left out.
     Returns: the tests, the hypothesis that explains most first and those that the data cannot show last.
     """
@@ -70,7 +73,7 @@ def score_all(before: Fit, candidates: Sequence[Hypothesis]) -> list[Scored]:
     if not testable:
         return []
     scored = []
-    for hypothesis, score in zip(testable, score_tests(*hypothesis_signatures(before, testable)), strict=True):
+    for hypothesis, score in zip(testable, score_tests(*hypothesis_signatures(fitted, testable)), strict=True):
         p_value = 1.0 if score is None else min(1.0, score.p_value * len(testable))
         scored.append(Scored(hypothesis, score, p_value))
     return sorted(scored, key=lambda s: s.explained, reverse=True)

@@ -9,7 +9,7 @@ from ballfg.arrays import Array
 from ballfg.diagnosis.fit.fit import fit_problem, reachable
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import Fit, Noise
-from ballfg.diagnosis.fit.stretches import Stretches
+from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.fit.system import by_track
 from ballfg.diagnosis.result import Errors
 from ballfg.diagnosis.search.score import score_tests
@@ -122,6 +122,15 @@ def held_out_gain(before: Fit, after: Fit, held_out: Stretches, on_before: Fit |
 def on_others(fitted: Fit, others: Stretches) -> Fit:
     """The fit of first states to stretches of other tracks, everything else as it was fitted."""
     return _on(fitted, _reached(fitted, others), fitted.noise)
+
+
+def on_all(fitted: Fit, others: Fit) -> Fit:
+    """The fit to the tracks of two fits of one problem, at the same noise. others: as `on_others(fitted, ...)`."""
+    own, more = fitted.problem.stretches, others.problem.stretches
+    stretches = joined([own, replace(more, track=more.track + own.track.max() + 1)])
+    starts = np.concatenate((fitted.unknowns.starts, others.unknowns.starts))
+    unknowns = replace(fitted.unknowns, starts=starts)
+    return fit_problem(replace(fitted.problem, stretches=stretches), unknowns, fitted.noise, settle_noise=False)
 
 
 def _reached(fitted: Fit, stretches: Stretches) -> Stretches:

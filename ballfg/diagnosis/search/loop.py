@@ -11,7 +11,7 @@ from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Errors, Outcome, Refusal
 from ballfg.diagnosis.search.candidates import Refit, Scored, delta_bic
-from ballfg.diagnosis.search.evaluation import held_out_gain, on_others
+from ballfg.diagnosis.search.evaluation import held_out_gain, on_all, on_others
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.diagnosis.search.parsimony import halves_differ, insignificant
 from ballfg.diagnosis.search.plausible import implausible, in_table
@@ -75,31 +75,34 @@ class SearchLoop:
         judged = self.judge(declared.model)
         before = self.judge(as_declared(declared.model, stamps)) if stamps.found else judged
         named, findings = stamp_hypotheses(stamps), stamp_findings(first, stamps)
-        search, helped = Search(first, declared, first, declared, before, judged, named, findings), True
+        search, helped = Search(first, declared, first, declared, before, judged, first, named, findings), True
         while helped and len(search.rounds) < MOST_EFFECTS:
             search, helped = self._round(search)
         search = self._pruned(search)
         refused = {n: r for n, r in search.refused.items() if n not in {f.name for f in search.findings}}
-        return replace(search, findings=as_left(search.findings, search.named, search.fit, first), refused=refused)
+        whole = self._on_all(search.fit)
+        findings = as_left(search.findings, search.named, whole, first)
+        return replace(search, whole=whole, findings=findings, refused=refused)
 
     def _round(self, search: Search) -> tuple[Search, bool]:
         """The search after one more round, and whether the round added an effect."""
         number = len(search.rounds) + 1
-        scored, refits = self._tried(search, number)
+        on_before = on_others(search.fit, self.holdout.held_out)
+        scored, refits = self._tried(search, on_before, number)
         if refits and (better := self._better_minimum(search, refits[0])) is not None:
-            search = better
-            scored, refits = self._tried(search, number)
+            search, on_before = better, on_others(better.fit, self.holdout.held_out)
+            scored, refits = self._tried(search, on_before, number)
         outcomes: dict[str, Outcome] = {}
         tell = partial(self._tell, number)
-        winner, refused = self._confirmed(search, refits, outcomes)
+        winner, refused = self._confirmed(search, on_before, refits, outcomes)
         while winner is None and (fitted := try_further(search.fit, scored, refits, tell, self.jobs)):
-            winner, further = self._confirmed(search, fitted, outcomes)
+            winner, further = self._confirmed(search, on_before, fitted, outcomes)
             refits, refused = [*refits, *fitted], refused | further
         if winner is None:  # a pattern that one effect explains for all tracks must not get a name for each group
             ways = self.ways or partial(groupings, self.holdout.tracks)
             some = self.of_some or self.catalogue
             more, fitted = try_varying(search.fit, some, self.holdout.held_out, ways, tell, self.jobs)
-            winner, further = self._confirmed(search, fitted, outcomes)
+            winner, further = self._confirmed(search, on_before, fitted, outcomes)
             scored, refits, refused = [*scored, *more], [*refits, *fitted], refused | further
         if winner is None:
             self.watch(f"round {number}: nothing helps")
@@ -117,14 +120,19 @@ class SearchLoop:
             predictive=winner.predictive,
             judged=winner.judged,
             named=(*winner.kept, winner.refit.scored.hypothesis),
-            findings=(*kept, finding_of(winner.refit, winner.settled, winner.evidence, alike)),
+            findings=(*kept, finding_of(winner.refit, winner.whole, winner.evidence, alike)),
             rounds=(*search.rounds, ranking(scored, refits, outcomes)),
             refused=search.refused | refused,
         )
         return after, True
 
-    def _tried(self, search: Search, number: int) -> tuple[list[Scored], list[Refit]]:
-        return try_hypotheses(search.fit, self.catalogue, partial(self._tell, number), self.jobs)
+    def _tried(self, search: Search, on_before: Fit, number: int) -> tuple[list[Scored], list[Refit]]:
+        whole = on_all(search.fit, on_before)
+        return try_hypotheses(search.fit, whole, self.catalogue, partial(self._tell, number), self.jobs)
+
+    def _on_all(self, fit: Fit) -> Fit:
+        """The fit to the tracks of both halves, from one to the search half: significance is theirs."""
+        return on_all(fit, on_others(fit, self.holdout.held_out))
 
     def _tell(self, number: int, line: str) -> None:
         self.watch(f"round {number}: {line}")
@@ -152,15 +160,13 @@ class SearchLoop:
         return replace(moved, first=settled, declared=predictive, before=judged)
 
     def _confirmed(
-        self, search: Search, refits: Sequence[Refit], outcomes: dict[str, Outcome]
+        self, search: Search, on_before: Fit, refits: Sequence[Refit], outcomes: dict[str, Outcome]
     ) -> tuple[Confirmed | None, dict[str, Refusal]]:
         """The best refit that deserves a name, and better ones that do not; fills in their outcomes."""
         refused: dict[str, Refusal] = {}
-        on_before: Fit | None = None
         for candidate in refits:
             if candidate.delta_bic >= 0.0:
                 break
-            on_before = on_others(search.fit, self.holdout.held_out) if on_before is None else on_before
             examined = self._examined(search, candidate, on_before)
             if isinstance(examined, Confirmed):
                 return examined, refused
@@ -178,7 +184,8 @@ class SearchLoop:
         settled = fit_problem(candidate.fit.problem, candidate.fit.unknowns, candidate.fit.noise)
         if self._implausible(hypothesis, settled):
             return Outcome.IMPLAUSIBLE, settled
-        idle = insignificant(settled, [*search.named, hypothesis], search.first)
+        whole = self._on_all(settled)
+        idle = insignificant(whole, [*search.named, hypothesis], search.first)
         if hypothesis in idle:
             return Outcome.INSIGNIFICANT, settled
         kept = tuple(h for h in search.named if h not in idle)
@@ -189,6 +196,7 @@ class SearchLoop:
             if delta_bic(search.fit, alone) >= 0.0:
                 return Outcome.SAME_PATTERN, settled
             settled = fit_problem(alone.problem, alone.unknowns, alone.noise)
+            whole = self._on_all(settled)
         if not _same_change(search, hypothesis) and halves_differ(settled, hypothesis, self.holdout.held_out):
             return Outcome.CONTRADICTORY, settled
         predictive = self.predictive(settled)
@@ -197,7 +205,7 @@ class SearchLoop:
         judged = self.judge(predictive.model)
         if _worse(judged, search.judged):
             return Outcome.MISLEADING, settled
-        return Confirmed(candidate, evidence, kept, settled, predictive, judged)
+        return Confirmed(candidate, evidence, kept, settled, whole, predictive, judged)
 
     def _implausible(self, hypothesis: Hypothesis, fit: Fit) -> str:
         """Why the fitted strengths of an effect are not plausible; empty if they are."""
@@ -222,7 +230,7 @@ class SearchLoop:
         Effects are asked again whether they are plausible, differ from zero, and make predictions of the judging half
         better; not so the last ones that were `examined` beside all others when they were added.
         """
-        idle = insignificant(search.fit, search.named, search.first)
+        idle = insignificant(self._on_all(search.fit), search.named, search.first) if search.named else []
         for hypothesis in reversed(search.named[: len(search.named) - examined]):
             if hypothesis.name in self.holdout.stamps.found:
                 continue

@@ -19,6 +19,7 @@ class Search:
         first, declared: fit of the declared model, and that model as it predicts.
         fit, predictive: the same of the model with the effects added so far.
         before, judged: prediction errors of both on the judging half.
+        whole: the last model fitted to the tracks of both halves, once the search is over; its values are reported.
         named: the effects added so far, in order.
         findings, rounds: as in `Diagnosis`.
         refused: by name, effects that fit better and are no names.
@@ -30,6 +31,7 @@ class Search:
     predictive: PredictiveModel
     before: Errors
     judged: Errors
+    whole: Fit
     named: tuple[Hypothesis, ...] = ()
     findings: tuple[Finding, ...] = ()
     rounds: tuple[tuple[Candidate, ...], ...] = ()
@@ -45,6 +47,7 @@ class Confirmed:
         evidence: its gain on the held-out half.
         kept: effects named before that stay.
         settled, predictive: the fit with its noise settled, and as it predicts.
+        whole: the same model fitted to the tracks of both halves.
         judged: errors of its predictions on the judging half.
     """
 
@@ -52,6 +55,7 @@ class Confirmed:
     evidence: HeldOutGain
     kept: tuple[Hypothesis, ...]
     settled: Fit
+    whole: Fit
     predictive: PredictiveModel
     judged: Errors
 

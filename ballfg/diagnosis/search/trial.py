@@ -8,7 +8,7 @@ from typing import cast
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.search.candidates import (
-    ALARM,
+    HALF_ALARM,
     Refit,
     Scored,
     refit,
@@ -114,16 +114,24 @@ def _placed(before: Fit, closer: Sequence[Varying]) -> Scored:
 
 
 def try_hypotheses(
-    before: Fit, catalogue: Sequence[type[Effect]], tell: Callable[[str], None], jobs: int = 1
+    before: Fit, whole: Fit, catalogue: Sequence[type[Effect]], tell: Callable[[str], None], jobs: int = 1
 ) -> tuple[list[Scored], list[Refit]]:
-    """Every hypothesis, the one that explains most first; and the refits, the best first."""
+    """Every hypothesis, the one that explains most first; and the refits to the search half, the best first.
+
+    Args:
+        before: the fit to the search half without any of them.
+        whole: the same model's fit to the tracks of both halves, in which effects are looked for.
+        catalogue: effects to look for.
+        tell: is told of progress.
+        jobs: processes.
+    """
     model = before.problem.model
     listed = hypotheses(model, scene_of(before), catalogue)
     candidates = [h for h in listed if not set(h.columns) & set(before.problem.free)]
     tell(f"testing {len(candidates)} hypotheses")
     unlabelled = before.problem.stretches.labelled.mean() < LABELLED
     driven = [h for h in candidates if h.effect.multiplies_spin and unlabelled]
-    scored = score_all(before, [h for h in candidates if h not in driven])
+    scored = score_all(whole, [h for h in candidates if h not in driven])
     leading = shortlist(scored)
     called = {candidate.hypothesis.name for candidate in leading}
     usual = {h.name: h for h in (s.hypothesis for s in scored) if h.usual and h.name not in called}
@@ -136,9 +144,9 @@ def try_hypotheses(
     tasks += [partial(refit_usual, before, h) for h in usual.values()]
     tasks += [partial(refit_driven, before, h) for h in driven]
     refits = do_all(tasks, jobs)
-    telling = {r.name: r.scored for r in refits if r.name in usual and r.scored.p_value < ALARM}
+    telling = {r.name: r.scored for r in refits if r.name in usual and r.scored.p_value < HALF_ALARM}
     scored = [telling.get(s.hypothesis.name, s) for s in scored]
     scored += [r.scored for r in refits if r.name in {h.name for h in driven}]
-    refits = [r for r in refits if r.name in called or r.scored.p_value < ALARM]
+    refits = [r for r in refits if r.name in called or r.scored.p_value < HALF_ALARM]
     ranked = sorted(scored, key=lambda s: s.explained, reverse=True)
     return ranked, sorted(refits, key=lambda r: r.delta_bic)
