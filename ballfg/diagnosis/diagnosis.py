@@ -109,10 +109,7 @@ def _with_own_noise(
     Errors of the declared model are those with the same tracker.
     """
     declared, corrected = search.declared.model, search.predictive.model
-    tell("looking at the noise about the corrected model")
-    if search.fit is not search.first:
-        corrected.noise = noise_about(corrected, holdout.search_tracks, holdout.dataset, jobs=jobs)
-        search = replace(search, judged=evaluate(corrected))
+    tell("looking at the tracker")
     tracker = look_at_tracker(corrected, holdout, jobs)
     if not tracker.findings:
         return corrected, tracker.noise, search

@@ -99,24 +99,21 @@ def noise_about(
 
 
 class Predicting:
-    """Makes models that predict from fits of one holdout, all with the same noise, so that effects alone differ.
+    """Makes models that predict from fits of one holdout, each with the noise that the search half shows about it.
 
-    It is the noise that the search half shows about the first fit. A declared model that lacks an effect has too much
-    of it for the corrected one, whose own noise is found once the search is over.
+    A model that lacks an effect has too much noise for the corrected one; with its noise predictions hardly follow the
+    observed part, and what an effect gains would be judged by how wrong the others are.
 
     Args: holdout: the halves.  jobs: processes.
     """
 
     def __init__(self, holdout: Holdout, jobs: int) -> None:
         self.holdout, self.jobs = holdout, jobs
-        self._noise: list[TrackNoise | None] = []
 
     def __call__(self, fit: Fit) -> PredictiveModel:
-        """The fitted model with that noise, and its errors on some tracks of the search half."""
+        """The fitted model with its noise, and its errors on some tracks of the search half."""
         holdout, model = self.holdout, calibrated_model(fit, self.holdout.launcher.embedding)
-        if not self._noise:
-            self._noise.append(noise_about(model, holdout.search_tracks, holdout.dataset, jobs=self.jobs))
-        (model.noise,) = self._noise
+        model.noise = noise_about(model, holdout.search_tracks, holdout.dataset, jobs=self.jobs)
         count = len(holdout.search_tracks)
         some = spread_over(holdout.search_tracks, count, MOST_PREDICTED)
         settings = dataset_settings(holdout.dataset, model)
