@@ -35,6 +35,11 @@ PLAUSIBLE = 10.0
 stronger than that (air that moves at 20 m/s through a part of the room) stands for something else."""
 POORER = 0.3
 """Share of an effect's gain that is there without the effect too, from which the fit before was in a poor minimum."""
+SURELY = 1.645
+"""Standard errors, from the scatter of tracks, by which squared prediction errors grow where predictions are worse."""
+HARDLY = 1.01
+"""Ratio of prediction errors that counts as worse even if the tracks cannot tell. An effect near the detection limit
+moves predictions by less than that, up or down by chance."""
 FEW_WORSE = 1.05
 MOST_BETTER = 0.9
 """Where half of the tracks are predicted so much better, the root mean square over all may grow by so much: a few balls
@@ -256,10 +261,13 @@ class SearchLoop:
 
 
 def _worse(after: Errors, before: Errors) -> bool:
-    """Whether predictions got worse."""
+    """Whether predictions got worse, by more than chance makes of an effect that hardly moves them."""
     ratio = after.prediction_rmse_mm / before.prediction_rmse_mm
     typical = float(np.median(after.by_track) / np.median(before.by_track))
-    return ratio > 1.0 and not (ratio < FEW_WORSE and typical < MOST_BETTER)
+    if ratio <= 1.0 or (ratio < FEW_WORSE and typical < MOST_BETTER):
+        return False
+    growth = np.square(after.by_track) - np.square(before.by_track)
+    return ratio > HARDLY or bool(growth.mean() > SURELY * growth.std(ddof=1) / np.sqrt(len(growth)))
 
 
 def _same_change(search: Search, hypothesis: Hypothesis) -> bool:

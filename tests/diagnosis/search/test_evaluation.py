@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from ballfg.diagnosis.fit.fit import covariance_of, fit_problem
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
+from ballfg.diagnosis.fit.stretches import joined
 from ballfg.diagnosis.search.candidates import refit, score_all
-from ballfg.diagnosis.search.evaluation import held_out_gain, prediction_errors
+from ballfg.diagnosis.search.evaluation import held_out_gain, on_all, on_others, prediction_errors
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.settings import Settings
@@ -48,6 +52,21 @@ def test_a_fit_gains_nothing_over_itself(calm_fit, others):
     found = held_out_gain(calm_fit, calm_fit, others[1])
     assert found.gain == 0.0
     assert found.p_value == 1.0
+
+
+def test_the_fit_to_all_tracks_is_that_of_both_halves_at_once(windy, windy_fit, others):
+    """From the fit to one half, and the states that go with it on the other."""
+    found = on_all(windy_fit, on_others(windy_fit, others[0]))
+    theirs = replace(others[0], track=others[0].track + len(windy.stretches))
+    problem = replace(windy_fit.problem, stretches=joined([windy_fit.problem.stretches, theirs]))
+    starts = np.concatenate((windy_fit.problem.stretches.starts.numpy(), theirs.starts.numpy()))
+    unknowns = replace(windy_fit.unknowns, starts=starts)
+    right = fit_problem(problem, unknowns, windy_fit.noise, settle_noise=False)
+    assert found.cost == pytest.approx(right.cost, rel=1e-5)  # the tolerance of a minimisation
+    assert len(found.gram) == len(np.unique(windy.stretches.track)) + 12
+    sigmas = np.sqrt(np.diagonal(covariance_of(right, list(problem.free))))
+    difference = [found.unknowns.values[n] - right.unknowns.values[n] for n in problem.free]
+    assert (np.abs(difference) < 0.1 * sigmas).all()
 
 
 def test_stretches_of_one_track_are_one_observation(windy_fit, with_wind, others):

@@ -11,7 +11,7 @@ from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.result import Errors, Outcome
 from ballfg.diagnosis.search.hypothesis import has_effect, without_effect
-from ballfg.diagnosis.search.loop import SearchLoop
+from ballfg.diagnosis.search.loop import SearchLoop, _worse
 from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.settings import Settings
@@ -146,13 +146,27 @@ def test_what_predicts_the_judging_half_worse_is_not_added(make_ball, make_launc
     data = (shots(make_ball, make_launches, make_shots, seed, table_tilt={"x": 0.02, "y": 0.0}) for seed in (71, 72))
 
     def judge(model):
-        return judged(10.1 if has_effect(model, "table_tilt") else 10.0)
+        return judged(10.2 if has_effect(model, "table_tilt") else 10.0)
 
     search = SearchLoop(holdout(*data), [EFFECTS["table_tilt"]], predicts_well, judge, unwatched).run(make_ball())
     assert search.findings == ()
     (row,) = search.rounds[0]
     assert row.outcome is Outcome.MISLEADING
     assert search.refused["table_tilt"].outcome is Outcome.MISLEADING
+
+
+def errors_of(tracks):
+    return Errors(float(np.sqrt(np.square(tracks).mean())), 1.0, 1.0, 0.0, np.asarray(tracks))
+
+
+def test_predictions_are_worse_where_chance_does_not_make_them_so():
+    before = np.random.default_rng(3).uniform(5.0, 15.0, 40)
+    up_and_down = before * np.where(np.arange(40) % 2, 1.05, 0.96)  # a little worse on the whole
+    assert 1.0 < errors_of(up_and_down).prediction_rmse_mm / errors_of(before).prediction_rmse_mm < 1.01
+    assert not _worse(errors_of(up_and_down), errors_of(before))
+    assert _worse(errors_of(1.005 * before), errors_of(before))  # as little, but on every track
+    assert _worse(errors_of(1.02 * up_and_down), errors_of(before))
+    assert not _worse(errors_of(0.99 * before), errors_of(before))
 
 
 def test_what_later_effects_make_superfluous_is_taken_out_again(make_ball, make_launches, make_shots):
