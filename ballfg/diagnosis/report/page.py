@@ -63,8 +63,8 @@ def _errors(diagnosis: Diagnosis) -> Html:
         kind="cards",
     )
     words = (
-        f"Of {diagnosis.tracks_judged_on} tracks that had no part in the search, the first 40 % of each was observed. "
-        "The rest was predicted and compared with the measured positions."
+        f"Both models were fitted to the other tracks. Of {diagnosis.tracks_judged_on} tracks the first 40 % of each was "
+        "observed. The rest was predicted and compared with the measured positions."
     )
     if not changed:
         return section("How well the model predicts", tag("p", words), cards)
@@ -223,9 +223,10 @@ def _values(values: Mapping[str, Value]) -> Iterator[tuple[str, ...]]:
 def _evaluation(diagnosis: Diagnosis) -> Html:
     """The halves, their use, and tracks that were left out."""
     words = (
-        f"{diagnosis.tracks_found_on} tracks were searched, {diagnosis.tracks_judged_on} others were held out. "
-        "Residuals, rankings and coefficients are those of the first, errors those of the second. Probabilities are "
-        "corrected for the number of candidates and use the noise that the tracks show."
+        f"Effects were looked for in all tracks, fitted to {diagnosis.tracks_found_on} of them, and had to help on the "
+        f"other {diagnosis.tracks_judged_on}, on which errors are measured. The coefficients of the corrected model are "
+        "those of all tracks. Probabilities are corrected for the number of candidates and use the noise that the "
+        "tracks show."
     )
     excluded = items(diagnosis.excluded)
     return section("How it was evaluated", tag("p", words), tag("p", "Left out:") if excluded else "", excluded)
