@@ -63,7 +63,7 @@ def _errors(diagnosis: Diagnosis) -> Html:
         kind="cards",
     )
     words = (
-        f"Both models were fitted to the other tracks. Of {diagnosis.tracks_judged_on} tracks the first 40 % of each was "
+        f"Both models were fitted to the other tracks. Of {diagnosis.tracks_judged_on} tracks the first 40 % was "
         "observed. The rest was predicted and compared with the measured positions."
     )
     if not changed:
@@ -224,7 +224,7 @@ def _evaluation(diagnosis: Diagnosis) -> Html:
     """The halves, their use, and tracks that were left out."""
     words = (
         f"Effects were looked for in all tracks, fitted to {diagnosis.tracks_found_on} of them, and had to help on the "
-        f"other {diagnosis.tracks_judged_on}, on which errors are measured. The coefficients of the corrected model are "
+        f"other {diagnosis.tracks_judged_on}, whose errors are given. The coefficients of the corrected model are "
         "those of all tracks. Probabilities are corrected for the number of candidates and use the noise that the "
         "tracks show."
     )
