@@ -193,6 +193,7 @@ class SearchLoop:
         idle = insignificant(whole, [*search.named, hypothesis], search.first)
         if hypothesis in idle:
             return Outcome.INSIGNIFICANT, settled
+        idle += [h for h in search.named if h not in idle and self._pushed(h, search.fit, settled)]
         kept = tuple(h for h in search.named if h not in idle)
         if idle:
             alone = candidate.fit
@@ -223,6 +224,10 @@ class SearchLoop:
         if not ranged and hypothesis.strain(fit.unknowns.values) > self.plausible:
             return f"more than {self.plausible:g} times its typical distance from the usual value"
         return ""
+
+    def _pushed(self, hypothesis: Hypothesis, before: Fit, after: Fit) -> bool:
+        """Whether the strengths of an effect are plausible, and would not be beside a further effect."""
+        return bool(self._implausible(hypothesis, after)) and not self._implausible(hypothesis, before)
 
     def _refusal(self, hypothesis: Hypothesis, fit: Fit, outcome: Outcome) -> Refusal:
         """An effect that fits better and is no name; fit: with it."""
