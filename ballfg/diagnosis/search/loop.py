@@ -187,30 +187,30 @@ class SearchLoop:
         if evidence.p_value >= CONFIRMED:
             return Outcome.NOT_HELPFUL, candidate.fit
         settled = fit_problem(candidate.fit.problem, candidate.fit.unknowns, candidate.fit.noise)
-        if self._implausible(hypothesis, settled):
-            return Outcome.IMPLAUSIBLE, settled
         whole = self._on_all(settled)
+        if self._implausible(hypothesis, whole):
+            return Outcome.IMPLAUSIBLE, whole
         idle = insignificant(whole, [*search.named, hypothesis], search.first)
         if hypothesis in idle:
-            return Outcome.INSIGNIFICANT, settled
-        idle += [h for h in search.named if h not in idle and self._pushed(h, search.fit, settled)]
+            return Outcome.INSIGNIFICANT, whole
+        idle += [h for h in search.named if h not in idle and self._pushed(h, search.fit, whole)]
         kept = tuple(h for h in search.named if h not in idle)
         if idle:
             alone = candidate.fit
             for other in idle:
                 alone = without_named(alone, other, search.first)
             if delta_bic(search.fit, alone) >= 0.0:
-                return Outcome.SAME_PATTERN, settled
+                return Outcome.SAME_PATTERN, whole
             settled = fit_problem(alone.problem, alone.unknowns, alone.noise)
             whole = self._on_all(settled)
         if not _same_change(search, hypothesis) and halves_differ(settled, hypothesis, self.holdout.held_out):
-            return Outcome.CONTRADICTORY, settled
+            return Outcome.CONTRADICTORY, whole
         predictive = self.predictive(settled)
         if predictive.errors.prediction_rmse_mm > WORSE * search.predictive.errors.prediction_rmse_mm:
-            return Outcome.MISLEADING, settled
+            return Outcome.MISLEADING, whole
         judged = self.judge(predictive.model)
         if _worse(judged, search.judged):
-            return Outcome.MISLEADING, settled
+            return Outcome.MISLEADING, whole
         return Confirmed(candidate, evidence, kept, settled, whole, predictive, judged)
 
     def _implausible(self, hypothesis: Hypothesis, fit: Fit) -> str:
@@ -240,7 +240,8 @@ class SearchLoop:
         Effects are asked again whether they are plausible, differ from zero, and make predictions of the judging half
         better; not so the last ones that were `examined` beside all others when they were added.
         """
-        idle = insignificant(self._on_all(search.fit), search.named, search.first) if search.named else []
+        whole = self._on_all(search.fit)
+        idle = insignificant(whole, search.named, search.first)
         for hypothesis in reversed(search.named[: len(search.named) - examined]):
             if hypothesis.name in self.holdout.stamps.found:
                 continue
@@ -249,16 +250,16 @@ class SearchLoop:
             predictive = self.predictive(fit)
             judged = self.judge(predictive.model)
             refusal = None
-            if self._implausible(hypothesis, search.fit):
-                refusal = self._refusal(hypothesis, search.fit, Outcome.IMPLAUSIBLE)
+            if self._implausible(hypothesis, whole):
+                refusal = self._refusal(hypothesis, whole, Outcome.IMPLAUSIBLE)
             elif hypothesis in idle:
-                refusal = self._refusal(hypothesis, search.fit, Outcome.INSIGNIFICANT)
+                refusal = self._refusal(hypothesis, whole, Outcome.INSIGNIFICANT)
             elif _worse(search.judged, judged):
                 reason = (
                     f"{search.judged.prediction_rmse_mm:.1f} mm off on the judging half with it, "
                     f"{judged.prediction_rmse_mm:.1f} mm without it"
                 )
-                refusal = replace(self._refusal(hypothesis, search.fit, Outcome.MISLEADING), reason=reason)
+                refusal = replace(self._refusal(hypothesis, whole, Outcome.MISLEADING), reason=reason)
             if refusal is not None:
                 self.watch(f"{hypothesis.name} taken out again")
                 return self._pruned(left_out(search, hypothesis, fit, predictive, judged, refusal), examined=0)
