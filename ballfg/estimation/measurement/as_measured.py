@@ -45,6 +45,8 @@ def _without_effects(model: BallModel) -> BallModel:
     }
     if isinstance(plain._modules.get(_MEASUREMENT), torch.nn.ModuleDict):
         plain._modules[_MEASUREMENT] = torch.nn.ModuleDict()
+    left = dict(plain.named_parameters())
+    plain.variations = {name: variation for name, variation in model.variations.items() if name in left}
     return plain
 
 

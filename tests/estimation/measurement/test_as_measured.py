@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, advance, nominal_model
+from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, Variation, advance, nominal_model
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.effects.measurement import signed_permutations
 from ballfg.dynamics.measurement import Later
@@ -18,6 +18,7 @@ from ballfg.estimation.measurement.as_measured import (
     true_times,
     written_time,
 )
+from ballfg.tracks import Track
 
 TABLE = Surfaces(0.0)
 STATES = torch.tensor(
@@ -58,6 +59,17 @@ def test_the_plain_model_is_the_same_ball() -> None:
         torch.testing.assert_close(mine, other, rtol=0, atol=0)
     torch.testing.assert_close(plain.measured(STATES, lambda _: STATES), STATES[:, :3], rtol=0, atol=0)
     assert plainly_measured(nominal_model()).measures_plainly
+
+
+def test_coefficients_of_measurement_that_differ_between_tracks() -> None:
+    """A plain model keeps those of its motion and knows nothing of the others."""
+    model = measuring(time_offset={"x": 0.01})
+    rising = Variation("track", {"000": 0.1, "001": 0.2}, line=True)
+    model.variations = {"flight.drag.k": rising, "measurement.time_offset.x": rising}
+    plain = plainly_measured(model)
+    assert plain.variations == {"flight.drag.k": rising}
+    track = Track(np.arange(20) / 100.0, np.zeros((20, 3)), name="001")
+    assert float(dict(plain.for_track(track).named_parameters())["flight.drag.k"]) == pytest.approx(0.2)
 
 
 def test_augmented_models_too() -> None:
