@@ -6,6 +6,7 @@ from functools import partial
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
@@ -13,7 +14,7 @@ from ballfg.diagnosis.result import Errors, Outcome, Refusal
 from ballfg.diagnosis.search.candidates import Refit, Scored, delta_bic
 from ballfg.diagnosis.search.evaluation import held_out_gain, on_all, on_others
 from ballfg.diagnosis.search.hypothesis import Hypothesis
-from ballfg.diagnosis.search.parsimony import halves_differ, insignificant
+from ballfg.diagnosis.search.parsimony import SIGMAS, halves_differ, insignificant
 from ballfg.diagnosis.search.plausible import implausible, in_table
 from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.diagnosis.search.ranking import NO_NAME, as_left, finding_of, fitted_values, ranking
@@ -273,7 +274,15 @@ def _worse(after: Errors, before: Errors) -> bool:
     if ratio <= 1.0 or (ratio < FEW_WORSE and typical < MOST_BETTER):
         return False
     growth = np.square(after.by_track) - np.square(before.by_track)
-    return ratio > HARDLY or bool(growth.mean() > SURELY * growth.std(ddof=1) / np.sqrt(len(growth)))
+    others = np.delete(np.log(before.by_track / after.by_track), growth.argmax())
+    if growth.sum() < growth.max() and _sure(others) > SIGMAS:  # one ball misses the table's end, others are better
+        return False
+    return ratio > HARDLY or _sure(growth) > SURELY
+
+
+def _sure(values: Array) -> float:
+    """By how many of its standard errors the mean of some numbers lies above zero; 0 for a single one."""
+    return float(values.mean() / values.std(ddof=1) * np.sqrt(len(values))) if len(values) > 1 else 0.0
 
 
 def _same_change(search: Search, hypothesis: Hypothesis) -> bool:
