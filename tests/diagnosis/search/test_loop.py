@@ -169,7 +169,7 @@ def test_predictions_are_worse_where_chance_does_not_make_them_so():
     assert not _worse(errors_of(0.99 * before), errors_of(before))
     one = 0.9 * up_and_down
     one[7] = 10 * before[7]  # misses the end of the table
-    assert errors_of(one).prediction_rmse_mm > 1.5 * errors_of(before).prediction_rmse_mm
+    assert errors_of(one).prediction_rmse_mm > 1.3 * errors_of(before).prediction_rmse_mm
     assert not _worse(errors_of(one), errors_of(before))
     one[8] = 10 * before[8]
     assert _worse(errors_of(one), errors_of(before))
