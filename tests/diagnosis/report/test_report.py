@@ -136,7 +136,7 @@ def test_the_page_says_what_was_found(found_page: Page) -> None:
         "Cannot be told from gust_region.",
         "These data cannot tell wind and gust_region apart. What would decide it:",
         "wind: Shoot in the opposite direction, or across",
-        "25 tracks were searched, 25 others were held out.",
+        "Effects were looked for in all tracks, fitted to 25 of them, and had to help on the other 25",
         "flight.drag.k 0.12 0.1213 ± 0.0011 1/m",
         "shot 7 has no free flight of 10 samples.",
         "12.1 → – nothing to compare",
