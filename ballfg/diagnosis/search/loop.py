@@ -86,9 +86,8 @@ class SearchLoop:
             search, helped = self._round(search)
         search = self._pruned(search)
         refused = {n: r for n, r in search.refused.items() if n not in {f.name for f in search.findings}}
-        whole = self._on_all(search.fit)
-        findings = as_left(search.findings, search.named, whole, first)
-        return replace(search, whole=whole, findings=findings, refused=refused)
+        findings = as_left(search.findings, search.named, search.whole, first)
+        return replace(search, findings=findings, refused=refused)
 
     def _round(self, search: Search) -> tuple[Search, bool]:
         """The search after one more round, and whether the round added an effect."""
@@ -264,7 +263,7 @@ class SearchLoop:
             if refusal is not None:
                 self.watch(f"{hypothesis.name} taken out again")
                 return self._pruned(left_out(search, hypothesis, fit, predictive, judged, refusal), examined=0)
-        return search
+        return replace(search, whole=whole)
 
 
 def _worse(after: Errors, before: Errors) -> bool:
