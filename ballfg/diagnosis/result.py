@@ -27,7 +27,7 @@ class Outcome(enum.Enum):
     MISLEADING = "fits whole tracks better and predicts them worse"
     INSIGNIFICANT = "its coefficients do not differ from zero by themselves"
     CONTRADICTORY = "the two halves of the tracks want different values"
-    SAME_PATTERN = "explains the same pattern as an effect that was added before"
+    SAME_PATTERN = "explains the same pattern as another effect, which explains more"
     NOT_NEEDED = "not needed"
     INVISIBLE = "cannot be seen in these data"
 

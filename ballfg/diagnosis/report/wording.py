@@ -17,7 +17,7 @@ REFUSED = {
     Outcome.IMPLAUSIBLE: "it would have to be stronger than is plausible",
     Outcome.INSIGNIFICANT: "its coefficients do not differ from zero by themselves",
     Outcome.CONTRADICTORY: "the two halves of the tracks want different values of it",
-    Outcome.SAME_PATTERN: "it explains the same pattern as an effect that was added before",
+    Outcome.SAME_PATTERN: "it explains the same pattern as another effect, which explains more",
     Outcome.MISLEADING: "predictions get worse with it",
 }
 """Reasons for which an effect that fits better is no name."""

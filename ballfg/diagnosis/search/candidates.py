@@ -28,15 +28,21 @@ FRAME_CHOICE = 2.0 * float(np.log(FRAMES - 1))
 """Cost of a label frame in BIC: it was chosen among so many others."""
 LEADING = 0.5
 """A hypothesis that explains less than this share of the best one's is not refitted."""
+ALIKE = 6.0
+"""BIC difference below which two effects cannot be told apart: odds of 20 to 1."""
 
 
 @dataclass(frozen=True)
 class Scored:
-    """A hypothesis and the outcome of its score test, corrected for the number of hypotheses; None: not visible."""
+    """A hypothesis and the outcome of its score test, corrected for the number of hypotheses; None: not visible.
+
+    `opposite` is the best shape in which its effect would have the opposite sign: there may be the better minimum.
+    """
 
     hypothesis: Hypothesis
     score: Score | None
     p_value: float
+    opposite: Hypothesis | None = None
 
     @property
     def explained(self) -> float:
@@ -86,11 +92,21 @@ def shortlist(scored: Sequence[Scored], alarm: float = ALARM) -> list[Scored]:
         if candidate.score is not None and candidate.p_value < alarm:
             best.setdefault(candidate.hypothesis.name, candidate)
     listed = list(best.values())[:MOST_REFITS]
-    return [s for s in listed if s.explained >= LEADING * listed[0].explained]
+    leading = [s for s in listed if s.explained >= LEADING * listed[0].explained]
+    return [replace(s, opposite=_opposite(s, scored)) for s in leading]
+
+
+def _opposite(best: Scored, scored: Sequence[Scored]) -> Hypothesis | None:
+    """Of an effect with one strength, the shape with the other sign of it that explains most."""
+    if best.score is None or len(best.score.estimate) != 1:
+        return None
+    estimate = best.score.estimate
+    shapes = (s for s in scored if s.score is not None and s.hypothesis.name == best.hypothesis.name)
+    return next((s.hypothesis for s in shapes if s.score is not None and s.score.estimate @ estimate < 0.0), None)
 
 
 def refit(before: Fit, scored: Scored) -> Refit:
-    """The joint fit with a hypothesis in the model, started where it is absent.
+    """The joint fit with a hypothesis in the model, started where it is absent, in the shapes that are to be tried.
 
     An effect that balls usually have (friction, say) is also started at its usual strength, for its absence may be a
     minimum of its own: without friction, spins are fitted that friction contradicts.
@@ -100,6 +116,13 @@ def refit(before: Fit, scored: Scored) -> Refit:
         scored: the hypothesis and its score test.
     Returns: the better of the fits.
     """
+    fits = [_refit(before, scored)]
+    if scored.opposite is not None:
+        fits.append(_refit(before, replace(scored, hypothesis=scored.opposite)))
+    return min(fits, key=lambda refitted: refitted.fit.cost)
+
+
+def _refit(before: Fit, scored: Scored) -> Refit:
     hypothesis, problem = scored.hypothesis, with_hypothesis(before.problem, scored.hypothesis)
     parameters = dict(problem.model.named_parameters())
     absent = {name: float(parameters[name]) if name in parameters else 0.0 for name in hypothesis.free()}
@@ -118,6 +141,15 @@ def _started_at(before: Fit, hypothesis: Hypothesis, problem: Problem, values: M
     if hypothesis.shape and not hypothesis.strengths:
         unknowns = replace(unknowns, starts=_starts_with_labels(problem, unknowns.starts))
     return fit_problem(problem, unknowns, before.noise, settle_noise=False)
+
+
+def says_the_same(candidate: Refit, better: Refit) -> bool:
+    """Whether a hypothesis has nothing left to explain beside another one that explains clearly more."""
+    hypothesis = candidate.scored.hypothesis
+    if not hypothesis.strengths or hypothesis.effect.multiplies_spin or better.delta_bic > candidate.delta_bic - ALIKE:
+        return False
+    (beside,) = score_all(better.fit, [hypothesis])
+    return beside.p_value > HALF_ALARM
 
 
 def with_hypothesis(problem: Problem, hypothesis: Hypothesis) -> Problem:

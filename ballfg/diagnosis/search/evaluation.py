@@ -12,6 +12,7 @@ from ballfg.diagnosis.fit.problem import Fit, Noise
 from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.fit.system import by_track
 from ballfg.diagnosis.result import Errors
+from ballfg.diagnosis.search.plausible import SIGMAS
 from ballfg.diagnosis.search.score import score_tests
 from ballfg.diagnosis.search.signatures import Signatures
 from ballfg.dynamics import BallModel, Surfaces
@@ -23,6 +24,15 @@ OBSERVED = 0.4
 """Share of each track that is observed; the rest is predicted."""
 LEAST_PREDICTED = 3
 """Samples that must be left to predict."""
+SURELY = 1.645
+"""Standard errors, from the scatter of tracks, by which squared prediction errors grow where predictions are worse."""
+HARDLY = 1.01
+"""Ratio of prediction errors that counts as worse even if the tracks cannot tell. An effect near the detection limit
+moves predictions by less than that, up or down by chance."""
+FEW_WORSE = 1.05
+MOST_BETTER = 0.9
+"""Where half of the tracks are predicted so much better, the root mean square over all may grow by so much: a few balls
+that miss another surface than before weigh more in it than all others."""
 
 
 def prediction_errors(
@@ -143,3 +153,24 @@ def _on(fitted: Fit, stretches: Stretches, noise: Noise) -> Fit:
     problem = replace(fitted.problem, stretches=stretches, shared=False)
     unknowns = replace(fitted.unknowns, starts=stretches.starts.numpy().copy())
     return fit_problem(problem, unknowns, noise, settle_noise=False)
+
+
+def got_worse(after: Errors, before: Errors) -> bool:
+    """Whether predictions got worse, by more than chance makes of an effect that hardly moves them.
+
+    Args: after, before: errors of the predictions (mm) of the same tracks by two models.
+    """
+    ratio = after.prediction_rmse_mm / before.prediction_rmse_mm
+    typical = float(np.median(after.by_track) / np.median(before.by_track))
+    if ratio <= 1.0 or (ratio < FEW_WORSE and typical < MOST_BETTER):
+        return False
+    growth = np.square(after.by_track) - np.square(before.by_track)
+    others = np.delete(np.log(before.by_track / after.by_track), growth.argmax())
+    if growth.sum() < growth.max() and _sure(others) > SIGMAS:  # one ball misses the table's end, others are better
+        return False
+    return ratio > HARDLY or _sure(growth) > SURELY
+
+
+def _sure(values: Array) -> float:
+    """By how many of its standard errors the mean of some numbers lies above zero; 0 for a single one."""
+    return float(values.mean() / values.std(ddof=1) * np.sqrt(len(values))) if len(values) > 1 else 0.0

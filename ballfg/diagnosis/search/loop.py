@@ -4,17 +4,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
-import numpy as np
-
-from ballfg.arrays import Array
 from ballfg.diagnosis.fit.fit import fit_problem
 from ballfg.diagnosis.fit.holdout import Holdout
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Errors, Outcome, Refusal
-from ballfg.diagnosis.search.candidates import Refit, Scored, delta_bic
-from ballfg.diagnosis.search.evaluation import held_out_gain, on_all, on_others
+from ballfg.diagnosis.search.candidates import ALIKE, Refit, Scored, delta_bic, says_the_same
+from ballfg.diagnosis.search.evaluation import got_worse, held_out_gain, on_all, on_others
 from ballfg.diagnosis.search.hypothesis import Hypothesis
-from ballfg.diagnosis.search.parsimony import SIGMAS, halves_differ, insignificant
+from ballfg.diagnosis.search.parsimony import halves_differ, insignificant
 from ballfg.diagnosis.search.plausible import implausible, in_table
 from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.diagnosis.search.ranking import NO_NAME, as_left, finding_of, fitted_values, ranking
@@ -36,17 +33,6 @@ PLAUSIBLE = 10.0
 stronger than that (air that moves at 20 m/s through a part of the room) stands for something else."""
 POORER = 0.3
 """Share of an effect's gain that is there without the effect too, from which the fit before was in a poor minimum."""
-SURELY = 1.645
-"""Standard errors, from the scatter of tracks, by which squared prediction errors grow where predictions are worse."""
-HARDLY = 1.01
-"""Ratio of prediction errors that counts as worse even if the tracks cannot tell. An effect near the detection limit
-moves predictions by less than that, up or down by chance."""
-FEW_WORSE = 1.05
-MOST_BETTER = 0.9
-"""Where half of the tracks are predicted so much better, the root mean square over all may grow by so much: a few balls
-that miss another surface than before weigh more in it than all others."""
-ALIKE = 6.0
-"""BIC difference below which two effects cannot be told apart: odds of 20 to 1."""
 
 
 @dataclass(frozen=True)
@@ -99,15 +85,16 @@ class SearchLoop:
             scored, refits = self._tried(search, on_before, number)
         outcomes: dict[str, Outcome] = {}
         tell = partial(self._tell, number)
-        winner, refused = self._confirmed(search, on_before, refits, outcomes)
+        misleading: list[Refit] = []
+        winner, refused = self._confirmed(search, on_before, refits, outcomes, misleading)
         while winner is None and (fitted := try_further(search.fit, scored, refits, tell, self.jobs)):
-            winner, further = self._confirmed(search, on_before, fitted, outcomes)
+            winner, further = self._confirmed(search, on_before, fitted, outcomes, misleading)
             refits, refused = [*refits, *fitted], refused | further
         if winner is None:  # a pattern that one effect explains for all tracks must not get a name for each group
             ways = self.ways or partial(groupings, self.holdout.tracks)
             some = self.of_some or self.catalogue
             more, fitted = try_varying(search.fit, some, self.holdout.held_out, ways, tell, self.jobs)
-            winner, further = self._confirmed(search, on_before, fitted, outcomes)
+            winner, further = self._confirmed(search, on_before, fitted, outcomes, misleading)
             scored, refits, refused = [*scored, *more], [*refits, *fitted], refused | further
         if winner is None:
             self.watch(f"round {number}: nothing helps")
@@ -165,17 +152,29 @@ class SearchLoop:
         return replace(moved, first=settled, declared=predictive, before=judged)
 
     def _confirmed(
-        self, search: Search, on_before: Fit, refits: Sequence[Refit], outcomes: dict[str, Outcome]
+        self,
+        search: Search,
+        on_before: Fit,
+        refits: Sequence[Refit],
+        outcomes: dict[str, Outcome],
+        misleading: list[Refit],
     ) -> tuple[Confirmed | None, dict[str, Refusal]]:
-        """The best refit that deserves a name, and better ones that do not; fills in their outcomes."""
+        """The best refit that deserves a name, and better ones that do not; fills in their outcomes.
+
+        What one effect explains gets no lesser name only because the better one predicted a few balls worse; such
+        better ones are added to `misleading`.
+        """
         refused: dict[str, Refusal] = {}
         for candidate in refits:
             if candidate.delta_bic >= 0.0:
                 break
-            examined = self._examined(search, candidate, on_before)
+            examined: Confirmed | tuple[Outcome, Fit] = (Outcome.SAME_PATTERN, candidate.fit)
+            if not any(says_the_same(candidate, better) for better in misleading):
+                examined = self._examined(search, candidate, on_before)
             if isinstance(examined, Confirmed):
                 return examined, refused
             outcomes[candidate.name], settled = examined
+            misleading += [candidate] if outcomes[candidate.name] is Outcome.MISLEADING else []
             if outcomes[candidate.name] in NO_NAME:
                 refused[candidate.name] = self._refusal(candidate.scored.hypothesis, settled, outcomes[candidate.name])
         return None, refused
@@ -209,7 +208,7 @@ class SearchLoop:
         if predictive.errors.prediction_rmse_mm > WORSE * search.predictive.errors.prediction_rmse_mm:
             return Outcome.MISLEADING, whole
         judged = self.judge(predictive.model)
-        if _worse(judged, search.judged):
+        if got_worse(judged, search.judged):
             return Outcome.MISLEADING, whole
         return Confirmed(candidate, evidence, kept, settled, whole, predictive, judged)
 
@@ -254,7 +253,7 @@ class SearchLoop:
                 refusal = self._refusal(hypothesis, whole, Outcome.IMPLAUSIBLE)
             elif hypothesis in idle:
                 refusal = self._refusal(hypothesis, whole, Outcome.INSIGNIFICANT)
-            elif _worse(search.judged, judged):
+            elif got_worse(search.judged, judged):
                 reason = (
                     f"{search.judged.prediction_rmse_mm:.1f} mm off on the judging half with it, "
                     f"{judged.prediction_rmse_mm:.1f} mm without it"
@@ -264,24 +263,6 @@ class SearchLoop:
                 self.watch(f"{hypothesis.name} taken out again")
                 return self._pruned(left_out(search, hypothesis, fit, predictive, judged, refusal), examined=0)
         return replace(search, whole=whole)
-
-
-def _worse(after: Errors, before: Errors) -> bool:
-    """Whether predictions got worse, by more than chance makes of an effect that hardly moves them."""
-    ratio = after.prediction_rmse_mm / before.prediction_rmse_mm
-    typical = float(np.median(after.by_track) / np.median(before.by_track))
-    if ratio <= 1.0 or (ratio < FEW_WORSE and typical < MOST_BETTER):
-        return False
-    growth = np.square(after.by_track) - np.square(before.by_track)
-    others = np.delete(np.log(before.by_track / after.by_track), growth.argmax())
-    if growth.sum() < growth.max() and _sure(others) > SIGMAS:  # one ball misses the table's end, others are better
-        return False
-    return ratio > HARDLY or _sure(growth) > SURELY
-
-
-def _sure(values: Array) -> float:
-    """By how many of its standard errors the mean of some numbers lies above zero; 0 for a single one."""
-    return float(values.mean() / values.std(ddof=1) * np.sqrt(len(values))) if len(values) > 1 else 0.0
 
 
 def _same_change(search: Search, hypothesis: Hypothesis) -> bool:

@@ -17,14 +17,13 @@ from ballfg.diagnosis.fit.fit import covariance_of, fit_problem, reachable
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.stretches import Stretches
 from ballfg.diagnosis.search.hypothesis import Hypothesis
+from ballfg.diagnosis.search.plausible import SIGMAS
 from ballfg.diagnosis.search.score import Score, score_tests
 from ballfg.diagnosis.search.signatures import Signatures
 from ballfg.diagnosis.search.state import without_named
 
-SIGMAS: Final = 3.0
-"""Coefficients must differ from absent by so many standard deviations, and the halves by no more than so many."""
 CHANCE: Final = 2.0 * float(stats.norm.sf(SIGMAS))
-"""The probability that goes with it: a group of several coefficients is held to the same one."""
+"""The probability that goes with `SIGMAS`: a group of several coefficients is held to the same one."""
 
 
 def own_scores(fit: Fit, named: Sequence[Hypothesis]) -> list[Score | None]:

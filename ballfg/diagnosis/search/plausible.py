@@ -14,7 +14,8 @@ NEAR: Final = 0.15
 MARGIN: Final = 0.1
 """Share of a range by which a fitted value may lie outside of it."""
 SIGMAS: Final = 3.0
-"""Standard deviations by which it may, if that is less."""
+"""Standard deviations: coefficients must differ from absent by so many and the halves by no more, and a value may lie
+so many outside of its range."""
 
 
 @dataclass(frozen=True)

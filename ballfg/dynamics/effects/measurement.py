@@ -4,6 +4,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import Final
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -197,9 +198,11 @@ class Distortion(MeasurementEffect):
 
     @classmethod
     def shapes(cls, scene: Scene) -> Sequence[Mapping[str, float]]:
-        """About the middle of the space that the data fill."""
-        middle = (0.5 * (low + high) for low, high in zip(scene.low, scene.high, strict=True))
-        return (dict(zip("xyz", middle, strict=True)),)
+        """About the middle of the space that the data fill, and about its corners: a fit finds only a centre nearby."""
+        low, high = np.array(scene.low), np.array(scene.high)
+        corners = [np.where(upper, high, low) for upper in itertools.product((False, True), repeat=3)]
+        centers = [0.5 * (low + high), *corners]
+        return [dict(zip("xyz", map(float, center), strict=True)) for center in centers]
 
     def positions(self, states: Tensor, later: Later) -> Tensor:
         """(..., 3) m, stretched about the centre."""

@@ -10,8 +10,9 @@ import pytest
 from ballfg.diagnosis.fit.free import declared_free
 from ballfg.diagnosis.fit.stamps import Stamps
 from ballfg.diagnosis.result import Errors, Outcome
+from ballfg.diagnosis.search.evaluation import got_worse
 from ballfg.diagnosis.search.hypothesis import has_effect, without_effect
-from ballfg.diagnosis.search.loop import SearchLoop, _worse
+from ballfg.diagnosis.search.loop import SearchLoop
 from ballfg.diagnosis.search.process_noise import PredictiveModel
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.settings import Settings
@@ -155,6 +156,35 @@ def test_what_predicts_the_judging_half_worse_is_not_added(make_ball, make_launc
     assert search.refused["table_tilt"].outcome is Outcome.MISLEADING
 
 
+def test_a_refused_effect_leaves_no_pattern_to_lesser_names(make_ball, make_launches, make_shots):
+    """Axes that are tilted, and a judge who refuses that: a scale that would fit most of it is not the cause."""
+    data = [shots(make_ball, make_launches, make_shots, seed, frame_tilt={"x": 0.0, "y": 0.02}) for seed in (71, 72)]
+    catalogue = [EFFECTS[name] for name in ("frame_tilt", "scale", "wind")]
+
+    def judge(model):
+        return judged(10.2 if has_effect(model, "frame_tilt") else 10.0)
+
+    search = SearchLoop(holdout(*data), catalogue, predicts_well, judge, unwatched).run(make_ball())
+    assert search.findings == ()
+    outcomes = {row.name: row.outcome for row in search.rounds[0]}
+    assert outcomes == {
+        "frame_tilt": Outcome.MISLEADING,
+        "scale": Outcome.SAME_PATTERN,
+        "wind": Outcome.SAME_PATTERN,
+    }
+
+
+def test_a_distortion_is_found_about_a_center_at_the_edge_of_the_data(make_ball, make_launches, make_shots):
+    truth = {"k": 0.008, "x": 2.5, "y": 0.3, "z": 0.1}
+    data = (shots(make_ball, make_launches, make_shots, seed, distortion=truth) for seed in (71, 72))
+    catalogue = [EFFECTS[name] for name in ("distortion", "wind", "frame_tilt", "scale")]
+    search = SearchLoop(holdout(*data), catalogue, predicts_well, judges_alike, unwatched).run(make_ball())
+    (finding,) = search.findings
+    assert finding.name == "distortion"
+    for name, value in truth.items():
+        assert abs(finding.parameters[name].value - value) < 4 * finding.parameters[name].sigma, name
+
+
 def errors_of(tracks):
     return Errors(float(np.sqrt(np.square(tracks).mean())), 1.0, 1.0, 0.0, np.asarray(tracks))
 
@@ -163,16 +193,16 @@ def test_predictions_are_worse_where_chance_does_not_make_them_so():
     before = np.random.default_rng(3).uniform(5.0, 15.0, 40)
     up_and_down = before * np.where(np.arange(40) % 2, 1.05, 0.96)  # a little worse on the whole
     assert 1.0 < errors_of(up_and_down).prediction_rmse_mm / errors_of(before).prediction_rmse_mm < 1.01
-    assert not _worse(errors_of(up_and_down), errors_of(before))
-    assert _worse(errors_of(1.005 * before), errors_of(before))  # as little, but on every track
-    assert _worse(errors_of(1.02 * up_and_down), errors_of(before))
-    assert not _worse(errors_of(0.99 * before), errors_of(before))
+    assert not got_worse(errors_of(up_and_down), errors_of(before))
+    assert got_worse(errors_of(1.005 * before), errors_of(before))  # as little, but on every track
+    assert got_worse(errors_of(1.02 * up_and_down), errors_of(before))
+    assert not got_worse(errors_of(0.99 * before), errors_of(before))
     one = 0.9 * up_and_down
     one[7] = 10 * before[7]  # misses the end of the table
     assert errors_of(one).prediction_rmse_mm > 1.3 * errors_of(before).prediction_rmse_mm
-    assert not _worse(errors_of(one), errors_of(before))
+    assert not got_worse(errors_of(one), errors_of(before))
     one[8] = 10 * before[8]
-    assert _worse(errors_of(one), errors_of(before))
+    assert got_worse(errors_of(one), errors_of(before))
 
 
 def test_what_later_effects_make_superfluous_is_taken_out_again(make_ball, make_launches, make_shots):
