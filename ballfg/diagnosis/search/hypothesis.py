@@ -18,6 +18,8 @@ TWINS: Mapping[str, tuple[str, ...]] = {"gravity": ("buoyancy",)}
 """Effects that are exactly the same as another one of a model: the other one is listed for both."""
 LEAST_GAP = 1e-4
 """s. Stamps nearer together tell no speed."""
+AROUND = 0.1
+"""s to each side of a contact in which the speed before it is looked for: offsets of time shift it."""
 
 
 @dataclass(frozen=True)
@@ -168,11 +170,12 @@ def scene_of(fit: Fit) -> Scene:
     times = fit.problem.model.true_stamps(stretches.times).detach().numpy()
     gaps = np.maximum(np.gradient(times, axis=1), LEAST_GAP)[..., None]
     velocities = np.gradient(fit.predicted.positions, axis=1) / gaps
-    impacts = [
-        -velocities[i, max(0, int(np.searchsorted(times[i], time)) - 2), 2]  # no difference spans the contact there
-        for i, row in enumerate(fit.predicted.contacts)
-        for time in row[np.isfinite(row)]
-    ]
+    falls = []  # the steepest near each contact: no difference that spans it is, nor one after it
+    for i, row in enumerate(fit.predicted.contacts):
+        for time in row[np.isfinite(row)]:
+            first, last = np.searchsorted(times[i], (time - AROUND, time + AROUND))
+            falls.append(-velocities[i, first : last + 1, 2].min())
+    impacts = [fall for fall in falls if fall > 0.0]
     low, high, middle = (
         cast(Vector, tuple(place.tolist()))
         for place in (positions.min(axis=0), positions.max(axis=0), np.median(positions, axis=0))

@@ -13,6 +13,7 @@ from ballfg.diagnosis.search.hypothesis import (
     effects_of,
     has_effect,
     hypotheses,
+    scene_of,
     with_effects,
     without_effect,
 )
@@ -137,3 +138,14 @@ def test_usual_effects_are_those_with_a_nominal_strength():
 def usual(name):
     strengths = tuple(c.name for c in EFFECTS[name].coefficients if c.absent is not None)
     return Hypothesis(EFFECTS[name], {}, strengths).usual
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.04, -0.04])
+def test_impact_speeds_are_found_with_heights_that_lag_behind_the_stamps(
+    offset, make_ball, make_launches, make_shots, make_fit
+):
+    model = make_ball(time_offset={"x": 0.0, "y": 0.0, "z": offset})
+    fit = make_fit(model, make_shots(model, make_launches(6, 5), 5, rate=100.0, duration=0.6).stretches)
+    # from 0.3 m above the table, less the ball's radius; two balls bounce a second time
+    assert 1.9 < scene_of(fit).impact_speed < 2.8
+    assert scene_of(fit).contacts == 8
