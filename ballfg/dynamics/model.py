@@ -187,7 +187,7 @@ def _soft_direction(vector: Tensor) -> Tensor:
 
 
 def substitute(module: M, values: Mapping[str, Tensor]) -> M:
-    """A copy of a module in which some parameters are the given tensors; everything else is shared.
+    """A copy of a module in which some parameters or buffers are the given tensors; everything else is shared.
 
     Args:
         module: for instance a `BallModel`.
@@ -203,7 +203,7 @@ def substitute(module: M, values: Mapping[str, Tensor]) -> M:
         if rest:
             children.setdefault(head, {})[rest] = value
         else:
-            if head not in substituted:
+            if head not in substituted and head not in module._buffers:
                 del clone._parameters[head]
             clone.__dict__[head] = value
     for head, inner in children.items():

@@ -12,7 +12,7 @@ from ballfg.diagnosis.fit.shooting import steps_of_arc
 from ballfg.diagnosis.fit.tangents import MovedArc
 from ballfg.dynamics.compiled.contacts import contacts
 from ballfg.dynamics.compiled.flight import fly_arcs
-from ballfg.dynamics.compiled.functions import CompiledModel, Function
+from ballfg.dynamics.compiled.functions import NONE, CompiledModel, Function
 from ballfg.dynamics.motion.limits import LONGEST_FALL
 
 
@@ -54,7 +54,7 @@ def shoot_compiled(
     """The motion of n balls, as `shooting.shoot`, with its derivatives in d directions.
 
     Args:
-        model: its functions.
+        model: its functions, of an analytic model.
         coefficients: of each ball.
         start: (n, 9) at time 0.
         moved: (n, 9, d) its derivatives.
@@ -84,7 +84,9 @@ def shoot_compiled(
         level = np.ascontiguousarray(met[rows, number])
         computes = (function.compute for function in functions)
         longest = np.full(m, LONGEST_FALL)
-        contacts(*computes, near, nearer, *given, level, longest, model.radius, tau, slower, start, moved)
+        contacts(
+            *computes, near, nearer, *given, NONE, NONE, NONE, level, longest, model.radius, tau, slower, start, moved
+        )
         found[rows, number] = begun + tau
         begun, began = begun + np.nan_to_num(tau), began + slower
     return MovedShot(arcs, torch.from_numpy(found))
@@ -105,5 +107,7 @@ def _flown(
     nodes, slopes = np.empty((m, count + 1, 9)), np.empty((m, count + 1, 9))
     nodes_moved, slopes_moved = np.empty((m, count + 1, 9, d)), np.empty((m, count + 1, 9, d))
     given = coefficients.of(model.rates, rows, d)
-    fly_arcs(model.rates.compute, start, moved, *given, step.numpy(), count, nodes, nodes_moved, slopes, slopes_moved)
+    fly_arcs(
+        model.rates.compute, start, moved, *given, NONE, step.numpy(), count, nodes, nodes_moved, slopes, slopes_moved
+    )
     return MovedArc(rows, begun, began, step.numpy(), nodes, slopes, nodes_moved, slopes_moved)

@@ -19,12 +19,13 @@ from numba import njit
 HEADER: Final = '''"""Generated from a model of a ball; safe to delete."""
 import math
 
+import numpy as np
 from numba import njit, types
 
 ONE, TWO = types.Array(types.float64, 1, "C"), types.Array(types.float64, 2, "C")
 
 
-@njit(types.void(ONE, ONE, TWO, TWO, ONE, TWO), error_model="numpy", cache=True)
+@njit(types.void(ONE, ONE, ONE, TWO, TWO, ONE, TWO), error_model="numpy", cache=True)
 '''
 """What comes before `compute` in a file. Without numpy's error model every division would be checked for a zero."""
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.flight import fly_one, slope_at
+from ballfg.dynamics.compiled.flight import fly_one
 from ballfg.dynamics.compiled.signatures import COUNT, FUNCTION, NOTHING, ONE, REAL, THREE, TWO, several
 from ballfg.dynamics.motion.limits import (
     GAP_TOLERANCE,
@@ -21,12 +21,12 @@ LEAST = 1e-300
 """Keeps a division by zero away."""
 
 
-@machine_code(several(REAL, 3)(FUNCTION, FUNCTION, ONE, ONE, ONE, REAL, REAL))
-def _approach(rates, surface, x, c, s, height, radius):
+@machine_code(several(REAL, 3)(FUNCTION, FUNCTION, ONE, ONE, ONE, ONE, ONE, REAL, REAL))
+def _approach(rates, surface, x, c, s, w, ws, height, radius):
     """Gap (m) of a state to a surface, its rate (m/s) and the acceleration (m/s^2) with which it closes."""
     none, a, o = np.empty((9, 0)), np.empty(6), np.empty(3)
-    rates(x, c, none, np.empty((len(c), 0)), a, np.empty((6, 0)))
-    surface(x, s, none, np.empty((len(s), 0)), o, np.empty((3, 0)))
+    rates(x, c, w, none, np.empty((len(c), 0)), a, np.empty((6, 0)))
+    surface(x, s, ws, none, np.empty((len(s), 0)), o, np.empty((3, 0)))
     gap = x[2] - height - o[0] - radius
     rate = x[5] - o[1] * x[3] - o[2] * x[4]
     return gap, rate, -(a[2] - o[1] * a[0] - o[2] * a[1])
@@ -42,23 +42,23 @@ def _common_steps(durations):
     return max(1, math.ceil(longest / MAX_STEP - 1e-9))
 
 
-@machine_code(NOTHING(FUNCTION, FUNCTION, TWO, TWO, TWO, ONE, REAL, ONE, ONE))
-def _search(rates, surface, state, c, s, heights, radius, longest, tau):
+@machine_code(NOTHING(FUNCTION, FUNCTION, TWO, TWO, TWO, ONE, ONE, ONE, REAL, ONE, ONE))
+def _search(rates, surface, state, c, s, w, ws, heights, radius, longest, tau):
     """Times (s) of contacts near tau, in place: each step solves the parabola through the motion there. NaN: none.
 
     All rows take the same number of integration steps, as they do in torch: a time is exact for its steps.
     """
     m = len(tau)
     lost, arrived, none = np.isnan(tau), np.zeros(m, dtype=np.bool_), np.empty((9, 0))
-    nonec, at = np.empty((c.shape[1], 0)), np.empty(9)
+    nonec, at, still = np.empty((c.shape[1], 0)), np.empty(9), np.empty(0)
     tau[lost] = 0.0
     for _ in range(SEARCH_STEPS):
         steps = _common_steps(tau)
         for r in range(m):
             at[:] = state[r]
             if tau[r] != 0.0:
-                fly_one(rates, at, c[r], none, nonec, tau[r], steps)
-            gap, rate, fall = _approach(rates, surface, at, c[r], s[r], heights[r], radius)
+                fly_one(rates, at, c[r], w, none, nonec, tau[r], still, steps)
+            gap, rate, fall = _approach(rates, surface, at, c[r], s[r], w, ws, heights[r], radius)
             used = max(fall, LEAST_FALL)
             square = rate * rate + 2.0 * used * gap
             root = math.sqrt(max(square, 0.0))
@@ -78,17 +78,17 @@ def _search(rates, surface, state, c, s, heights, radius, longest, tau):
             tau[r] = np.nan
 
 
-@machine_code(REAL(FUNCTION, FUNCTION, ONE, ONE, ONE, REAL, REAL, REAL))
-def _scan(rates, surface, state, c, s, height, radius, longest):
+@machine_code(REAL(FUNCTION, FUNCTION, ONE, ONE, ONE, ONE, ONE, REAL, REAL, REAL))
+def _scan(rates, surface, state, c, s, w, ws, height, radius, longest):
     """Time (s) within one step of the contact, by small steps; NaN where the ball turns before it gets there."""
-    none, nonec, at = np.empty((9, 0)), np.empty((len(c), 0)), state.copy()
-    gap, rate, _ = _approach(rates, surface, at, c, s, height, radius)
+    none, nonec, at, still = np.empty((9, 0)), np.empty((len(c), 0)), state.copy(), np.empty(0)
+    gap, rate, _ = _approach(rates, surface, at, c, s, w, ws, height, radius)
     forward = not (gap < 0.0 and rate < 0.0)
     step = MAX_STEP if forward else -MAX_STEP
     for i in range(math.ceil(longest / MAX_STEP)):
         before = gap
-        fly_one(rates, at, c, none, nonec, step, 1)
-        gap, rate, _ = _approach(rates, surface, at, c, s, height, radius)
+        fly_one(rates, at, c, w, none, nonec, step, still, 1)
+        gap, rate, _ = _approach(rates, surface, at, c, s, w, ws, height, radius)
         if not math.isfinite(gap + rate):
             return np.nan
         if (before >= 0.0 and gap < 0.0) if forward else gap >= 0.0:
@@ -113,6 +113,9 @@ def _scan(rates, surface, state, c, s, height, radius, longest):
         THREE,
         ONE,
         ONE,
+        ONE,
+        ONE,
+        ONE,
         REAL,
         ONE,
         TWO,
@@ -121,27 +124,50 @@ def _scan(rates, surface, state, c, s, height, radius, longest):
     ),
 )
 def contacts(
-    rates, impact, surface, start, startt, c, ct, b, bt, s, st, heights, longest, radius, tau, taut, after, aftert
+    rates,
+    impact,
+    surface,
+    start,
+    startt,
+    c,
+    ct,
+    b,
+    bt,
+    s,
+    st,
+    w,
+    wb,
+    ws,
+    heights,
+    longest,
+    radius,
+    tau,
+    taut,
+    after,
+    aftert,
 ):
     """The next contacts of m falling balls, near their states (m, 9).
 
     Args:
         start (m, 9), startt (m, 9, d): states and tangents.
         c, b, s: coefficients of rates, impact and surface, (m, p) with tangents (m, p, d).
+        w, wb, ws: weights of the three.
         heights (m,) m, longest (m,) s: of the surfaces, and how far to look.  radius: m, of the ball.
     Writes: time to the contact tau (m,) s and the state after it (m, 9), with tangents; NaN where there is none.
     """
     d = startt.shape[2]
-    x, xt, k, kt, a, at = np.empty(9), np.empty((9, d)), np.empty(9), np.empty((9, d)), np.empty(6), np.empty((6, d))
-    o, ot = np.empty(3), np.empty((3, d))
+    x, later, xt, o = np.empty(9), np.empty((9, d + 1)), np.empty((9, d)), np.empty(3)
+    moved, ct1, st1 = np.empty((3, d + 1)), np.zeros((ct.shape[1], d + 1)), np.zeros((st.shape[1], d + 1))
+    by_time = np.zeros(d + 1)  # the last direction is that of the contact's time
+    by_time[d] = 1.0
     tau[:] = 0.0
-    _search(rates, surface, start, c, s, heights, radius, longest, tau)
+    _search(rates, surface, start, c, s, w, ws, heights, radius, longest, tau)
     if np.isnan(tau).any():
         near = np.full(len(tau), np.nan)
         for r in range(len(tau)):
             if math.isnan(tau[r]):
-                near[r] = _scan(rates, surface, start[r], c[r], s[r], heights[r], radius, longest[r])
-        _search(rates, surface, start, c, s, heights, radius, longest, near)
+                near[r] = _scan(rates, surface, start[r], c[r], s[r], w, ws, heights[r], radius, longest[r])
+        _search(rates, surface, start, c, s, w, ws, heights, radius, longest, near)
         for r in range(len(tau)):
             if math.isnan(tau[r]):
                 tau[r] = near[r]
@@ -152,13 +178,13 @@ def contacts(
             after[r], aftert[r], taut[r] = np.nan, 0.0, 0.0
             continue
         x[:] = start[r]
-        xt[:] = startt[r]
-        fly_one(rates, x, c[r], xt, ct[r], found, steps)
-        slope_at(rates, x, c[r], xt, ct[r], k, kt, a, at)
-        surface(x, s[r], xt, st[r], o, ot)
-        speed = min(x[5] - o[1] * x[3] - o[2] * x[4], -MIN_SPEED)
-        for q in range(d):  # at the contact the gap is zero: d gap + rate d tau = 0
-            taut[r, q] = -(xt[2, q] - ot[0, q]) / speed
+        later[:, :d], later[:, d] = startt[r], 0.0
+        ct1[:, :d], st1[:, :d] = ct[r], st[r]
+        fly_one(rates, x, c[r], w, later, ct1, found, by_time, steps)
+        surface(x, s[r], ws, later, st1, o, moved)
+        speed = min(later[2, d] - moved[0, d], -MIN_SPEED)
+        for q in range(d):  # at the contact the gap is zero: d gap + d gap / d tau d tau = 0
+            taut[r, q] = -(later[2, q] - moved[0, q]) / speed
             for i in range(9):
-                xt[i, q] += k[i] * taut[r, q]
-        impact(x, b[r], xt, bt[r], after[r], aftert[r])
+                xt[i, q] = later[i, q] + later[i, d] * taut[r, q]
+        impact(x, b[r], wb, xt, bt[r], after[r], aftert[r])

@@ -16,8 +16,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import built, read_note, write_note
 from ballfg.dynamics.model import BallModel, is_substituted, substitute
+from ballfg.dynamics.networks.architecture import Architecture
+from ballfg.dynamics.networks.layers import MNN
 from ballfg.state import STATE_DIM
 
 VALUES_AGREE: Final = 1e-12
@@ -31,15 +34,17 @@ class Function:
     """A compiled function of a state and some coefficients.
 
     Attributes:
-        compute: `compute(x, c, xt, ct, y, yt)`: state x (9,), coefficients c (p,), tangents xt (9, d) and ct (p, d);
-            writes the result y (m,) and its tangents yt (m, d).
+        compute: `compute(x, c, w, xt, ct, y, yt)`: state x (9,), coefficients c (p,), weights w (k,), tangents xt
+            (9, d) and ct (p, d); writes the result y (m,) and its tangents yt (m, d).
         names: of the p coefficients that matter, as in `model.named_parameters()`.
         size: m.
+        weigh: gives the weights from a model's tables; None where there are none.
     """
 
     compute: Any
     names: tuple[str, ...]
     size: int
+    weigh: Callable[..., Tensor] | None = None
 
 
 @dataclass(frozen=True)
@@ -58,7 +63,21 @@ class CompiledModel:
     surface: Function
     radius: float
 
+    def weights(self, model: BallModel) -> tuple[Array, Array, Array]:
+        """Those that rates, impact and surface take, from a model's tables as they are now."""
+        now = tuple((id(table), table._version, table.data_ptr()) for table in _tables(model).values())
+        if model not in _weights or _weights[model][0] != now:
+            tables = list(_tables(model).values())
+            parts = (self.rates, self.impact, self.surface)
+            rates, impact, surface = (NONE if p.weigh is None else p.weigh(*tables).numpy() for p in parts)
+            _weights[model] = now, (rates, impact, surface)
+        return _weights[model][1]
 
+
+NONE: Final = np.zeros(0)
+"""The weights of a function without tables."""
+_weights: weakref.WeakKeyDictionary[BallModel, tuple[Hashable, tuple[Array, Array, Array]]]
+_weights = weakref.WeakKeyDictionary()
 _OF_TORCH: Final = frozenset(vars(nn.Module()))
 """What every module has; its parameters, buffers and parts are looked at by themselves."""
 _BESIDE: Final = frozenset({"trained", "noise", "variations", "measurement"})
@@ -78,7 +97,7 @@ _by_structure: dict[Hashable, CompiledModel | None] = {}
 
 
 def compiled(model: BallModel) -> CompiledModel | None:
-    """The functions of a model, whose scalar parameters they take as arguments; None where one cannot be compiled.
+    """The functions of a model, whose parameters they take as arguments; None where one cannot be compiled.
 
     Args: model: without substituted parameters. Its structure must not change afterwards.
     """
@@ -101,8 +120,8 @@ def _structure(module: nn.Module) -> Hashable:
     """
     own = {name: _plain(value) for name, value in vars(module).items() if name not in _OF_TORCH | _BESIDE}
     parts = tuple((name, _structure(child)) for name, child in module.named_children() if name not in _BESIDE)
-    buffers = tuple((name, tuple(b.reshape(-1).tolist())) for name, b in module.named_buffers(recurse=False))
-    parameters = tuple(name for name, _ in module.named_parameters(recurse=False))
+    buffers = tuple((name, tuple(b.shape)) for name, b in module.named_buffers(recurse=False))
+    parameters = tuple((name, tuple(p.shape)) for name, p in module.named_parameters(recurse=False))
     return (
         f"{type(module).__module__}.{type(module).__qualname__}",
         tuple(sorted(own.items())),
@@ -117,11 +136,13 @@ def _plain(value: object) -> Hashable:
         return tuple(_plain(part) for part in value)
     if isinstance(value, (int, float, str, bool, type(None))):
         return value
+    if isinstance(value, Architecture):
+        return repr(value)
     raise NotComparableError
 
 
 def _compiled(model: BallModel, key: Hashable | None) -> CompiledModel | None:
-    if any(parameter.dim() for parameter in model.parameters()) or is_substituted(model):  # more than scalars
+    if is_substituted(model):
         return None
     try:
         rates, impact, surface = (_function(model, part, key) for part in (_rates, _impact, _surface))
@@ -161,11 +182,10 @@ def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor],
             pass
         else:
             return made
-    source, names, size = _traced(model, function)
-    made = Function(built(source), names, size)
+    source, made = _traced(model, function)
     _compare(model, function, made)
-    if known is not None:
-        write_note(known, {"source": source, "names": names, "size": size})
+    if known is not None and made.weigh is None:
+        write_note(known, {"source": source, "names": made.names, "size": made.size})
     return made
 
 
@@ -185,22 +205,34 @@ def _digest(file: str) -> str:
     return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:12]
 
 
-def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -> tuple[str, tuple[str, ...], int]:
-    """Source, names of the coefficients that matter, and size of the result."""
+def _tables(model: BallModel) -> dict[str, Tensor]:
+    """Parameters that are no scalars, and buffers, by name: derivatives by them are left to torch."""
+    return {name: p.detach() for name, p in model.named_parameters() if p.dim()} | dict(model.named_buffers())
+
+
+def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -> tuple[str, Function]:
+    """A function that was traced anew, and its source."""
     from ballfg.dynamics.compiled.source import function_source
     from ballfg.dynamics.compiled.trace import trace  # torch's tracer takes a second to import
 
     scalars = [name for name, parameter in model.named_parameters() if parameter.dim() == 0]
+    tables = _tables(model)
 
-    def of_vectors(state: Tensor, coefficients: Tensor) -> Tensor:
+    def of_vectors(state: Tensor, coefficients: Tensor, *given: Tensor) -> Tensor:
         values = {name: coefficients[i] for i, name in enumerate(scalars)}
-        return function(substitute(model, values), state)
+        whole = substitute(model, values | dict(zip(tables, given, strict=True)))
+        for part in whole.modules():
+            if isinstance(part, MNN):
+                part.write_out()
+        return function(whole, state)
 
-    program, (state, coefficients), outputs = trace(of_vectors, [STATE_DIM, len(scalars)])
-    needed = set(program.needed(outputs))
+    traced = trace(of_vectors, [STATE_DIM, len(scalars)], list(tables.values()))
+    state, coefficients = traced.inputs
+    needed = set(traced.program.needed(traced.outputs))
     used = [(name, number) for name, number in zip(scalars, coefficients, strict=True) if number in needed]
-    source = function_source(program, outputs, state, [number for _, number in used])
-    return source, tuple(name for name, _ in used), len(outputs)
+    source = function_source(traced, state, [number for _, number in used])
+    names = tuple(name for name, _ in used)
+    return source, Function(built(source), names, len(traced.outputs), traced.weights)
 
 
 def _compare(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], made: Function) -> None:
@@ -213,6 +245,7 @@ def _compare(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], 
     if not parameters.keys() >= set(made.names):
         raise NotTheSameError(f"compiled {function.__name__} takes coefficients that the model does not have")
     own = np.array([float(parameters[name].detach()) for name in made.names])
+    weights = NONE if made.weigh is None else made.weigh(*_tables(model).values()).numpy()
     for _ in range(4):
         state = rng.normal(size=STATE_DIM) * np.repeat((1.0, 5.0, 100.0), 3)
         coefficients = own + 0.05 * rng.normal(size=p)
@@ -226,7 +259,7 @@ def _compare(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], 
         right = of_both(x, c).detach().numpy()
         rows = torch.cat([j.reshape(made.size, -1) for j in torch.autograd.functional.jacobian(of_both, (x, c))], dim=1)
         y, yt = np.zeros(made.size), np.zeros((made.size, STATE_DIM + p))
-        made.compute(state, coefficients, tangents[:STATE_DIM].copy(), tangents[STATE_DIM:].copy(), y, yt)
+        made.compute(state, coefficients, weights, tangents[:STATE_DIM].copy(), tangents[STATE_DIM:].copy(), y, yt)
         for got, wanted, limit in ((y, right, VALUES_AGREE), (yt, rows.numpy(), SLOPES_AGREE)):
             scale = np.maximum(1.0, np.abs(wanted))
             if not (np.abs(got - wanted) <= limit * scale).all():

@@ -37,6 +37,7 @@ class Moving:
         n, width = states.shape
         names = model.names if isinstance(model, AugmentedModel) else ()
         inner = model.model if isinstance(model, AugmentedModel) else model
+        self.weights = functions.weights(inner)
         self.functions, self.travelling = functions, states.numpy()[:, STATE_DIM:]
         self.states = np.array(states.numpy()[:, :STATE_DIM], order="C")  # moved in place
         self.moved = np.tile(np.eye(STATE_DIM, width), (n, 1, 1))
@@ -50,7 +51,9 @@ class Moving:
         left, earlier = np.ascontiguousarray(dt - self.elapsed), -self.slower
         steps = step_count(torch.from_numpy(left))
         rates = self.functions.rates
-        fly_rows(rates.compute, self.states, self.moved, *self._coefficients(rates), left, earlier, steps)
+        fly_rows(
+            rates.compute, self.states, self.moved, *self._coefficients(rates), self.weights[0], left, earlier, steps
+        )
 
     def bounce(self, height: Array, longest: Array) -> None:
         """Move on through the next contact with surfaces at some heights (n,) m; NaN where there is none."""
@@ -61,7 +64,20 @@ class Moving:
         after, moved = np.empty_like(self.states), np.empty_like(self.moved)
         computes = (function.compute for function in functions)
         radius = self.functions.radius
-        contacts(*computes, self.states, self.moved, *given, height, longest, radius, tau, slower, after, moved)
+        contacts(
+            *computes,
+            self.states,
+            self.moved,
+            *given,
+            *self.weights,
+            height,
+            longest,
+            radius,
+            tau,
+            slower,
+            after,
+            moved,
+        )
         self.states, self.moved = after, moved
         self.elapsed, self.slower = self.elapsed + tau, self.slower + slower
 

@@ -33,11 +33,20 @@ FOLDED: Final[dict[str, Callable[..., float]]] = {
 
 @dataclass(frozen=True)
 class Operation:
-    """One operation: its name, the numbers it takes, and a constant that belongs to it (an exponent, a value)."""
+    """One operation.
+
+    Attributes:
+        name: what it does.
+        operands: the numbers it takes.
+        constant: that belongs to it: an exponent, a value.
+        where: of a number that is read from an array or from its derivatives: the array, the place in it, by how many
+            of the operands derivatives are taken, and by which of them.
+    """
 
     name: str
     operands: tuple[Number, ...] = ()
     constant: float | None = None
+    where: tuple[int, ...] = ()
 
 
 @dataclass
@@ -50,11 +59,11 @@ class Program:
 
     def input(self) -> Number:
         """A further input."""
-        return self._place(Operation("input", constant=float(len(self.operations))))
+        return self.place(Operation("input", constant=float(len(self.operations))))
 
     def constant(self, value: float) -> Number:
         """A constant."""
-        return self._place(Operation("constant", constant=float(value)))
+        return self.place(Operation("constant", constant=float(value)))
 
     def value(self, number: Number) -> float | None:
         """The value of a constant; None where it is none."""
@@ -72,7 +81,7 @@ class Program:
             return simple
         if name in COMMUTATIVE:
             operands = tuple(sorted(operands))
-        return self._place(Operation(name, operands, constant))
+        return self.place(Operation(name, operands, constant))
 
     def total(self, terms: Iterable[Number]) -> Number:
         """The sum of numbers."""
@@ -81,7 +90,8 @@ class Program:
             result = self.apply("add", result, term)
         return result
 
-    def _place(self, operation: Operation) -> Number:
+    def place(self, operation: Operation) -> Number:
+        """The place of an operation, which is listed once."""
         if operation not in self._known:
             self._known[operation] = len(self.operations)
             self.operations.append(operation)
@@ -190,6 +200,16 @@ def _of_pow(p: Program, _: Number, operation: Operation, __: int) -> Number:
     return p.apply("mul", p.constant(exponent), lower)
 
 
+def _of_read(p: Program, number: Number, operation: Operation, place: int) -> Number:
+    """The derivative by one of the numbers through which an array depends on others; for the others it is zero."""
+    block, entry, through = operation.where
+    if place >= through:
+        return p.constant(0.0)
+    by, loaded = operation.operands[:through], operation.operands[through:]
+    moved = [p.derivative(one, other) for one in loaded for other in by]
+    return p.place(Operation("slope", (number, *by, *moved), where=(block, entry, through, place)))
+
+
 def _still(p: Program, *_: object) -> Number:
     return p.constant(0.0)
 
@@ -212,6 +232,7 @@ PARTIALS: Final[dict[str, Partial]] = {
     "maximum": _chosen("ge"),
     "where": _of_where,
     "pow": _of_pow,
+    "read": _of_read,
     **dict.fromkeys(("le", "ge", "lt", "gt", "sign"), _still),
 }
 """Derivatives by operation."""

@@ -13,8 +13,8 @@ REAL: Final[Any] = types.float64
 COUNT: Final[Any] = types.int64
 FLAG: Final[Any] = types.boolean
 NOTHING: Final[Any] = types.void
-FUNCTION: Final[Any] = types.FunctionType(types.void(ONE, ONE, TWO, TWO, ONE, TWO))
-"""A compiled function of a model, `compute(x, c, xt, ct, y, yt)`."""
+FUNCTION: Final[Any] = types.FunctionType(types.void(ONE, ONE, ONE, TWO, TWO, ONE, TWO))
+"""A compiled function of a model, `compute(x, c, w, xt, ct, y, yt)`."""
 
 
 def several(kind: Any, count: int) -> Any:

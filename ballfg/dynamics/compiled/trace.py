@@ -1,241 +1,166 @@
-"""From a torch function to a scalar program: torch's own tracer, and every small tensor taken apart into numbers."""
+"""From a torch function to a program, by torch's own tracer.
+
+Small tensors are taken apart into numbers (`rules.py`), and so is what is made of them. What is made of large ones,
+the layers of a network for instance, stays an array (`array_rules.py`). What depends on tables alone, such as weights,
+torch computes once for all states (`weights.py`).
+"""
 
 from __future__ import annotations
 
-import operator
-from collections.abc import Callable, Sequence
-from typing import Any, Final
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
+from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from ballfg.dynamics.compiled.program import Number, Program
+from ballfg.dynamics.compiled.array_rules import ARRAY_RULES, EACH, each_of
+from ballfg.dynamics.compiled.arrays import SMALL, Arrays, Load, View
+from ballfg.dynamics.compiled.program import Number, Operation, Program
+from ballfg.dynamics.compiled.rules import RULES, Numbers, Rules, UnknownOperationError
+from ballfg.dynamics.compiled.weights import Known, Weights
 
-Numbers = NDArray[np.object_]
-"""A tensor of numbers of a program."""
-aten: Any = torch.ops.aten
+MOST_READ = 500
+"""Numbers of an array that is taken apart for an operation which arrays do not have."""
 
 
-class UnknownOperationError(Exception):
-    """An operation that no rule takes apart."""
+@dataclass(frozen=True)
+class Traced:
+    """A function as a program.
+
+    Attributes:
+        program, arrays: all of it.
+        inputs: of the program, vector by vector.
+        outputs: numbers of the program.
+        weights: gives the weights (k,) that the program takes, from the function's tables; None: it takes none.
+    """
+
+    program: Program
+    arrays: Arrays
+    inputs: list[list[Number]]
+    outputs: list[Number]
+    weights: Callable[..., Tensor] | None
 
 
-def trace(function: Callable[..., Tensor], lengths: Sequence[int]) -> tuple[Program, list[list[Number]], list[Number]]:
-    """A program, its inputs vector by vector, and its outputs, of a function of vectors.
+def trace(function: Callable[..., Tensor], lengths: Sequence[int], tables: Sequence[Tensor] = ()) -> Traced:
+    """The program of a function of vectors and of tables.
 
-    Args: function: of float64 vectors; its branches must not depend on their values.  lengths: of the vectors.
+    Args:
+        function: of float64 vectors and tables; its branches must not depend on their values.
+        lengths: of the vectors.
+        tables: of any shape, derivatives by which nobody asks for.
     Raises: UnknownOperationError: if the function does what no rule covers.
     """
-    program = Program()
     examples = [torch.linspace(0.5, 1.5, size, dtype=torch.float64) for size in lengths]
     with torch.no_grad():
-        graph = make_fx(function)(*examples)
-    given = [[program.input() for _ in range(size)] for size in lengths]
-    result = _run(graph, program, [np.array(vector, dtype=object) for vector in given])
-    return program, given, [int(n) for n in np.asarray(result).reshape(-1)]
+        graph = make_fx(function)(*examples, *tables)
+        tracing = _Tracing(graph)
+        inputs = [[tracing.program.input() for _ in range(size)] for size in lengths]
+        result = tracing.run([np.array(vector, dtype=object) for vector in inputs], tables)
+    outputs = [int(n) for n in result.reshape(-1)]
+    return Traced(tracing.program, tracing.arrays, inputs, outputs, tracing.weights.function(graph))
 
 
-def _run(graph: torch.fx.GraphModule, program: Program, given: Sequence[Numbers]) -> Numbers:
-    rules, waiting = Rules(program), iter(given)
-    values: dict[torch.fx.Node, Any] = {}
-    for node in graph.graph.nodes:
-        if node.op == "placeholder":
-            values[node] = next(waiting)
-        elif node.op == "get_attr":
-            constant = getattr(graph, node.target)
-            values[node] = rules.constants(constant)
-        elif node.op == "output":
-            return values[node.args[0]]
+@dataclass
+class _Tracing:
+    graph: GraphModule
+    program: Program = field(default_factory=Program)
+    weights: Weights = field(default_factory=Weights)
+
+    def __post_init__(self) -> None:
+        self.arrays, self.rules = Arrays(self.program), Rules(self.program)
+
+    def run(self, vectors: Sequence[Numbers], tables: Sequence[Tensor]) -> Numbers:
+        """Operations in their order: the numbers of the result."""
+        values: dict[Node, Any] = {}
+        given = iter((*vectors, *tables))
+        for node in self.graph.graph.nodes:
+            if node.op == "placeholder":
+                value = next(given)
+                values[node] = value if isinstance(value, np.ndarray) else Known(node, value, varies=True)
+            elif node.op == "get_attr":
+                values[node] = Known(node, getattr(self.graph, node.target), varies=False)
+            elif node.op == "output":
+                return self._numbers(values[node.args[0]])
+            else:
+                values[node] = self._applied(node, values)
+        raise UnknownOperationError("a function without result")
+
+    def _applied(self, node: Node, values: Mapping[Node, Any]) -> Any:
+        inputs = [values[n] for n in node.all_input_nodes]
+        if all(isinstance(value, Known) for value in inputs) and not _of_shape_only(node):
+            args, kwargs = (_mapped(a, lambda n: values[n].example) for a in (node.args, node.kwargs))
+            example = node.target(*args, **kwargs)
+            return Known(node, example, any(value.varies for value in inputs))
+        args, kwargs = (_mapped(a, lambda n: self._operand(values[n])) for a in (node.args, node.kwargs))
+        if any(isinstance(self._operand(value), View) for value in inputs):
+            made = self._of_arrays(node.target, args, kwargs)
+            if made is not None:
+                return self._numbers(made) if made.block is not None and made.size <= SMALL else made
+            args, kwargs = (_parts(a, self._numbers) for a in (args, kwargs))
+        rule = RULES.get(node.target)
+        if rule is None:
+            raise UnknownOperationError(f"torch's {node.target} cannot be compiled")
+        return rule(self.rules, *args, **kwargs)
+
+    def _operand(self, value: Any) -> Any:
+        """Numbers of a small tensor, an array of a large one; tables of whole numbers as they are."""
+        if not isinstance(value, Known) or not isinstance(value.example, Tensor):
+            return value
+        tensor = value.example
+        if not tensor.is_floating_point():
+            return tensor
+        if tensor.numel() > SMALL:
+            return self.weights.take(value)
+        return self._numbers(self.weights.take(value)) if value.varies else self.rules.constants(tensor)
+
+    def _numbers(self, value: Any) -> Any:
+        if isinstance(value, Known):
+            value = self._operand(value)
+        if not isinstance(value, View):
+            return value
+        if value.size > MOST_READ:
+            raise UnknownOperationError(f"{value.size} numbers cannot be taken apart")
+        if value.block is None:
+            found = [self.program.place(Operation("weight", where=(place,))) for place in value.places]
         else:
-            args = torch.fx.node.map_arg(node.args, values.__getitem__)
-            kwargs = torch.fx.node.map_arg(node.kwargs, values.__getitem__)
-            rule = RULES.get(node.target)
-            if rule is None:
-                raise UnknownOperationError(f"torch's {node.target} cannot be compiled")
-            values[node] = rule(rules, *args, **kwargs)
-    raise UnknownOperationError("a function without result")
+            found = self.arrays.read(value)
+        return np.array(found, dtype=object).reshape(value.shape)
+
+    def _of_arrays(self, target: Any, args: Sequence[Any], kwargs: Mapping[str, Any]) -> View | None:
+        """The result of an operation on arrays; None where arrays do not have it."""
+        given = [self._loaded(a) if target in EACH or target in LOADS else a for a in args]
+        if target in EACH:
+            return each_of(self.arrays, target, given, kwargs)
+        rule = ARRAY_RULES.get(target)
+        return None if rule is None else rule(self.arrays, *given, **kwargs)
+
+    def _loaded(self, value: Any) -> Any:
+        """Numbers as an array."""
+        if not isinstance(value, np.ndarray):
+            return value
+        return self.arrays.make(Load(tuple(int(n) for n in value.reshape(-1))), value.shape)
 
 
-class Rules:
-    """What torch's operations do to tensors of numbers."""
-
-    def __init__(self, program: Program) -> None:
-        self.program = program
-
-    def constants(self, tensor: Tensor) -> Numbers:
-        """The numbers of a constant tensor."""
-        flat = [self.program.constant(v) for v in tensor.detach().double().reshape(-1).tolist()]
-        return np.array(flat, dtype=object).reshape(tuple(tensor.shape))
-
-    def numbers(self, value: Any) -> Numbers:
-        """A tensor of numbers, or one constant."""
-        return value if isinstance(value, np.ndarray) else np.array(self.program.constant(float(value)), dtype=object)
-
-    def each(self, name: str, *operands: Any, constant: float | None = None) -> Numbers:
-        """An operation number by number."""
-        arrays = np.broadcast_arrays(*map(self.numbers, operands))
-        made = [
-            self.program.apply(name, *(int(a) for a in one), constant=constant)
-            for one in zip(*(a.flat for a in arrays), strict=True)
-        ]
-        return np.array(made, dtype=object).reshape(arrays[0].shape)
-
-    def total(self, numbers: Numbers, dims: Sequence[int] | None, keep: bool) -> Numbers:
-        """Sums over dimensions."""
-        axes = tuple(d % numbers.ndim for d in dims) if dims else tuple(range(numbers.ndim))
-        moved = np.moveaxis(numbers, axes, range(len(axes)))
-        flat = moved.reshape(-1, *moved.shape[len(axes) :])
-        result = np.empty(flat.shape[1:], dtype=object)
-        for place in np.ndindex(result.shape):
-            result[place] = self.program.total(int(flat[(k, *place)]) for k in range(len(flat)))
-        if keep:
-            result = np.expand_dims(result, axes)
-        return result
-
-    def matmul(self, a: Numbers, b: Numbers) -> Numbers:
-        """Products of matrices (..., m, k) and (..., k, n)."""
-        return self.total(self.each("mul", a[..., :, :, None], b[..., None, :, :]), [-2], keep=False)
+LOADS = frozenset({torch.ops.aten.mm.default, torch.ops.aten.addmm.default})
+"""Operations on arrays that may take numbers too."""
 
 
-def _each(name: str) -> Callable[..., Numbers]:
-    return lambda rules, *operands: rules.each(name, *operands)
+def _of_shape_only(node: Node) -> bool:
+    """Whether a node takes nothing at all, so that it is a constant."""
+    return not node.all_input_nodes
 
 
-def _pow(rules: Rules, base: Numbers, exponent: float) -> Numbers:
-    if exponent == 2:
-        return rules.each("mul", base, base)
-    if exponent == 0.5:
-        return rules.each("sqrt", base)
-    return rules.each("pow", base, constant=float(exponent))
+def _mapped(args: Any, function: Callable[[Node], Any]) -> Any:
+    return torch.fx.node.map_arg(args, function)
 
 
-def _add(rules: Rules, a: Any, b: Any, alpha: float = 1) -> Numbers:
-    return rules.each("add", a, b if alpha == 1 else rules.each("mul", b, alpha))
-
-
-def _sub(rules: Rules, a: Any, b: Any, alpha: float = 1) -> Numbers:
-    return rules.each("sub", a, b if alpha == 1 else rules.each("mul", b, alpha))
-
-
-def _slice(
-    rules: Rules, x: Numbers, dim: int = 0, start: int | None = None, end: int | None = None, step: int = 1
-) -> Numbers:
-    where = [slice(None)] * x.ndim
-    where[dim] = slice(start, end, step)
-    return x[tuple(where)]
-
-
-def _norm(
-    rules: Rules, x: Numbers, order: float = 2, dims: Sequence[int] | None = None, keep: bool = False, **_: Any
-) -> Numbers:
-    if order != 2:
-        raise UnknownOperationError(f"a norm of order {order} cannot be compiled")
-    return rules.each("sqrt", rules.total(rules.each("mul", x, x), dims, keep))
-
-
-def _cross(rules: Rules, a: Numbers, b: Numbers, dim: int = -1) -> Numbers:
-    a, b = (np.moveaxis(v, dim, -1) for v in np.broadcast_arrays(a, b))
-    parts = []
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        parts.append(
-            rules.each("sub", rules.each("mul", a[..., j], b[..., k]), rules.each("mul", a[..., k], b[..., j]))
-        )
-    return np.moveaxis(np.stack(parts, axis=-1), -1, dim)
-
-
-def _clamp(rules: Rules, x: Numbers, low: float | None = None, high: float | None = None) -> Numbers:
-    x = x if low is None else rules.each("maximum", x, low)
-    return x if high is None else rules.each("minimum", x, high)
-
-
-def _filled(value: float) -> Callable[..., Numbers]:
-    def make(rules: Rules, like: Any, *_: Any, **__: Any) -> Numbers:
-        shape = like.shape if isinstance(like, np.ndarray) else tuple(like)
-        return np.full(shape, rules.program.constant(value), dtype=object)
-
-    return make
-
-
-def _new(rules: Rules, _: Numbers, shape: Sequence[int], value: float = 0.0, **__: Any) -> Numbers:
-    return np.full(tuple(shape), rules.program.constant(value), dtype=object)
-
-
-RULES: Final[dict[Any, Callable[..., Any]]] = {
-    aten.add.Tensor: _add,
-    aten.add.Scalar: _add,
-    aten.sub.Tensor: _sub,
-    aten.sub.Scalar: _sub,
-    aten.rsub.Scalar: lambda r, a, b, alpha=1: _sub(r, b, a, alpha),
-    aten.mul.Tensor: _each("mul"),
-    aten.mul.Scalar: _each("mul"),
-    aten.div.Tensor: _each("div"),
-    aten.div.Scalar: _each("div"),
-    aten.neg.default: _each("neg"),
-    aten.sqrt.default: _each("sqrt"),
-    aten.exp.default: _each("exp"),
-    aten.tan.default: _each("tan"),
-    aten.tanh.default: _each("tanh"),
-    aten.abs.default: _each("abs"),
-    aten.minimum.default: _each("minimum"),
-    aten.maximum.default: _each("maximum"),
-    aten.reciprocal.default: lambda r, x: r.each("div", 1.0, x),
-    aten.rsqrt.default: lambda r, x: r.each("div", 1.0, r.each("sqrt", x)),
-    aten.sin.default: _each("sin"),
-    aten.cos.default: _each("cos"),
-    aten.log.default: _each("log"),
-    aten.sign.default: _each("sign"),
-    aten.square.default: lambda r, x: r.each("mul", x, x),
-    aten.pow.Tensor_Scalar: _pow,
-    aten.clamp.default: _clamp,
-    aten.clamp_min.default: lambda r, x, low: r.each("maximum", x, low),
-    aten.clamp_max.default: lambda r, x, high: r.each("minimum", x, high),
-    aten.where.self: _each("where"),
-    aten.lt.Scalar: _each("lt"),
-    aten.lt.Tensor: _each("lt"),
-    aten.gt.Scalar: _each("gt"),
-    aten.gt.Tensor: _each("gt"),
-    aten.le.Scalar: _each("le"),
-    aten.ge.Scalar: _each("ge"),
-    aten.sum.dim_IntList: lambda r, x, dims, keep=False, **_: r.total(x, dims, keep),
-    aten.sum.default: lambda r, x, **_: r.total(x, None, keep=False),
-    aten.linalg_vector_norm.default: _norm,
-    aten.linalg_cross.default: lambda r, a, b, dim=-1: _cross(r, a, b, dim),
-    aten.mm.default: lambda r, a, b: r.matmul(a, b),
-    aten.bmm.default: lambda r, a, b: r.matmul(a, b),
-    aten.slice.Tensor: _slice,
-    aten.select.int: lambda r, x, dim, index: np.asarray(np.take(x, index, axis=dim), dtype=object),
-    aten.split_with_sizes.default: lambda r, x, sizes, dim=0: np.split(x, np.cumsum(sizes)[:-1], axis=dim),
-    aten.split.Tensor: lambda r, x, size, dim=0: np.split(x, range(size, x.shape[dim], size), axis=dim),
-    aten.unbind.int: lambda r, x, dim=0: [np.asarray(part, dtype=object) for part in np.moveaxis(x, dim, 0)],
-    aten.cat.default: lambda r, parts, dim=0: np.concatenate(parts, axis=dim),
-    aten.stack.default: lambda r, parts, dim=0: np.stack(parts, axis=dim),
-    aten.flip.default: lambda r, x, dims: np.flip(x, dims),
-    aten.expand.default: lambda r, x, shape, **_: np.broadcast_to(
-        x, [x.shape[i - len(shape)] if n == -1 else n for i, n in enumerate(shape)]
-    ),
-    aten.unsqueeze.default: lambda r, x, dim: np.expand_dims(x, dim),
-    aten.squeeze.dim: lambda r, x, dim: np.squeeze(x, dim) if x.shape[dim] == 1 else x,
-    aten.view.default: lambda r, x, shape: x.reshape(shape),
-    aten.reshape.default: lambda r, x, shape: x.reshape(shape),
-    aten._unsafe_view.default: lambda r, x, shape: x.reshape(shape),
-    aten.permute.default: lambda r, x, dims: np.transpose(x, dims),
-    aten.transpose.int: lambda r, x, a, b: np.swapaxes(x, a, b),
-    aten.t.default: lambda r, x: x.T,
-    aten.zeros_like.default: _filled(0.0),
-    aten.ones_like.default: _filled(1.0),
-    aten.new_zeros.default: _new,
-    aten.new_full.default: _new,
-    aten.zeros.default: _filled(0.0),
-    aten.ones.default: _filled(1.0),
-    aten.clone.default: lambda r, x, **_: x,
-    aten.alias.default: lambda r, x: x,
-    aten.detach.default: lambda r, x: x,
-    aten.lift_fresh_copy.default: lambda r, x: x,
-    aten._to_copy.default: lambda r, x, **_: x,
-    operator.getitem: lambda r, parts, i: parts[i],
-}
-"""Rules by operation."""
+def _parts(args: Any, function: Callable[[Any], Any]) -> Any:
+    if isinstance(args, (list, tuple)):
+        return type(args)(_parts(a, function) for a in args)
+    if isinstance(args, dict):
+        return {name: _parts(a, function) for name, a in args.items()}
+    return function(args)

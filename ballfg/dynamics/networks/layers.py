@@ -68,6 +68,11 @@ class MNN(nn.Module):
         self.last = _zero_linear(width, outputs)
         self._least_rows = EXPANSION_ROWS if evaluation_cost(inputs, outputs, depth) < depth * width**2 else math.inf
 
+    def write_out(self) -> None:
+        """Have it written out for single states too, where that is cheaper once the coefficients are there."""
+        if math.isfinite(self._least_rows):
+            self._least_rows = 0
+
     def forward(self, x: Tensor) -> Tensor:
         """Outputs (..., o) from features (..., f)."""
         if x.numel() >= self._least_rows * x.shape[-1]:

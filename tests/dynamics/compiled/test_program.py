@@ -5,9 +5,11 @@ import math
 import numpy as np
 import pytest
 
+from ballfg.dynamics.compiled.arrays import Arrays
 from ballfg.dynamics.compiled.build import built
 from ballfg.dynamics.compiled.program import Program
 from ballfg.dynamics.compiled.source import function_source
+from ballfg.dynamics.compiled.trace import Traced
 
 UNARY = {
     "neg": lambda a: -a,
@@ -30,12 +32,16 @@ BINARY = {
 }
 
 
+def whole(program, outputs):
+    return Traced(program, Arrays(program), [], outputs, None)
+
+
 def run(program, outputs, state, others, x, c):
     """Values (m,) and the derivatives (m, len(x) + len(c)) that the generated code gives."""
-    compute = built(function_source(program, outputs, state, others))
+    compute = built(function_source(whole(program, outputs), state, others))
     eye = np.eye(len(x) + len(c))
     y, yt = np.zeros(len(outputs)), np.zeros((len(outputs), len(eye)))
-    compute(np.array(x), np.array(c), eye[: len(x)].copy(), eye[len(x) :].copy(), y, yt)
+    compute(np.array(x), np.array(c), np.zeros(0), eye[: len(x)].copy(), eye[len(x) :].copy(), y, yt)
     return y, yt
 
 
@@ -92,5 +98,5 @@ def test_source_does_not_depend_on_what_else_a_program_holds() -> None:
     sources = []
     for program in (short, long):
         a, b = program.input(), program.input()
-        sources.append(function_source(program, [program.apply("mul", a, b)], [a], [b]))
+        sources.append(function_source(whole(program, [program.apply("mul", a, b)]), [a], [b]))
     assert sources[0] == sources[1]

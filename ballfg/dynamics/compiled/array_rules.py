@@ -1,0 +1,132 @@
+"""What torch's operations do to arrays of a program."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from ballfg.dynamics.compiled.arrays import Arrays, Each, Product, Total, View
+from ballfg.dynamics.compiled.program import Program
+from ballfg.dynamics.compiled.rules import RULES, Rules, UnknownOperationError, aten
+
+EACH: Final = frozenset(
+    {
+        aten.add.Tensor,
+        aten.add.Scalar,
+        aten.sub.Tensor,
+        aten.sub.Scalar,
+        aten.rsub.Scalar,
+        aten.mul.Tensor,
+        aten.mul.Scalar,
+        aten.div.Tensor,
+        aten.div.Scalar,
+        aten.neg.default,
+        aten.sqrt.default,
+        aten.exp.default,
+        aten.log.default,
+        aten.sin.default,
+        aten.cos.default,
+        aten.tanh.default,
+        aten.abs.default,
+        aten.reciprocal.default,
+        aten.rsqrt.default,
+        aten.square.default,
+        aten.pow.Tensor_Scalar,
+        aten.clamp.default,
+        aten.clamp_min.default,
+        aten.clamp_max.default,
+        aten.addcmul.default,
+    }
+)
+"""Operations number by number."""
+
+
+def each_of(arrays: Arrays, target: Any, args: Sequence[Any], kwargs: Mapping[str, Any]) -> View:
+    """An operation of arrays number by number, by its rule for numbers."""
+    views = [a for a in args if isinstance(a, View)]
+    shape = np.broadcast_shapes(*(view.shape for view in views))
+    program = Program()
+    inputs = [program.input() for _ in views]
+    numbers = iter(inputs)
+    given = [np.array(next(numbers), dtype=object) if isinstance(a, View) else a for a in args]
+    result = int(RULES[target](Rules(program), *given, **kwargs).item())
+    operands = tuple(view.broadcast(shape) for view in views)
+    return arrays.make(Each(program, tuple(inputs), result, operands), shape)
+
+
+def _copied(arrays: Arrays, view: View) -> View:
+    program = Program()
+    number = program.input()
+    return arrays.make(Each(program, (number,), number, (view,)), view.shape)
+
+
+def _reshaped(arrays: Arrays, view: View, shape: Sequence[int]) -> View:
+    same = view.reshaped(shape)
+    if same is None:
+        same = _copied(arrays, view).reshaped(shape)
+    assert same is not None
+    return same
+
+
+def _product(arrays: Arrays, left: View, right: View) -> View:
+    return arrays.make(Product(left, right, None), (left.shape[0], right.shape[1]))
+
+
+def _linear(arrays: Arrays, plus: View, left: View, right: View, beta: float = 1, alpha: float = 1) -> View:
+    if beta != 1 or alpha != 1:
+        raise UnknownOperationError("a matrix product with factors cannot be compiled")
+    shape = left.shape[0], right.shape[1]
+    return arrays.make(Product(left, right, plus.broadcast(shape)), shape)
+
+
+def _total(arrays: Arrays, view: View, dims: Sequence[int] | None = None, keep: bool = False, **_: Any) -> View:
+    rank = len(view.shape)
+    summed = [d % rank for d in dims] if dims else list(range(rank))
+    left = [d for d in range(rank) if d not in summed]
+    made = arrays.make(Total(view.permuted([*summed, *left]), len(summed)), [view.shape[d] for d in left])
+    for dim in sorted(summed) if keep else ():
+        made = made.unsqueezed(dim)
+    return made
+
+
+def _mean(arrays: Arrays, view: View, dims: Sequence[int] | None = None, keep: bool = False, **_: Any) -> View:
+    total = _total(arrays, view, dims, keep)
+    return each_of(arrays, aten.mul.Scalar, [total, total.size / view.size], {})
+
+
+def _transposed(view: View, a: int, b: int) -> View:
+    dims = list(range(len(view.shape)))
+    dims[a], dims[b] = dims[b], dims[a]
+    return view.permuted(dims)
+
+
+ARRAY_RULES: Final[dict[Any, Callable[..., View]]] = {
+    aten.mm.default: _product,
+    aten.addmm.default: _linear,
+    aten.sum.dim_IntList: _total,
+    aten.sum.default: _total,
+    aten.mean.dim: _mean,
+    aten.mean.default: _mean,
+    aten.view.default: _reshaped,
+    aten.reshape.default: _reshaped,
+    aten._unsafe_view.default: _reshaped,
+    aten.unsqueeze.default: lambda _, view, dim: view.unsqueezed(dim),
+    aten.squeeze.dim: lambda _, view, dim: view.squeezed(dim),
+    aten.squeeze_.dim: lambda _, view, dim: view.squeezed(dim),
+    aten.expand.default: lambda _, view, shape, **__: view.broadcast(_full(view, shape)),
+    aten.permute.default: lambda _, view, dims: view.permuted(dims),
+    aten.transpose.int: lambda _, view, a, b: _transposed(view, a, b),
+    aten.t.default: lambda _, view: view.permuted((1, 0)) if len(view.shape) == 2 else view,
+    aten.clone.default: lambda _, view, **__: view,
+    aten.alias.default: lambda _, view: view,
+    aten.detach.default: lambda _, view: view,
+    aten._to_copy.default: lambda _, view, **__: view,
+}
+"""Rules of further operations by operation."""
+
+
+def _full(view: View, shape: Sequence[int]) -> list[int]:
+    missing = len(shape) - len(view.shape)
+    return [view.shape[i - missing] if n == -1 else n for i, n in enumerate(shape)]

@@ -1,0 +1,223 @@
+"""Arrays in a program: layers of networks and other tables, which are too large to be taken apart into numbers.
+
+An array is made from numbers of the program and from weights by loops. It is read by numbers again. Its derivatives
+run forward, by the few numbers through which all of its inputs depend on those of the program.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from math import prod
+from typing import Final
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+from ballfg.dynamics.compiled.program import Number, Operation, Program
+
+INPUTS: Final = ("input",)
+"""Operations by which derivatives may be asked for."""
+SMALL: Final = 12
+"""Numbers that an array may hold to be taken apart."""
+
+
+@dataclass(frozen=True)
+class View:
+    """An array: where its numbers lie, in a block or among the weights.
+
+    Attributes:
+        block: its number; None where they lie among the weights.
+        shape: of the array.
+        strides: how many numbers further the next entry along each dimension lies.
+        offset: of the first number.
+    """
+
+    block: int | None
+    shape: tuple[int, ...]
+    strides: tuple[int, ...]
+    offset: int = 0
+
+    @classmethod
+    def whole(cls, block: int | None, shape: Sequence[int], offset: int = 0) -> View:
+        """An array whose numbers lie one behind another."""
+        strides = tuple(prod(shape[i + 1 :]) for i in range(len(shape)))
+        return cls(block, tuple(shape), strides, offset)
+
+    @property
+    def size(self) -> int:
+        """How many numbers it has."""
+        return prod(self.shape)
+
+    @property
+    def places(self) -> list[int]:
+        """Where its numbers lie, in the order of the array."""
+        found = [self.offset]
+        for length, stride in zip(self.shape, self.strides, strict=True):
+            found = [place + k * stride for place in found for k in range(length)]
+        return found
+
+    def reshaped(self, shape: Sequence[int]) -> View | None:
+        """The same numbers in another shape; None where that needs a copy."""
+        known = [n for n in shape if n != -1]
+        full = tuple(self.size // prod(known) if n == -1 else n for n in shape)
+        plain = View.whole(self.block, self.shape, self.offset)
+        squeezed = [(n, s) for n, s in zip(self.shape, self.strides, strict=True) if n != 1]
+        if squeezed != [(n, s) for n, s in zip(plain.shape, plain.strides, strict=True) if n != 1]:
+            return None
+        return View.whole(self.block, full, self.offset)
+
+    def permuted(self, dims: Sequence[int]) -> View:
+        """With its dimensions in another order."""
+        return replace(self, shape=tuple(self.shape[d] for d in dims), strides=tuple(self.strides[d] for d in dims))
+
+    def unsqueezed(self, dim: int) -> View:
+        """With a further dimension of length one."""
+        at = dim % (len(self.shape) + 1)
+        return replace(
+            self,
+            shape=(*self.shape[:at], 1, *self.shape[at:]),
+            strides=(*self.strides[:at], 0, *self.strides[at:]),
+        )
+
+    def squeezed(self, dim: int) -> View:
+        """Without a dimension of length one."""
+        at = dim % len(self.shape)
+        if self.shape[at] != 1:
+            return self
+        return replace(
+            self, shape=self.shape[:at] + self.shape[at + 1 :], strides=self.strides[:at] + self.strides[at + 1 :]
+        )
+
+    def broadcast(self, shape: Sequence[int]) -> View:
+        """Repeated to a larger shape."""
+        missing = len(shape) - len(self.shape)
+        own = ((1,) * missing + self.shape, (0,) * missing + self.strides)
+        strides = tuple(0 if n == 1 else s for n, s in zip(*own, strict=True))
+        return replace(self, shape=tuple(shape), strides=strides)
+
+
+@dataclass(frozen=True)
+class Load:
+    """A block filled with numbers of the program."""
+
+    numbers: tuple[Number, ...]
+
+
+@dataclass(frozen=True)
+class Each:
+    """An operation number by number, of views of one shape; the operation is a small program of its own.
+
+    Attributes:
+        program, inputs, result: the operation, its operands and its result.
+        operands: views, as many as inputs.
+    """
+
+    program: Program
+    inputs: tuple[Number, ...]
+    result: Number
+    operands: tuple[View, ...]
+
+
+@dataclass(frozen=True)
+class Product:
+    """A matrix product (m, k) (k, n), plus a view (m, n) where there is one."""
+
+    left: View
+    right: View
+    plus: View | None
+
+
+@dataclass(frozen=True)
+class Total:
+    """A sum over the first dimensions of a view, as many as are `summed`."""
+
+    of: View
+    summed: int
+
+
+Making = Load | Each | Product | Total
+
+
+def operands_of(making: Making) -> list[View]:
+    """The views from which a block is made."""
+    match making:
+        case Load():
+            return []
+        case Each():
+            return list(making.operands)
+        case Product():
+            return [making.left, making.right, *([] if making.plus is None else [making.plus])]
+        case Total():
+            return [making.of]
+
+
+@dataclass
+class Arrays:
+    """The blocks of a program: how each is made, and its size."""
+
+    program: Program
+    makings: list[Making] = field(default_factory=list)
+    sizes: list[int] = field(default_factory=list)
+
+    def make(self, making: Making, shape: Sequence[int]) -> View:
+        """A new block of a shape."""
+        self.makings.append(making)
+        self.sizes.append(prod(shape))
+        return View.whole(len(self.makings) - 1, shape)
+
+    def sources(self, block: int) -> list[int]:
+        """A block and all those from which it is made, in an order in which each comes after what it needs."""
+        found, wanted = set[int](), [block]
+        while wanted:
+            current = wanted.pop()
+            if current not in found:
+                found.add(current)
+                wanted += [v.block for v in operands_of(self.makings[current]) if v.block is not None]
+        return sorted(found)
+
+    def loaded(self, block: int) -> list[Number]:
+        """The numbers of the program that a block depends on."""
+        found: dict[Number, None] = {}
+        for source in self.sources(block):
+            making = self.makings[source]
+            if isinstance(making, Load):
+                found |= dict.fromkeys(making.numbers)
+        return list(found)
+
+    def read(self, view: View) -> list[Number]:
+        """The numbers of an array, as numbers of the program."""
+        assert view.block is not None
+        loaded = self.loaded(view.block)
+        through = narrowest(self.program, loaded)
+        operands = (*through, *loaded)
+        return [
+            self.program.place(Operation("read", operands, where=(view.block, place, len(through))))
+            for place in view.places
+        ]
+
+
+def narrowest(program: Program, numbers: Sequence[Number]) -> list[Number]:
+    """The fewest numbers through which some numbers depend on the inputs of a program.
+
+    They are a minimum cut of the graph of operations in which every number may be passed once: derivatives by three
+    features of a state take half as long as those by its six coordinates.
+    """
+    needed = program.needed(numbers)
+    places = {number: k for k, number in enumerate(needed)}
+    n, endless = len(needed), len(needed) + 1
+    source, sink = 2 * n, 2 * n + 1  # a number is entered at k, passed, and left at n + k
+    edges = [(k, n + k, 1) for k in range(n)]
+    for number, k in places.items():
+        operation = program.operations[number]
+        edges += [(n + places[o], k, endless) for o in set(operation.operands)]
+        if operation.name in INPUTS:
+            edges.append((source, k, endless))
+    edges += [(n + places[number], sink, endless) for number in set(numbers)]
+    starts, ends, room = np.array(edges, dtype=np.int32).T
+    graph = csr_array((room, (starts, ends)), shape=(sink + 1, sink + 1))
+    left = graph - maximum_flow(graph, source, sink).flow
+    left.eliminate_zeros()
+    reached = set(breadth_first_order(left, source, return_predecessors=False).tolist())
+    return [number for number, k in places.items() if k in reached and n + k not in reached]
