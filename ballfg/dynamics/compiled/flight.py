@@ -1,7 +1,8 @@
 """Machine code that moves balls in free flight, round a model's compiled rates.
 
-Each row of a batch is a ball with coefficients of its own; weights w are the same for all. Tangents travel with the values: derivatives in d directions
-at once, of which there may be none. The rules are those of `ballfg.dynamics.motion`, which torch code follows.
+Each row of a batch is a ball with coefficients of its own; weights w are the same for all. Tangents travel with the
+values: derivatives in d directions at once, of which there may be none. The rules are those of
+`ballfg.dynamics.motion`, which torch code follows.
 """
 
 import numpy as np

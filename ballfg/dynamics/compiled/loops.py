@@ -22,9 +22,8 @@ def filled(arrays: Arrays, block: int, names: Names) -> list[str]:
         case Each():
             whole = View.whole(block, making.operands[0].shape)
             given = {n: _entry(v, "i") for n, v in zip(making.inputs, making.operands, strict=True)}
-            body = _computed(making.program, [making.result], given)
-            body = [*body[0], f"{_entry(whole, 'i')} = {body[1][making.result]}"]
-            lines += _loops(whole.shape, "i", body)
+            body, called = _computed(making.program, [making.result], given)
+            lines += _loops(whole.shape, "i", [*body, f"{_entry(whole, 'i')} = {called[making.result]}"])
         case Product(left, right, plus):
             lines += _product(left, right, block, _value, first="0.0" if plus is None else _entry(plus, "i"))
         case Total(of, summed):
@@ -57,9 +56,8 @@ def moved(
             body, called = _computed(program, list(partials.values()), given)
             terms = [f"{called[partials[n]]} * {_entry(v, 'i', kind=kind)}" for n, v in moving]
             if terms:
-                lines += _loops(
-                    whole.shape, "i", [*body, each_by, f"    {_entry(whole, 'i', kind=kind)} = {' + '.join(terms)}"]
-                )
+                set_one = f"    {_entry(whole, 'i', kind=kind)} = {' + '.join(terms)}"
+                lines += _loops(whole.shape, "i", [*body, each_by, set_one])
         case Product(left, right, plus):
             inner: list[str] = []
             if left.block is not None:
@@ -77,7 +75,11 @@ def moved(
     return lines
 
 
-def _product(left: View, right: View, block: int, term: Callable[..., str], first: str | None) -> list[str]:
+_Term = Callable[[View, View, View], tuple[str, str, str]]
+"""Of the left, right and whole matrix: the entry that is added to, the factor from the left and that from the right."""
+
+
+def _product(left: View, right: View, block: int, term: _Term, first: str | None) -> list[str]:
     """A product row by row, the innermost loop along rows of the right matrix, which lie together."""
     whole = View.whole(block, (left.shape[0], right.shape[1]))
     kept, factor, add = term(left, right, whole)

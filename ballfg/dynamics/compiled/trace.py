@@ -91,7 +91,8 @@ class _Tracing:
 
     def _applied(self, node: Node, values: Mapping[Node, Any]) -> Any:
         inputs = [values[n] for n in node.all_input_nodes]
-        if all(isinstance(value, Known) for value in inputs) and not _of_shape_only(node):
+        assert callable(node.target)
+        if inputs and all(isinstance(value, Known) for value in inputs):
             args, kwargs = (_mapped(a, lambda n: values[n].example) for a in (node.args, node.kwargs))
             example = node.target(*args, **kwargs)
             return Known(node, example, any(value.varies for value in inputs))
@@ -147,11 +148,6 @@ class _Tracing:
 
 LOADS = frozenset({torch.ops.aten.mm.default, torch.ops.aten.addmm.default})
 """Operations on arrays that may take numbers too."""
-
-
-def _of_shape_only(node: Node) -> bool:
-    """Whether a node takes nothing at all, so that it is a constant."""
-    return not node.all_input_nodes
 
 
 def _mapped(args: Any, function: Callable[[Node], Any]) -> Any:
