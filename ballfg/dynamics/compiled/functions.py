@@ -7,7 +7,7 @@ import sys
 import warnings
 import weakref
 from collections.abc import Callable, Hashable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Final
@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import built, read_note, write_note
+from ballfg.dynamics.compiled.recipe import Recipe
 from ballfg.dynamics.model import BallModel, is_substituted, substitute
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.layers import MNN
@@ -44,7 +45,7 @@ class Function:
     compute: Any
     names: tuple[str, ...]
     size: int
-    weigh: Callable[..., Tensor] | None = None
+    weigh: Recipe | None = None
 
 
 @dataclass(frozen=True)
@@ -175,7 +176,8 @@ def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor],
     known = None if files is None else f"{function.__name__}, {key}, {files}, torch {torch.__version__}"
     kept = None if known is None else read_note(known)
     if kept is not None:
-        made = Function(built(kept["source"]), tuple(kept["names"]), kept["size"])
+        weigh = None if kept["weights"] is None else Recipe(**kept["weights"])
+        made = Function(built(kept["source"]), tuple(kept["names"]), kept["size"], weigh)
         try:
             _compare(model, function, made)
         except NotTheSameError:  # its source has changed since
@@ -184,8 +186,9 @@ def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor],
             return made
     source, made = _traced(model, function)
     _compare(model, function, made)
-    if known is not None and made.weigh is None:
-        write_note(known, {"source": source, "names": made.names, "size": made.size})
+    if known is not None:
+        weights = None if made.weigh is None else asdict(made.weigh)
+        write_note(known, {"source": source, "names": made.names, "size": made.size, "weights": weights})
     return made
 
 

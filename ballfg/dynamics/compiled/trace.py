@@ -20,6 +20,7 @@ from torch.fx.experimental.proxy_tensor import make_fx
 from ballfg.dynamics.compiled.array_rules import ARRAY_RULES, EACH, each_of
 from ballfg.dynamics.compiled.arrays import SMALL, Arrays, Load, View
 from ballfg.dynamics.compiled.program import Number, Operation, Program
+from ballfg.dynamics.compiled.recipe import Recipe
 from ballfg.dynamics.compiled.rules import RULES, Numbers, Rules, UnknownOperationError
 from ballfg.dynamics.compiled.weights import Known, Weights
 
@@ -42,7 +43,7 @@ class Traced:
     arrays: Arrays
     inputs: list[list[Number]]
     outputs: list[Number]
-    weights: Callable[..., Tensor] | None
+    weights: Recipe | None
 
 
 def trace(function: Callable[..., Tensor], lengths: Sequence[int], tables: Sequence[Tensor] = ()) -> Traced:
@@ -61,7 +62,7 @@ def trace(function: Callable[..., Tensor], lengths: Sequence[int], tables: Seque
         inputs = [[tracing.program.input() for _ in range(size)] for size in lengths]
         result = tracing.run([np.array(vector, dtype=object) for vector in inputs], tables)
     outputs = [int(n) for n in result.reshape(-1)]
-    return Traced(tracing.program, tracing.arrays, inputs, outputs, tracing.weights.function(graph))
+    return Traced(tracing.program, tracing.arrays, inputs, outputs, tracing.weights.recipe(graph, len(lengths)))
 
 
 @dataclass

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from math import prod
-from typing import Any
+from typing import Any, Final
 
 import torch
-from torch import Tensor
-from torch.fx import Graph, GraphModule, Node
+from torch.fx import GraphModule, Node
 
 from ballfg.dynamics.compiled.arrays import View
+from ballfg.dynamics.compiled.recipe import Recipe
+from ballfg.dynamics.compiled.rules import UnknownOperationError
+
+IDLE: Final = frozenset({"memory_format", "pin_memory", "device", "layout"})
+"""Arguments that change nothing about numbers in the memory of a computer."""
 
 
 @dataclass(frozen=True)
@@ -44,28 +47,51 @@ class Weights:
             self.length += prod(shape)
         return View.whole(None, shape, self.taken[known.node])
 
-    def function(self, graph: GraphModule) -> Callable[..., Tensor] | None:
-        """The function of the tables that gives all weights (k,); None where there are none."""
+    def recipe(self, graph: GraphModule, vectors: int) -> Recipe | None:
+        """How the weights come from the tables, which are placeholders after so many vectors; None: there are none.
+
+        Raises: UnknownOperationError: for an argument that cannot be written down.
+        """
         if not self.taken:
             return None
-        needed: set[Node] = set()
-        wanted = list(self.taken)
+        needed = self._needed()
+        tables = [node for node in graph.graph.nodes if node.op == "placeholder"][vectors:]
+        constants = [node for node in graph.graph.nodes if node.op == "get_attr" and node in needed]
+        places = {node: k for k, node in enumerate([*tables, *constants])}
+        steps = []
+        for node in graph.graph.nodes:
+            if node in needed and node.op == "call_function":
+                kwargs = {name: value for name, value in node.kwargs.items() if name not in IDLE}
+                steps.append((_name(node.target), *(_written(a, places) for a in (node.args, kwargs))))
+                places[node] = len(tables) + len(constants) + len(steps) - 1
+        held = [getattr(graph, str(node.target)).detach() for node in constants]
+        plain = [(tensor.tolist(), str(tensor.dtype).removeprefix("torch.")) for tensor in held]
+        return Recipe(plain, steps, [places[node] for node in self.taken])
+
+    def _needed(self) -> set[Node]:
+        needed, wanted = set[Node](), list(self.taken)
         while wanted:
             node = wanted.pop()
             if node not in needed:
                 needed.add(node)
                 wanted += node.all_input_nodes
-        own, copies = Graph(), dict[Node, Node]()
-        for node in graph.graph.nodes:
-            if node.op == "placeholder" or node in needed:
-                copies[node] = own.node_copy(node, copies.__getitem__)
-        own.output(tuple(copies[node] for node in self.taken))
-        made = GraphModule(graph, own)
-        vectors = sum(node.op == "placeholder" for node in graph.graph.nodes)
+        return needed
 
-        def compute(*tables: Tensor) -> Tensor:
-            unused = [torch.zeros(0, dtype=torch.float64)] * (vectors - len(tables))
-            with torch.no_grad():
-                return torch.cat([part.detach().double().reshape(-1) for part in made(*unused, *tables)])
 
-        return compute
+def _name(target: Any) -> str:
+    """Of an operation of torch, as `_operation` finds it; `getitem` of Python's."""
+    return "getitem" if getattr(target, "__name__", "") == "getitem" else str(target).removeprefix("aten.")
+
+
+def _written(argument: Any, places: dict[Node, int]) -> Any:
+    if isinstance(argument, Node):
+        return {"value": places[argument]}
+    if isinstance(argument, (list, tuple)):
+        return [_written(part, places) for part in argument]
+    if isinstance(argument, dict):
+        return {name: _written(part, places) for name, part in argument.items()}
+    if isinstance(argument, torch.dtype):
+        return {"dtype": str(argument).removeprefix("torch.")}
+    if argument is None or isinstance(argument, (bool, int, float)):
+        return argument
+    raise UnknownOperationError(f"{argument!r} cannot be written down")
