@@ -98,6 +98,22 @@ def _scan(rates, surface, state, c, s, w, ws, height, radius, longest):
     return np.nan
 
 
+@machine_code(NOTHING(FUNCTION, FUNCTION, TWO, TWO, TWO, ONE, ONE, ONE, ONE, REAL, ONE))
+def contact_times(rates, surface, start, c, s, w, ws, heights, longest, radius, tau):
+    """Times tau (m,) s to the next contacts of m falling balls; NaN where there is none. Arguments as `contacts`."""
+    tau[:] = 0.0
+    _search(rates, surface, start, c, s, w, ws, heights, radius, longest, tau)
+    if np.isnan(tau).any():
+        near = np.full(len(tau), np.nan)
+        for r in range(len(tau)):
+            if math.isnan(tau[r]):
+                near[r] = _scan(rates, surface, start[r], c[r], s[r], w, ws, heights[r], radius, longest[r])
+        _search(rates, surface, start, c, s, w, ws, heights, radius, longest, near)
+        for r in range(len(tau)):
+            if math.isnan(tau[r]):
+                tau[r] = near[r]
+
+
 @machine_code(
     NOTHING(
         FUNCTION,
@@ -160,17 +176,7 @@ def contacts(
     moved, ct1, st1 = np.empty((3, d + 1)), np.zeros((ct.shape[1], d + 1)), np.zeros((st.shape[1], d + 1))
     by_time = np.zeros(d + 1)  # the last direction is that of the contact's time
     by_time[d] = 1.0
-    tau[:] = 0.0
-    _search(rates, surface, start, c, s, w, ws, heights, radius, longest, tau)
-    if np.isnan(tau).any():
-        near = np.full(len(tau), np.nan)
-        for r in range(len(tau)):
-            if math.isnan(tau[r]):
-                near[r] = _scan(rates, surface, start[r], c[r], s[r], w, ws, heights[r], radius, longest[r])
-        _search(rates, surface, start, c, s, w, ws, heights, radius, longest, near)
-        for r in range(len(tau)):
-            if math.isnan(tau[r]):
-                tau[r] = near[r]
+    contact_times(rates, surface, start, c, s, w, ws, heights, longest, radius, tau)
     steps = _common_steps(tau)
     for r in range(len(start)):
         found = tau[r]

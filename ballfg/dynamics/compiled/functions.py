@@ -103,6 +103,8 @@ def compiled(model: BallModel) -> CompiledModel | None:
     Args: model: without substituted parameters. Its structure must not change afterwards.
     """
     if model not in _by_model:
+        if is_substituted(model):
+            return None
         try:
             key = _structure(model)
         except NotComparableError:
@@ -143,8 +145,6 @@ def _plain(value: object) -> Hashable:
 
 
 def _compiled(model: BallModel, key: Hashable | None) -> CompiledModel | None:
-    if is_substituted(model):
-        return None
     try:
         rates, impact, surface = (_function(model, part, key) for part in (_rates, _impact, _surface))
         return CompiledModel(rates, impact, surface, model.radius)

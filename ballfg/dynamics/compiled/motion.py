@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.compiled.contacts import contacts
+from ballfg.dynamics.compiled.contacts import contact_times, contacts
 from ballfg.dynamics.compiled.flight import fly_rows
 from ballfg.dynamics.compiled.functions import CompiledModel, Function, compiled
 from ballfg.dynamics.model import BallModel
@@ -26,15 +26,16 @@ class Moving:
         model: the ball; coefficients that travel with the states are columns of theirs.
         functions: of the model.
         states: (n, 9 + p).
+        width: d, 9 + p, or 0 for no derivatives.
 
     Attributes:
         states: (n, 9) where the balls are.
-        moved: (n, 9, 9 + p) derivatives by the states they began with.
-        elapsed, slower: (n,) s so far, and (n, 9 + p) its derivatives: contacts come sooner or later.
+        moved: (n, 9, d) derivatives by the states they began with.
+        elapsed, slower: (n,) s so far, and (n, d) its derivatives: contacts come sooner or later.
     """
 
-    def __init__(self, model: BallModel, functions: CompiledModel, states: Tensor) -> None:
-        n, width = states.shape
+    def __init__(self, model: BallModel, functions: CompiledModel, states: Tensor, width: int) -> None:
+        n = len(states)
         names = model.names if isinstance(model, AugmentedModel) else ()
         inner = model.model if isinstance(model, AugmentedModel) else model
         self.weights = functions.weights(inner)
@@ -81,6 +82,19 @@ class Moving:
         self.states, self.moved = after, moved
         self.elapsed, self.slower = self.elapsed + tau, self.slower + slower
 
+    def meets(self, height: Array, longest: Array) -> Array:
+        """(n,) s until the next contact with surfaces at some heights (n,) m; NaN where there is none."""
+        rates, surface, tau = self.functions.rates, self.functions.surface, np.empty(len(self.states))
+        c, s = (self._coefficients(function)[0] for function in (rates, surface))
+        w, _, ws = self.weights
+        radius = self.functions.radius
+        contact_times(rates.compute, surface.compute, self.states, c, s, w, ws, height, longest, radius, tau)
+        return tau
+
+    def whole(self) -> Tensor:
+        """(n, 9 + p) states with the coefficients that travel with them."""
+        return torch.from_numpy(np.concatenate((self.states, self.travelling), axis=1))
+
     def results(self) -> tuple[Tensor, Tensor]:
         """States (n, 9 + p) and Jacobians (n, 9 + p, 9 + p)."""
         n, _, width = self.moved.shape
@@ -88,18 +102,18 @@ class Moving:
         jacobian[:, :STATE_DIM] = self.moved
         own = np.arange(STATE_DIM, width)
         jacobian[:, own, own] = 1.0
-        states = np.concatenate((self.states, self.travelling), axis=1)
-        return torch.from_numpy(states), torch.from_numpy(jacobian)
+        return self.whole(), torch.from_numpy(jacobian)
 
     def _coefficients(self, function: Function) -> tuple[Array, Array]:
-        """(n, p) of a function for each ball, and (n, p, 9 + p) how they move."""
+        """(n, p) of a function for each ball, and (n, p, d) how they move."""
         if function.names not in self._known:
             n, _, width = self.moved.shape
             values, moved = np.empty((n, len(function.names))), np.zeros((n, len(function.names), width))
             for place, name in enumerate(function.names):
                 if name in self._places:
                     values[:, place] = self.travelling[:, self._places[name]]
-                    moved[:, place, STATE_DIM + self._places[name]] = 1.0
+                    if width:
+                        moved[:, place, STATE_DIM + self._places[name]] = 1.0
                 else:
                     values[:, place] = float(self._values[name].detach())
             self._known[function.names] = values, moved
@@ -111,9 +125,34 @@ def functions_of(model: BallModel) -> CompiledModel | None:
     return compiled(model.model if isinstance(model, AugmentedModel) else model)
 
 
+def fly(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> Tensor:
+    """As `integrate.fly`, without derivatives."""
+    shape = torch.broadcast_shapes(state.shape[:-1], dt.shape)
+    rows = state.detach().expand(*shape, -1).reshape(-1, state.shape[-1])
+    moving = Moving(model, functions, rows, 0)
+    moving.fly(dt.detach().expand(shape).reshape(-1).numpy())
+    return moving.whole().reshape(*shape, -1)
+
+
+def contact_time(
+    model: BallModel, functions: CompiledModel, state: Tensor, height: Tensor | float, longest: Tensor | float
+) -> Tensor:
+    """As `contact.contact_time`, without derivatives."""
+    shape = state.shape[:-1]
+    moving = Moving(model, functions, state.detach().reshape(-1, state.shape[-1]), 0)
+    return torch.from_numpy(moving.meets(*(_numbers(given, shape) for given in (height, longest)))).reshape(shape)
+
+
+def _numbers(given: Tensor | float, shape: torch.Size) -> Array:
+    """(n,) of one number or one a ball."""
+    if isinstance(given, Tensor):
+        return np.ascontiguousarray(given.detach().expand(shape).reshape(-1).numpy(), dtype=np.float64)
+    return np.full(shape.numel(), given, dtype=np.float64)
+
+
 def fly_jacobian(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
     """As `integrate.fly_jacobian`."""
-    moving = Moving(model, functions, state.detach())
+    moving = Moving(model, functions, state.detach(), state.shape[-1])
     moving.fly(dt.detach().numpy())
     return moving.results()
 
@@ -122,7 +161,7 @@ def fly_through_jacobian(
     model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, heights: Sequence[Tensor | float]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """As `contact.fly_through_jacobian`."""
-    moving, whole = Moving(model, functions, state.detach()), dt.detach().numpy()
+    moving, whole = Moving(model, functions, state.detach(), state.shape[-1]), dt.detach().numpy()
     times = []
     for height in heights:
         level = np.full(whole.shape, height, dtype=np.float64)

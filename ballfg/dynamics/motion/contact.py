@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import batch_jacobian, derivative, fly, fly_jacobian, rk4_step
+from ballfg.dynamics.motion.integrate import batch_jacobian, derivative, fly, fly_jacobian, followed, rk4_step
 from ballfg.dynamics.motion.limits import (
     BEYOND,
     GAP_TOLERANCE,
@@ -38,14 +38,26 @@ def contact_time(
         parameters.
     """
     with torch.no_grad():
-        tau = _search(model, state, height, torch.zeros_like(state[..., Z]), longest)
-        if bool(tau.isnan().any()):  # rare: lift above the weight, near misses, or no contact at all
-            start = _scan(model, state, height, tau.isnan(), longest)
-            scanned = _search(model, state, height, start, longest)
-            tau = torch.where(tau.isnan(), scanned, tau)
+        tau = _found(model, state, height, longest)
     if torch.is_grad_enabled():
         for _ in range(2):
             tau = tau + _newton_step(model, state, height, tau)
+    return tau
+
+
+def _found(model: BallModel, state: Tensor, height: Tensor | float, longest: Tensor | float) -> Tensor:
+    """`contact_time` without derivatives."""
+    if not followed(state, height, longest):
+        from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
+
+        functions = motion.functions_of(model)
+        if functions is not None:
+            return motion.contact_time(model, functions, state, height, longest)
+    tau = _search(model, state, height, torch.zeros_like(state[..., Z]), longest)
+    if bool(tau.isnan().any()):  # rare: lift above the weight, near misses, or no contact at all
+        start = _scan(model, state, height, tau.isnan(), longest)
+        scanned = _search(model, state, height, start, longest)
+        tau = torch.where(tau.isnan(), scanned, tau)
     return tau
 
 

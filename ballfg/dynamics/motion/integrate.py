@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd import forward_ad
 
 from ballfg.dynamics.model import BallModel, Rates
 from ballfg.dynamics.motion.limits import MAX_STEP
@@ -82,11 +83,24 @@ def fly(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
         dt: (...) s, broadcast against the batch; negative goes back in time.
     Returns: (..., 9), differentiable in the state, in dt and in the model's parameters.
     """
+    if not followed(state, dt):
+        from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
+
+        functions = motion.functions_of(model)
+        if functions is not None:
+            return motion.fly(model, functions, state, dt)
     steps = step_count(dt)
     h = (dt / steps).unsqueeze(-1)
     for _ in range(steps):
         state = rk4_step(model.rates, state, h)
     return state
+
+
+def followed(*tensors: Tensor | float) -> bool:
+    """Whether torch must do the work: it follows tensors for derivatives or to record them, or they are not float64."""
+    if torch.is_grad_enabled() or forward_ad._current_level >= 0:
+        return True
+    return any(isinstance(t, Tensor) and not (type(t) is Tensor and t.dtype is torch.float64) for t in tensors)
 
 
 def fly_jacobian(model: BallModel, state: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
