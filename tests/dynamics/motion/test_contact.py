@@ -175,7 +175,8 @@ def test_saltation_formula(model, states):
     saltation = impact + (f_after - impact @ f_before) @ row / before[:, 5, None, None]
     _, flight = batch_jacobian(lambda s: fly(model, s, tau), state)
     _, _, jacobian = fly_through_jacobian(model, state, tau, (0.0,))
-    torch.testing.assert_close(jacobian, saltation @ flight, rtol=1e-9, atol=1e-9)
+    # the Jacobian is that of the Runge-Kutta steps to the contact, whose rate there is the true one but for their error
+    torch.testing.assert_close(jacobian, saltation @ flight, rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize("contacts", [0, 1, 2])
