@@ -5,13 +5,14 @@ g = 0: a ball that is late is further back but crosses at the same place (docs/d
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
+from scipy.optimize import brentq
 from torch import Tensor
 
 from ballfg.arrays import Array
@@ -31,6 +32,8 @@ LOOKS = 16
 """How often a step of `MAX_STEP` is looked at: two crossings within 1.25 ms may pass unseen."""
 TIME_TOLERANCE = 1e-12
 """s. A crossing is bracketed to this."""
+MARGIN = 0.01
+"""Share of a look's width to each side of it in which the exact crossing is looked for too."""
 VALUE_JUMP = 1e-6
 """Value, in the event's own unit, beyond which it jumped through zero in a bounce and did not cross it."""
 JUST_NOW = 1e-9
@@ -83,6 +86,9 @@ def next_contact(
     start, end = _span(belief, horizon)
     model, earliest = belief.model, max(start, after) + JUST_NOW
     while (left := end - float(belief.time)) > 0.0:
+        if flown := propagator.flights(belief, _steps(left, MAX_STEP)):
+            belief = flown[-1]
+            continue
         h = torch.tensor([min(left, MAX_STEP)], dtype=torch.float64)
         found = _contact_within(model, belief.mean, h, propagator.surfaces)
         if found is not None:
@@ -157,6 +163,12 @@ def next_crossing(
     start, end = _span(belief, horizon)
     earliest = max(start, after) + JUST_NOW
     while (left := end - float(belief.time)) > 0.0:
+        if flown := propagator.flights(belief, _steps(left, MAX_STEP - JUST_NOW)):
+            found = _crossing_in_flight(propagator, [belief, *flown], event, earliest, either_way)
+            if found is not None:
+                return found
+            belief = flown[-1]
+            continue
         h = torch.tensor([min(left, MAX_STEP - JUST_NOW)], dtype=torch.float64)
         for tau in _crossings(propagator, belief, event, h + JUST_NOW, either_way):  # no gap between steps
             if float(belief.time) + tau > earliest:
@@ -164,6 +176,54 @@ def next_crossing(
                 return _projected(there, event, _rates(propagator, there))
         belief = propagator.forward(belief, h)
     return None
+
+
+def _steps(left: float, longest: float) -> Tensor:
+    """(1, k) s, steps of at most `longest` that fill what is left of a search."""
+    count = math.ceil(left / longest)
+    return torch.full((1, count), longest, dtype=torch.float64).clamp_max(left - longest * torch.arange(count))
+
+
+def _crossing_in_flight(
+    propagator: Propagator, beliefs: Sequence[Belief], event: EventFunction, earliest: float, either_way: bool
+) -> Crossing | None:
+    """The first crossing after the time `earliest` (s) in the free flight between some beliefs of one ball.
+
+    Looks are at cubics through states and slopes, which are right to a micrometre; the crossing is exact.
+    """
+    model, times = beliefs[0].model, torch.cat([belief.time for belief in beliefs])
+    states, h = torch.cat([belief.mean for belief in beliefs]), times.diff()
+    with torch.no_grad():
+        values = event(_cubics(states, derivative(model.rates, states), h))[..., 0]  # (k, LOOKS + 1)
+    falls = (values[:, :-1] > 0) & (values[:, 1:] <= 0)
+    rises = (values[:, :-1] < 0) & (values[:, 1:] >= 0)
+    for step, look in (falls | rises if either_way else falls).nonzero().tolist():
+        width, belief = float(h[step]) / LOOKS, beliefs[step]
+        tau = _exact_time(belief, event, (look - MARGIN) * width, (look + 1 + MARGIN) * width)
+        if tau is not None and float(belief.time) + tau > earliest:
+            there = propagator.in_flight(belief, torch.tensor([tau], dtype=torch.float64))
+            return _projected(there, event, model.rates)
+    return None
+
+
+def _cubics(states: Tensor, slopes: Tensor, h: Tensor) -> Tensor:
+    """(k, LOOKS + 1, d) between k + 1 states (k + 1, d) with their slopes, h (k,) s apart."""
+    at = torch.linspace(0.0, 1.0, LOOKS + 1, dtype=torch.float64)[:, None]
+    low, high, step = states[:-1, None], states[1:, None], h[:, None, None]
+    bent = (1 - at) * (slopes[:-1, None] * step - (high - low)) - at * (slopes[1:, None] * step - (high - low))
+    return low + at * (high - low) + at * (1 - at) * bent
+
+
+def _exact_time(belief: Belief, event: EventFunction, low: float, high: float) -> float | None:
+    """Time (s from the belief's) between two others at which one ball's value is zero; None: the same sign at both."""
+
+    def value(tau: float) -> float:
+        return float(event(fly(belief.model, belief.mean, torch.tensor([tau], dtype=torch.float64))))
+
+    with torch.no_grad():
+        if value(low) * value(high) > 0.0:
+            return None
+        return float(brentq(value, low, high, xtol=TIME_TOLERANCE))
 
 
 def _span(belief: Belief, horizon: float) -> tuple[float, float]:

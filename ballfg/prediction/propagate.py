@@ -13,9 +13,11 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ballfg.arrays import Array
+from ballfg.dynamics.compiled.motion import fly_beliefs, functions_of
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
-from ballfg.dynamics.motion.integrate import fly_jacobian, step_count
+from ballfg.dynamics.motion.integrate import fly_jacobian
+from ballfg.dynamics.motion.limits import BEYOND, MAX_STEP
 from ballfg.dynamics.motion.rollout import LONGEST_MOTION, is_resting
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
@@ -23,6 +25,9 @@ from ballfg.prediction.belief import Belief
 from ballfg.prediction.edges import edge_doubt
 from ballfg.prediction.near_contact import Unbounced, spread_over_contacts
 from ballfg.state import STATE_DIM, VZ
+
+AT_ONCE = 64
+"""Steps of free flight that machine code does before anyone looks: more would keep covariances that nobody needs."""
 
 
 @dataclass(frozen=True)
@@ -90,32 +95,81 @@ class Propagator:
         steps = torch.diff(times, dim=-1, prepend=belief.time[:, None])
         if not bool((steps >= 0).all()):
             raise ValueError("times must not decrease and must not lie before the belief's time. Sort them.")
-        unbounced = _no_ball_of(belief)
-        for dt in steps.unbind(-1):
-            belief, unbounced = self._forward(belief, dt, unbounced)
-            yield belief, unbounced
+        return self._over(belief, steps)
 
     def forward(self, belief: Belief, dt: Tensor) -> Belief:
         """The belief after dt (n,) s, on the mean's side of every contact.
 
         Raises: ValueError: if a dt is negative, infinite or not a number.
         """
-        return self._forward(belief, dt, _no_ball_of(belief))[0]
+        ((after, _),) = self._over(belief, dt[:, None])
+        return after
 
-    def _forward(self, belief: Belief, dt: Tensor, unbounced: Unbounced) -> tuple[Belief, Unbounced]:
-        """The belief after dt (n,) s, and the balls of which some may not have bounced by then."""
-        if not bool(((dt >= 0) & dt.isfinite()).all()):
-            raise ValueError(f"dt must be finite and not negative; got {float(dt.min()):g} to {float(dt.max()):g} s")
-        moving = dt.clamp_max(LONGEST_MOTION)
-        count = step_count(moving)
-        for _ in range(count):
-            belief, unbounced = self._step(belief, moving / count, unbounced)
-        staying = dt - moving
-        if not bool((staying > 0).any()):
-            return belief, unbounced
-        noise = torch.from_numpy(self.noise.flight(staying.numpy()))
+    def _over(self, belief: Belief, durations: Tensor) -> Iterator[tuple[Belief, Unbounced]]:
+        """Linear beliefs after each of some durations (n, k) s, and the balls of which some may not have bounced."""
+        if not bool(((durations >= 0) & durations.isfinite()).all()):
+            low, high = float(durations.min()), float(durations.max())
+            raise ValueError(f"dt must be finite and not negative; got {low:g} to {high:g} s")
+        moving = durations.clamp_max(LONGEST_MOTION)
+        staying = durations - moving
+        unbounced, first = _no_ball_of(belief), 0
+        for last in (*(staying > 0).any(0).nonzero()[:, 0].tolist(), durations.shape[1] - 1):
+            counts = (moving[:, first : last + 1].amax(0) / MAX_STEP - 1e-9).ceil().clamp_min(1).long()
+            steps = (moving[:, first : last + 1] / counts).repeat_interleave(counts, dim=1)
+            wanted = {0, *counts.cumsum(0).tolist()}
+            for number, moved in enumerate(self._steps(belief, unbounced, steps), 1):
+                belief, unbounced = moved
+                if number == steps.shape[1] and bool((staying[:, last] > 0).any()):
+                    belief, unbounced = self._stay(belief, staying[:, last]), _no_ball_of(belief)
+                if number in wanted:
+                    yield belief, unbounced
+            first = last + 1
+
+    def _stay(self, belief: Belief, dt: Tensor) -> Belief:
+        """The belief after dt (n,) s in which nothing moves."""
         eye = torch.eye(belief.mean.shape[-1], dtype=dt.dtype)
-        return _moved(belief, staying, belief.mean, eye, noise), _no_ball_of(belief)
+        return _moved(belief, dt, belief.mean, eye, torch.from_numpy(self.noise.flight(dt.numpy())))
+
+    def _steps(self, belief: Belief, unbounced: Unbounced, h: Tensor) -> Iterator[tuple[Belief, Unbounced]]:
+        """Linear beliefs and unbounced balls after each of some steps h (n, k) s of at most `MAX_STEP`."""
+        done = 0
+        while done < h.shape[1]:
+            flown = self._flights(belief, unbounced, h[:, done:]) or [self._step(belief, h[:, done], unbounced)]
+            yield from flown
+            (belief, unbounced), done = flown[-1], done + len(flown)
+
+    def flights(self, belief: Belief, h: Tensor) -> list[Belief]:
+        """The beliefs after each step of free flight, as far as no ball comes down on a surface or rests.
+
+        Args: belief: of n balls.  h: (n, k) s, steps of at most `MAX_STEP`.
+        Returns: none at all where the model has no machine code.
+        """
+        return [after for after, _ in self._flights(belief, _no_ball_of(belief), h)]
+
+    def _flights(self, belief: Belief, unbounced: Unbounced, h: Tensor) -> list[tuple[Belief, Unbounced]]:
+        """As `flights`, as long as the same unbounced balls are followed too; at most `AT_ONCE` steps."""
+        if functions_of(belief.model) is None:
+            return []
+        n, h = len(belief), h[:, :AT_ONCE]
+        if len(unbounced.rows):
+            later = unbounced.belief.time + h[unbounced.rows, 0] - unbounced.since
+            unbounced = unbounced.take(later < BEYOND)
+        everyone = Belief.joined([belief, unbounced.belief])
+        steps = torch.cat((h, h[unbounced.rows]))
+        times = everyone.time[:, None] + steps.cumsum(1)
+        recent = (times[n:] - unbounced.since[:, None] < BEYOND).all(0)
+        steps = steps[:, : int(recent.long().cumprod(0).sum())]
+        levels = (self.surfaces.table_height, self.surfaces.lowest())
+        densities = (self.noise.acceleration, self.noise.spin)
+        given = (everyone.mean.numpy(), everyone.covariance.numpy(), steps.numpy())
+        flown = []
+        for k, (mean, covariance) in enumerate(
+            zip(*fly_beliefs(belief.model, *given, n, levels, densities), strict=True)
+        ):
+            after = Belief(belief.model, times[:n, k], mean[:n], covariance[:n])
+            beside = Belief(belief.model, times[n:, k], mean[n:], covariance[n:])
+            flown.append((after, replace(unbounced, belief=beside)))
+        return flown
 
     def in_flight(self, belief: Belief, dt: Tensor) -> Belief:
         """The belief after dt (n,) s of free flight; surfaces are not there."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ballfg.dynamics import AnalyticModel, BallModel, Effect
 from ballfg.dynamics.model import Rates
-from ballfg.dynamics.motion.rollout import REST_SPEED
+from ballfg.dynamics.motion.limits import REST_SPEED
 from ballfg.simulation.config import MotionNoise
 from ballfg.state import SPIN, STATE_DIM, VELOCITY, VZ
 

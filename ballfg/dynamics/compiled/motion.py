@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.compiled.beliefs import carry
 from ballfg.dynamics.compiled.contacts import contact_times, contacts
 from ballfg.dynamics.compiled.flight import fly_rows
 from ballfg.dynamics.compiled.functions import CompiledModel, Function, compiled
@@ -53,14 +54,14 @@ class Moving:
         steps = step_count(torch.from_numpy(left))
         rates = self.functions.rates
         fly_rows(
-            rates.compute, self.states, self.moved, *self._coefficients(rates), self.weights[0], left, earlier, steps
+            rates.compute, self.states, self.moved, *self.coefficients(rates), self.weights[0], left, earlier, steps
         )
 
     def bounce(self, height: Array, longest: Array) -> None:
         """Move on through the next contact with surfaces at some heights (n,) m; NaN where there is none."""
         n, _, width = self.moved.shape
         functions = (self.functions.rates, self.functions.impact, self.functions.surface)
-        given = [array for function in functions for array in self._coefficients(function)]
+        given = [array for function in functions for array in self.coefficients(function)]
         tau, slower = np.empty(n), np.empty((n, width))
         after, moved = np.empty_like(self.states), np.empty_like(self.moved)
         computes = (function.compute for function in functions)
@@ -85,7 +86,7 @@ class Moving:
     def meets(self, height: Array, longest: Array) -> Array:
         """(n,) s until the next contact with surfaces at some heights (n,) m; NaN where there is none."""
         rates, surface, tau = self.functions.rates, self.functions.surface, np.empty(len(self.states))
-        c, s = (self._coefficients(function)[0] for function in (rates, surface))
+        c, s = (self.coefficients(function)[0] for function in (rates, surface))
         w, _, ws = self.weights
         radius = self.functions.radius
         contact_times(rates.compute, surface.compute, self.states, c, s, w, ws, height, longest, radius, tau)
@@ -104,7 +105,7 @@ class Moving:
         jacobian[:, own, own] = 1.0
         return self.whole(), torch.from_numpy(jacobian)
 
-    def _coefficients(self, function: Function) -> tuple[Array, Array]:
+    def coefficients(self, function: Function) -> tuple[Array, Array]:
         """(n, p) of a function for each ball, and (n, p, d) how they move."""
         if function.names not in self._known:
             n, _, width = self.moved.shape
@@ -170,3 +171,49 @@ def fly_through_jacobian(
     moving.fly(whole)
     after, jacobian = moving.results()
     return after, torch.stack(times, dim=-1) if times else dt.new_zeros((*dt.shape, 0)), jacobian
+
+
+def fly_beliefs(
+    model: BallModel,
+    mean: Array,
+    covariance: Array,
+    h: Array,
+    checked: int,
+    levels: tuple[float, float],
+    densities: tuple[float, float],
+) -> tuple[Tensor, Tensor]:
+    """Means (k, n, d) and covariances (k, n, d, d) of n balls after each step of free flight.
+
+    Args:
+        model: of the ball, one that has compiled functions.
+        mean, covariance: (n, d) and (n, d, d) at the start.
+        h: (n, m) s, steps of at most `MAX_STEP`.
+        checked: the first so many balls meet surfaces, the others fly through them.
+        levels: m, of the table and of what lies below it.
+        densities: of the process noise, m/s^2/sqrt(Hz) and rad/s/sqrt(s).
+    Returns: for the k steps before the first one in which a ball comes down on a surface or rests.
+    """
+    n, d = mean.shape
+    functions = functions_of(model)
+    assert functions is not None
+    moving = Moving(model, functions, torch.from_numpy(mean), d)
+    rates, surface = functions.rates, functions.surface
+    w, _, ws = moving.weights
+    means, covariances = np.empty((h.shape[1], n, d)), np.empty((h.shape[1], n, d, d))
+    done = carry(
+        rates.compute,
+        surface.compute,
+        mean,
+        covariance,
+        *moving.coefficients(rates),
+        moving.coefficients(surface)[0],
+        w,
+        ws,
+        np.ascontiguousarray(h),
+        checked,
+        np.array([*levels, functions.radius]),
+        np.array(densities),
+        means,
+        covariances,
+    )
+    return torch.from_numpy(means[:done]), torch.from_numpy(covariances[:done])

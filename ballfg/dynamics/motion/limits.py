@@ -21,3 +21,8 @@ BEYOND: Final = 0.3
 """s. A contact that lies further away than its interval's length and this is no continuation of it any more: NaN."""
 MIN_SPEED: Final = 1e-6
 """m/s. Least normal speed that a Newton step divides by; a ball that grazes more gently is at its apex."""
+REST_SPEED: Final = 0.05
+"""m/s. A ball that leaves a surface more slowly would be back within 10 ms, 0.13 mm high: it rests."""
+REST_GAP: Final = 1e-5
+"""m. A ball this close to a surface and slower than half of `REST_SPEED` rests on it. A ball that left at `REST_SPEED`
+or faster is never both, so that a hop is the same motion however its time is cut."""

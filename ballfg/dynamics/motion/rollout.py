@@ -20,14 +20,10 @@ from torch import Tensor
 from ballfg.dynamics.model import BallModel, take_rows
 from ballfg.dynamics.motion.contact import contact_time
 from ballfg.dynamics.motion.integrate import RateFunction, fly, rk4_step, step_count
+from ballfg.dynamics.motion.limits import REST_GAP, REST_SPEED
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import VZ, Z
 
-REST_SPEED = 0.05
-"""m/s. A ball that leaves a surface more slowly would be back within 10 ms, 0.13 mm high: it rests."""
-REST_GAP = 1e-5
-"""m. A ball this close to a surface and slower than half of `REST_SPEED` rests on it. A ball that left at `REST_SPEED`
-or faster is never both, so that a hop is the same motion however its time is cut."""
 LONGEST_MOTION = 20.0
 """s. A ball that nobody touches lies still by then; over a longer interval it is taken to stay where it is."""
 MAX_CONTACTS = 32

@@ -11,7 +11,8 @@ from scipy.integrate import solve_ivp
 
 from ballfg.dynamics import Surfaces, advance, fly, fly_through, rollout, substitute
 from ballfg.dynamics.motion.impact import slip_velocity
-from ballfg.dynamics.motion.rollout import LONGEST_MOTION, MAX_CONTACTS, REST_SPEED, is_resting, place_on, roll
+from ballfg.dynamics.motion.limits import REST_SPEED
+from ballfg.dynamics.motion.rollout import LONGEST_MOTION, MAX_CONTACTS, is_resting, place_on, roll
 
 R = 0.02
 TABLE_ONLY = Surfaces(0.0)
