@@ -5,26 +5,27 @@ Near a contact of uncertain time the reported mean and covariance are those of t
 (docs/derivations/prediction.md).
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
 from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ballfg.arrays import Array
-from ballfg.dynamics.compiled.motion import fly_beliefs, functions_of
+from ballfg.dynamics.compiled.course import BOUNCES, Carrier, Course, density_of
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
 from ballfg.dynamics.motion.integrate import fly_jacobian
-from ballfg.dynamics.motion.limits import BEYOND, MAX_STEP
-from ballfg.dynamics.motion.rollout import LONGEST_MOTION, is_resting
+from ballfg.dynamics.motion.limits import MAX_STEP
+from ballfg.dynamics.motion.rollout import LONGEST_MOTION
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.edges import edge_doubt
-from ballfg.prediction.near_contact import Unbounced, spread_over_contacts
-from ballfg.state import STATE_DIM, VZ
+from ballfg.state import STATE_DIM
 
 AT_ONCE = 64
 """Steps of free flight that machine code does before anyone looks: more would keep covariances that nobody needs."""
@@ -68,14 +69,10 @@ class Propagator:
         stamps = torch.as_tensor(times, dtype=torch.float64)
         if stamps.dim() == 1:
             stamps = stamps.expand(len(belief), -1)
-        carried, unbounced = zip(*self._carried(belief, stamps), strict=True)
-        # one batch over all stamps: what a call costs hardly depends on its number of balls
-        late = [replace(u, rows=u.rows + len(belief) * k) for k, u in enumerate(unbounced)]
-        spread = spread_over_contacts(Belief.joined(carried), Unbounced.joined(late), self.surfaces, self.noise)
-        shape = (stamps.shape[1], len(belief))
-        states = spread.mean[:, :STATE_DIM].unflatten(0, shape).transpose(0, 1)
-        covariances = spread.covariance[:, :STATE_DIM, :STATE_DIM].unflatten(0, shape).transpose(0, 1)
-        return Prediction(stamps.numpy().copy(), states.detach().numpy().copy(), covariances.detach().numpy().copy())
+        course = Course.joined([part for part, _ in self._mixed(belief, stamps)])
+        states = course.mean[:, :, :STATE_DIM].swapaxes(0, 1).copy()
+        covariances = course.covariance[:, :, :STATE_DIM, :STATE_DIM].swapaxes(0, 1).copy()
+        return Prediction(stamps.numpy().copy(), states, covariances)
 
     def walk(self, belief: Belief, times: Tensor) -> Iterator[Belief]:
         """The beliefs at given times (n, k) s, one after the other.
@@ -85,136 +82,113 @@ class Propagator:
 
         Raises: ValueError: as `rollout`.
         """
-        for carried, unbounced in self._carried(belief, times):
-            yield spread_over_contacts(carried, unbounced, self.surfaces, self.noise)
-
-    def _carried(self, belief: Belief, times: Tensor) -> Iterator[tuple[Belief, Unbounced]]:
-        """Linear beliefs at given times (n, k) s, and the balls of which some may not have bounced by then."""
-        if times.dim() != 2 or len(times) != len(belief) or times.shape[1] == 0:
-            raise ValueError(f"times must have shape ({len(belief)}, k) with k >= 1; got {tuple(times.shape)}")
-        steps = torch.diff(times, dim=-1, prepend=belief.time[:, None])
-        if not bool((steps >= 0).all()):
-            raise ValueError("times must not decrease and must not lie before the belief's time. Sort them.")
-        return self._over(belief, steps)
+        for part, elapsed in self._mixed(belief, times):
+            yield from _beliefs(belief, part, elapsed)
 
     def forward(self, belief: Belief, dt: Tensor) -> Belief:
         """The belief after dt (n,) s, on the mean's side of every contact.
 
         Raises: ValueError: if a dt is negative, infinite or not a number.
         """
-        ((after, _),) = self._over(belief, dt[:, None])
-        return after
-
-    def _over(self, belief: Belief, durations: Tensor) -> Iterator[tuple[Belief, Unbounced]]:
-        """Linear beliefs after each of some durations (n, k) s, and the balls of which some may not have bounced."""
-        if not bool(((durations >= 0) & durations.isfinite()).all()):
-            low, high = float(durations.min()), float(durations.max())
-            raise ValueError(f"dt must be finite and not negative; got {low:g} to {high:g} s")
-        moving = durations.clamp_max(LONGEST_MOTION)
-        staying = durations - moving
-        unbounced, first = _no_ball_of(belief), 0
-        for last in (*(staying > 0).any(0).nonzero()[:, 0].tolist(), durations.shape[1] - 1):
-            counts = (moving[:, first : last + 1].amax(0) / MAX_STEP - 1e-9).ceil().clamp_min(1).long()
-            steps = (moving[:, first : last + 1] / counts).repeat_interleave(counts, dim=1)
-            wanted = {0, *counts.cumsum(0).tolist()}
-            for number, moved in enumerate(self._steps(belief, unbounced, steps), 1):
-                belief, unbounced = moved
-                if number == steps.shape[1] and bool((staying[:, last] > 0).any()):
-                    belief, unbounced = self._stay(belief, staying[:, last]), _no_ball_of(belief)
-                if number in wanted:
-                    yield belief, unbounced
-            first = last + 1
-
-    def _stay(self, belief: Belief, dt: Tensor) -> Belief:
-        """The belief after dt (n,) s in which nothing moves."""
-        eye = torch.eye(belief.mean.shape[-1], dtype=dt.dtype)
-        return _moved(belief, dt, belief.mean, eye, torch.from_numpy(self.noise.flight(dt.numpy())))
-
-    def _steps(self, belief: Belief, unbounced: Unbounced, h: Tensor) -> Iterator[tuple[Belief, Unbounced]]:
-        """Linear beliefs and unbounced balls after each of some steps h (n, k) s of at most `MAX_STEP`."""
-        done = 0
-        while done < h.shape[1]:
-            flown = self._flights(belief, unbounced, h[:, done:]) or [self._step(belief, h[:, done], unbounced)]
-            yield from flown
-            (belief, unbounced), done = flown[-1], done + len(flown)
+        ((part, elapsed),) = self._over(self._carrier(belief), belief, dt[:, None])
+        return next(_beliefs(belief, part, elapsed))
 
     def flights(self, belief: Belief, h: Tensor) -> list[Belief]:
         """The beliefs after each step of free flight, as far as no ball comes down on a surface or rests.
 
         Args: belief: of n balls.  h: (n, k) s, steps of at most `MAX_STEP`.
-        Returns: none at all where the model has no machine code.
         """
-        return [after for after, _ in self._flights(belief, _no_ball_of(belief), h)]
+        start = Course.start(belief.mean.detach().numpy(), belief.covariance.detach().numpy())
+        course, hard = self._carrier(belief).carry(start, h.numpy()[:, :AT_ONCE])
+        contacts = (course.age == 0.0).any(-1)
+        contacts[len(contacts) - 1 :] |= bool(hard.any())
+        free = int(np.logical_not(contacts).cumprod().sum())
+        return list(_beliefs(belief, course.at(slice(1, free)), h.cumsum(1)[:, : free - 1]))
 
-    def _flights(self, belief: Belief, unbounced: Unbounced, h: Tensor) -> list[tuple[Belief, Unbounced]]:
-        """As `flights`, as long as the same unbounced balls are followed too; at most `AT_ONCE` steps."""
-        if functions_of(belief.model) is None:
-            return []
-        n, h = len(belief), h[:, :AT_ONCE]
-        if len(unbounced.rows):
-            later = unbounced.belief.time + h[unbounced.rows, 0] - unbounced.since
-            unbounced = unbounced.take(later < BEYOND)
-        everyone = Belief.joined([belief, unbounced.belief])
-        steps = torch.cat((h, h[unbounced.rows]))
-        times = everyone.time[:, None] + steps.cumsum(1)
-        recent = (times[n:] - unbounced.since[:, None] < BEYOND).all(0)
-        steps = steps[:, : int(recent.long().cumprod(0).sum())]
-        levels = (self.surfaces.table_height, self.surfaces.lowest())
-        densities = (self.noise.acceleration, self.noise.spin)
-        given = (everyone.mean.numpy(), everyone.covariance.numpy(), steps.numpy())
-        flown = []
-        for k, (mean, covariance) in enumerate(
-            zip(*fly_beliefs(belief.model, *given, n, levels, densities), strict=True)
-        ):
-            after = Belief(belief.model, times[:n, k], mean[:n], covariance[:n])
-            beside = Belief(belief.model, times[n:, k], mean[n:], covariance[n:])
-            flown.append((after, replace(unbounced, belief=beside)))
-        return flown
+    def _carrier(self, belief: Belief) -> Carrier:
+        return Carrier(belief.model, belief.mean.detach().numpy(), self.surfaces, density_of(self.noise))
+
+    def _mixed(self, belief: Belief, times: Tensor) -> Iterator[tuple[Course, Tensor]]:
+        """Beliefs at given times (n, k) s, mixed near contacts, a few at a time, and the time elapsed by then."""
+        if times.dim() != 2 or len(times) != len(belief) or times.shape[1] == 0:
+            raise ValueError(f"times must have shape ({len(belief)}, k) with k >= 1; got {tuple(times.shape)}")
+        durations = torch.diff(times, dim=-1, prepend=belief.time[:, None])
+        if not bool((durations >= 0).all()):
+            raise ValueError("times must not decrease and must not lie before the belief's time. Sort them.")
+        carrier = self._carrier(belief)
+        for part, elapsed in self._over(carrier, belief, durations):
+            yield carrier.mixed(part), elapsed
+
+    def _over(self, carrier: Carrier, belief: Belief, durations: Tensor) -> Iterator[tuple[Course, Tensor]]:
+        """Beliefs after each of some durations (n, k) s, linear, a few at a time, and the time (n, j) elapsed by then."""
+        if not bool(((durations >= 0) & durations.isfinite()).all()):
+            low, high = float(durations.min()), float(durations.max())
+            raise ValueError(f"dt must be finite and not negative; got {low:g} to {high:g} s")
+        moving = durations.clamp_max(LONGEST_MOTION)
+        staying, elapsed = durations - moving, durations.cumsum(1)
+        course, first = Course.start(belief.mean.detach().numpy(), belief.covariance.detach().numpy()), 0
+        for last in sorted({*(staying > 0).any(0).nonzero()[:, 0].tolist(), durations.shape[1] - 1}):
+            part = moving[:, first : last + 1]
+            counts = (part.amax(0) / MAX_STEP - 1e-9).ceil().clamp_min(1).long()
+            steps, ends = (part / counts).repeat_interleave(counts, dim=1).numpy(), counts.cumsum(0).numpy()
+            done = 0
+            while done < steps.shape[1]:
+                flown = self._steps(carrier, belief.model, course, steps[:, done : done + AT_ONCE])
+                course = flown.at(slice(-1, None))
+                asked = (done < ends) & (ends <= done + len(flown))
+                if bool((staying[:, last] > 0).any()) and done + len(flown) == steps.shape[1]:
+                    course = self._stay(course, staying[:, last].numpy())
+                    flown = Course.joined([flown.at(slice(-1)), course])
+                if asked.any():
+                    columns = first + asked.nonzero()[0]
+                    yield flown.at(ends[asked] - done - 1), elapsed[:, columns]
+                done += len(flown)
+            first = last + 1
+
+    def _stay(self, course: Course, dt: Array) -> Course:
+        """The last belief of a course after dt (n,) s in which nothing moves."""
+        covariance = course.covariance[-1].copy()
+        covariance[:, :STATE_DIM, :STATE_DIM] += self.noise.flight(dt)
+        return Course.start(course.mean[-1], covariance)
+
+    def _steps(self, carrier: Carrier, model: BallModel, start: Course, h: Array) -> Course:
+        """The beliefs after one or more of some steps h (n, k) s of at most `MAX_STEP`."""
+        course, hard = carrier.carry(start, h)
+        rows, k = hard.nonzero()[0], len(course) - 1
+        for r in rows:
+            one = slice(r, r + 1)
+            mean, covariance = (
+                torch.from_numpy(array[k - 1, one].copy()) for array in (course.mean, course.covariance)
+            )
+            touched, height = self._touch(model, mean, covariance, float(h[r, k - 1]))
+            course.mean[k, r], course.covariance[k, r] = touched
+            if hard[r] == BOUNCES:
+                course.level[k, r], course.age[k, r] = height, 0.0 if np.isfinite(height) else np.nan
+        return course.at(slice(1, None))
+
+    def _touch(self, model: BallModel, mean: Tensor, covariance: Tensor, h: float) -> tuple[tuple[Array, Array], float]:
+        """Mean and covariance of a ball (1, d) that reaches a surface's level, or rests, within a step of h s.
+
+        And the height (m) of the surface that it bounced on; NaN if it did not bounce, or more than once.
+        """
+        dt = torch.tensor([h], dtype=torch.float64)
+        motion = advance_jacobian(model, mean, h, self.surfaces)
+        noise = torch.from_numpy(self.noise.flight(dt.numpy()))
+        if motion.contacts:
+            times = mean.new_tensor([[time for time, _ in motion.contacts]])
+            noise = self._bounce_noise(model, mean, dt, times, motion.jacobian[None])
+        noise = noise + edge_doubt(model, mean, covariance, dt, self.surfaces)
+        spread = _carried(motion.jacobian, covariance, noise)
+        height = motion.contacts[0][1] if len(motion.contacts) == 1 else math.nan
+        return (motion.after[0].numpy(), spread[0].numpy()), height
 
     def in_flight(self, belief: Belief, dt: Tensor) -> Belief:
         """The belief after dt (n,) s of free flight; surfaces are not there."""
         after, jacobian = fly_jacobian(belief.model, belief.mean, dt)
-        return _moved(belief, dt, after, jacobian, torch.from_numpy(self.noise.flight(dt.numpy())))
-
-    def _step(self, belief: Belief, h: Tensor, unbounced: Unbounced) -> tuple[Belief, Unbounced]:
-        """One step of at most `MAX_STEP`; the unbounced balls fly on along with it."""
-        model, mean, n = belief.model, belief.mean, len(belief)
-        level = self.surfaces.level_below(mean)
-        everyone = Belief.joined([belief, unbounced.belief]) if len(unbounced.rows) else belief
-        flown = self.in_flight(everyone, torch.cat((h, h[unbounced.rows])))
-        after, unbounced = flown.take(slice(n)), replace(unbounced, belief=flown.take(slice(n, None))).recent()
-        with torch.no_grad():
-            falls_below = (model.gap(after.mean, level) < 0) & (after.mean[:, VZ] < 0)
-            touching = is_resting(model, mean, level) | falls_below
-        rows = touching.nonzero()[:, 0]
-        if not len(rows):
-            return after, unbounced
-        touched, heights = self._touch(belief.take(rows), h[rows])
-        bounced = heights.isfinite()
-        unbounced = unbounced.followed_by(Unbounced.just_now(after, rows[bounced], heights[bounced]))
-        mean, covariance = after.mean.clone(), after.covariance.clone()
-        mean[rows], covariance[rows] = touched.mean, touched.covariance
-        return replace(after, mean=mean, covariance=covariance), unbounced
-
-    def _touch(self, belief: Belief, h: Tensor) -> tuple[Belief, Tensor]:
-        """Balls that reach a surface's level, or rest, within a step; and (n,) m the surface that a ball bounced on.
-
-        NaN for a ball that did not bounce, or more than once.
-        """
-        model, mean = belief.model, belief.mean
-        after, jacobian = torch.empty_like(mean), mean.new_empty((*mean.shape, mean.shape[-1]))
-        noise, heights = torch.from_numpy(self.noise.flight(h.numpy())), torch.full_like(h, torch.nan)
-        for i in range(len(mean)):
-            row = slice(i, i + 1)
-            motion = advance_jacobian(model, mean[row], float(h[i]), self.surfaces)
-            after[row], jacobian[i] = motion.after, motion.jacobian
-            if motion.contacts:
-                times = mean.new_tensor([[time for time, _ in motion.contacts]])
-                noise[row] = self._bounce_noise(model, mean[row], h[row], times, jacobian[row])
-            noise[row] += edge_doubt(model, mean[row], belief.covariance[row], h[row], self.surfaces)
-            if len(motion.contacts) == 1:
-                heights[row] = motion.contacts[0][1]
-        return _moved(belief, h, after, jacobian, noise), heights
+        noise = torch.from_numpy(self.noise.flight(dt.numpy()))
+        return replace(
+            belief, time=belief.time + dt, mean=after, covariance=_carried(jacobian, belief.covariance, noise)
+        )
 
     def _bounce_noise(self, model: BallModel, mean: Tensor, h: Tensor, times: Tensor, jacobian: Tensor) -> Tensor:
         """(n, 9, 9) covariance gathered in a step with impacts at times (n, k).
@@ -231,13 +205,14 @@ class Propagator:
         return noise
 
 
-def _no_ball_of(belief: Belief) -> Unbounced:
-    nothing = torch.zeros(0, dtype=torch.long)
-    return Unbounced.just_now(belief, nothing, belief.time[nothing])
+def _beliefs(start: Belief, course: Course, elapsed: Tensor) -> Iterator[Belief]:
+    """The beliefs of a course, each after the time (n, k) s since the start in one column."""
+    for k in range(len(course)):
+        mean, covariance = torch.from_numpy(course.mean[k]), torch.from_numpy(course.covariance[k])
+        yield Belief(start.model, start.time + elapsed[:, k], mean, covariance)
 
 
-def _moved(belief: Belief, h: Tensor, after: Tensor, jacobian: Tensor, noise: Tensor) -> Belief:
-    covariance = jacobian @ belief.covariance @ jacobian.transpose(-1, -2)
-    covariance[:, :STATE_DIM, :STATE_DIM] += noise
-    covariance = (covariance + covariance.transpose(-1, -2)) / 2  # rounding would add up
-    return replace(belief, time=belief.time + h, mean=after, covariance=covariance)
+def _carried(jacobian: Tensor, covariance: Tensor, noise: Tensor) -> Tensor:
+    after = jacobian @ covariance @ jacobian.transpose(-1, -2)
+    after[:, :STATE_DIM, :STATE_DIM] += noise
+    return (after + after.transpose(-1, -2)) / 2  # rounding would add up

@@ -1,20 +1,44 @@
-"""Machine code that carries means and covariances of balls through free flight, step by step.
+"""Machine code that carries means and covariances of balls forward, step by step, through flight and plain bounces.
 
-A step in which a ball comes down on a surface, or rests, is not one of free flight: the code stops before it.
+A ball that bounces has neighbours within its uncertainty that have not bounced yet. One that flies on through the
+surface as if it were not there, *unbounced*, stands for them for a while: `mixture.py` makes use of it.
 """
+
+import math
 
 import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.contacts import contact_times, contacts
 from ballfg.dynamics.compiled.flight import fly_one
-from ballfg.dynamics.compiled.signatures import COUNT, FOUR, FUNCTION, NOTHING, ONE, REAL, THREE, TWO
-from ballfg.dynamics.motion.limits import REST_GAP, REST_SPEED
+from ballfg.dynamics.compiled.signatures import (
+    COUNT,
+    FLAG,
+    FOUR,
+    FUNCTION,
+    NOTHING,
+    ONE,
+    REAL,
+    THREE,
+    THREE_FUNCTIONS,
+    THREE_TANGENTS,
+    THREE_VALUES,
+    THREE_WEIGHTS,
+    TWO,
+)
+from ballfg.dynamics.motion.limits import BEYOND, REST_GAP, REST_SPEED
+
+NEGLIGIBLE = 1e-4
+"""Share of balls that go past a table's edge while the mean bounces, below which they do not count; they would add
+0.05 m/s to a velocity."""
+LEAST_SIGMA = 1e-12
+"""m. A place known better than this has a sigma of this."""
 
 
-@machine_code(NOTHING(TWO, TWO, REAL, ONE, TWO))
-def _carry_covariance(jacobian, covariance, h, noise, after):
-    """J P J^T and what the ball gathers in h s; J (9, d) by the state, the coefficients stay. Writes after (d, d)."""
-    d, acceleration, spin = len(covariance), noise[0], noise[1]
+@machine_code(NOTHING(TWO, TWO, TWO))
+def through(jacobian, covariance, after):
+    """J P J^T of covariance P (d, d); J (9, d) of the state, the coefficients stay. Writes after (d, d)."""
+    d = len(covariance)
     half = covariance.copy()  # J P
     for i in range(9):
         for j in range(d):
@@ -23,60 +47,223 @@ def _carry_covariance(jacobian, covariance, h, noise, after):
                 total += jacobian[i, q] * covariance[q, j]
             half[i, j] = total
     for i in range(d):
-        for j in range(i + 1):
+        for j in range(min(i + 1, 9)):
             total = 0.0
-            if j < 9:
-                for q in range(d):
-                    total += half[i, q] * jacobian[j, q]
-            else:
-                total = half[i, j]
-            after[i, j] = total
+            for q in range(d):
+                total += half[i, q] * jacobian[j, q]
+            after[i, j] = after[j, i] = total
+        for j in range(9, i + 1):
+            after[i, j] = after[j, i] = 0.5 * (half[i, j] + half[j, i])
+
+
+@machine_code(NOTHING(TWO, REAL, ONE))
+def add_flight(covariance, h, noise):
+    """Add what h s of free flight gather; noise (5,) as in `carry`."""
+    acceleration, spin = noise[0] ** 2, noise[1] ** 2
     for i in range(3):
-        after[i, i] += acceleration**2 * h**3 / 3.0
-        after[3 + i, i] += acceleration**2 * h**2 / 2.0
-        after[3 + i, 3 + i] += acceleration**2 * h
-        after[6 + i, 6 + i] += spin**2 * h
-    for i in range(d):
-        for j in range(i):
-            after[j, i] = after[i, j]
+        covariance[i, i] += acceleration * h**3 / 3.0
+        covariance[3 + i, i] += acceleration * h**2 / 2.0
+        covariance[i, 3 + i] += acceleration * h**2 / 2.0
+        covariance[3 + i, 3 + i] += acceleration * h
+        covariance[6 + i, 6 + i] += spin * h
 
 
-@machine_code(COUNT(FUNCTION, FUNCTION, TWO, THREE, TWO, THREE, TWO, ONE, ONE, TWO, COUNT, ONE, ONE, THREE, FOUR))
-def carry(rates, surface, mean, covariance, c, ct, s, w, ws, h, checked, heights, noise, means, covariances):
-    """Carry n balls on by steps of h (n, k) s, as long as the first `checked` of them fly freely.
+@machine_code(NOTHING(TWO, REAL, ONE))
+def add_impact(covariance, since, noise):
+    """Add what an impact `since` s ago has left; noise (5,) as in `carry`."""
+    for i in range(3):
+        velocity = noise[3] if i < 2 else noise[2]
+        covariance[i, i] += (since * velocity) ** 2
+        covariance[3 + i, i] += since * velocity**2
+        covariance[i, 3 + i] += since * velocity**2
+        covariance[3 + i, 3 + i] += velocity**2
+        covariance[6 + i, 6 + i] += noise[4] ** 2
+
+
+@machine_code(REAL(FUNCTION, ONE, ONE, ONE, REAL, REAL))
+def gap_of(surface, x, s, ws, level, radius):
+    """Gap (m) of a state to a surface."""
+    offset = np.empty(3)
+    surface(x, s, ws, np.empty((9, 0)), np.empty((len(s), 0)), offset, np.empty((3, 0)))
+    return x[2] - level - offset[0] - radius
+
+
+@machine_code(REAL(ONE, TWO, ONE))
+def _share_over_table(touch, covariance, world):
+    """Probability that a ball which is at `touch` (9,) in the mean when it comes down is then above the table."""
+    within, along = 1.0, np.empty(9)
+    for axis in range(2):
+        along[:] = 0.0
+        along[axis], along[2] = 1.0, -touch[3 + axis] / touch[5]
+        variance = 0.0
+        for i in range(9):
+            for j in range(9):
+                variance += along[i] * covariance[i, j] * along[j]
+        below = np.empty(2)
+        for end in range(2):
+            spread = math.sqrt(max(variance, 0.0) + world[7 + 2 * axis + end] ** 2)
+            away = (world[3 + 2 * axis + end] - touch[axis]) / max(spread, LEAST_SIGMA)
+            below[end] = math.erfc(-away / math.sqrt(2.0)) / 2.0
+        within *= max(below[1] - below[0], 0.0)
+    return within
+
+
+@machine_code(
+    FLAG(THREE_FUNCTIONS, THREE_VALUES, THREE_TANGENTS, THREE_WEIGHTS, ONE, TWO, REAL, REAL, ONE, ONE, ONE, TWO)
+)
+def _bounce(functions, values, tangents, weights, start, covariance, h, level, world, noise, x, after):
+    """One ball (9,), with its covariance, that comes down on a level within h s.
+
+    Writes: its state x (9,) and covariance after (d, d) at the end.
+    Returns: whether this is a plain bounce: one, away from the table's edges, after which the ball rises.
+    """
+    d, radius = len(covariance), world[2]
+    tau, taut, there, moved = np.empty(1), np.empty((1, d)), np.empty((1, 9)), np.zeros((1, 9, d))
+    touch, jacobian, gathered = start.copy().reshape((1, 9)), np.zeros((1, 9, d)), np.empty((d, d))
+    levels, longest, still = np.full(1, level), np.full(1, BEYOND), np.zeros(d)
+    rates, impact, surface = functions
+    c, b, s = values
+    ct, bt, st = tangents
+    w, wb, ws = weights
+    contact_times(rates, surface, touch, c, s, w, ws, levels, longest, radius, tau)
+    if not 0.0 <= tau[0] <= h:
+        return False
+    elapsed = tau[0]
+    for i in range(9):
+        jacobian[0, i, i] = 1.0
+    moved[:] = jacobian
+    fly_one(rates, touch[0], c[0], w, jacobian[0], ct[0], elapsed, still, 1)
+    if not touch[0, 5] < 0.0:
+        return False
+    if level == world[0] and not _share_over_table(touch[0], covariance, world) > 1.0 - NEGLIGIBLE:
+        return False
+    through(jacobian[0], covariance, gathered)
+    add_flight(gathered, elapsed, noise)
+    jacobian[:] = moved
+    contacts(
+        rates,
+        impact,
+        surface,
+        touch,
+        jacobian,
+        c,
+        ct,
+        b,
+        bt,
+        s,
+        st,
+        w,
+        wb,
+        ws,
+        levels,
+        longest,
+        radius,
+        tau,
+        taut,
+        there,
+        moved,
+    )
+    if not there[0, 5] >= REST_SPEED:
+        return False
+    left = h - (elapsed + tau[0])
+    fly_one(rates, there[0], c[0], w, moved[0], ct[0], left, -taut[0], 1)
+    x[:] = there[0]
+    if x[5] < 0.0 and not gap_of(surface, x, s[0], ws, level, radius) >= 0.0:
+        return False
+    through(moved[0], gathered, after)
+    add_flight(after, left, noise)
+    add_impact(after, left, noise)
+    return True
+
+
+@machine_code(NOTHING(FUNCTION, ONE, TWO, ONE, TWO, ONE, REAL, ONE, ONE, TWO))
+def _fly(rates, mean, covariance, c, ct, w, h, noise, after, spread):
+    """Free flight of one ball over h s. Writes its mean (d,) and covariance (d, d)."""
+    d = len(mean)
+    jacobian, still = np.zeros((9, d)), np.zeros(d)
+    for i in range(9):
+        jacobian[i, i] = 1.0
+    after[:] = mean
+    fly_one(rates, after[:9], c, w, jacobian, ct, h, still, 1)
+    through(jacobian, covariance, spread)
+    add_flight(spread, h, noise)
+
+
+@machine_code(
+    COUNT(
+        *(FUNCTION, FUNCTION, FUNCTION, TWO, THREE, TWO, THREE, TWO, THREE, ONE, ONE, ONE),
+        *(TWO, ONE, ONE, THREE, FOUR, THREE, FOUR, TWO, TWO, ONE),
+    )
+)
+def carry(
+    rates,
+    impact,
+    surface,
+    c,
+    ct,
+    b,
+    bt,
+    s,
+    st,
+    w,
+    wb,
+    ws,
+    h,
+    world,
+    noise,
+    mean,
+    covariance,
+    beside,
+    besides,
+    level,
+    age,
+    hard,
+):
+    """Carry n balls on by k steps of at most `MAX_STEP`, from the first row of each array to the next ones.
 
     Args:
-        mean (n, d), covariance (n, d, d): at the start.
-        c, s: coefficients of rates and surface, (n, p), those of the rates with tangents ct (n, p, d).
-        w, ws: weights of the two.
-        checked: how many of the balls meet surfaces; the others fly through them.
-        heights (3,) m: of the table, of what lies below it (-inf: nothing), and the ball's radius.
-        noise (2,): densities of the process noise, m/s^2/sqrt(Hz) of the acceleration and rad/s/sqrt(s) of the spin.
-    Writes: means (k, n, d) and covariances (k, n, d, d) after each step.
-    Returns: the number of steps until one in which a ball comes down on a surface or rests.
+        c, b, s: coefficients of rates, impact and surface, (n, p) with tangents (n, p, d); w, wb, ws: their weights.
+        h (n, k): s, the steps.
+        world (11,): m, heights of the table and of what lies below it (-inf: nothing), the ball's radius, the table's
+            extent (x_low, x_high, y_low, y_high), the standard deviations of its ends.
+        noise (5,): densities of the acceleration (m/s^2/sqrt(Hz)) and the spin (rad/s/sqrt(s)); of an impact along the
+            vertical and along the surface (m/s), and of the spin (rad/s).
+    Writes: mean (k + 1, n, d) and covariance (k + 1, n, d, d); for balls that fly on unbounced beside and besides, of
+        the same shapes, the surface's level (k + 1, n) m and age (k + 1, n) s since then, NaN where there is none.
+    Returns: the number of steps done. Where that is less than k, hard (n,) tells which balls have not done the next
+        one: 1 if their bounce is not a plain one, 2 if they rest.
     """
-    n, d = mean.shape
-    jacobian, still, x, none = np.empty((9, d)), np.zeros(d), np.empty(9), np.empty((9, 0))
-    offset, nothing, nones = np.empty(3), np.empty((3, 0)), np.empty((s.shape[1], 0))
+    n = mean.shape[1]
     for k in range(h.shape[1]):
+        stop = False
         for r in range(n):
-            before = mean[r] if k == 0 else means[k - 1, r]
-            x[:] = before[:9]
-            jacobian[:] = 0.0
-            for i in range(9):
-                jacobian[i, i] = 1.0
-            level = heights[0] if x[2] > heights[0] else heights[1]
-            if r < checked and abs(x[5]) <= REST_SPEED / 2:
-                surface(x, s[r], ws, none, nones, offset, nothing)
-                if abs(x[2] - level - offset[0] - heights[2]) <= REST_GAP:
-                    return k
-            fly_one(rates, x, c[r], w, jacobian, ct[r], h[r, k], still, 1)
-            if r < checked and not x[5] >= 0.0:
-                surface(x, s[r], ws, none, nones, offset, nothing)
-                if not x[2] - level - offset[0] - heights[2] >= 0.0:
-                    return k
-            means[k, r, :9] = x
-            means[k, r, 9:] = before[9:]
-            held = covariance[r] if k == 0 else covariances[k - 1, r]
-            _carry_covariance(jacobian, held, h[r, k], noise, covariances[k, r])
+            x, step = mean[k, r], h[r, k]
+            _fly(rates, x, covariance[k, r], c[r], ct[r], w, step, noise, mean[k + 1, r], covariance[k + 1, r])
+            age[k + 1, r] = age[k, r] + step
+            if age[k + 1, r] < BEYOND:
+                at, spread = beside[k + 1, r], besides[k + 1, r]
+                _fly(rates, beside[k, r], besides[k, r], c[r], ct[r], w, step, noise, at, spread)
+                level[k + 1, r] = level[k, r]
+            else:
+                age[k + 1, r] = np.nan
+            low = world[0] if x[2] > world[0] else world[1]
+            after = mean[k + 1, r]
+            if abs(x[5]) <= REST_SPEED / 2 and abs(gap_of(surface, x[:9], s[r], ws, low, world[2])) <= REST_GAP:
+                hard[r], stop = 2.0, True
+                continue
+            if after[5] >= 0.0 or gap_of(surface, after[:9], s[r], ws, low, world[2]) >= 0.0:
+                continue
+            beside[k + 1, r], besides[k + 1, r] = after, covariance[k + 1, r]
+            level[k + 1, r], age[k + 1, r] = low, 0.0
+            one = slice(r, r + 1)
+            if not _bounce(
+                (rates, impact, surface),
+                (c[one], b[one], s[one]),
+                (ct[one], bt[one], st[one]),
+                (w, wb, ws),
+                *(x[:9], covariance[k, r], step, low, world, noise, after[:9], covariance[k + 1, r]),
+            ):
+                hard[r], stop = 1.0, True
+        if stop:
+            return k
     return h.shape[1]

@@ -15,6 +15,7 @@ from types import ModuleType
 from typing import Any, Final
 
 from numba import njit
+from numba.core.types import WrapperAddressProtocol
 
 HEADER: Final = '''"""Generated from a model of a ball; safe to delete."""
 import math
@@ -42,18 +43,39 @@ def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
     return compile_one
 
 
-def built(source: str) -> Any:
+class Code(WrapperAddressProtocol):
+    """A compiled function as machine code takes it: by its address, which numba would look up anew in every call."""
+
+    def __init__(self, compiled: Any) -> None:
+        self.__wrapped__ = compiled
+        (self._signature,) = compiled.nopython_signatures
+        result = compiled.get_compile_result(self._signature)
+        self._address = result.library.get_pointer_to_function(result.fndesc.llvm_cfunc_wrapper_name)
+
+    def __call__(self, *args: Any) -> None:
+        """Call it from Python."""
+        self.__wrapped__(*args)
+
+    def __wrapper_address__(self) -> int:
+        return int(self._address)
+
+    def signature(self) -> Any:
+        """Of its arguments and result, as numba asks for it."""
+        return self._signature
+
+
+def built(source: str) -> Code:
     """The compiled `compute` of some source."""
     return _built(HEADER + source)
 
 
 @cache
-def _built(text: str) -> Any:
+def _built(text: str) -> Code:
     name = f"ballfg_compiled_{hashlib.sha256(text.encode()).hexdigest()[:20]}"
     path = cache_folder() / f"{name}.py"
     if not path.exists():
         _write(path, text)
-    return _imported(name, path).compute
+    return Code(_imported(name, path).compute)
 
 
 def write_note(about: str, note: Mapping[str, Any]) -> None:

@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import built, read_note, write_note
+from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.compiled.recipe import Recipe
 from ballfg.dynamics.model import BallModel, is_substituted, substitute
 from ballfg.dynamics.networks.architecture import Architecture
@@ -66,9 +67,9 @@ class CompiledModel:
 
     def weights(self, model: BallModel) -> tuple[Array, Array, Array]:
         """Those that rates, impact and surface take, from a model's tables as they are now."""
-        now = tuple((id(table), table._version, table.data_ptr()) for table in _tables(model).values())
+        tables = list(numbers_of(model).tables().values())
+        now = tuple((id(table), table._version, table.data_ptr()) for table in tables)
         if model not in _weights or _weights[model][0] != now:
-            tables = list(_tables(model).values())
             parts = (self.rates, self.impact, self.surface)
             rates, impact, surface = (NONE if p.weigh is None else p.weigh(*tables).numpy() for p in parts)
             _weights[model] = now, (rates, impact, surface)
@@ -146,7 +147,7 @@ def _plain(value: object) -> Hashable:
 
 def _compiled(model: BallModel, key: Hashable | None) -> CompiledModel | None:
     try:
-        rates, impact, surface = (_function(model, part, key) for part in (_rates, _impact, _surface))
+        rates, impact, surface = (_function(model, part, key) for part in PARTS)
         return CompiledModel(rates, impact, surface, model.radius)
     except Exception as error:  # a user's own effect may do anything, and torch runs it all the same
         warnings.warn(f"{type(model).__name__} runs in torch, and so more slowly: {error}", stacklevel=2)
@@ -168,6 +169,10 @@ def _surface(model: BallModel, state: Tensor) -> Tensor:
         offset = state.new_full(state.shape[:-1], offset)
     slope = state.new_zeros((*state.shape[:-1], 2)) if slope is None else slope.expand(*state.shape[:-1], 2)
     return torch.cat((offset.expand(state.shape[:-1]).unsqueeze(-1), slope), dim=-1)
+
+
+PARTS: Final = (_rates, _impact, _surface)
+"""What is compiled of a model: functions of it and of a state (9,)."""
 
 
 def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], key: Hashable | None) -> Function:
@@ -208,18 +213,13 @@ def _digest(file: str) -> str:
     return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:12]
 
 
-def _tables(model: BallModel) -> dict[str, Tensor]:
-    """Parameters that are no scalars, and buffers, by name: derivatives by them are left to torch."""
-    return {name: p.detach() for name, p in model.named_parameters() if p.dim()} | dict(model.named_buffers())
-
-
 def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -> tuple[str, Function]:
     """A function that was traced anew, and its source."""
     from ballfg.dynamics.compiled.source import function_source
     from ballfg.dynamics.compiled.trace import trace  # torch's tracer takes a second to import
 
     scalars = [name for name, parameter in model.named_parameters() if parameter.dim() == 0]
-    tables = _tables(model)
+    tables = numbers_of(model).tables()
 
     def of_vectors(state: Tensor, coefficients: Tensor, *given: Tensor) -> Tensor:
         values = {name: coefficients[i] for i, name in enumerate(scalars)}
@@ -248,7 +248,7 @@ def _compare(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], 
     if not parameters.keys() >= set(made.names):
         raise NotTheSameError(f"compiled {function.__name__} takes coefficients that the model does not have")
     own = np.array([float(parameters[name].detach()) for name in made.names])
-    weights = NONE if made.weigh is None else made.weigh(*_tables(model).values()).numpy()
+    weights = NONE if made.weigh is None else made.weigh(*numbers_of(model).tables().values()).numpy()
     for _ in range(4):
         state = rng.normal(size=STATE_DIM) * np.repeat((1.0, 5.0, 100.0), 3)
         coefficients = own + 0.05 * rng.normal(size=p)

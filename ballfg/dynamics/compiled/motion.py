@@ -10,10 +10,10 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.compiled.beliefs import carry
 from ballfg.dynamics.compiled.contacts import contact_times, contacts
 from ballfg.dynamics.compiled.flight import fly_rows
 from ballfg.dynamics.compiled.functions import CompiledModel, Function, compiled
+from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import step_count
 from ballfg.dynamics.motion.limits import BEYOND
@@ -45,7 +45,7 @@ class Moving:
         self.moved = np.tile(np.eye(STATE_DIM, width), (n, 1, 1))
         self.elapsed, self.slower = np.zeros(n), np.zeros((n, width))
         self._places = {name: k for k, name in enumerate(names)}
-        self._values = {name: p for name, p in inner.named_parameters() if p.dim() == 0}
+        self._numbers = numbers_of(inner)
         self._known: dict[tuple[str, ...], tuple[Array, Array]] = {}
 
     def fly(self, dt: Array) -> None:
@@ -116,7 +116,7 @@ class Moving:
                     if width:
                         moved[:, place, STATE_DIM + self._places[name]] = 1.0
                 else:
-                    values[:, place] = float(self._values[name].detach())
+                    values[:, place] = self._numbers.value(name)
             self._known[function.names] = values, moved
         return self._known[function.names]
 
@@ -171,49 +171,3 @@ def fly_through_jacobian(
     moving.fly(whole)
     after, jacobian = moving.results()
     return after, torch.stack(times, dim=-1) if times else dt.new_zeros((*dt.shape, 0)), jacobian
-
-
-def fly_beliefs(
-    model: BallModel,
-    mean: Array,
-    covariance: Array,
-    h: Array,
-    checked: int,
-    levels: tuple[float, float],
-    densities: tuple[float, float],
-) -> tuple[Tensor, Tensor]:
-    """Means (k, n, d) and covariances (k, n, d, d) of n balls after each step of free flight.
-
-    Args:
-        model: of the ball, one that has compiled functions.
-        mean, covariance: (n, d) and (n, d, d) at the start.
-        h: (n, m) s, steps of at most `MAX_STEP`.
-        checked: the first so many balls meet surfaces, the others fly through them.
-        levels: m, of the table and of what lies below it.
-        densities: of the process noise, m/s^2/sqrt(Hz) and rad/s/sqrt(s).
-    Returns: for the k steps before the first one in which a ball comes down on a surface or rests.
-    """
-    n, d = mean.shape
-    functions = functions_of(model)
-    assert functions is not None
-    moving = Moving(model, functions, torch.from_numpy(mean), d)
-    rates, surface = functions.rates, functions.surface
-    w, _, ws = moving.weights
-    means, covariances = np.empty((h.shape[1], n, d)), np.empty((h.shape[1], n, d, d))
-    done = carry(
-        rates.compute,
-        surface.compute,
-        mean,
-        covariance,
-        *moving.coefficients(rates),
-        moving.coefficients(surface)[0],
-        w,
-        ws,
-        np.ascontiguousarray(h),
-        checked,
-        np.array([*levels, functions.radius]),
-        np.array(densities),
-        means,
-        covariances,
-    )
-    return torch.from_numpy(means[:done]), torch.from_numpy(covariances[:done])

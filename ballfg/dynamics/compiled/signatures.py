@@ -20,3 +20,13 @@ FUNCTION: Final[Any] = types.FunctionType(types.void(ONE, ONE, ONE, TWO, TWO, ON
 def several(kind: Any, count: int) -> Any:
     """A tuple of so many results of one kind."""
     return types.UniTuple(kind, count)
+
+
+THREE_FUNCTIONS: Final[Any] = several(FUNCTION, 3)
+"""Rates, impact and surface of a model."""
+THREE_VALUES: Final[Any] = several(TWO, 3)
+"""Their coefficients, one row a ball."""
+THREE_TANGENTS: Final[Any] = several(THREE, 3)
+"""How these move with the tangents."""
+THREE_WEIGHTS: Final[Any] = several(ONE, 3)
+"""Their weights."""

@@ -1,0 +1,117 @@
+"""Gaussian beliefs of balls at a sequence of times, and the machine code that carries them on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, Final
+
+import numpy as np
+import torch
+
+from ballfg.arrays import Array
+from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.compiled.beliefs import carry
+from ballfg.dynamics.compiled.functions import compiled
+from ballfg.dynamics.compiled.in_torch import in_torch, raise_errors
+from ballfg.dynamics.compiled.mixture import mix
+from ballfg.dynamics.compiled.motion import Moving
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.surfaces import Surfaces
+
+BOUNCES: Final = 1.0
+"""A ball whose bounce is not a plain one."""
+RESTS: Final = 2.0
+"""A ball that lies on a surface."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """Beliefs of n balls at k times, linear about the mean, and of balls beside them that fly on without a bounce.
+
+    Attributes:
+        mean: (k, n, 9 + p) states and coefficients.  covariance: (k, n, 9 + p, 9 + p).
+        beside, besides: the same of a ball that went through a surface a short while ago as if it were not there.
+        level: (k, n) m, that surface.  age: (k, n) s since then; NaN where there is no such ball.
+    """
+
+    mean: Array
+    covariance: Array
+    beside: Array
+    besides: Array
+    level: Array
+    age: Array
+
+    @classmethod
+    def start(cls, mean: Array, covariance: Array) -> Course:
+        """One time, with no ball beside: mean (n, d), covariance (n, d, d)."""
+        none = np.full((1, len(mean)), np.nan)
+        return cls(mean[None], covariance[None], mean[None], covariance[None], none, none)
+
+    def __len__(self) -> int:
+        return len(self.mean)
+
+    def at(self, rows: Any) -> Course:
+        """Some of the times: a slice or indices."""
+        return Course(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    @staticmethod
+    def joined(parts: Sequence[Course]) -> Course:
+        """All times of some parts."""
+        if len(parts) == 1:
+            return parts[0]
+        return Course(*(np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Course)))
+
+
+class Carrier:
+    """Carries the beliefs of n balls on, with the coefficients that they have at the start.
+
+    Args:
+        model: of the balls; coefficients that travel with the states are columns of theirs.
+        mean: (n, 9 + p) at the start.
+        surfaces: that they may meet.
+        noise: (5,) densities of the acceleration, m/s^2/sqrt(Hz), and of the spin, rad/s/sqrt(s); of an impact along
+            the vertical and along the surface, m/s, and of its spin, rad/s.
+    """
+
+    def __init__(self, model: BallModel, mean: Array, surfaces: Surfaces, noise: Array) -> None:
+        inner = model.model if isinstance(model, AugmentedModel) else model
+        functions = compiled(inner) or in_torch(inner)
+        moving = Moving(model, functions, torch.from_numpy(mean), mean.shape[1])
+        parts = (functions.rates, functions.impact, functions.surface)
+        coefficients = [array for part in parts for array in moving.coefficients(part)]
+        ends = surfaces.extent or (-np.inf, np.inf, -np.inf, np.inf)
+        levels = (surfaces.table_height, surfaces.lowest(), functions.radius)
+        world = np.array([*levels, *ends, *surfaces.edge_sigmas])
+        self._given = (*(part.compute for part in parts), *coefficients, *moving.weights)
+        self._world, self._noise = world, noise
+        self._keeps = inner  # what torch computes is found by the model as long as it is there
+
+    def carry(self, course: Course, h: Array) -> tuple[Course, Array]:
+        """Carry the last beliefs of a course on by steps of h (n, k) s of at most `MAX_STEP`.
+
+        Returns: the course from that time on, 1 + j times for j <= k steps; and hard (n,). If any of it is not zero,
+            then the last time of the course is one that these balls have not reached: `BOUNCES`, `RESTS`, or 0.
+        """
+        last, steps, n = course.at(slice(-1, None)), h.shape[1], h.shape[0]
+        whole = Course(*(np.empty((steps + 1, *getattr(last, f.name).shape[1:])) for f in fields(Course)))
+        for field in fields(Course):
+            getattr(whole, field.name)[0] = getattr(last, field.name)[0]
+        hard = np.zeros(n)
+        arrays = [getattr(whole, field.name) for field in fields(Course)]
+        done = carry(*self._given, np.ascontiguousarray(h), self._world, self._noise, *arrays, hard)
+        raise_errors()
+        return whole.at(slice(done + 1 + bool(hard.any()))), hard
+
+    def mixed(self, course: Course) -> Course:
+        """The course with means and covariances of the balls on both sides of contacts of uncertain time."""
+        copied = Course(*(np.array(getattr(course, f.name), order="C") for f in fields(Course)))
+        mix(*self._given, self._world, self._noise, *(getattr(copied, f.name) for f in fields(Course)))
+        raise_errors()
+        return copied
+
+
+def density_of(noise: Any) -> Array:
+    """(5,) the numbers that `Carrier` takes, of a process noise."""
+    along = np.hypot(noise.contact_velocity, noise.contact_tangential)
+    return np.array([noise.acceleration, noise.spin, noise.contact_velocity, along, noise.contact_spin])

@@ -1,0 +1,106 @@
+"""Functions of a model that torch computes, in the shape in which machine code calls them.
+
+They serve models that cannot be compiled: prediction then runs the same code for every model, only more slowly.
+"""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache, partial
+from itertools import count
+from typing import Final
+
+import numpy as np
+import torch
+from numba import njit, objmode, types
+from torch import Tensor
+
+from ballfg.arrays import Array
+from ballfg.dynamics.compiled.build import Code
+from ballfg.dynamics.compiled.functions import PARTS, CompiledModel, Function
+from ballfg.dynamics.compiled.places import numbers_of
+from ballfg.dynamics.compiled.signatures import ONE, TWO
+from ballfg.dynamics.model import BallModel, substitute
+
+SIZES: Final = (6, 9, 3)
+"""Numbers that rates, impact and surface give."""
+
+_asked: dict[int, Callable[[Tensor, Tensor], Tensor]] = {}
+_failed: list[Exception] = []
+
+
+def _answer(number, x, c, xt, ct, y, yt):  # type: ignore[no-untyped-def]
+    """Compute one function; an error waits for `raise_errors`, since machine code cannot pass it on."""
+    try:
+        given = (torch.from_numpy(np.array(x)), torch.from_numpy(np.array(c)))
+        if not xt.shape[1]:
+            with torch.no_grad():
+                y[:] = _asked[number](*given).numpy()
+            return
+        y[:] = _asked[number](*given).detach().numpy()
+        by_state, by_coefficients = torch.autograd.functional.jacobian(_asked[number], given)
+        yt[:] = by_state.numpy() @ xt + by_coefficients.numpy() @ ct
+    except Exception as error:
+        _failed.append(error)
+        y[:], yt[:] = np.nan, np.nan
+
+
+@cache
+def _code() -> Code:
+    @njit(types.void(ONE, ONE, ONE, TWO, TWO, ONE, TWO))
+    def compute(x, c, w, xt, ct, y, yt):  # type: ignore[no-untyped-def]
+        with objmode():
+            _answer(int(w[0]), x, c, xt, ct, y, yt)
+
+    return Code(compute)
+
+
+@dataclass(frozen=True)
+class InTorch(CompiledModel):
+    """The functions of a model that torch computes; `numbers` are the weights by which they are known."""
+
+    numbers: tuple[int, int, int]
+
+    def weights(self, model: BallModel) -> tuple[Array, Array, Array]:
+        """The numbers of rates, impact and surface."""
+        rates, impact, surface = (np.array([float(number)]) for number in self.numbers)
+        return rates, impact, surface
+
+
+_made: weakref.WeakKeyDictionary[BallModel, InTorch] = weakref.WeakKeyDictionary()
+_next = count()
+
+
+def in_torch(model: BallModel) -> InTorch:
+    """The functions of any model, each of whose calls costs about a millisecond."""
+    if model not in _made:
+        names, known = tuple(numbers_of(model).scalars), weakref.ref(model)
+        numbers = (next(_next), next(_next), next(_next))
+        for number, part in zip(numbers, PARTS, strict=True):
+            _asked[number] = partial(_value, known, part, names)
+            weakref.finalize(model, _asked.pop, number)
+        rates, impact, surface = (Function(_code(), names, size) for size in SIZES)
+        _made[model] = InTorch(rates, impact, surface, model.radius, numbers)
+    return _made[model]
+
+
+def _value(
+    known: weakref.ref[BallModel],
+    part: Callable[[BallModel, Tensor], Tensor],
+    names: tuple[str, ...],
+    state: Tensor,
+    coefficients: Tensor,
+) -> Tensor:
+    model = known()
+    assert model is not None, "whoever computes with a model keeps it"
+    return part(substitute(model, dict(zip(names, coefficients.unbind(), strict=True))), state)
+
+
+def raise_errors() -> None:
+    """Raise what torch raised while machine code was running."""
+    if _failed:
+        first = _failed[0]
+        _failed.clear()
+        raise first
