@@ -12,7 +12,7 @@ from functools import partial
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq
+from scipy.optimize import brentq, root_scalar
 from torch import Tensor
 
 from ballfg.arrays import Array
@@ -221,6 +221,9 @@ def _exact_time(belief: Belief, event: EventFunction, low: float, high: float) -
         return float(event(fly(belief.model, belief.mean, torch.tensor([tau], dtype=torch.float64))))
 
     with torch.no_grad():
+        found = root_scalar(value, method="secant", x0=low, x1=high, xtol=TIME_TOLERANCE)
+        if found.converged and low <= found.root <= high:
+            return float(found.root)
         if value(low) * value(high) > 0.0:
             return None
         return float(brentq(value, low, high, xtol=TIME_TOLERANCE))

@@ -120,7 +120,7 @@ class Propagator:
             yield carrier.mixed(part), elapsed
 
     def _over(self, carrier: Carrier, belief: Belief, durations: Tensor) -> Iterator[tuple[Course, Tensor]]:
-        """Beliefs after each of some durations (n, k) s, linear, a few at a time, and the time (n, j) elapsed by then."""
+        """Linear beliefs after some durations (n, k) s, a few at a time, and the time (n, j) s elapsed by then."""
         if not bool(((durations >= 0) & durations.isfinite()).all()):
             low, high = float(durations.min()), float(durations.max())
             raise ValueError(f"dt must be finite and not negative; got {low:g} to {high:g} s")

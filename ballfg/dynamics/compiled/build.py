@@ -16,6 +16,9 @@ from typing import Any, Final
 
 from numba import njit
 from numba.core.types import WrapperAddressProtocol
+from numba.extending import typeof_impl
+
+from ballfg.dynamics.compiled.signatures import FUNCTION
 
 HEADER: Final = '''"""Generated from a model of a ball; safe to delete."""
 import math
@@ -62,6 +65,11 @@ class Code(WrapperAddressProtocol):
     def signature(self) -> Any:
         """Of its arguments and result, as numba asks for it."""
         return self._signature
+
+
+@typeof_impl.register(Code)
+def _type_of(code: Code, _context: Any) -> Any:
+    return FUNCTION
 
 
 def built(source: str) -> Code:
