@@ -99,11 +99,10 @@ class Propagator:
         Args: belief: of n balls.  h: (n, k) s, steps of at most `MAX_STEP`.
         """
         start = Course.start(belief.mean.detach().numpy(), belief.covariance.detach().numpy())
-        course, hard = self._carrier(belief).carry(start, h.numpy()[:, :AT_ONCE])
-        contacts = (course.age == 0.0).any(-1)
-        contacts[len(contacts) - 1 :] |= bool(hard.any())
-        free = int(np.logical_not(contacts).cumprod().sum())
-        return list(_beliefs(belief, course.at(slice(1, free)), h.cumsum(1)[:, : free - 1]))
+        carrier, steps = self._carrier(belief), h.numpy()[:, :AT_ONCE]
+        course, hard = carrier.carry(start, steps, through_contacts=False)
+        flown = course.at(slice(1, len(course) - bool(hard.any())))
+        return list(_beliefs(belief, flown, h.cumsum(1)))
 
     def _carrier(self, belief: Belief) -> Carrier:
         return Carrier(belief.model, belief.mean.detach().numpy(), self.surfaces, density_of(self.noise))

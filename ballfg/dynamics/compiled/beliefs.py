@@ -192,7 +192,7 @@ def _fly(rates, mean, covariance, c, ct, w, h, noise, after, spread):
 @machine_code(
     COUNT(
         *(FUNCTION, FUNCTION, FUNCTION, TWO, THREE, TWO, THREE, TWO, THREE, ONE, ONE, ONE),
-        *(TWO, ONE, ONE, THREE, FOUR, THREE, FOUR, TWO, TWO, ONE),
+        *(TWO, FLAG, ONE, ONE, THREE, FOUR, THREE, FOUR, TWO, TWO, ONE),
     )
 )
 def carry(
@@ -209,6 +209,7 @@ def carry(
     wb,
     ws,
     h,
+    through_contacts,
     world,
     noise,
     mean,
@@ -223,7 +224,7 @@ def carry(
 
     Args:
         c, b, s: coefficients of rates, impact and surface, (n, p) with tangents (n, p, d); w, wb, ws: their weights.
-        h (n, k): s, the steps.
+        h (n, k): s, the steps.  through_contacts: else a step in which a ball comes down is left undone.
         world (11,): m, heights of the table and of what lies below it (-inf: nothing), the ball's radius, the table's
             extent (x_low, x_high, y_low, y_high), the standard deviations of its ends.
         noise (5,): densities of the acceleration (m/s^2/sqrt(Hz)) and the spin (rad/s/sqrt(s)); of an impact along the
@@ -253,6 +254,8 @@ def carry(
                 continue
             if after[5] >= 0.0 or gap_of(surface, after[:9], s[r], ws, low, world[2]) >= 0.0:
                 continue
+            if not through_contacts:
+                return k
             beside[k + 1, r], besides[k + 1, r] = after, covariance[k + 1, r]
             level[k + 1, r], age[k + 1, r] = low, 0.0
             one = slice(r, r + 1)

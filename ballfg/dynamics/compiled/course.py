@@ -87,9 +87,10 @@ class Carrier:
         self._world, self._noise = world, noise
         self._keeps = inner  # what torch computes is found by the model as long as it is there
 
-    def carry(self, course: Course, h: Array) -> tuple[Course, Array]:
+    def carry(self, course: Course, h: Array, *, through_contacts: bool = True) -> tuple[Course, Array]:
         """Carry the last beliefs of a course on by steps of h (n, k) s of at most `MAX_STEP`.
 
+        Args: through_contacts: else only as long as no ball comes down on a surface.
         Returns: the course from that time on, 1 + j times for j <= k steps; and hard (n,). If any of it is not zero,
             then the last time of the course is one that these balls have not reached: `BOUNCES`, `RESTS`, or 0.
         """
@@ -99,7 +100,7 @@ class Carrier:
             getattr(whole, field.name)[0] = getattr(last, field.name)[0]
         hard = np.zeros(n)
         arrays = [getattr(whole, field.name) for field in fields(Course)]
-        done = carry(*self._given, np.ascontiguousarray(h), self._world, self._noise, *arrays, hard)
+        done = carry(*self._given, np.ascontiguousarray(h), through_contacts, self._world, self._noise, *arrays, hard)
         raise_errors()
         return whole.at(slice(done + 1 + bool(hard.any()))), hard
 

@@ -19,7 +19,7 @@ from torch import Tensor, nn
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import built, read_note, write_note
 from ballfg.dynamics.compiled.places import numbers_of
-from ballfg.dynamics.compiled.recipe import Recipe
+from ballfg.dynamics.compiled.translation.recipe import Recipe
 from ballfg.dynamics.model import BallModel, is_substituted, substitute
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.layers import MNN
@@ -215,8 +215,8 @@ def _digest(file: str) -> str:
 
 def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -> tuple[str, Function]:
     """A function that was traced anew, and its source."""
-    from ballfg.dynamics.compiled.source import function_source
-    from ballfg.dynamics.compiled.trace import trace  # torch's tracer takes a second to import
+    from ballfg.dynamics.compiled.translation.source import function_source
+    from ballfg.dynamics.compiled.translation.trace import trace  # torch's tracer takes a second to import
 
     scalars = [name for name, parameter in model.named_parameters() if parameter.dim() == 0]
     tables = numbers_of(model).tables()

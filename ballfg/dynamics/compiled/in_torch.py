@@ -39,9 +39,16 @@ def _answer(number, x, c, xt, ct, y, yt):  # type: ignore[no-untyped-def]
             with torch.no_grad():
                 y[:] = _asked[number](*given).numpy()
             return
-        y[:] = _asked[number](*given).detach().numpy()
-        by_state, by_coefficients = torch.autograd.functional.jacobian(_asked[number], given)
-        yt[:] = by_state.numpy() @ xt + by_coefficients.numpy() @ ct
+        leaves = [value.expand(len(y), -1).clone().requires_grad_(True) for value in given]  # one row an output
+        with torch.enable_grad():
+            rows = _asked[number](*leaves)
+        y[:], yt[:] = rows[0].detach().numpy(), 0.0
+        if not rows.requires_grad:  # a weight alone
+            return
+        slopes = torch.autograd.grad(rows.diagonal().sum(), leaves, allow_unused=True)
+        for slope, moved in zip(slopes, (xt, ct), strict=True):
+            if slope is not None:
+                yt += slope.numpy() @ moved
     except Exception as error:
         _failed.append(error)
         y[:], yt[:] = np.nan, np.nan
@@ -74,7 +81,7 @@ _next = count()
 
 
 def in_torch(model: BallModel) -> InTorch:
-    """The functions of any model, each of whose calls costs about a millisecond."""
+    """The functions of any model, each of whose calls costs about half a millisecond."""
     if model not in _made:
         names, known = tuple(numbers_of(model).scalars), weakref.ref(model)
         numbers = (next(_next), next(_next), next(_next))
@@ -95,7 +102,8 @@ def _value(
 ) -> Tensor:
     model = known()
     assert model is not None, "whoever computes with a model keeps it"
-    return part(substitute(model, dict(zip(names, coefficients.unbind(), strict=True))), state)
+    values = coefficients.unbind() if state.dim() == 1 else coefficients.split(1, dim=1)
+    return part(substitute(model, dict(zip(names, values, strict=True))), state)
 
 
 def raise_errors() -> None:

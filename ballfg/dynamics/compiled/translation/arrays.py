@@ -15,7 +15,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 
-from ballfg.dynamics.compiled.program import Number, Operation, Program
+from ballfg.dynamics.compiled.translation.program import Number, Operation, Program
 
 INPUTS: Final = ("input",)
 """Operations by which derivatives may be asked for."""

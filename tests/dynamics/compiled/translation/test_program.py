@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from ballfg.dynamics.compiled.arrays import Arrays
 from ballfg.dynamics.compiled.build import built
-from ballfg.dynamics.compiled.program import Program
-from ballfg.dynamics.compiled.source import function_source
-from ballfg.dynamics.compiled.trace import Traced
+from ballfg.dynamics.compiled.translation.arrays import Arrays
+from ballfg.dynamics.compiled.translation.program import Program
+from ballfg.dynamics.compiled.translation.source import function_source
+from ballfg.dynamics.compiled.translation.trace import Traced
 
 UNARY = {
     "neg": lambda a: -a,

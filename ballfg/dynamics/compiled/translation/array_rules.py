@@ -7,9 +7,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from ballfg.dynamics.compiled.arrays import Arrays, Each, Product, Total, View
-from ballfg.dynamics.compiled.program import Program
-from ballfg.dynamics.compiled.rules import RULES, Rules, UnknownOperationError, aten
+from ballfg.dynamics.compiled.translation.arrays import Arrays, Each, Product, Total, View
+from ballfg.dynamics.compiled.translation.program import Program
+from ballfg.dynamics.compiled.translation.rules import RULES, Rules, UnknownOperationError, aten
 
 EACH: Final = frozenset(
     {

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from ballfg.dynamics.compiled import loops
-from ballfg.dynamics.compiled.program import Number, Program
-from ballfg.dynamics.compiled.trace import Traced
+from ballfg.dynamics.compiled.translation.program import Number, Program
+from ballfg.dynamics.compiled.translation.trace import Traced
 
 INFIX: Final = {"add": "+", "sub": "-", "mul": "*", "div": "/", "le": "<=", "ge": ">=", "lt": "<", "gt": ">"}
 CALLS: Final = {

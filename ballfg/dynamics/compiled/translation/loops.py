@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
-from ballfg.dynamics.compiled.arrays import Arrays, Each, Load, Product, Total, View
-from ballfg.dynamics.compiled.program import Number, Program
+from ballfg.dynamics.compiled.translation.arrays import Arrays, Each, Load, Product, Total, View
+from ballfg.dynamics.compiled.translation.program import Number, Program
 
 Names = Mapping[Number, str]
 """How numbers of the program are called in the source."""
@@ -108,7 +108,7 @@ def _right_moves(kind: str, left: View, right: View, whole: View) -> tuple[str, 
 
 def _computed(program: Program, results: Sequence[Number], given: Names) -> tuple[list[str], dict[Number, str]]:
     """Lines that compute results of a small program, and how its numbers are called; `given` ones are known."""
-    from ballfg.dynamics.compiled.source import expression
+    from ballfg.dynamics.compiled.translation.source import expression
 
     needed, wanted = set[Number](), list(results)
     while wanted:

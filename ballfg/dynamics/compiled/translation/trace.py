@@ -17,12 +17,12 @@ from torch import Tensor
 from torch.fx import GraphModule, Node
 from torch.fx.experimental.proxy_tensor import make_fx
 
-from ballfg.dynamics.compiled.array_rules import ARRAY_RULES, EACH, each_of
-from ballfg.dynamics.compiled.arrays import SMALL, Arrays, Load, View
-from ballfg.dynamics.compiled.program import Number, Operation, Program
-from ballfg.dynamics.compiled.recipe import Recipe
-from ballfg.dynamics.compiled.rules import RULES, Numbers, Rules, UnknownOperationError
-from ballfg.dynamics.compiled.weights import Known, Weights
+from ballfg.dynamics.compiled.translation.array_rules import ARRAY_RULES, EACH, each_of
+from ballfg.dynamics.compiled.translation.arrays import SMALL, Arrays, Load, View
+from ballfg.dynamics.compiled.translation.program import Number, Operation, Program
+from ballfg.dynamics.compiled.translation.recipe import Recipe
+from ballfg.dynamics.compiled.translation.rules import RULES, Numbers, Rules, UnknownOperationError
+from ballfg.dynamics.compiled.translation.weights import Known, Weights
 
 MOST_READ = 500
 """Numbers of an array that is taken apart for an operation which arrays do not have."""

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ballfg.dynamics.compiled.program import Program
+from ballfg.dynamics.compiled.translation.program import Program
 
 Numbers = NDArray[np.object_]
 """A tensor of numbers of a program."""

@@ -9,9 +9,9 @@ from typing import Any, Final
 import torch
 from torch.fx import GraphModule, Node
 
-from ballfg.dynamics.compiled.arrays import View
-from ballfg.dynamics.compiled.recipe import Recipe
-from ballfg.dynamics.compiled.rules import UnknownOperationError
+from ballfg.dynamics.compiled.translation.arrays import View
+from ballfg.dynamics.compiled.translation.recipe import Recipe
+from ballfg.dynamics.compiled.translation.rules import UnknownOperationError
 
 IDLE: Final = frozenset({"memory_format", "pin_memory", "device", "layout"})
 """Arguments that change nothing about numbers in the memory of a computer."""

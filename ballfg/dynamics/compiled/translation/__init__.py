@@ -1,0 +1,1 @@
+"""From a function of torch to the source of machine code."""
