@@ -1,0 +1,3 @@
+from .tracker import BallUpdate as BallUpdate
+from .tracker import Counts as Counts
+from .tracker import Tracker as Tracker
