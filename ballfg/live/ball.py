@@ -6,6 +6,7 @@ from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -174,8 +175,8 @@ class Ball:
         if window is None:
             return ()
         samples = window.samples[-LOOK_BACK:]
-        found = []
-        for before, sample in zip(samples[:-1], samples[1:], strict=True):
+        found: list[BallEvent] = []
+        for before, sample in pairwise(samples):
             found += _events(sample.motion, before.motion, before.time, sample.time)
         fresh = [event for event in found if not self._was_told(event)]
         self._told.extend((event.kind, event.time) for event in fresh)
