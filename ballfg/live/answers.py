@@ -86,8 +86,7 @@ def _crossing(event: Crossing | None) -> Fields | None:
 
 def _numbers(values: Array) -> list[float | None]:
     """Numbers of JSON, which knows no NaN."""
-    found: list[float] = values.tolist()
-    return found if math.isfinite(sum(found)) else [_number(x) for x in found]
+    return [_number(x) for x in values.tolist()]
 
 
 def _number(value: float) -> float | None:

@@ -67,7 +67,7 @@ def _topic(bag: Path, topic: str | None) -> str:
     shown = ", ".join(f"{name} ({kind})" for name, kind in kinds.items()) or "none"
     if topic is None and len(good) == 1:
         return good[0]
-    if topic not in good:
+    if topic is None or topic not in good:
         known = ", ".join(kind.rpartition("/")[2] for kind in READERS)
         got = f"{topic!r}" if topic is not None else "none"
         raise ValueError(f"topic must be one of {known}; got {got}. The bag has: {shown}. Choose with --topic.")

@@ -31,9 +31,8 @@ def listen(address: str) -> Source:
     try:
         return kind(found[2].strip("[]"), int(found[3]))
     except OSError as error:
-        raise ValueError(
-            f"listen must be an address that is free; {address}: {error.strerror}. Choose another."
-        ) from None
+        problem = error.strerror or str(error)
+        raise ValueError(f"listen must be a free address; {address}: {problem}. Choose another.") from None
 
 
 def _bound(host: str, port: int, kind: socket.SocketKind) -> socket.socket:

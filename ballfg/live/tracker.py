@@ -202,7 +202,7 @@ class Tracker:
         return gone
 
     def _refuse_unusable(self, frame: _Frame) -> None:
-        good = np.isfinite(frame.positions).all(axis=1) & (np.abs(frame.positions) <= FARTHEST).all(axis=1)
+        good = [bool((np.abs(position) <= FARTHEST).all()) for position in frame.positions]  # NaN is not
         for k, (point, sigma) in enumerate(zip(frame.positions, frame.sigmas, strict=True)):
             if not np.isfinite(frame.time):
                 reason = "the stamp is not finite"

@@ -28,7 +28,8 @@ class Viewer:
             import rerun
         except ImportError:
             raise ValueError(
-                "viewer must have the package rerun-sdk, which is not installed. Install it: pip install 'ballfg[viewer]'."
+                "viewer must have the package rerun-sdk, which is not installed. "
+                "Install it: pip install 'ballfg[viewer]'."
             ) from None
         self.horizon = horizon
         self._rerun = rerun

@@ -33,4 +33,4 @@ def ball_settings() -> Settings:
 
 def rows(track: Track, later: float = 0.0, beside: float = 0.0) -> np.ndarray:
     """(n, 4) t, x, y, z of a track, `later` s on the clock and `beside` m along y."""
-    return np.column_stack((track.times + later, track.positions + [0.0, beside, 0.0]))
+    return np.column_stack((track.times + later, track.positions + np.array([0.0, beside, 0.0])))

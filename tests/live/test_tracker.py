@@ -121,7 +121,7 @@ def test_unusable_samples_change_nothing(time: float, position: list[float], rea
 
 def test_a_stamp_astray_costs_no_ball_and_a_clock_that_begins_anew_no_more_than_two_samples() -> None:
     first, second = rows(shots(2)[0], later=100.0)[:30], rows(shots(2)[1])
-    astray = first[20:21] + [1e6, 0.0, 0.0, 0.0]
+    astray = first[20:21] + np.array([1e6, 0.0, 0.0, 0.0])
     live = tracker()
     updates = fed(live, np.concatenate((first[:20], astray, first[20:], second)))
     assert live.counts.stray == live.counts.restarts == 1
