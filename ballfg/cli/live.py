@@ -111,7 +111,7 @@ def _scene(
 
     from ballfg.checks import check_number
     from ballfg.dynamics import Surfaces, load_model, nominal_model
-    from ballfg.estimation import Settings, dataset_settings, dataset_surfaces
+    from ballfg.estimation import dataset_settings, dataset_surfaces
     from ballfg.tracks import TABLE_TENNIS
 
     if data is not None:
@@ -122,13 +122,25 @@ def _scene(
 
         torch.set_num_threads(1)
         ball = nominal_model(TABLE_TENNIS) if model is None else load_model(model)
-        surfaces, settings = Surfaces.table_tennis(0.0), Settings.for_measured(ball)
+        surfaces, settings = Surfaces.table_tennis(0.0), _settings(ball)
     if table is not None:
         surfaces = Surfaces.table_tennis(check_number("table", table, "m", limit=50.0, instead="mm"))
     if noise is not None:
         sigma = check_number("noise", noise, "m", above=0.0, limit=1.0, instead="mm")
         settings = replace(settings, position_noise=(sigma,) * 3)
     return ball, surfaces, settings
+
+
+def _settings(ball: BallModel) -> Settings:
+    """The noise of a stream of which no dataset tells: the usual, or what the model brings along."""
+    from ballfg.estimation import Settings
+    from ballfg.estimation.configure import learned_process
+    from ballfg.estimation.noise.parameters import with_noise
+
+    settings = Settings.for_measured(ball)
+    if ball.trained is not None:
+        settings = Settings(position_scale=ball.trained.position_scale, process=learned_process(ball.trained))
+    return settings if ball.noise is None else with_noise(settings, ball.noise)
 
 
 def _source(

@@ -29,10 +29,9 @@ def need_rosbags() -> None:
     """Refuses to go on without the extra. Raises: ValueError."""
     try:
         import rosbags  # noqa: F401
-    except ImportError:
+    except ImportError as error:
         raise ValueError(
-            "bags must be read and written by the package rosbags, which is not installed. "
-            "Install it: pip install 'ballfg[ros]'."
+            f"bags must be read and written by the package rosbags; got {error}. Install it: pip install 'ballfg[ros]'."
         ) from None
 
 

@@ -80,11 +80,6 @@ class Ball:
         """s, the newest stamp."""
         return self.recent[-1].time
 
-    @property
-    def first(self) -> float:
-        """s, the oldest stamp that is still held."""
-        return self.recent[0].time
-
     def accepts(self, time: float) -> bool:
         """Whether a sample of that stamp can be put where it belongs."""
         return time > max(self.last - self.lag, self._copies[0][0])

@@ -17,14 +17,16 @@ from ballfg.prediction.state import BallState
 
 GATE = 30.0
 """Squared Mahalanobis distance, 3 degrees of freedom: one good position in a million is further from its ball."""
+LONG_GATE = 16.0
+"""The same after a silence of more than `HIT_TIME`, when a ball may be in a wide region, and another one too."""
 HIT_GATE = 9.0
 """The same for a ball that may have been hit: beyond three standard deviations a position begins another ball."""
 HIT_TIME = 0.1
 """s. After a longer silence a ball is only looked for on its path: a hit could have brought it anywhere."""
 HIT_SPEED = 10.0
 """m/s per axis, by which a hit moves the ball away from its path, apart from half of its own speed."""
-SLACK = 8.0
-"""m/s^2. Spread of the acceleration that gravity and drag leave out: the Magnus force of a strong spin."""
+SLACK = 4.0
+"""m/s^2. Spread of the acceleration that gravity and drag leave out: the Magnus force of a strong spin is 20."""
 SLIDE = 1.0
 """m/s. Spread of the tangential velocity that a bounce takes or gives."""
 FLOOR = 0.002
@@ -68,14 +70,17 @@ class Gate:
         self.jitter = jitter
 
     def on_path(self, ball: Known, time: float, positions: Array) -> Array:
-        """(n,) squared Mahalanobis distances of positions (n, 3) m from a ball that flew on or bounced."""
+        """(n,) squared Mahalanobis distances of positions (n, 3) m from a ball that flew on or bounced.
+
+        After a long silence they are stretched, so that `GATE` holds for them too.
+        """
         dt = time - ball.time
         mean, covariance = self._flown(ball, dt)
         distance = self._distance(mean, covariance, ball, positions)
         bounced = self._bounced(ball, dt, mean, covariance) if dt > 0.0 else None
         if bounced is not None:
             distance = np.minimum(distance, self._distance(*bounced, ball, positions))
-        return distance
+        return distance * (GATE / LONG_GATE) if abs(dt) > HIT_TIME else distance
 
     def if_hit(self, ball: Known, time: float, positions: Array) -> Array:
         """(n,) the same from a ball that something may have hit; infinite after too long a silence."""

@@ -26,10 +26,9 @@ class Viewer:
     def __init__(self, horizon: float, save: Path | None = None) -> None:
         try:
             import rerun
-        except ImportError:
+        except ImportError as error:
             raise ValueError(
-                "viewer must have the package rerun-sdk, which is not installed. "
-                "Install it: pip install 'ballfg[viewer]'."
+                f"viewer must have the package rerun-sdk; got {error}. Install it: pip install 'ballfg[viewer]'."
             ) from None
         self.horizon = horizon
         self._rerun = rerun

@@ -58,6 +58,25 @@ def test_states_are_those_of_the_estimator_and_a_new_ball_follows_the_old() -> N
     assert live.counts.balls == live.counts.lost == 2
 
 
+def test_a_ball_that_starts_elsewhere_0_3_s_after_another_was_last_seen_is_a_new_one() -> None:
+    first, second = rows(shots(2)[0])[:24], rows(shots(2)[1])
+    second[:, 0] += first[-1, 0] + 0.3
+    live = tracker()
+    updates = fed(live, np.concatenate((first, second)))
+    same_state(of_ball(updates, 2)[-1].state, online(second)[-1])
+    assert (live.counts.balls, live.counts.lost) == (2, 1)
+
+
+def test_a_ball_that_was_not_seen_for_0_2_s_is_the_same() -> None:
+    """The bounce lies in the gap."""
+    samples = rows(shots(1)[0])
+    seen = samples[(samples[:, 0] < 0.5) | (samples[:, 0] > 0.7)]
+    live = tracker()
+    updates = fed(live, seen)
+    same_state(of_ball(updates, 1)[-1].state, online(seen)[-1])
+    assert live.counts.balls == 1
+
+
 @pytest.mark.parametrize("together", [True, False], ids=["one push a stamp", "one push a position"])
 def test_two_balls_at_once_are_kept_apart(together: bool) -> None:
     """The second flies 0.25 m beside the first, and begins later; its positions come first where stamps are shared."""
