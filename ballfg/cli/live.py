@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from ballfg.dynamics import BallModel, Surfaces
     from ballfg.estimation import Settings
     from ballfg.live.session import Session, Watcher
-    from ballfg.live.source import Inbox, Source
+    from ballfg.live.sources.source import Inbox, Source
     from ballfg.tracks import Dataset
 
 BAG_ENDINGS = (".mcap", ".db3")
@@ -64,7 +64,7 @@ def live(
     from ballfg.checks import check_number, check_range
     from ballfg.live.outlook import Plane
     from ballfg.live.session import Session, Wanted, warm_up
-    from ballfg.live.source import Inbox
+    from ballfg.live.sources.source import Inbox
     from ballfg.live.tracker import Tracker
 
     check_range("speed", speed, 0.0, 1e6)
@@ -146,10 +146,10 @@ def _settings(ball: BallModel) -> Settings:
 def _source(
     replay: Path | None, bag: bool, listen: str | None, speed: float, topic: str | None, data: Dataset | None
 ) -> Source:
-    from ballfg.live.bag import bag_samples
-    from ballfg.live.replay import Replay, dataset_samples
-    from ballfg.live.sockets import listen as listened
-    from ballfg.live.source import Pipe
+    from ballfg.live.sources.bag import bag_samples
+    from ballfg.live.sources.replay import Replay, dataset_samples
+    from ballfg.live.sources.sockets import listen as listened
+    from ballfg.live.sources.source import Pipe
 
     if replay is not None and bag:
         return Replay(bag_samples(replay, topic), speed, str(replay))

@@ -15,8 +15,8 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.online.online import OnlineState
 from ballfg.files.whole_file import check_file, flush
-from ballfg.live.bag import need_rosbags
 from ballfg.live.outlook import Outlook, unusable
+from ballfg.live.sources.bag import need_rosbags
 from ballfg.live.tracker import BallUpdate
 from ballfg.state import POSITION, SPIN, VELOCITY
 

@@ -13,7 +13,7 @@ import numpy as np
 from ballfg.live.answers import answer, encoded, refusal
 from ballfg.live.latency import Latencies
 from ballfg.live.outlook import Outlook, Plane, look_out
-from ballfg.live.source import Arrival, Inbox
+from ballfg.live.sources.source import Arrival, Inbox
 from ballfg.live.tracker import BallUpdate, Tracker
 
 WARM_SAMPLES = 40

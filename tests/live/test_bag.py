@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from ballfg.live import BallUpdate, Tracker
-from ballfg.live.bag import bag_samples
 from ballfg.live.bag_writer import PATHS, STATES, bag_writer
 from ballfg.live.outlook import Outlook
+from ballfg.live.sources.bag import bag_samples
 from tests.live.shots import SURFACES, ball_model, ball_settings, rows, shots
 
 pytest.importorskip("rosbags", reason="the extra 'ros' is not installed")

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.live.lines import Sample
-from ballfg.live.replay import Replay, dataset_samples
-from ballfg.live.sockets import listen
-from ballfg.live.source import WAITING, Arrival, Inbox, Pipe, Source
+from ballfg.live.sources.lines import Sample
+from ballfg.live.sources.replay import Replay, dataset_samples
+from ballfg.live.sources.sockets import listen
+from ballfg.live.sources.source import WAITING, Arrival, Inbox, Pipe, Source
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Protocol
 
-from ballfg.live.lines import LONGEST, LineReader, Sample
+from ballfg.live.sources.lines import LONGEST, LineReader, Sample
 
 WAITING = 1024
 """Samples that may wait. Then a pipe or a TCP sender has to wait too, and of UDP packets the oldest are dropped."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ballfg.live.lines import Sample
+from ballfg.live.sources.lines import Sample
 
 Point = Any
 Reading = tuple[Sequence[Point], Any]

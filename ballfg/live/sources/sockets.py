@@ -8,7 +8,7 @@ import socket
 import threading
 from collections.abc import Iterator
 
-from ballfg.live.source import CHUNK, Arrival, LineBuffer, Source
+from ballfg.live.sources.source import CHUNK, Arrival, LineBuffer, Source
 
 WAIT = 0.1
 """s, after which a quiet socket looks whether it shall stop."""

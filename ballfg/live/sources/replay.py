@@ -6,8 +6,8 @@ import threading
 from collections.abc import Iterable, Iterator
 from time import perf_counter
 
-from ballfg.live.lines import Sample
-from ballfg.live.source import Arrival
+from ballfg.live.sources.lines import Sample
+from ballfg.live.sources.source import Arrival
 from ballfg.tracks import Dataset, Track
 
 PAUSE = 1.0
