@@ -78,7 +78,7 @@ class Ball:
     @property
     def last(self) -> float:
         """s, the newest stamp."""
-        return self.recent[-1].time
+        return self.states[-1].time
 
     def accepts(self, time: float) -> bool:
         """Whether a sample of that stamp can be put where it belongs."""
@@ -101,7 +101,7 @@ class Ball:
 
         Raises: ValueError, RuntimeError: from the estimator, where nothing can be made of the samples.
         """
-        if not self.recent or kept.time > self.last:
+        if not self.states or kept.time > self.last:
             self.tidy()
             return self._push(kept)
         self._rebuild(kept.time, added=kept)
@@ -112,21 +112,27 @@ class Ball:
         self._rebuild(kept.time, added=kept)
         return self.states[-1]
 
-    def forget_after(self, time: float) -> None:
-        """Drop the samples after a stamp of the last lag. Raises: as `take`."""
+    def forget_after(self, time: float) -> bool:
+        """Drop the samples after a stamp of the last lag; returns whether any are left. Raises: as `take`."""
         if self.last > time:
             self._rebuild(time, until=time)
+        return bool(self.states)
 
     def tidy(self) -> None:
         """Keep a copy of the estimator where one is due: best done while nothing waits."""
-        if self.lag <= 0.0 or self._since_copy < LEAST_APART or self.last - self._copies[-1][0] < self.lag / PARTS:
+        if (
+            not self.states
+            or self.lag <= 0.0
+            or self._since_copy < LEAST_APART
+            or self.last - self._copies[-1][0] < self.lag / PARTS
+        ):
             return
         self._copies.append((self.last, self._online.copy()))
         self._since_copy = 0
         while len(self._copies) > 1 and self._copies[1][0] <= self.last - self.lag:
             del self._copies[0]
         oldest = self._copies[0][0]
-        while self.recent[0].time <= oldest:
+        while self.recent and self.recent[0].time <= oldest:
             del self.recent[0]
         while self.states[0].time < oldest:  # the state of the copy itself stays: gates start from it
             self.states.popleft()
@@ -154,8 +160,7 @@ class Ball:
         self.states = deque(state for state in self.states if state.time <= base)
         self._online, self._since_copy = online.copy(), 0
         for kept in again:
-            if self.recent:
-                self.tidy()
+            self.tidy()
             self._push(kept)
 
     def start_anew(self, kept: Kept) -> OnlineState:

@@ -35,7 +35,7 @@ class Wanted:
     Attributes:
         horizon: s, how far ahead events are looked for.
         plane: whose crossing is wanted; None without one.
-        patience: s. A live line that waited longer gets no prediction, so that the states catch up.
+        patience: s. A live line that waited longer gets no prediction if another one waits: the states catch up.
     """
 
     horizon: float = 1.0
@@ -106,7 +106,7 @@ class Session:
         outlook = None
         if update.kind == "state" and update.state is not None:
             waited = perf_counter() - read
-            if self.inbox.source.live and waited > self.wanted.patience:
+            if self.inbox.waiting and waited > self.wanted.patience:
                 self.behind += 1
                 outlook = Outlook(note=f"no prediction: the line had waited {1e3 * waited:.0f} ms")
             else:

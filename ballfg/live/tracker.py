@@ -231,16 +231,26 @@ class Tracker:
             self._balls, self._newcomers = [], []
         elif stamp is Stamp.BACK:
             self.counts.stray += 1
-            self._undo_after(self._clock.newest)
+            gone = self._undo_after(self._clock.newest)
         frame.late = stamp is Stamp.LATE
         self.counts.late += len(frame.open) if frame.late else 0
         return gone + self._drop_unseen()
 
-    def _undo_after(self, time: float) -> None:
-        """Take back what a stamp astray has done."""
+    def _undo_after(self, time: float) -> list[BallUpdate]:
+        """Take back what a stamp astray has done; a ball of nothing else is lost."""
         self._newcomers = [newcomer for newcomer in self._newcomers if newcomer.last <= time]
-        for ball in self._balls:
-            ball.forget_after(time)
+        gone = []
+        for ball in list(self._balls):
+            farewell, left = self._farewell(ball), False
+            try:
+                left = ball.forget_after(time)
+            except (ValueError, RuntimeError):
+                self.counts.failed += 1
+            if not left:
+                self._balls.remove(ball)
+                self.counts.lost += 1
+                gone.append(farewell)
+        return gone
 
     def _drop_unseen(self) -> list[BallUpdate]:
         now = self._clock.safe
@@ -252,14 +262,15 @@ class Tracker:
 
     def _lost(self, ball: Ball) -> BallUpdate:
         self.counts.lost += 1
+        return self._farewell(ball)
+
+    def _farewell(self, ball: Ball) -> BallUpdate:
         return BallUpdate("lost", ball.last, ball.number, state=ball.states[-1], samples=ball.samples)
 
     def _to_balls(self, frame: _Frame, gate: float, hit: bool) -> None:
         """Give open positions to the balls that they fit: on their path, or as after a hit."""
         rows, t = frame.open, frame.time
         balls = [ball for ball in self._balls if ball.accepts(t) and abs(t - ball.last) <= self.gap]
-        if not rows or not balls:
-            return
         costs = np.full((len(rows), len(balls)), FAR)
         for j, ball in enumerate(balls):
             held = ball.at(t)
@@ -271,14 +282,14 @@ class Tracker:
             k = rows[i]
             frame.updates[k] = self._taken(balls[j], frame, k, Kept(t, frame.positions[k], frame.sigmas[k], hit))
         if not hit:
-            self._refuse_repeated(frame, balls)
+            self._refuse_repeated(frame)
 
-    def _refuse_repeated(self, frame: _Frame, balls: Sequence[Ball]) -> None:
+    def _refuse_repeated(self, frame: _Frame) -> None:
         """A position beside the one that a ball has of that stamp already is the same ball, measured twice."""
         for k in frame.open:
-            for ball in balls:
+            for ball in self._balls:
                 held = ball.at(frame.time)
-                if held is None or held.position is frame.positions[k]:
+                if held is None:
                     continue
                 near = self.gate.on_path(ball.known(frame.time), frame.time, frame.positions[[k]])[0] <= GATE
                 same = np.array_equal(held.position, frame.positions[k])
@@ -339,6 +350,8 @@ class Tracker:
         self._balls.append(ball)
         for kept in newcomer.samples:
             update = self._taken(ball, frame, k, kept)
+            if update.kind == "refused":
+                break
         return update
 
     def _begin_newcomers(self, frame: _Frame) -> None:

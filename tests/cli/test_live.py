@@ -115,9 +115,9 @@ def test_senders_that_talk_nonsense_and_break_off_do_not_hurt_the_next_ball(data
     for ball, number, since in ((1, 0, 0), (2, 1, 2)):  # two samples tell that the clock began anew
         last = [line for line in found if line["kind"] == "state" and line["ball"] == ball][-1]
         assert last["samples"] == SAMPLES - since
-        assert "no prediction: the line had waited" in last["note"]
         position = list(read_dataset(dataset))[number].positions[-1]
         np.testing.assert_allclose(last["position"], position, atol=0.01)
+    assert any("no prediction: the line had waited" in line.get("note", "") for line in found)
     reasons = [line["reason"] for line in found if line["kind"] == "refused"]
     assert len([reason for reason in reasons if "a CSV line must be t,x,y,z" in reason]) == 2
     assert "a coordinate is not finite" in reasons

@@ -166,3 +166,25 @@ def test_wrong_shapes_are_refused_at_the_edge() -> None:
         tracker().push(0.0, [1.0, 2.0, 3.0], [0.1])
     with pytest.raises(ValueError, match="lag must be at least 0"):
         tracker(lag=-1.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_any_stream_is_answered_position_by_position(seed: int) -> None:
+    """Three balls, shuffled beyond the lag, with outliers, wild stamps and numbers, repeats and odd sigmas."""
+    random = np.random.default_rng(seed)
+    samples = np.concatenate([rows(track, random.uniform(0, 0.3), 0.5 * k)[:16] for k, track in enumerate(shots(3, 5))])
+    samples = samples[np.argsort(samples[:, 0] + random.uniform(0, 0.2, len(samples)))]
+    live = tracker(lag=float(random.choice([0.0, 0.05, 1.0])), most=2)
+    for sample in samples:
+        wild = random.random()
+        if wild < 0.1:
+            sample[random.integers(4)] = random.choice([np.nan, np.inf, -1e300, 1e9, 0.4])
+        elif wild < 0.2:
+            sample += random.normal(0.0, 0.4, 4)
+        sigma = None if random.random() < 0.9 else np.full(3, random.choice([0.0, np.nan, 1e-9, 10.0]))
+        for _ in range(1 + (random.random() < 0.1)):
+            updates = live.push(sample[0], sample[1:], sigma)
+            assert [u.kind for u in updates if u.kind != "lost"] == [updates[-1].kind]
+            assert all(np.isfinite(u.state.mean).all() for u in updates if u.state is not None)
+    live.end()
+    assert live.counts.balls == live.counts.lost

@@ -147,6 +147,11 @@ class Inbox:
                 group.append(other)
             yield group
 
+    @property
+    def waiting(self) -> bool:
+        """Whether something newer of a live source waits."""
+        return self.source.live and (self._ahead is not None or not self._queue.empty())
+
     def interrupt(self) -> None:
         """End the samples as if the source had ended; a signal handler may call it."""
         self._stop.set()
