@@ -11,7 +11,7 @@ import numpy as np
 
 from ballfg.estimation.online.online import OnlineState
 from ballfg.estimation.result import Status
-from ballfg.prediction import BallState, Crossing
+from ballfg.prediction import BallState, Belief, Crossing, Propagator, apex, next_contact, plane_crossing
 from ballfg.state import VELOCITY
 
 VAGUE = 3.0
@@ -45,6 +45,11 @@ class Plane:
     axis: str
     place: float
 
+    @property
+    def normal(self) -> tuple[float, ...]:
+        """(3,) dimensionless."""
+        return tuple(float(axis == self.axis) for axis in AXES)
+
     @classmethod
     def parse(cls, text: str) -> Plane:
         """The plane of a text such as x=2.0. Raises: ValueError: any other text."""
@@ -69,16 +74,23 @@ def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook
     notes: list[str] = []
     with np.errstate(all="ignore"):
         try:
-            ahead = state.predict(horizon, step=horizon)
+            carried = _carried(state)
         except Exception as error:  # a prediction must not end the stream
             return Outlook(note=f"no prediction: {_one_line(error)}")
-        bounce = _tried(lambda: ahead.next_contact, "bounce", notes)
-        apex = _tried(lambda: ahead.apex, "apex", notes)
+        bounce = _tried(lambda: next_contact(*carried, horizon), "bounce", notes)
+        top = _tried(lambda: apex(*carried, horizon), "apex", notes)
         crossing = None
         if plane is not None:
-            where = {plane.axis: plane.place}
-            crossing = _tried(lambda: ahead.crossing(**where), "crossing", notes)
-    return Outlook(bounce, apex, crossing, "; ".join(notes))
+            across, place = plane.normal, plane.place
+            crossing = _tried(lambda: plane_crossing(*carried, across, place, horizon), "crossing", notes)
+    return Outlook(bounce, top, crossing, "; ".join(notes))
+
+
+def _carried(state: BallState) -> tuple[Propagator, Belief]:
+    """What `state.predict` starts from, without the path that nobody asks for. Raises: ValueError: no model."""
+    if state.world is None:
+        raise ValueError("the state knows no model")
+    return Propagator(state.world.surfaces, state.world.process), Belief.of(state.world.model, [state])
 
 
 def unusable(state: BallState) -> str:
