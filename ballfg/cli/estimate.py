@@ -59,19 +59,18 @@ def estimate(
 
     outcome = inputs.Outcome()
     rows = hits = 0
-    with TableWriter(out) as table:
+    with TableWriter(out) as table, inputs.workers(cluster, address, jobs) as workers:
         inputs.check_out(out, dataset)
         positions = has_positions(dataset) if source is None else source is inputs.Source.POSITIONS
         open_dataset = inputs.open_inputs if positions else inputs.open_sighted
         opened = open_dataset(dataset, model, effects_file)
         count = len(opened.dataset)
-        with inputs.workers(cluster, address, jobs) as workers:
-            work = partial(_estimated, opened.estimator(method), opened.model)
-            results = map_tracks(work, opened.dataset, count, workers)
-            for result in progress(results, count, "tracks estimated"):
-                table.write(result.columns)
-                outcome.add(result.name, result.status, result.notes, result.outside)
-                rows, hits = rows + result.rows, hits + result.hits
+        work = partial(_estimated, opened.estimator(method), opened.model)
+        results = map_tracks(work, opened.dataset, count, workers)
+        for result in progress(results, count, "tracks estimated"):
+            table.write(result.columns)
+            outcome.add(result.name, result.status, result.notes, result.outside)
+            rows, hits = rows + result.rows, hits + result.hits
     print(f"{out}: {rows} states of {count} tracks by {method}; {hits} hits found")
     outcome.print()
     outcome.print_outside()

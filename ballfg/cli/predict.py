@@ -51,7 +51,7 @@ def predict(
     from ballfg.tracks import TableWriter
 
     outcome = _Outcome()
-    with TableWriter(out) as table:
+    with TableWriter(out) as table, inputs.workers(cluster, address, jobs) as workers:
         inputs.check_out(out, dataset)
         check_observe(observe)
         if save_conformal is not None:
@@ -60,16 +60,15 @@ def predict(
                 raise ValueError("save_conformal must come with --conformal, whose scales it keeps. Add --conformal.")
         opened = inputs.open_inputs(dataset, model, effects_file, observe)
         count = len(opened.dataset)
-        with inputs.workers(cluster, address, jobs) as workers:
-            estimator = opened.estimator(method)
-            scales = None
-            if conformal is not None:
-                scales = _conformal_scales(conformal, opened.dataset, estimator, method, observe, workers)
-            predictions = predict_tracks(estimator, opened.dataset, count, observe, jobs=workers)
-            for plain in progress(predictions, count, "tracks predicted"):
-                result = plain if scales is None else scales.scaled(plain)
-                table.write(_columns(result))
-                outcome.add(result, plain.sigmas)
+        estimator = opened.estimator(method)
+        scales = None
+        if conformal is not None:
+            scales = _conformal_scales(conformal, opened.dataset, estimator, method, observe, workers)
+        predictions = predict_tracks(estimator, opened.dataset, count, observe, jobs=workers)
+        for plain in progress(predictions, count, "tracks predicted"):
+            result = plain if scales is None else scales.scaled(plain)
+            table.write(_columns(result))
+            outcome.add(result, plain.sigmas)
     print(f"{out}: {outcome.rows} positions of {count} tracks, from the first {observe:g} s of each by {method}")
     outcome.print(observe)
     outcome.tracks.print_outside()

@@ -6,6 +6,7 @@ taken, so that they pile up in memory.
 
 import logging
 import pickle
+import re
 import time
 import uuid
 from collections.abc import Callable, Sequence
@@ -40,8 +41,11 @@ class DaskCluster:
             raise ValueError(
                 'cluster dask needs dask, which is not installed. Run: pip install "ballfg[dask]"'
             ) from None
-        if address is None:
-            raise ValueError("address must be given with --cluster dask; got none. Add --address tcp://HOST:8786.")
+        if not re.fullmatch(r"(\w+://)?[^/]+:\d+", address or ""):
+            raise ValueError(
+                f"address must be that of a dask scheduler, such as tcp://10.0.0.1:8786; got {address}. "
+                "Copy it from what the scheduler prints."
+            )
         self._address, self._seen = address, time.monotonic()
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it is raised here
         try:
