@@ -17,12 +17,11 @@ from ballfg.estimation import Estimate, Estimator, dataset_settings, dataset_sur
 from ballfg.estimation.batch import do_all, estimate_tracks
 from ballfg.parallel import on_cluster
 from ballfg.parallel.same_versions import HERE, differences, own_versions
-from ballfg.simulation import SimulationConfig, write_simulation
-from ballfg.tracks import Dataset, TrackNoise, read_dataset
+from ballfg.tracks import Dataset, read_dataset
+from tests.parallel.conftest import TRACKS
 
 needs_dask = pytest.mark.skipif(not find_spec("distributed"), reason="dask is not installed (pip install ballfg[dask])")
 needs_ray = pytest.mark.skipif(not find_spec("ray"), reason="ray is not installed (pip install ballfg[ray])")
-TRACKS = 40
 
 
 def status(*arguments: object) -> int:
@@ -30,18 +29,6 @@ def status(*arguments: object) -> int:
         run([str(argument) for argument in arguments])
     assert isinstance(exit_.value.code, int)
     return exit_.value.code
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Tracks whose noise is stated: nothing is learned before they are estimated."""
-    path = tmp_path_factory.mktemp("scale") / "shots"
-    write_simulation(path, SimulationConfig(tracks=TRACKS, rate=50.0, seed=5), file_format="parquet")
-    noise = TrackNoise(position=(0.003,) * 3)
-    text = (path / "dataset.yaml").read_text()
-    lines = "\n".join(f"  {name}: {list(value)}" for name, value in noise.to_mapping().items())
-    (path / "dataset.yaml").write_text(f"{text}noise:\n{lines}\n")
-    return path
 
 
 @pytest.fixture(scope="module")
@@ -76,8 +63,9 @@ def content(one: Estimate) -> bytes:
 
 @needs_dask
 def test_a_dask_cluster_finds_the_same_to_the_last_bit(
-    cluster: Any, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    cluster: Any, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("ballfg.estimation.batch.START_UP", 0.0)  # a second process, however little work there is
     files = [tmp_path / name for name in ("one.parquet", "two.parquet", "dask.parquet")]
     assert status("estimate", folder, "--out", files[0], "--jobs", 1) == 0
     assert status("estimate", folder, "--out", files[1], "--jobs", 2) == 0

@@ -1,4 +1,4 @@
-"""Chunks in order through real processes: nothing lost, nothing doubled, and few of them begun ahead of what is taken."""
+"""Chunks in order through real processes: nothing is lost or doubled, and few are begun ahead of what is taken."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ import pytest
 
 from ballfg.parallel.executor import executor
 from ballfg.parallel.processes import Processes
-from ballfg.parallel.stream import AHEAD, HELPED, finished, in_order, shared
 from ballfg.parallel.same_versions import own_versions
+from ballfg.parallel.stream import AHEAD, HELPED, finished, in_order, shared
 from ballfg.parallel.work import KEPT, Work, _functions, compute, packed
 
 NUMBERS = list(range(60))
@@ -80,6 +80,15 @@ def test_the_stream_is_read_no_further_than_the_window_while_nothing_is_taken() 
     assert len(taken) < 15
 
 
+def test_a_stream_that_breaks_off_raises_its_error_and_ends() -> None:
+    def broken() -> Iterator[list[int]]:
+        yield from list(fours())[:5]
+        raise ValueError("the table ends in the middle")
+
+    with pytest.raises(ValueError, match="in the middle"):
+        list(in_order(squares, broken(), Processes(2)))
+
+
 def test_an_error_of_the_function_arrives_as_it_is() -> None:
     with pytest.raises(ValueError, match="seven must not be squared"):
         list(in_order(refused, fours(), Processes(2)))
@@ -105,7 +114,7 @@ def test_long_tasks_are_shared_with_this_process() -> None:
 
 
 def test_long_tasks_hand_their_numbers_over_as_they_finish() -> None:
-    found = dict(finished(square, range(5), Processes(2, helped=False)))
+    found = dict(finished(square, range(5), Processes(1, helped=False)))
     assert found == {number: number**2 for number in range(5)}
 
 
