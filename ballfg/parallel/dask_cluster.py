@@ -5,6 +5,7 @@ taken, so that they pile up in memory.
 """
 
 import logging
+import math
 import pickle
 import re
 import time
@@ -46,7 +47,8 @@ class DaskCluster:
                 f"address must be that of a dask scheduler, such as tcp://10.0.0.1:8786; got {address}. "
                 "Copy it from what the scheduler prints."
             )
-        self._address, self._seen = address, time.monotonic()
+        self._address, self._workers = address, 0
+        self._looked, self._nobody_since = -LOOK, math.inf
         logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it is raised here
         try:
             self._client = distributed.Client(address, timeout=CONNECT, set_as_default=False)
@@ -63,8 +65,10 @@ class DaskCluster:
 
     @property
     def slots(self) -> int:
-        """How many workers there are; each computes one chunk at a time."""
-        return max(1, len(self._client.nthreads()))
+        """How many workers there were at the last look; each computes one chunk at a time."""
+        if time.monotonic() - self._looked > LOOK:
+            self.look()
+        return max(1, self._workers)
 
     def sender(self, function: Callable[[Sequence[Any]], Any]) -> Callable[[Sequence[Any]], "_Chunk"]:
         """Hands a function of a chunk over; see Executor.
@@ -82,16 +86,16 @@ class DaskCluster:
         return send
 
     def look(self) -> None:
-        """Raises: ConnectionError: the scheduler has left, or no worker has been there for `NOBODY` s."""
+        """Counts the workers. Raises: ConnectionError: the scheduler or, for `NOBODY` s, every worker has left."""
         try:
             workers = len(self._client.nthreads()) if self._client.status == "running" else None
         except (OSError, TimeoutError, RuntimeError):
             workers = None
         if workers is None:
             raise ConnectionError(f"the dask scheduler at {self._address} must stay while it is in use; it left.")
-        now = time.monotonic()
-        self._seen = now if workers else self._seen
-        if now - self._seen > NOBODY:
+        self._workers, self._looked = workers, (now := time.monotonic())
+        self._nobody_since = math.inf if workers else min(now, self._nobody_since)
+        if now - self._nobody_since > NOBODY:
             raise ConnectionError(
                 f"the dask scheduler at {self._address} must have workers; the last left {NOBODY:g} s ago."
             )

@@ -13,7 +13,7 @@ SOURCE = "source of ballfg"
 """Name of the digest of ballfg's own files: a checkout changes without its version."""
 HERE = (
     "dict(__import__('ballfg.parallel.same_versions', fromlist=['own_versions']).own_versions()) "
-    "if __import__('importlib.util').util.find_spec('ballfg') else {}"
+    "if (find := __import__('importlib.util').util.find_spec)('ballfg') and find('ballfg.parallel') else {}"
 )
 """Python expression for the versions of a worker, none without ballfg; it needs nothing but Python to be sent there."""
 
