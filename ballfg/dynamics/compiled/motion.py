@@ -132,7 +132,7 @@ def fly(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -
     rows = state.detach().expand(*shape, -1).reshape(-1, state.shape[-1])
     moving = Moving(model, functions, rows, 0)
     moving.fly(dt.detach().expand(shape).reshape(-1).numpy())
-    return moving.whole().reshape(*shape, -1)
+    return moving.whole().reshape(*shape, state.shape[-1])
 
 
 def contact_time(

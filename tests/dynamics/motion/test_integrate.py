@@ -210,3 +210,8 @@ def test_batch_jacobian_finds_the_number_of_outputs(states):
     expected = torch.zeros((3, 2, 9), dtype=torch.float64)
     expected[:, 0, 0], expected[:, 1, 1] = 2 * states(3)[:, 0], 2 * states(3)[:, 1]
     torch.testing.assert_close(jacobian, expected)
+
+
+def test_no_ball_flies_nowhere(model):
+    with torch.no_grad():
+        assert fly(model, torch.zeros((0, 9), dtype=torch.float64), torch.zeros(0, dtype=torch.float64)).shape == (0, 9)
