@@ -149,6 +149,8 @@ def _compiled(model: BallModel, key: Hashable | None) -> CompiledModel | None:
     try:
         rates, impact, surface = (_function(model, part, key) for part in PARTS)
         return CompiledModel(rates, impact, surface, model.radius)
+    except ImportError:
+        raise
     except Exception as error:  # a user's own effect may do anything, and torch runs it all the same
         warnings.warn(f"{type(model).__name__} runs in torch, and so more slowly: {error}", stacklevel=2)
         return None

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
-from ballfg.dynamics.compiled import loops
+from ballfg.dynamics.compiled.translation import loops
 from ballfg.dynamics.compiled.translation.program import Number, Program
 from ballfg.dynamics.compiled.translation.trace import Traced
 
