@@ -5,17 +5,16 @@ g = 0: a ball that is late is further back but crosses at the same place (docs/d
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
-from scipy.optimize import brentq, root_scalar
 from torch import Tensor
 
 from ballfg.arrays import Array
+from ballfg.dynamics.compiled.events import FOUND, LOOKS, NONE, TIME_TOLERANCE
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import contact_time
 from ballfg.dynamics.motion.integrate import MAX_STEP, RateFunction, batch_jacobian, derivative, fly
@@ -28,12 +27,6 @@ from ballfg.state import POSITION, STATE_DIM, VZ
 EventFunction = Callable[[Tensor], Tensor]
 """(..., d) states to (..., 1) values; the event is where the value falls through zero."""
 
-LOOKS = 16
-"""How often a step of `MAX_STEP` is looked at: two crossings within 1.25 ms may pass unseen."""
-TIME_TOLERANCE = 1e-12
-"""s. A crossing is bracketed to this."""
-MARGIN = 0.01
-"""Share of a look's width to each side of it in which the exact crossing is looked for too."""
 VALUE_JUMP = 1e-6
 """Value, in the event's own unit, beyond which it jumped through zero in a bounce and did not cross it."""
 JUST_NOW = 1e-9
@@ -71,7 +64,9 @@ def apex(propagator: Propagator, belief: Belief, horizon: float = 3.0, *, after:
     Returns: None if there is none within the horizon. A resting ball has none.
     Raises: ValueError: as `next_crossing`.
     """
-    return next_crossing(propagator, belief, _vertical_speed, horizon, after=after)
+    normal = np.zeros(STATE_DIM)
+    normal[VZ] = 1.0
+    return _line_crossing(propagator, belief, (normal, 0.0), horizon, after)
 
 
 def next_contact(
@@ -83,21 +78,16 @@ def next_contact(
     Returns: None if there is none within the horizon. A ball that rests or rolls has none until it falls.
     Raises: ValueError: as `next_crossing`.
     """
-    start, end = _span(belief, horizon)
-    model, earliest = belief.model, max(start, after) + JUST_NOW
+    end, earliest = _span(belief, horizon, after)
     while (left := end - float(belief.time)) > 0.0:
-        if flown := propagator.flights(belief, _steps(left, MAX_STEP)):
-            belief = flown[-1]
-            continue
-        h = torch.tensor([min(left, MAX_STEP)], dtype=torch.float64)
-        found = _contact_within(model, belief.mean, h, propagator.surfaces)
-        if found is not None:
-            tau, height = found
-            there = propagator.in_flight(belief, tau)
-            if float(there.time) > earliest:
-                return _projected(there, partial(_gap, model, height), model.rates)
-            h = tau + JUST_NOW  # a small hop may be over within the step
-        belief = propagator.forward(belief, h)
+        found = propagator.search(belief, left, earliest - float(belief.time))
+        if found.end == FOUND:
+            return _projected(found.belief, found.gradient, found.rate)
+        if found.end == NONE:
+            return None
+        crossing, belief = _contact_step(propagator, found.belief, end, earliest)
+        if crossing is not None:
+            return crossing
     return None
 
 
@@ -125,19 +115,37 @@ def plane_crossing(
     if not math.isfinite(offset):
         raise ValueError(f"offset must be finite; got {offset:g}")
     length = float(direction.square().sum().sqrt())
-
-    def distance(state: Tensor) -> Tensor:
-        return ((state[..., POSITION] * direction).sum(-1, keepdim=True) - offset) / length
-
-    return next_crossing(propagator, belief, distance, horizon, after=after, either_way=True)
+    line = np.zeros(STATE_DIM)
+    line[POSITION] = direction.numpy() / length
+    return _line_crossing(propagator, belief, (line, offset / length), horizon, after, either_way=True)
 
 
-def _gap(model: BallModel, height: float, state: Tensor) -> Tensor:
-    return model.gap(state, height).unsqueeze(-1)
+def _line_crossing(
+    propagator: Propagator,
+    belief: Belief,
+    line: tuple[Array, float],
+    horizon: float,
+    after: float,
+    *,
+    either_way: bool = False,
+) -> Crossing | None:
+    """The next time at which normal . state (9,) falls through an offset; line: both."""
+    normal, offset = torch.from_numpy(line[0]), line[1]
 
+    def event(state: Tensor) -> Tensor:
+        return (state[..., :STATE_DIM] * normal).sum(-1, keepdim=True) - offset
 
-def _vertical_speed(state: Tensor) -> Tensor:
-    return state[..., VZ : VZ + 1]
+    end, earliest = _span(belief, horizon, after)
+    while (left := end - float(belief.time)) > 0.0:
+        found = propagator.search(belief, left, earliest - float(belief.time), line, either_way=either_way)
+        if found.end == FOUND:
+            return _projected(found.belief, found.gradient, found.rate)
+        if found.end == NONE:
+            return None
+        crossing, belief = _crossing_step(propagator, found.belief, event, end, earliest, either_way)
+        if crossing is not None:
+            return crossing
+    return None
 
 
 def next_crossing(
@@ -160,83 +168,50 @@ def next_crossing(
     Returns: None if there is no crossing within the horizon.
     Raises: ValueError: if the belief does not hold exactly one ball, or the horizon is not a positive number of s.
     """
-    start, end = _span(belief, horizon)
-    earliest = max(start, after) + JUST_NOW
-    while (left := end - float(belief.time)) > 0.0:
-        if flown := propagator.flights(belief, _steps(left, MAX_STEP - JUST_NOW)):
-            found = _crossing_in_flight(propagator, [belief, *flown], event, earliest, either_way)
-            if found is not None:
-                return found
-            belief = flown[-1]
-            continue
-        h = torch.tensor([min(left, MAX_STEP - JUST_NOW)], dtype=torch.float64)
-        for tau in _crossings(propagator, belief, event, h + JUST_NOW, either_way):  # no gap between steps
-            if float(belief.time) + tau > earliest:
-                there = propagator.forward(belief, torch.tensor([tau], dtype=torch.float64))
-                return _projected(there, event, _rates(propagator, there))
-        belief = propagator.forward(belief, h)
+    end, earliest = _span(belief, horizon, after)
+    while end - float(belief.time) > 0.0:
+        crossing, belief = _crossing_step(propagator, belief, event, end, earliest, either_way)
+        if crossing is not None:
+            return crossing
     return None
 
 
-def _steps(left: float, longest: float) -> Tensor:
-    """(1, k) s, steps of at most `longest` that fill what is left of a search."""
-    count = math.ceil(left / longest)
-    return torch.full((1, count), longest, dtype=torch.float64).clamp_max(left - longest * torch.arange(count))
+def _contact_step(
+    propagator: Propagator, belief: Belief, end: float, earliest: float
+) -> tuple[Crossing | None, Belief]:
+    """A contact within one step, and the belief after the step, or after a contact that came too early."""
+    model, surfaces = belief.model, propagator.surfaces
+    h = torch.tensor([min(end - float(belief.time), MAX_STEP)], dtype=torch.float64)
+    found = _contact_within(model, belief.mean, h, surfaces)
+    if found is not None:
+        tau, height = found
+        there = propagator.in_flight(belief, tau)
+        if float(there.time) > earliest:
+            return _at_event(there, lambda state: model.gap(state, height).unsqueeze(-1), model.rates), there
+        h = tau + JUST_NOW  # a small hop may be over within the step
+    return None, propagator.forward(belief, h)
 
 
-def _crossing_in_flight(
-    propagator: Propagator, beliefs: Sequence[Belief], event: EventFunction, earliest: float, either_way: bool
-) -> Crossing | None:
-    """The first crossing after the time `earliest` (s) in the free flight between some beliefs of one ball.
-
-    Looks are at cubics through states and slopes, which are right to a micrometre; the crossing is exact.
-    """
-    model, times = beliefs[0].model, torch.cat([belief.time for belief in beliefs])
-    states, h = torch.cat([belief.mean for belief in beliefs]), times.diff()
-    with torch.no_grad():
-        values = event(_cubics(states, derivative(model.rates, states), h))[..., 0]  # (k, LOOKS + 1)
-    falls = (values[:, :-1] > 0) & (values[:, 1:] <= 0)
-    rises = (values[:, :-1] < 0) & (values[:, 1:] >= 0)
-    for step, look in (falls | rises if either_way else falls).nonzero().tolist():
-        width, belief = float(h[step]) / LOOKS, beliefs[step]
-        tau = _exact_time(belief, event, (look - MARGIN) * width, (look + 1 + MARGIN) * width)
-        if tau is not None and float(belief.time) + tau > earliest:
-            there = propagator.in_flight(belief, torch.tensor([tau], dtype=torch.float64))
-            return _projected(there, event, model.rates)
-    return None
+def _crossing_step(
+    propagator: Propagator, belief: Belief, event: EventFunction, end: float, earliest: float, either_way: bool
+) -> tuple[Crossing | None, Belief]:
+    """A crossing within one step, and the belief after the step."""
+    h = torch.tensor([min(end - float(belief.time), MAX_STEP - JUST_NOW)], dtype=torch.float64)
+    for tau in _crossings(propagator, belief, event, h + JUST_NOW, either_way):  # no gap between steps
+        if float(belief.time) + tau > earliest:
+            there = propagator.forward(belief, torch.tensor([tau], dtype=torch.float64))
+            return _at_event(there, event, _rates(propagator, there)), there
+    return None, propagator.forward(belief, h)
 
 
-def _cubics(states: Tensor, slopes: Tensor, h: Tensor) -> Tensor:
-    """(k, LOOKS + 1, d) between k + 1 states (k + 1, d) with their slopes, h (k,) s apart."""
-    at = torch.linspace(0.0, 1.0, LOOKS + 1, dtype=torch.float64)[:, None]
-    low, high, step = states[:-1, None], states[1:, None], h[:, None, None]
-    bent = (1 - at) * (slopes[:-1, None] * step - (high - low)) - at * (slopes[1:, None] * step - (high - low))
-    return low + at * (high - low) + at * (1 - at) * bent
-
-
-def _exact_time(belief: Belief, event: EventFunction, low: float, high: float) -> float | None:
-    """Time (s from the belief's) between two others at which one ball's value is zero; None: the same sign at both."""
-
-    def value(tau: float) -> float:
-        return float(event(fly(belief.model, belief.mean, torch.tensor([tau], dtype=torch.float64))))
-
-    with torch.no_grad():
-        found = root_scalar(value, method="secant", x0=low, x1=high, xtol=TIME_TOLERANCE)
-        if found.converged and low <= found.root <= high:
-            return float(found.root)
-        if value(low) * value(high) > 0.0:
-            return None
-        return float(brentq(value, low, high, xtol=TIME_TOLERANCE))
-
-
-def _span(belief: Belief, horizon: float) -> tuple[float, float]:
-    """Start and end (s) of a search; the arguments are checked."""
+def _span(belief: Belief, horizon: float, after: float) -> tuple[float, float]:
+    """End of a search, and the time (s) after which events count; the arguments are checked."""
     if len(belief) != 1:
         raise ValueError(f"belief must hold one ball; got {len(belief)}. Take them one by one.")
     if not 0.0 < horizon < math.inf:
         raise ValueError(f"horizon must be a positive, finite number of seconds; got {horizon:g}")
     start = float(belief.time)
-    return start, start + horizon
+    return start + horizon, max(start, after) + JUST_NOW
 
 
 def _contact_within(model: BallModel, mean: Tensor, h: Tensor, surfaces: Surfaces) -> tuple[Tensor, float] | None:
@@ -295,23 +270,29 @@ def _rates(propagator: Propagator, belief: Belief) -> RateFunction:
     return belief.model.roll if resting else belief.model.rates
 
 
-def _projected(there: Belief, event: EventFunction, rates: RateFunction) -> Crossing:
+def _at_event(there: Belief, event: EventFunction, rates: RateFunction) -> Crossing:
+    """The crossing whose mean is `there`."""
+    _, gradient = batch_jacobian(event, there.mean, outputs=1)
+    with torch.no_grad():
+        rate = derivative(rates, there.mean)
+    return _projected(there, gradient[0, 0].numpy(), rate[0].numpy())
+
+
+def _projected(there: Belief, gradient: Array, rate: Array) -> Crossing:
     """The crossing whose mean is `there`, with the covariance projected along the motion onto the event's surface.
 
     Where the motion only touches the surface, nothing fixes the time: its sigma is infinite, the covariance that
     at the mean time.
+
+    Args: gradient: (d,) of the event.  rate: (d,) of the state.
     """
-    mean, covariance = there.mean, there.covariance[0]
-    _, gradient = batch_jacobian(event, mean, outputs=1)
-    with torch.no_grad():
-        rate = derivative(rates, mean)  # (1, d)
-    closing = (gradient[:, 0] * rate).sum()
+    mean, covariance, closing = there.mean[0].detach().numpy(), there.covariance[0].detach().numpy(), gradient @ rate
     time_sigma = math.inf
-    if float(closing) != 0.0:
-        time_by_state = -gradient[0] / closing  # (1, d)
-        projection = torch.eye(mean.shape[-1], dtype=mean.dtype) + rate.T @ time_by_state
-        time_sigma = math.sqrt(max(float(time_by_state @ covariance @ time_by_state.T), 0.0))
+    if closing != 0.0:
+        time_by_state = -gradient / closing
+        projection = np.eye(len(mean)) + np.outer(rate, time_by_state)
+        time_sigma = math.sqrt(max(float(time_by_state @ covariance @ time_by_state), 0.0))
         covariance = projection @ covariance @ projection.T
         covariance = (covariance + covariance.T) / 2
-    state = mean[0, :STATE_DIM].detach().numpy().copy()
-    return Crossing(float(there.time), time_sigma, state, covariance[:STATE_DIM, :STATE_DIM].detach().numpy().copy())
+    state, spread = mean[:STATE_DIM].copy(), covariance[:STATE_DIM, :STATE_DIM].copy()
+    return Crossing(float(there.time), time_sigma, state, spread)

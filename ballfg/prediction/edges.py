@@ -6,7 +6,6 @@ other (docs/derivations/prediction.md).
 
 import math
 from dataclasses import replace
-from typing import Final
 
 import torch
 from torch import Tensor
@@ -14,14 +13,10 @@ from torch import Tensor
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import contact_time
 from ballfg.dynamics.motion.integrate import fly
+from ballfg.dynamics.motion.limits import LEAST_SIGMA, NEGLIGIBLE
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import STATE_DIM, VELOCITY, VZ, Z
-
-NEGLIGIBLE: Final = 1e-4
-"""Share of balls that take the other way, below which they do not count; they would add 0.05 m/s to a velocity."""
-LEAST_SIGMA: Final = 1e-12
-"""m. A place known better than this has a sigma of this."""
 
 
 @torch.no_grad()

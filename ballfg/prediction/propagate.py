@@ -47,6 +47,23 @@ class Prediction:
 
 
 @dataclass(frozen=True)
+class Found:
+    """What a search for an event ended with.
+
+    Attributes:
+        end: `events.NONE`, `FOUND`, or `HARD` before a step of rest, several bounces, or a bounce at a table's edge.
+        belief: there.
+        gradient: (9 + p,) of the event there.
+        rate: (9 + p,) 1/s, how the state changes.
+    """
+
+    end: float
+    belief: Belief
+    gradient: Array
+    rate: Array
+
+
+@dataclass(frozen=True)
 class Propagator:
     """Carries beliefs forward in time.
 
@@ -93,16 +110,29 @@ class Propagator:
         ((part, elapsed),) = self._over(self._carrier(belief), belief, dt[:, None])
         return next(_beliefs(belief, part, elapsed))
 
-    def flights(self, belief: Belief, h: Tensor) -> list[Belief]:
-        """The beliefs after each step of free flight, as far as no ball comes down on a surface or rests.
+    def search(
+        self,
+        belief: Belief,
+        horizon: float,
+        earliest: float,
+        line: tuple[Array, float] | None = None,
+        *,
+        either_way: bool = False,
+    ) -> Found:
+        """Look for an event on the way of one ball, through flight and plain bounces.
 
-        Args: belief: of n balls.  h: (n, k) s, steps of at most `MAX_STEP`.
+        Args:
+            belief: of the ball.
+            horizon, earliest: s from the belief's time; only events up to the one and after the other count.
+            line: (9,) and an offset: the event is that normal . state falls through it. None: the next contact.
+            either_way: take a rise through the offset as well.
         """
         start = Course.start(belief.mean.detach().numpy(), belief.covariance.detach().numpy())
-        carrier, steps = self._carrier(belief), h.numpy()[:, :AT_ONCE]
-        course, hard = carrier.carry(start, steps, through_contacts=False)
-        flown = course.at(slice(1, len(course) - bool(hard.any())))
-        return list(_beliefs(belief, flown, h.cumsum(1)))
+        carrier = self._carrier(belief)
+        end, elapsed, course = carrier.find(start, horizon, earliest, line, either_way=either_way)
+        (there,) = _beliefs(belief, course, torch.tensor([[elapsed]], dtype=torch.float64))
+        gradient, rate = carrier.slopes(course.mean[-1, 0], line)
+        return Found(end, there, gradient, rate)
 
     def _carrier(self, belief: Belief) -> Carrier:
         return Carrier(belief.model, belief.mean.detach().numpy(), self.surfaces, density_of(self.noise))

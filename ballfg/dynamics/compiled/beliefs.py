@@ -26,13 +26,7 @@ from ballfg.dynamics.compiled.signatures import (
     THREE_WEIGHTS,
     TWO,
 )
-from ballfg.dynamics.motion.limits import BEYOND, REST_GAP, REST_SPEED
-
-NEGLIGIBLE = 1e-4
-"""Share of balls that go past a table's edge while the mean bounces, below which they do not count; they would add
-0.05 m/s to a velocity."""
-LEAST_SIGMA = 1e-12
-"""m. A place known better than this has a sigma of this."""
+from ballfg.dynamics.motion.limits import BEYOND, LEAST_SIGMA, NEGLIGIBLE, REST_GAP, REST_SPEED
 
 
 @machine_code(NOTHING(TWO, TWO, TWO))
@@ -89,7 +83,7 @@ def gap_of(surface, x, s, ws, level, radius):
 
 
 @machine_code(REAL(ONE, TWO, ONE))
-def _share_over_table(touch, covariance, world):
+def share_over_table(touch, covariance, world):
     """Probability that a ball which is at `touch` (9,) in the mean when it comes down is then above the table."""
     within, along = 1.0, np.empty(9)
     for axis in range(2):
@@ -111,7 +105,7 @@ def _share_over_table(touch, covariance, world):
 @machine_code(
     FLAG(THREE_FUNCTIONS, THREE_VALUES, THREE_TANGENTS, THREE_WEIGHTS, ONE, TWO, REAL, REAL, ONE, ONE, ONE, TWO)
 )
-def _bounce(functions, values, tangents, weights, start, covariance, h, level, world, noise, x, after):
+def bounce(functions, values, tangents, weights, start, covariance, h, level, world, noise, x, after):
     """One ball (9,), with its covariance, that comes down on a level within h s.
 
     Writes: its state x (9,) and covariance after (d, d) at the end.
@@ -135,7 +129,7 @@ def _bounce(functions, values, tangents, weights, start, covariance, h, level, w
     fly_one(rates, touch[0], c[0], w, jacobian[0], ct[0], elapsed, still, 1)
     if not touch[0, 5] < 0.0:
         return False
-    if level == world[0] and not _share_over_table(touch[0], covariance, world) > 1.0 - NEGLIGIBLE:
+    if level == world[0] and not share_over_table(touch[0], covariance, world) > 1.0 - NEGLIGIBLE:
         return False
     through(jacobian[0], covariance, gathered)
     add_flight(gathered, elapsed, noise)
@@ -177,7 +171,7 @@ def _bounce(functions, values, tangents, weights, start, covariance, h, level, w
 
 
 @machine_code(NOTHING(FUNCTION, ONE, TWO, ONE, TWO, ONE, REAL, ONE, ONE, TWO))
-def _fly(rates, mean, covariance, c, ct, w, h, noise, after, spread):
+def fly_belief(rates, mean, covariance, c, ct, w, h, noise, after, spread):
     """Free flight of one ball over h s. Writes its mean (d,) and covariance (d, d)."""
     d = len(mean)
     jacobian, still = np.zeros((9, d)), np.zeros(d)
@@ -192,7 +186,7 @@ def _fly(rates, mean, covariance, c, ct, w, h, noise, after, spread):
 @machine_code(
     COUNT(
         *(FUNCTION, FUNCTION, FUNCTION, TWO, THREE, TWO, THREE, TWO, THREE, ONE, ONE, ONE),
-        *(TWO, FLAG, ONE, ONE, THREE, FOUR, THREE, FOUR, TWO, TWO, ONE),
+        *(TWO, ONE, ONE, THREE, FOUR, THREE, FOUR, TWO, TWO, ONE),
     )
 )
 def carry(
@@ -209,7 +203,6 @@ def carry(
     wb,
     ws,
     h,
-    through_contacts,
     world,
     noise,
     mean,
@@ -224,7 +217,7 @@ def carry(
 
     Args:
         c, b, s: coefficients of rates, impact and surface, (n, p) with tangents (n, p, d); w, wb, ws: their weights.
-        h (n, k): s, the steps.  through_contacts: else a step in which a ball comes down is left undone.
+        h (n, k): s, the steps.
         world (11,): m, heights of the table and of what lies below it (-inf: nothing), the ball's radius, the table's
             extent (x_low, x_high, y_low, y_high), the standard deviations of its ends.
         noise (5,): densities of the acceleration (m/s^2/sqrt(Hz)) and the spin (rad/s/sqrt(s)); of an impact along the
@@ -239,11 +232,11 @@ def carry(
         stop = False
         for r in range(n):
             x, step = mean[k, r], h[r, k]
-            _fly(rates, x, covariance[k, r], c[r], ct[r], w, step, noise, mean[k + 1, r], covariance[k + 1, r])
+            fly_belief(rates, x, covariance[k, r], c[r], ct[r], w, step, noise, mean[k + 1, r], covariance[k + 1, r])
             age[k + 1, r] = age[k, r] + step
             if age[k + 1, r] < BEYOND:
                 at, spread = beside[k + 1, r], besides[k + 1, r]
-                _fly(rates, beside[k, r], besides[k, r], c[r], ct[r], w, step, noise, at, spread)
+                fly_belief(rates, beside[k, r], besides[k, r], c[r], ct[r], w, step, noise, at, spread)
                 level[k + 1, r] = level[k, r]
             else:
                 age[k + 1, r] = np.nan
@@ -254,12 +247,10 @@ def carry(
                 continue
             if after[5] >= 0.0 or gap_of(surface, after[:9], s[r], ws, low, world[2]) >= 0.0:
                 continue
-            if not through_contacts:
-                return k
             beside[k + 1, r], besides[k + 1, r] = after, covariance[k + 1, r]
             level[k + 1, r], age[k + 1, r] = low, 0.0
             one = slice(r, r + 1)
-            if not _bounce(
+            if not bounce(
                 (rates, impact, surface),
                 (c[one], b[one], s[one]),
                 (ct[one], bt[one], st[one]),

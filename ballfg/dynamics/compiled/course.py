@@ -12,12 +12,14 @@ import torch
 from ballfg.arrays import Array
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled.beliefs import carry
+from ballfg.dynamics.compiled.events import find
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.compiled.in_torch import in_torch, raise_errors
 from ballfg.dynamics.compiled.mixture import mix
 from ballfg.dynamics.compiled.motion import Moving
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, Z
 
 BOUNCES: Final = 1.0
 """A ball whose bounce is not a plain one."""
@@ -87,10 +89,9 @@ class Carrier:
         self._world, self._noise = world, noise
         self._keeps = inner  # what torch computes is found by the model as long as it is there
 
-    def carry(self, course: Course, h: Array, *, through_contacts: bool = True) -> tuple[Course, Array]:
+    def carry(self, course: Course, h: Array) -> tuple[Course, Array]:
         """Carry the last beliefs of a course on by steps of h (n, k) s of at most `MAX_STEP`.
 
-        Args: through_contacts: else only as long as no ball comes down on a surface.
         Returns: the course from that time on, 1 + j times for j <= k steps; and hard (n,). If any of it is not zero,
             then the last time of the course is one that these balls have not reached: `BOUNCES`, `RESTS`, or 0.
         """
@@ -100,9 +101,54 @@ class Carrier:
             getattr(whole, field.name)[0] = getattr(last, field.name)[0]
         hard = np.zeros(n)
         arrays = [getattr(whole, field.name) for field in fields(Course)]
-        done = carry(*self._given, np.ascontiguousarray(h), through_contacts, self._world, self._noise, *arrays, hard)
+        done = carry(*self._given, np.ascontiguousarray(h), self._world, self._noise, *arrays, hard)
         raise_errors()
         return whole.at(slice(done + 1 + bool(hard.any()))), hard
+
+    def find(
+        self, course: Course, horizon: float, earliest: float, line: tuple[Array, float] | None, *, either_way: bool
+    ) -> tuple[float, float, Course]:
+        """Look for an event on the way of one ball from the last belief of a course on.
+
+        Args:
+            horizon, earliest: s from there; only events up to the one and after the other count.
+            line: (9,) and an offset: the event is that normal . state falls through it. None: the next contact.
+            either_way: take a rise through the offset as well.
+        Returns: `events.NONE`, `FOUND` or `HARD`; the time (s) from there at which the search ended; the belief then.
+        """
+        mean, covariance = course.mean[-1, 0].copy(), course.covariance[-1, 0].copy()
+        normal, offset = (np.zeros(STATE_DIM), 0.0) if line is None else line
+        end, time = find(
+            *self._given,
+            line is None,
+            either_way,
+            normal,
+            offset,
+            earliest,
+            horizon,
+            self._world,
+            self._noise,
+            mean,
+            covariance,
+        )
+        raise_errors()
+        return end, time, Course.start(mean[None], covariance[None])
+
+    def slopes(self, mean: Array, line: tuple[Array, float] | None) -> tuple[Array, Array]:
+        """Gradient (9 + p,) of the event of `find` at a mean (9 + p,), and how the mean changes in flight."""
+        width = len(mean)
+        gradient, rate, moved = np.zeros(width), np.zeros(width), np.zeros((3, width))
+        rates, _, surface, c, _, _, _, s, st, w, _, ws = self._given
+        if line is None:
+            surface(mean[:STATE_DIM].copy(), s[0], ws, np.eye(STATE_DIM, width), st[0], np.empty(3), moved)
+            gradient[Z] = 1.0
+            gradient -= moved[0]
+        else:
+            gradient[:STATE_DIM] = line[0]
+        change, nothing = np.empty(6), np.empty((STATE_DIM, 0))
+        rates(mean[:STATE_DIM].copy(), c[0], w, nothing, np.empty((c.shape[1], 0)), change, np.empty((6, 0)))
+        rate[POSITION], rate[VELOCITY], rate[SPIN] = mean[VELOCITY], change[:3], change[3:]
+        return gradient, rate
 
     def mixed(self, course: Course) -> Course:
         """The course with means and covariances of the balls on both sides of contacts of uncertain time."""

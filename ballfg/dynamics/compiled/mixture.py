@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs import LEAST_SIGMA, add_impact, gap_of, through
+from ballfg.dynamics.compiled.beliefs import add_impact, gap_of, through
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contacts
 from ballfg.dynamics.compiled.flight import fly_one
@@ -26,7 +26,7 @@ from ballfg.dynamics.compiled.signatures import (
     THREE_WEIGHTS,
     TWO,
 )
-from ballfg.dynamics.motion.limits import BEYOND
+from ballfg.dynamics.motion.limits import BEYOND, LEAST_SIGMA
 
 FAR = 4.5
 """Standard deviations of the gap beyond which all balls are on one side of a contact. One in 300,000 is on the other

@@ -26,3 +26,8 @@ REST_SPEED: Final = 0.05
 REST_GAP: Final = 1e-5
 """m. A ball this close to a surface and slower than half of `REST_SPEED` rests on it. A ball that left at `REST_SPEED`
 or faster is never both, so that a hop is the same motion however its time is cut."""
+NEGLIGIBLE: Final = 1e-4
+"""Share of balls that pass a table's edge on the other side than the mean, below which they do not count; they would
+add 0.05 m/s to a velocity."""
+LEAST_SIGMA: Final = 1e-12
+"""m. A place known better than this has a sigma of this."""

@@ -1,0 +1,162 @@
+"""Machine code that looks for an event on the way of one ball: a contact, or a linear function that falls to zero."""
+
+import math
+
+import numpy as np
+
+from ballfg.dynamics.compiled.beliefs import bounce, fly_belief, gap_of, share_over_table
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.contacts import contact_times
+from ballfg.dynamics.compiled.flight import fly_one
+from ballfg.dynamics.compiled.signatures import FLAG, FUNCTION, ONE, REAL, THREE, TWO, several
+from ballfg.dynamics.motion.limits import BEYOND, MAX_STEP, NEGLIGIBLE, REST_GAP, REST_SPEED
+
+LOOKS = 16
+"""How often a step of `MAX_STEP` is looked at: two crossings within 1.25 ms may pass unseen."""
+NEWTON_STEPS = 20
+"""Upper bound on the steps to a crossing, of which three or four are enough."""
+TIME_TOLERANCE = 1e-12
+"""s. A crossing is known to this."""
+NONE, FOUND, HARD = 0.0, 1.0, 2.0
+"""What a search ends with: nothing within the horizon; the event; a step that is not one of flight or plain bounces."""
+
+
+@machine_code(several(REAL, 2)(FUNCTION, ONE, ONE, ONE, ONE, REAL))
+def _value(rates, x, c, w, normal, offset):
+    """Normal . x - offset of a state (9,), and its derivative by time."""
+    a, value, rate = np.empty(6), -offset, 0.0
+    rates(x, c, w, np.empty((9, 0)), np.empty((len(c), 0)), a, np.empty((6, 0)))
+    for i in range(9):
+        value += normal[i] * x[i]
+        rate += normal[i] * (x[3 + i] if i < 3 else a[i - 3])
+    return value, rate
+
+
+@machine_code(REAL(FUNCTION, ONE, ONE, ONE, ONE, REAL, REAL, REAL))
+def _exact(rates, x, c, w, normal, offset, low, high):
+    """The time (s) between two others at which the value is zero in flight from x; NaN where Newton leaves them."""
+    at, none, nonec, still = np.empty(9), np.empty((9, 0)), np.empty((len(c), 0)), np.empty(0)
+    tau, margin = 0.5 * (low + high), 0.5 * (high - low)
+    for _ in range(NEWTON_STEPS):
+        at[:] = x
+        fly_one(rates, at, c, w, none, nonec, tau, still, 1)
+        value, rate = _value(rates, at, c, w, normal, offset)
+        move = -value / rate
+        tau += move
+        if not low - margin <= tau <= high + margin:
+            return np.nan
+        if abs(move) < TIME_TOLERANCE:
+            return tau
+    return tau if abs(move) < 1e3 * TIME_TOLERANCE else np.nan
+
+
+@machine_code(REAL(FUNCTION, ONE, ONE, ONE, ONE, REAL, REAL, REAL, FLAG))
+def _zero(rates, x, c, w, normal, offset, h, earliest, either_way):
+    """The first time after `earliest` in h s of free flight at which the value goes through zero; NaN: it does not.
+
+    Looks are at the cubic through the values and their rates at both ends, which is right to a micrometre.
+    """
+    end = x.copy()
+    fly_one(rates, end, c, w, np.empty((9, 0)), np.empty((len(c), 0)), h, np.empty(0), 1)
+    low, low_rate = _value(rates, x, c, w, normal, offset)
+    high, high_rate = _value(rates, end, c, w, normal, offset)
+    before = low
+    for look in range(1, LOOKS + 1):
+        t = look / LOOKS
+        bend = (1.0 - t) * (low_rate * h - (high - low)) - t * (high_rate * h - (high - low))
+        value = low + t * (high - low) + t * (1.0 - t) * bend
+        if (before > 0.0 and value <= 0.0) or (either_way and before < 0.0 and value >= 0.0):
+            tau = _exact(rates, x, c, w, normal, offset, (look - 1) * h / LOOKS, look * h / LOOKS)
+            if tau > earliest:
+                return tau
+        before = value
+    return np.nan
+
+
+@machine_code(several(REAL, 2)(FUNCTION, FUNCTION, ONE, TWO, TWO, ONE, ONE, REAL, ONE))
+def _contact_within(rates, surface, x, c, s, w, ws, h, world):
+    """The level (m) that a ball (9,) comes down on within h s and when; h where it does not, NaN where it rests."""
+    low, after = world[0] if x[2] > world[0] else world[1], x.copy()
+    if abs(x[5]) <= REST_SPEED / 2 and abs(gap_of(surface, x, s[0], ws, low, world[2])) <= REST_GAP:
+        return low, np.nan
+    fly_one(rates, after, c[0], w, np.empty((9, 0)), np.empty((c.shape[1], 0)), h, np.empty(0), 1)
+    if after[5] >= 0.0 or gap_of(surface, after, s[0], ws, low, world[2]) >= 0.0:
+        return np.nan, h
+    tau, state = np.empty(1), x.copy().reshape((1, 9))
+    contact_times(rates, surface, state, c, s, w, ws, np.full(1, low), np.full(1, BEYOND), world[2], tau)
+    return low, tau[0]
+
+
+@machine_code(
+    several(REAL, 2)(
+        *(FUNCTION, FUNCTION, FUNCTION, TWO, THREE, TWO, THREE, TWO, THREE, ONE, ONE, ONE),
+        *(FLAG, FLAG, ONE, REAL, REAL, REAL, ONE, ONE, ONE, TWO),
+    )
+)
+def find(
+    rates,
+    impact,
+    surface,
+    c,
+    ct,
+    b,
+    bt,
+    s,
+    st,
+    w,
+    wb,
+    ws,
+    contact,
+    either_way,
+    normal,
+    offset,
+    earliest,
+    horizon,
+    world,
+    noise,
+    mean,
+    covariance,
+):
+    """Carry one ball on to an event, in place: to its next contact, or to where normal . x falls through an offset.
+
+    Args:
+        c, b, s: coefficients of rates, impact and surface, (1, p) with tangents (1, p, d); w, wb, ws: their weights.
+        contact: look for the next contact.  either_way: take a rise through the offset too.  normal (9,).
+        earliest, horizon: s from the start; only events after the one and up to the other count.
+        world (11,), noise (5,): as `beliefs.carry`.
+    Writes: mean (d,) and covariance (d, d) at the event, or where the search ended.
+    Returns: `NONE`, `FOUND` or `HARD`, and the time (s) since the start.
+    """
+    d, passed = len(mean), 0.0
+    after, spread, x = np.empty(d), np.empty((d, d)), mean[:9]
+    while passed < horizon:
+        h = min(MAX_STEP, horizon - passed)
+        low, tau = _contact_within(rates, surface, x, c, s, w, ws, h, world)
+        if not 0.0 <= tau <= h:
+            return HARD, passed
+        h, event = tau, np.nan
+        if not contact:
+            event = _zero(rates, x, c[0], w, normal, offset, h, earliest - passed, either_way)
+        elif math.isfinite(low) and passed + h > earliest:
+            event = h
+        if math.isfinite(low) and not math.isfinite(event):
+            if not bounce(
+                (rates, impact, surface),
+                (c, b, s),
+                (ct, bt, st),
+                (w, wb, ws),
+                *(x, covariance, h, low, world, noise, after[:9], spread),
+            ):
+                return HARD, passed
+            after[9:] = mean[9:]
+        else:
+            h = event if math.isfinite(event) else h
+            fly_belief(rates, mean, covariance, c[0], ct[0], w, h, noise, after, spread)
+            if contact and low == world[0] and not share_over_table(after[:9], covariance, world) > 1.0 - NEGLIGIBLE:
+                return HARD, passed
+        mean[:] = after
+        covariance[:] = spread
+        passed += h
+        if math.isfinite(event):
+            return FOUND, passed
+    return NONE, passed
