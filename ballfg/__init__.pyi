@@ -4,6 +4,7 @@ from . import dynamics as dynamics
 from . import estimation as estimation
 from . import factors as factors
 from . import learning as learning
+from . import live as live
 from . import prediction as prediction
 from . import simulation as simulation
 from . import tracks as tracks
@@ -29,6 +30,7 @@ from .estimation import register_observation as register_observation
 from .front import diagnose as diagnose
 from .front import estimate as estimate
 from .front import predict as predict
+from .live import Tracker as Tracker
 from .prediction import BallState as BallState
 from .simulation import simulate as simulate
 from .tracks import Ball as Ball

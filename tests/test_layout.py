@@ -17,7 +17,7 @@ LEVELS = (
     ("simulation", "factors"),
     ("prediction",),
     ("estimation",),
-    ("learning",),
+    ("live", "learning"),
     ("diagnosis",),
     ("front",),
     ("benchmarks", "cli"),

@@ -15,6 +15,7 @@ from ballfg.cli.diagnose import diagnose
 from ballfg.cli.errors import guarded
 from ballfg.cli.estimate import estimate
 from ballfg.cli.info import info
+from ballfg.cli.live import live
 from ballfg.cli.noise import noise
 from ballfg.cli.predict import predict
 from ballfg.cli.render import render
@@ -35,6 +36,7 @@ app = typer.Typer(
 
 app.command()(estimate)
 app.command()(predict)
+app.command()(live)
 app.command()(diagnose)
 app.command()(noise)
 app.command()(simulate)

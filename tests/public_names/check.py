@@ -30,6 +30,7 @@ ROOMS = (
     "ballfg.factors",
     "ballfg.estimation",
     "ballfg.prediction",
+    "ballfg.live",
     "ballfg.learning",
     "ballfg.diagnosis",
     "ballfg.benchmarks",

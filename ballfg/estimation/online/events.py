@@ -1,5 +1,6 @@
 """Events as a stream brings them: what the segmenter believes now, laid over the samples of the window."""
 
+import copy
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -44,6 +45,14 @@ class EventTracker:
         self._final: list[Event] = []
         self._pending: tuple[Event, ...] = ()
         self._moves: dict[tuple[int, float], list[int]] = {}  # steps of each contact, by the place it was found at
+
+    def copy(self) -> "EventTracker":
+        """Events of a stream of its own, which has had the same samples so far."""
+        other = copy.copy(self)
+        other.segmenter = self.segmenter.copy()
+        other._final = list(self._final)
+        other._moves = {place: list(steps) for place, steps in self._moves.items()}
+        return other
 
     def push(self, time: float, position: Array, sigma: Array) -> bool:
         """Takes in a sample; returns whether the explanation of the window may differ from the last one."""

@@ -1,5 +1,6 @@
 """The online estimator: iSAM2, one observation at a time, within a window of bounded length."""
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -110,6 +111,24 @@ class Online(Estimator):
         self._stream = SightingStream(self.cameras, self.settings.sighting_loss) if self.cameras else None
         self._frozen: list[Frozen] | None = None  # states that left the window, where someone asks for them
         self._counts = np.zeros(2, dtype=np.int64)
+
+    def copy(self) -> "Online":
+        """An estimator that has taken in the same observations; what either takes in from now on is its own.
+
+        A copy kept from before a late sample lets a stream go back: what follows the sample is pushed into it again,
+        and the states are those of the samples in order. It costs about as much as one sample.
+        """
+        other = copy.copy(self)
+        other._samples = [copy.copy(sample) for sample in self._samples]
+        for sample in other._samples:
+            sample.measurements = list(sample.measurements)
+        if self.window is not None:
+            other.window = self.window.copy(other._samples[: len(self.window)])
+        other.events = self.events.copy()
+        other._stream = copy.deepcopy(self._stream)
+        other._frozen = None if self._frozen is None else list(self._frozen)
+        other._counts = self._counts.copy()
+        return other
 
     def push(
         self,

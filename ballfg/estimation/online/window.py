@@ -1,5 +1,8 @@
 """A window that can also go back, change its mind, let go of its oldest state, and start anew."""
 
+import copy
+from collections.abc import Sequence
+
 import gtsam
 import numpy as np
 
@@ -14,6 +17,22 @@ class Window(IncrementalWindow):
 
     def __len__(self) -> int:
         return len(self.samples)
+
+    def copy(self, samples: Sequence[Sample]) -> "Window":
+        """A window with the same states and factors, which goes on by itself.
+
+        iSAM2 is copied with its cliques. The factors are shared: their bridges answer for any state, from what they
+        keep or by evaluating anew.
+
+        Args: samples: copies of the window's.
+        """
+        other = copy.copy(self)
+        other.isam = gtsam.ISAM2(self.isam)
+        other.samples = list(samples)
+        other.intervals = [copy.copy(interval) for interval in self.intervals]
+        other.shared = list(self.shared)
+        other.coefficient_delta = self.coefficient_delta.copy()  # GTSAM's own memory, which its next update overwrites
+        return other
 
     def retract(self, count: int) -> None:
         """Take the newest samples back, with their states and factors; iSAM2 forgets them.

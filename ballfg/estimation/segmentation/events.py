@@ -64,6 +64,25 @@ class Node:
         self.final = False
 
 
+def copied(node: Node | None, known: dict[int, Node]) -> Node | None:
+    """A chain of its own with the same events: making one chain final leaves the other as it is.
+
+    Args: known: copies made so far, by the identity of their original; chains that share nodes go on sharing them.
+    """
+    if node is None:
+        return None
+    chain = [node]
+    while (parent := chain[-1].parent) is not None and id(chain[-1]) not in known:
+        chain.append(parent)
+    last: Node | None = None
+    for old in reversed(chain):
+        if id(old) not in known:
+            known[id(old)] = Node(old.event, last)
+            known[id(old)].final = old.final
+        last = known[id(old)]
+    return last
+
+
 def open_nodes(node: Node | None) -> list[Node]:
     """The nodes of a chain that are not final, oldest first."""
     chain: list[Node] = []

@@ -1,5 +1,6 @@
 """The forward pass: a multi-hypothesis (Viterbi) Kalman filter, one sample at a time, with bounded memory."""
 
+import copy
 import math
 from dataclasses import dataclass
 
@@ -10,7 +11,7 @@ from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.segmentation import branches
 from ballfg.estimation.segmentation.bank import FLYING, Bank, concatenate
-from ballfg.estimation.segmentation.events import Event, EventKind, Node, contains, make_final, open_nodes
+from ballfg.estimation.segmentation.events import Event, EventKind, Node, contains, copied, make_final, open_nodes
 from ballfg.estimation.segmentation.evidence import prune, update
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.scene import Scene
@@ -55,6 +56,15 @@ class Segmenter:
         self._bank: Bank | None = None
         self._count = 0
         self._time = -math.inf
+
+    def copy(self) -> "Segmenter":
+        """A segmenter that has taken in the same samples; what either takes in from now on is its own."""
+        other = copy.copy(self)
+        if self._bank is not None:
+            known: dict[int, Node] = {}
+            other._bank = self._bank.take(list(range(len(self._bank))))
+            other._bank.tips[:] = [copied(tip, known) for tip in self._bank.tips]
+        return other
 
     @property
     def count(self) -> int:

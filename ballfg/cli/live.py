@@ -1,0 +1,214 @@
+"""`ballfg live`: positions in as they are measured, states and predictions out."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ballfg.cli import inputs
+
+if TYPE_CHECKING:
+    from ballfg.dynamics import BallModel, Surfaces
+    from ballfg.estimation import Settings
+    from ballfg.live.session import Session, Watcher
+    from ballfg.live.sources.source import Inbox, Source
+    from ballfg.tracks import Dataset
+
+BAG_ENDINGS = (".mcap", ".db3")
+
+
+def live(
+    model: inputs.ModelFile = None,
+    replay: Annotated[
+        Path | None, typer.Option(help="Dataset, or rosbag2 / MCAP, to replay in place of standard input.")
+    ] = None,
+    listen: Annotated[
+        str | None, typer.Option(help="Take lines from tcp://HOST:PORT or udp://HOST:PORT, not from standard input.")
+    ] = None,
+    speed: Annotated[float, typer.Option(help="Speed of a replay: 1 is real time, 0 as fast as possible.")] = 1.0,
+    topic: Annotated[str | None, typer.Option(help="Topic of positions in a bag.")] = None,
+    plane: Annotated[str | None, typer.Option(help="Plane whose crossing is predicted, such as x=2.0 (m).")] = None,
+    horizon: Annotated[float, typer.Option(help="How far ahead events are predicted, s.")] = 1.0,
+    lag: Annotated[float, typer.Option(help="By how much stamps may be late, s.")] = 0.1,
+    patience: Annotated[
+        float, typer.Option(help="A live line that has waited longer gets no prediction, s; the states catch up.")
+    ] = 0.1,
+    like: Annotated[
+        Path | None, typer.Option(help="Dataset whose ball, table and noise the stream has.", show_default=False)
+    ] = None,
+    table: Annotated[float | None, typer.Option(help="Height of the table's surface, m.", show_default="0")] = None,
+    noise: Annotated[
+        float | None, typer.Option(help="Standard deviation of a coordinate, m.", show_default="0.0015")
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="JSON lines, or .mcap for ROS 2 messages.", show_default="standard output"),
+    ] = None,
+    viewer: Annotated[bool, typer.Option("--viewer", help="Show it live in rerun (extra: viewer).")] = False,
+    effects_file: inputs.EffectsFiles = None,
+) -> None:
+    """States with covariances, next bounce, apex and the crossing of a plane for each position, in real time.
+
+    A line in is t,x,y,z (s, m), or JSON with t and x, y, z or positions; a line out is JSON with its latency. New balls
+    are found by themselves, several at once are kept apart. Ctrl-C ends it; latencies and counts are told on stderr.
+
+    Example: ballfg live --replay data/aimy --plane x=2.0 --out states.jsonl
+    """
+    from ballfg.checks import check_number, check_range
+    from ballfg.live.outlook import Plane
+    from ballfg.live.session import Session, Wanted, warm_up
+    from ballfg.live.sources.source import Inbox
+    from ballfg.live.tracker import Tracker
+
+    check_range("speed", speed, 0.0, 1e6)
+    wanted = Wanted(
+        check_number("horizon", horizon, "s", above=0.0, limit=60.0),
+        None if plane is None else Plane.parse(plane),
+        check_range("patience", patience, 0.0, float("inf")),
+    )
+    if replay is not None and listen is not None:
+        raise ValueError(f"listen must stand alone; got it with --replay {replay}. Leave one of them out.")
+    inputs.know_effects(effects_file)
+    bag = replay is not None and _is_bag(replay)
+    data = _dataset(like if bag or replay is None else replay)
+    tracker = Tracker(*_scene(data, model, table, noise), lag=lag)
+    with _output(out) as write, _watchers(out, viewer, wanted.horizon) as watchers:
+        source = _source(replay, bag, listen, speed, topic, data)
+        warm_up(tracker, wanted)
+        print(f"ballfg live: reading {source.name}", file=sys.stderr, flush=True)
+        inbox = Inbox(source)
+        session = Session(tracker, inbox, write, wanted, watchers)
+        _run(session, inbox)
+    for line in session.summary():
+        print(f"ballfg live: {line}", file=sys.stderr)
+
+
+def _is_bag(path: Path) -> bool:
+    return path.suffix in BAG_ENDINGS or (path / "metadata.yaml").is_file()
+
+
+def _dataset(folder: Path | None) -> Dataset | None:
+    """The dataset of a replay, or the one that the stream is like."""
+    if folder is None:
+        return None
+    from ballfg.tracks import read_dataset
+
+    return read_dataset(folder)
+
+
+def _scene(
+    data: Dataset | None, model: Path | None, table: float | None, noise: float | None
+) -> tuple[BallModel, Surfaces, Settings]:
+    """Ball, surfaces and noise: the dataset's, or as the options say."""
+    from dataclasses import replace
+
+    from ballfg.checks import check_number
+    from ballfg.dynamics import Surfaces, load_model, nominal_model
+    from ballfg.estimation import dataset_settings, dataset_surfaces
+    from ballfg.tracks import TABLE_TENNIS
+
+    if data is not None:
+        ball = inputs.open_model(data, model)
+        surfaces, settings = dataset_surfaces(data), dataset_settings(data, ball)
+    else:
+        import torch
+
+        torch.set_num_threads(1)
+        ball = nominal_model(TABLE_TENNIS) if model is None else load_model(model)
+        surfaces, settings = Surfaces.table_tennis(0.0), _settings(ball)
+    if table is not None:
+        surfaces = Surfaces.table_tennis(check_number("table", table, "m", limit=50.0, instead="mm"))
+    if noise is not None:
+        sigma = check_number("noise", noise, "m", above=0.0, limit=1.0, instead="mm")
+        settings = replace(settings, position_noise=(sigma,) * 3)
+    return ball, surfaces, settings
+
+
+def _settings(ball: BallModel) -> Settings:
+    """The noise of a stream of which no dataset tells: the usual, or what the model brings along."""
+    from ballfg.estimation import Settings
+    from ballfg.estimation.configure import learned_process
+    from ballfg.estimation.noise.parameters import with_noise
+
+    settings = Settings.for_measured(ball)
+    if ball.trained is not None:
+        settings = Settings(position_scale=ball.trained.position_scale, process=learned_process(ball.trained))
+    return settings if ball.noise is None else with_noise(settings, ball.noise)
+
+
+def _source(
+    replay: Path | None, bag: bool, listen: str | None, speed: float, topic: str | None, data: Dataset | None
+) -> Source:
+    from ballfg.live.sources.bag import bag_samples
+    from ballfg.live.sources.replay import Replay, dataset_samples
+    from ballfg.live.sources.sockets import listen as listened
+    from ballfg.live.sources.source import Pipe
+
+    if replay is not None and bag:
+        return Replay(bag_samples(replay, topic), speed, str(replay))
+    if topic is not None:
+        raise ValueError(f"topic must come with a bag to replay; got {topic!r} without one. Add --replay BAG.mcap.")
+    if replay is not None and data is not None:
+        return Replay(dataset_samples(data), speed, str(replay))
+    return Pipe() if listen is None else listened(listen)
+
+
+@contextlib.contextmanager
+def _output(out: Path | None) -> Iterator[Callable[[bytes], None]]:
+    """Where lines are written; a file gets its name when the stream ends."""
+    if out is None or out.suffix == ".mcap":
+        stream = sys.stdout.buffer
+
+        def write(line: bytes) -> None:
+            stream.write(line)
+            stream.flush()
+
+        yield write if out is None else lambda line: None
+        return
+    from ballfg.files.whole_file import whole_file
+
+    with whole_file(out) as temporary, temporary.open("wb", buffering=0) as file:
+        yield file.write  # type: ignore[misc]
+
+
+@contextlib.contextmanager
+def _watchers(out: Path | None, viewer: bool, horizon: float) -> Iterator[list[Watcher]]:
+    with contextlib.ExitStack() as stack:
+        found: list[Watcher] = []
+        if out is not None and out.suffix == ".mcap":
+            from ballfg.live.bag_writer import bag_writer
+
+            found.append(stack.enter_context(bag_writer(out, horizon)))
+        if viewer:
+            from ballfg.live.viewer import Viewer
+
+            found.append(stack.enter_context(contextlib.closing(Viewer(horizon))))
+        yield found
+
+
+def _run(session: Session, inbox: Inbox) -> None:
+    """Until the input ends, the output closes, or Ctrl-C: the first lets the sample at hand be finished."""
+
+    def stop(number: int, frame: object) -> None:
+        inbox.interrupt()
+        signal.signal(number, signal.default_int_handler)
+
+    before = {number: signal.signal(number, stop) for number in (signal.SIGINT, signal.SIGTERM)}
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(5e-4)  # the reading thread gets its turn soon, and with it the true moment of reading
+    try:
+        session.run()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # what is still buffered goes nowhere
+    finally:
+        inbox.close()
+        sys.setswitchinterval(interval)
+        for number, handler in before.items():
+            signal.signal(number, handler)

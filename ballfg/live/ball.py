@@ -1,0 +1,198 @@
+"""One ball of a tracker: its estimator, and what it needs to put a late sample where it belongs."""
+
+from __future__ import annotations
+
+from bisect import bisect_left, insort
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.estimation.online.online import Online, OnlineState
+from ballfg.estimation.smoother.motion import Motion
+from ballfg.live.gate import Known
+
+PARTS = 4
+"""Copies of the estimator in one lag: a late sample is pushed with those of the lag and of a quarter of it."""
+LEAST_APART = 8
+"""Samples between two copies: a copy costs some 0.7 ms."""
+LOOK_BACK = 24
+"""Samples in which an event may still be found, or found to lie elsewhere."""
+SAME_EVENT = 0.03
+"""s. Two events of a kind that lie closer are one."""
+
+
+@dataclass(frozen=True, order=True)
+class Kept:
+    """A sample that a ball has taken in.
+
+    Attributes:
+        time: s.
+        position: (3,) m.
+        sigma: (3,) m, or None.
+        by_hit: the ball took it for one after a hit: it was not where the ball's path led.
+    """
+
+    time: float
+    position: Array = field(compare=False)
+    sigma: Array | None = field(compare=False, default=None)
+    by_hit: bool = field(compare=False, default=False)
+
+
+@dataclass(frozen=True)
+class BallEvent:
+    """Something that happened to a ball.
+
+    Attributes:
+        kind: `bounce`, `hit`, `rest` (it came to lie) or `gap` (too long to link its sides).
+        time: s; of a bounce its own, of a hit the middle of its interval, of the others the sample that shows it.
+        height: m, of the surface; None without one.
+    """
+
+    kind: str
+    time: float
+    height: float | None = None
+
+
+class Ball:
+    """A ball and the samples of the last lag.
+
+    Args: number: its name.  fresh: an estimator without samples, which is copied.  lag: s.
+    """
+
+    def __init__(self, number: int, fresh: Online, lag: float) -> None:
+        self.number = number
+        self.samples = 0
+        self.lag = lag
+        self.recent: list[Kept] = []
+        self.states: deque[OnlineState] = deque()
+        self._fresh = fresh
+        self._online = fresh.copy()
+        self._copies: list[tuple[float, Online]] = [(-np.inf, fresh)]
+        self._since_copy = 0
+        self._told: deque[tuple[str, float]] = deque(maxlen=64)
+
+    @property
+    def last(self) -> float:
+        """s, the newest stamp."""
+        return self.states[-1].time
+
+    def accepts(self, time: float) -> bool:
+        """Whether a sample of that stamp can be put where it belongs."""
+        return time > max(self.last - self.lag, self._copies[0][0])
+
+    def at(self, time: float) -> Kept | None:
+        """The sample of exactly that stamp."""
+        place = bisect_left(self.recent, time, key=lambda kept: kept.time)
+        return self.recent[place] if place < len(self.recent) and self.recent[place].time == time else None
+
+    def known(self, time: float) -> Known:
+        """The newest state before a stamp; the oldest one that is held if there is none."""
+        for state in reversed(self.states):
+            if state.time < time:
+                return Known.of(state)
+        return Known.of(self.states[0])
+
+    def take(self, kept: Kept) -> OnlineState:
+        """Take in a sample, late or not; returns the newest state.
+
+        Raises: ValueError, RuntimeError: from the estimator, where nothing can be made of the samples.
+        """
+        if not self.states or kept.time > self.last:
+            self.tidy()
+            return self._push(kept)
+        self._rebuild(kept.time, added=kept)
+        return self.states[-1]
+
+    def replace(self, kept: Kept) -> OnlineState:
+        """Take in a sample in place of the one with its stamp. Raises: as `take`."""
+        self._rebuild(kept.time, added=kept)
+        return self.states[-1]
+
+    def forget_after(self, time: float) -> bool:
+        """Drop the samples after a stamp of the last lag; returns whether any are left. Raises: as `take`."""
+        if self.last > time:
+            self._rebuild(time, until=time)
+        return bool(self.states)
+
+    def tidy(self) -> None:
+        """Keep a copy of the estimator where one is due: best done while nothing waits."""
+        if (
+            not self.states
+            or self.lag <= 0.0
+            or self._since_copy < LEAST_APART
+            or self.last - self._copies[-1][0] < self.lag / PARTS
+        ):
+            return
+        self._copies.append((self.last, self._online.copy()))
+        self._since_copy = 0
+        while len(self._copies) > 1 and self._copies[1][0] <= self.last - self.lag:
+            del self._copies[0]
+        oldest = self._copies[0][0]
+        while self.recent and self.recent[0].time <= oldest:
+            del self.recent[0]
+        while self.states[0].time < oldest:  # the state of the copy itself stays: gates start from it
+            self.states.popleft()
+
+    def _push(self, kept: Kept) -> OnlineState:
+        state = self._online.push(kept.time, kept.position, kept.sigma)
+        insort(self.recent, kept)
+        self.states.append(state)
+        self.samples += 1
+        self._since_copy += 1
+        if self.lag <= 0.0:
+            self.recent, self.states = self.recent[-1:], deque([state])
+        return state
+
+    def _rebuild(self, since: float, added: Kept | None = None, until: float = np.inf) -> None:
+        """Go back to the last copy before a stamp, and push what follows in order."""
+        while self._copies[-1][0] >= since and len(self._copies) > 1:
+            self._copies.pop()
+        base, online = self._copies[-1]
+        again = [k for k in self.recent if base < k.time <= until and (added is None or k.time != added.time)]
+        if added is not None:
+            insort(again, added)
+        self.samples -= sum(k.time > base for k in self.recent)
+        self.recent = [k for k in self.recent if k.time <= base]
+        self.states = deque(state for state in self.states if state.time <= base)
+        self._online, self._since_copy = online.copy(), 0
+        for kept in again:
+            self.tidy()
+            self._push(kept)
+
+    def start_anew(self, kept: Kept) -> OnlineState:
+        """Forget everything but one sample, after the estimator could make nothing of it. Raises: as `take`."""
+        self.recent, self.states, self._copies = [], deque(), [(-np.inf, self._fresh)]
+        self._online, self._since_copy = self._fresh.copy(), 0
+        return self._push(kept)
+
+    def news(self) -> tuple[BallEvent, ...]:
+        """Events among the last samples that have not been told yet, in the order of time."""
+        window = self._online.window
+        if window is None:
+            return ()
+        samples = window.samples[-LOOK_BACK:]
+        found: list[BallEvent] = []
+        for before, sample in pairwise(samples):
+            found += _events(sample.motion, before.motion, before.time, sample.time)
+        fresh = [event for event in found if not self._was_told(event)]
+        self._told.extend((event.kind, event.time) for event in fresh)
+        return tuple(fresh)
+
+    def _was_told(self, event: BallEvent) -> bool:
+        return any(kind == event.kind and abs(time - event.time) < SAME_EVENT for kind, time in self._told)
+
+
+def _events(motion: Motion, before: Motion, start: float, end: float) -> Sequence[BallEvent]:
+    """What happened between two samples."""
+    if not motion.linked:
+        return [BallEvent("gap", end)]
+    found = [BallEvent("bounce", start + t, h) for t, h in zip(motion.times, motion.heights, strict=True)]
+    if motion.hit:
+        found.append(BallEvent("hit", 0.5 * (start + end)))
+    if motion.rest is not None and before.rest is None:
+        found.append(BallEvent("rest", end, motion.rest))
+    return found

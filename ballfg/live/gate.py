@@ -1,0 +1,136 @@
+"""Which ball a position belongs to: where each ball may be at a stamp, and the best assignment of the positions.
+
+A ball may have flown on, bounced, or been hit. The first two are Gaussians about a parabola with drag; they are coarse
+and cheap, for they decide only between centimetres and decimetres. The estimator weighs the sample itself.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ballfg.arrays import Array
+from ballfg.estimation.segmentation import SegmentationPhysics
+from ballfg.prediction.state import BallState
+
+GATE = 30.0
+"""Squared Mahalanobis distance, 3 degrees of freedom: one good position in a million is further from its ball."""
+LONG_GATE = 16.0
+"""The same after a silence of more than `HIT_TIME`, when a ball may be in a wide region, and another one too."""
+HIT_GATE = 9.0
+"""The same for a ball that may have been hit: beyond three standard deviations a position begins another ball."""
+HIT_TIME = 0.1
+"""s. After a longer silence a ball is only looked for on its path: a hit could have brought it anywhere."""
+HIT_SPEED = 10.0
+"""m/s per axis, by which a hit moves the ball away from its path, apart from half of its own speed."""
+SLACK = 4.0
+"""m/s^2. Spread of the acceleration that gravity and drag leave out: the Magnus force of a strong spin is 20."""
+SLIDE = 1.0
+"""m/s. Spread of the tangential velocity that a bounce takes or gives."""
+FLOOR = 0.002
+"""m. Noise of a position is taken to be no less."""
+FAR = 1e6
+"""Cost of what is not possible."""
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of a ball at a time.
+
+    Attributes:
+        time: s.
+        mean: (6,) position m and velocity m/s.
+        covariance: (6, 6) of that, in the products of those units.
+    """
+
+    time: float
+    mean: Array
+    covariance: Array
+
+    @classmethod
+    def of(cls, state: BallState) -> "Known":
+        """Of an estimated state."""
+        return cls(state.time, state.mean[:6], state.joint[:6, :6])
+
+
+class Gate:
+    """Distances of positions from where balls may be.
+
+    Args:
+        physics: of the ball.  heights: m, of the surfaces.  noise: (3,) m, of a position.
+        jitter: s, standard deviation of the error of a stamp.
+    """
+
+    def __init__(self, physics: SegmentationPhysics, heights: Sequence[float], noise: Array, jitter: float) -> None:
+        self.physics = physics
+        self.rises = sorted((h + physics.surface_offset + physics.radius for h in heights), reverse=True)
+        self.noise = np.maximum(noise, FLOOR) ** 2
+        self.jitter = jitter
+
+    def on_path(self, ball: Known, time: float, positions: Array) -> Array:
+        """(n,) squared Mahalanobis distances of positions (n, 3) m from a ball that flew on or bounced.
+
+        After a long silence they are stretched, so that `GATE` holds for them too.
+        """
+        dt = time - ball.time
+        mean, covariance = self._flown(ball, dt)
+        distance = self._distance(mean, covariance, ball, positions)
+        bounced = self._bounced(ball, dt, mean, covariance) if dt > 0.0 else None
+        if bounced is not None:
+            distance = np.minimum(distance, self._distance(*bounced, ball, positions))
+        return distance * (GATE / LONG_GATE) if abs(dt) > HIT_TIME else distance
+
+    def if_hit(self, ball: Known, time: float, positions: Array) -> Array:
+        """(n,) the same from a ball that something may have hit; infinite after too long a silence."""
+        dt = time - ball.time
+        if abs(dt) > HIT_TIME:
+            return np.full(len(positions), np.inf)
+        velocity = ball.mean[3:]
+        mean = ball.mean[:3] + 0.5 * dt * velocity
+        way = (HIT_SPEED + 0.5 * float(np.linalg.norm(velocity))) * abs(dt) + FLOOR
+        return self._distance(mean, ball.covariance[:3, :3] + way**2 * np.eye(3), ball, positions)
+
+    def _distance(self, mean: Array, covariance: Array, ball: Known, positions: Array) -> Array:
+        spread = covariance + np.diag(self.noise)
+        if self.jitter:
+            way = self.jitter * ball.mean[3:]
+            spread = spread + np.outer(way, way)
+        away = positions - mean
+        return np.asarray(np.einsum("ni,ni->n", away, np.linalg.solve(spread, away.T).T))
+
+    def _flown(self, ball: Known, dt: float) -> tuple[Array, Array]:
+        """Mean (3,) m and covariance (3, 3) m^2 of the place of a ball in flight, dt s later or earlier."""
+        P, velocity = ball.covariance, ball.mean[3:]
+        pull = -self.physics.drag * float(np.linalg.norm(velocity)) * velocity
+        pull[2] -= self.physics.gravity
+        cross = dt * P[:3, 3:]
+        covariance = P[:3, :3] + cross + cross.T + dt**2 * P[3:, 3:] + (0.5 * SLACK * dt**2) ** 2 * np.eye(3)
+        return ball.mean[:3] + dt * velocity + 0.5 * dt**2 * pull, covariance
+
+    def _bounced(self, ball: Known, dt: float, flown: Array, covariance: Array) -> tuple[Array, Array] | None:
+        """The same of a ball that met a surface on the way; None if none was within reach."""
+        z, vz, g = float(ball.mean[2]), float(ball.mean[5]), self.physics.gravity
+        sigma = math.sqrt(covariance[2, 2])
+        for rise in self.rises:
+            if z < rise - 3.0 * sigma - 2 * self.physics.radius or flown[2] > rise + 3.0 * sigma:
+                continue
+            fall = math.sqrt(max(vz * vz + 2 * g * (z - rise), 0.0))
+            after = min(max(dt - (vz + fall) / g, 0.0), dt)  # s since the contact
+            up = self.physics.restitution * fall * after - 0.5 * g * after**2
+            mean = np.array([flown[0], flown[1], rise + max(up, 0.0)])
+            slide, rebound = (SLIDE * after) ** 2, (0.15 * fall * after) ** 2
+            return mean, covariance + np.diag([slide, slide, rebound + self.physics.radius**2 / 4])
+        return None
+
+
+def assign(costs: Array, limit: float) -> list[tuple[int, int]]:
+    """The assignment of rows to columns with the smallest sum; pairs that cost more than a limit stay apart.
+
+    Args: costs: (n, m) dimensionless.  limit: of one pair.
+    """
+    if costs.size == 0:
+        return []
+    rows, columns = linear_sum_assignment(np.where(costs <= limit, costs, FAR))
+    return [(int(i), int(j)) for i, j in zip(rows, columns, strict=True) if costs[i, j] <= limit]

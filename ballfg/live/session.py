@@ -1,0 +1,159 @@
+"""A session of `ballfg live`: samples from an inbox to a tracker, its answers to those who want them."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from time import perf_counter
+from typing import Protocol
+
+import numpy as np
+
+from ballfg.live.answers import answer, encoded, refusal
+from ballfg.live.latency import Latencies
+from ballfg.live.outlook import Outlook, Plane, look_out
+from ballfg.live.sources.source import Arrival, Inbox
+from ballfg.live.tracker import BallUpdate, Tracker
+
+WARM_SAMPLES = 40
+"""Of the made-up ball that gets everything compiled and loaded before the first real one comes."""
+
+
+class Watcher(Protocol):
+    """Somebody who sees every update with its outlook: a viewer, a bag."""
+
+    def see(self, update: BallUpdate, outlook: Outlook | None) -> None:
+        """Take note of one update."""
+        ...
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What is wanted of every state.
+
+    Attributes:
+        horizon: s, how far ahead events are looked for.
+        plane: whose crossing is wanted; None without one.
+        patience: s. A live line that waited longer gets no prediction if another one waits: the states catch up.
+    """
+
+    horizon: float = 1.0
+    plane: Plane | None = None
+    patience: float = 0.1
+
+
+class Session:
+    """Answers samples until they end.
+
+    Args: write: takes the bytes of one line and brings them out.  watchers: see every update after its line.
+
+    Attributes:
+        latencies: of the lines with states, from reading the input to having written the line.
+        malformed: lines that could not be read.  behind: states without prediction because their line had waited.
+    """
+
+    def __init__(
+        self,
+        tracker: Tracker,
+        inbox: Inbox,
+        write: Callable[[bytes], None],
+        wanted: Wanted,
+        watchers: Sequence[Watcher] = (),
+    ) -> None:
+        self.tracker = tracker
+        self.inbox = inbox
+        self.wanted = wanted
+        self.latencies = Latencies()
+        self.malformed = 0
+        self.behind = 0
+        self._write = write
+        self._watchers = watchers
+
+    def run(self) -> None:
+        """Answer samples until the inbox ends. Raises: OSError: from reading or writing."""
+        for group in self.inbox.groups():
+            self._take(group)
+            self.tracker.tidy()
+        now = perf_counter()
+        for update in self.tracker.end():
+            self._tell(update, now)
+
+    def _take(self, group: Sequence[Arrival]) -> None:
+        """The arrivals of one stamp."""
+        if group[0].sample is None:
+            self.malformed += 1
+            self._write(encoded(refusal(group[0].problem), 1e3 * (perf_counter() - group[0].read)))
+            return
+        stated = [arrival.sample is not None and arrival.sample.sigmas is not None for arrival in group]
+        for part in [group] if len(set(stated)) == 1 else [[arrival] for arrival in group]:
+            self._push(part)
+
+    def _push(self, group: Sequence[Arrival]) -> None:
+        samples = [arrival.sample for arrival in group if arrival.sample is not None]
+        positions = [position for sample in samples for position in sample.positions]
+        sigmas = [sigma for sample in samples for sigma in sample.sigmas or ()]
+        owners = [arrival for arrival in group for _ in (arrival.sample.positions if arrival.sample else ())]
+        updates = self.tracker.push(samples[0].time, positions, sigmas or None)
+        gone = len(updates) - len(owners)
+        for update in updates[:gone]:
+            self._tell(update, group[0].read)
+        for update, arrival in zip(updates[gone:], owners, strict=True):
+            self._tell(update, arrival.read, arrival)
+
+    def _tell(self, update: BallUpdate, read: float, arrival: Arrival | None = None) -> None:
+        """Write the line of one update."""
+        outlook = None
+        if update.kind == "state" and update.state is not None:
+            waited = perf_counter() - read
+            if self.inbox.waiting and waited > self.wanted.patience:
+                self.behind += 1
+                outlook = Outlook(note=f"no prediction: the line had waited {1e3 * waited:.0f} ms")
+            else:
+                outlook = look_out(update.state, self.wanted.horizon, self.wanted.plane)
+        tag = arrival.sample.tag if arrival is not None and arrival.sample is not None else ()
+        fields = answer(update, outlook, tag)
+        self._write(encoded(fields, 1e3 * (perf_counter() - read)))
+        if outlook is not None:
+            self.latencies.add(1e3 * (perf_counter() - read))
+        for watcher in self._watchers:
+            watcher.see(update, outlook)
+
+    def summary(self) -> Iterator[str]:
+        """What there is to say at the end, one line each."""
+        counts = self.tracker.counts
+        yield str(self.latencies)
+        yield (
+            f"{counts.positions} positions, {counts.balls} balls; {counts.late} late, {counts.old} too old, "
+            f"{counts.repeated} repeated, {counts.malformed + self.malformed} malformed, {self.inbox.dropped} dropped"
+        )
+        rare = {
+            "stamps astray": counts.stray,
+            "clocks begun anew": counts.restarts,
+            "samples that the estimator could make nothing of": counts.failed,
+            "states without prediction, because their lines had waited": self.behind,
+        }
+        if any(rare.values()):
+            yield ", ".join(f"{number} {text}" for text, number in rare.items() if number)
+
+
+def warm_up(tracker: Tracker, wanted: Wanted) -> None:
+    """Estimate and predict a made-up ball through a bounce, so that the first real one meets no compiler.
+
+    The tracker itself is left alone.
+    """
+    estimator, gravity = tracker.estimator.copy(), tracker.estimator.physics.gravity
+    rise = tracker.estimator.surfaces.table_height + tracker.estimator.physics.radius
+    t = 0.01 * np.arange(WARM_SAMPLES)
+    height = 0.2 - 0.5 * gravity * t**2
+    contact, speed = np.sqrt(0.4 / gravity), np.sqrt(0.4 * gravity)
+    after = np.maximum(t - contact, 0.0)
+    height = np.where(t < contact, height, 0.9 * speed * after - 0.5 * gravity * after**2)
+    for k in range(WARM_SAMPLES):
+        state = estimator.push(t[k], [3.0 * t[k], 0.0, rise + height[k]])
+        if k in (15, WARM_SAMPLES - 1):
+            update = BallUpdate("state", state.time, 1, state.position, state)
+            encoded(answer(update, look_out(state, wanted.horizon, wanted.plane), ()), 0.0)
+    estimator.copy()
+    gc.collect()
+    gc.freeze()  # what lives until the end is not looked through again

@@ -1,0 +1,93 @@
+"""Positions out of rosbag2 folders and MCAP files, without ROS: the extra `ros`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ballfg.live.sources.lines import Sample
+
+Point = Any
+Reading = tuple[Sequence[Point], Any]
+"""The points of a message, and the covariance (36,) of the only one or None."""
+
+READERS: dict[str, Callable[[Any], Reading]] = {
+    "geometry_msgs/msg/PointStamped": lambda m: ([m.point], None),
+    "geometry_msgs/msg/PoseStamped": lambda m: ([m.pose.position], None),
+    "geometry_msgs/msg/PoseWithCovarianceStamped": lambda m: ([m.pose.pose.position], m.pose.covariance),
+    "geometry_msgs/msg/PoseArray": lambda m: ([pose.position for pose in m.poses], None),
+    "geometry_msgs/msg/TransformStamped": lambda m: ([m.transform.translation], None),
+    "nav_msgs/msg/Odometry": lambda m: ([m.pose.pose.position], m.pose.covariance),
+}
+"""How positions are read from each type of message."""
+
+
+def need_rosbags() -> None:
+    """Refuses to go on without the extra. Raises: ValueError."""
+    try:
+        import rosbags  # noqa: F401
+    except ImportError as error:
+        raise ValueError(
+            f"bags must be read and written by the package rosbags; got {error}. Install it: pip install 'ballfg[ros]'."
+        ) from None
+
+
+def bag_samples(bag: Path, topic: str | None) -> Iterator[Sample]:
+    """The positions of a topic, with the stamps of their headers.
+
+    Args: bag: a folder of rosbag2, or a file .mcap or .db3.  topic: None takes the only one with positions.
+    Raises: ValueError: no such topic, or the package `rosbags` is missing. FileNotFoundError: no such bag.
+    """
+    need_rosbags()
+    if not bag.exists():
+        raise FileNotFoundError(f"bag must exist; {bag} does not. Give a folder of rosbag2 or a file .mcap.")
+    chosen = _topic(bag, topic)
+    return _samples(bag, chosen)
+
+
+def _opened(bag: Path) -> Any:
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    return AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+
+
+def _topic(bag: Path, topic: str | None) -> str:
+    """The topic to read. Raises: ValueError: there is none such."""
+    try:
+        with _opened(bag) as reader:
+            kinds = {connection.topic: str(connection.msgtype) for connection in reader.connections}
+    except Exception as error:
+        raise ValueError(f"bag must be readable; {bag}: {' '.join(str(error).split())}. Check the file.") from None
+    good = [name for name, kind in kinds.items() if kind in READERS]
+    shown = ", ".join(f"{name} ({kind})" for name, kind in kinds.items()) or "none"
+    if topic is None and len(good) == 1:
+        return good[0]
+    if topic is None or topic not in good:
+        known = ", ".join(kind.rpartition("/")[2] for kind in READERS)
+        got = f"{topic!r}" if topic is not None else "none"
+        raise ValueError(f"topic must be one of {known}; got {got}. The bag has: {shown}. Choose with --topic.")
+    return topic
+
+
+def _samples(bag: Path, topic: str) -> Iterator[Sample]:
+    with _opened(bag) as reader:
+        connections = [c for c in reader.connections if c.topic == topic]
+        for connection, _, data in reader.messages(connections=connections):
+            message = reader.deserialize(data, connection.msgtype)
+            stamp = message.header.stamp
+            points, covariance = READERS[connection.msgtype](message)
+            if len(points):
+                positions = [[float(p.x), float(p.y), float(p.z)] for p in points]
+                yield Sample(stamp.sec + 1e-9 * stamp.nanosec, positions, _sigmas(covariance))
+
+
+def _sigmas(covariance: Any) -> list[list[float]] | None:
+    """m, from the covariance (36,) of a pose; None where it states none."""
+    if covariance is None:
+        return None
+    variances = np.asarray(covariance, dtype=np.float64).reshape(6, 6).diagonal()[:3]
+    return [np.sqrt(variances).tolist()] if (np.isfinite(variances) & (variances > 0.0)).all() else None

@@ -1,0 +1,62 @@
+"""A dataset as a stream: its tracks one after the other, at the rate at which they were measured."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterable, Iterator
+from time import perf_counter
+
+from ballfg.live.sources.lines import Sample
+from ballfg.live.sources.source import Arrival
+from ballfg.tracks import Dataset, Track
+
+PAUSE = 1.0
+"""s between two tracks: longer than a ball may stay unseen."""
+
+
+class Replay:
+    """Samples at their own pace, or a multiple of it.
+
+    Args: samples: with their stamps, which the pace follows.  speed: 1 is real time; 0 as fast as they are taken.
+    """
+
+    lossy = False
+
+    def __init__(self, samples: Iterable[Sample], speed: float, name: str) -> None:
+        self.samples = samples
+        self.speed = speed
+        self.live = speed > 0.0
+        self.name = name
+
+    def arrivals(self, stop: threading.Event) -> Iterator[Arrival]:
+        """As `Source.arrivals`."""
+        begun: tuple[float, float] | None = None
+        for sample in self.samples:
+            if self.live:
+                begun = begun or (perf_counter(), sample.time)
+                wait = begun[0] + (sample.time - begun[1]) / self.speed - perf_counter()
+                if wait > 0.0 and stop.wait(wait):
+                    return
+            yield Arrival(perf_counter(), sample)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def dataset_samples(dataset: Dataset) -> Iterator[Sample]:
+    """The samples of a dataset on one clock: each track begins `PAUSE` after the end of the one before.
+
+    Their tags tell the trajectory and the stamp on its own clock.
+    """
+    later = 0.0
+    for number, track in enumerate(dataset):
+        begins = float(track.times[0])
+        shift = 0.0 if number == 0 else later + PAUSE - begins
+        yield from _track_samples(track, shift)
+        later = float(track.times[-1]) + shift
+
+
+def _track_samples(track: Track, shift: float) -> Iterator[Sample]:
+    for k, (time, position) in enumerate(zip(track.times.tolist(), track.positions.tolist(), strict=True)):
+        sigmas = None if track.sigmas is None else [track.sigmas[k].tolist()]
+        yield Sample(time + shift, [position], sigmas, (("trajectory", track.name), ("t_track", time)))

@@ -1,0 +1,363 @@
+"""The tracker: positions of any number of balls in, the state of each ball out, one stamp at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ballfg.arrays import Array
+from ballfg.checks import check_count, check_range
+from ballfg.dynamics import BallModel, Surfaces
+from ballfg.estimation.online.online import Online, OnlineState
+from ballfg.estimation.settings import Settings
+from ballfg.live.ball import Ball, BallEvent, Kept
+from ballfg.live.clock import Clock, Stamp
+from ballfg.live.gate import FAR, GATE, HIT_GATE, Gate, assign
+from ballfg.live.newcomer import Newcomer
+from ballfg.tracks import Ball as BallKind
+
+GAP = 0.5
+"""s. A ball that was not seen for longer is lost; the estimator links nothing over longer gaps either."""
+CONFIRM = 3
+"""Consistent samples that make a ball: the first number of them that a velocity can be checked with."""
+MOST_BALLS = 16
+"""Balls that are followed at once."""
+MOST_NEWCOMERS = 32
+"""Places that may become balls. Of more the oldest are dropped, so that clutter costs a bounded time."""
+FARTHEST = 1000.0
+"""m, of a coordinate. Beyond it the unit is another one."""
+
+
+@dataclass(frozen=True)
+class BallUpdate:
+    """What became of one position, or of one ball.
+
+    Attributes:
+        kind: `state`: a ball took the position in. `newcomer`: it may become a ball. `lost`: a ball was not seen for so
+            long that it is dropped. `refused`: nothing was done with the position.
+        time: s, the position's stamp; of a lost ball its last.
+        ball: number of the ball, from 1; None without one.
+        position: (3,) m as measured; None of a lost ball.
+        state: the ball's newest state; None without one.
+        samples: how many the ball has taken in.
+        events: bounces, hits, rests and gaps that were found now, some of them some samples ago.
+        late: the sample was put before others: the state is that of a later stamp.
+        reason: why a position was refused, or what went wrong with a state; empty otherwise.
+    """
+
+    kind: str
+    time: float
+    ball: int | None = None
+    position: Array | None = None
+    state: OnlineState | None = None
+    samples: int = 0
+    events: tuple[BallEvent, ...] = ()
+    late: bool = False
+    reason: str = ""
+
+
+@dataclass
+class Counts:
+    """What a tracker has seen.
+
+    Attributes:
+        positions: that came.  balls: that were begun.  lost: of these.
+        late: positions put before others.  old: positions older than the lag, dropped.
+        repeated: positions of a stamp that the ball had already, dropped.
+        malformed: positions that are not finite or not in m, dropped.
+        stray: stamps that the next one disproved.  restarts: of the sender's clock.
+        failed: samples that the estimator could make nothing of.
+    """
+
+    positions: int = 0
+    balls: int = 0
+    lost: int = 0
+    late: int = 0
+    old: int = 0
+    repeated: int = 0
+    malformed: int = 0
+    stray: int = 0
+    restarts: int = 0
+    failed: int = 0
+
+
+@dataclass
+class _Frame:
+    """The positions of one stamp, and what has become of each."""
+
+    time: float
+    late: bool
+    positions: Array
+    sigmas: Sequence[Array | None]
+    updates: list[BallUpdate | None] = field(default_factory=list)
+
+    @property
+    def open(self) -> list[int]:
+        """Those of which nothing is known yet."""
+        return [k for k, update in enumerate(self.updates) if update is None]
+
+
+class Tracker:
+    """Follows balls: begins them, tells them apart, estimates each by `Online`, and drops those that are gone.
+
+    A position belongs to the ball whose predicted place it fits best. What fits none begins a newcomer, which
+    becomes a ball with its third consistent sample. Positions may come late by up to the lag: they are put where they
+    belong, and the states are those of the positions in order. Work and memory do not grow with the stream.
+
+    Args:
+        model: the ball; of a `Ball`, its nominal model.
+        surfaces: that it may bounce on; of a number (m), a table of that height with the floor below it.
+        settings: noise and priors; those of measured tracks where None.
+        lag: s, by which a position may be late.
+        gap: s, after which a ball that was not seen is dropped.
+        confirm: consistent samples that make a ball.
+        most: balls that are followed at once; what else flies is refused.
+
+    Attributes:
+        counts: of what came and what became of it.
+
+    Raises: ValueError: a number out of range, or as `Online`. TypeError: a number that is none.
+    """
+
+    def __init__(
+        self,
+        model: BallModel | BallKind,
+        surfaces: Surfaces | float = 0.0,
+        settings: Settings | None = None,
+        *,
+        lag: float = 0.1,
+        gap: float = GAP,
+        confirm: int = CONFIRM,
+        most: int = MOST_BALLS,
+    ) -> None:
+        self.lag = check_range("lag", lag, 0.0, 10.0)
+        self.gap = check_range("gap", gap, 1e-3, 60.0)
+        self.confirm = check_count("confirm", confirm, 1, 20)
+        self.most = check_count("most", most, 1, 1000)
+        self.estimator = Online(model, surfaces, settings)
+        own = self.estimator.settings
+        noise = own.position_scale * np.hypot(own.position_noise, own.memory)
+        self.gate = Gate(self.estimator.physics, self.estimator.surfaces.heights(), noise, own.stamp_jitter)
+        self.counts = Counts()
+        self._begin()
+
+    def _begin(self) -> None:
+        self._clock = Clock(self.lag, self.gap)
+        self._balls: list[Ball] = []
+        self._newcomers: list[Newcomer] = []
+
+    @property
+    def balls(self) -> dict[int, OnlineState]:
+        """The newest state of every ball by its number."""
+        return {ball.number: ball.states[-1] for ball in self._balls}
+
+    def push(self, time: float, positions: ArrayLike, sigmas: ArrayLike | None = None) -> list[BallUpdate]:
+        """Take in the positions of one stamp.
+
+        Positions of one stamp belong to different balls. They may come in one call or in several.
+
+        Args:
+            time: s, on the sender's clock.
+            positions: (3,) or (n, 3) m.
+            sigmas: (3,) or (n, 3) m, their standard deviations; the settings' where None.
+        Returns: balls that were lost until then, and one update a position, in their order. A position that is not
+            usable is refused: nothing is raised for what a sender can get wrong.
+        Raises: ValueError: positions or sigmas of another shape.
+        """
+        points = np.atleast_2d(np.asarray(positions, dtype=np.float64))
+        if points.shape[-1] != 3 or points.ndim != 2:
+            raise ValueError(f"positions must be (3,) or (n, 3) m; got {np.shape(positions)}. Give x, y and z.")
+        spreads: Sequence[Array | None] = [None] * len(points)
+        if sigmas is not None:
+            given = np.asarray(sigmas, dtype=np.float64)
+            if given.shape not in ((3,), points.shape):
+                raise ValueError(f"sigmas must be (3,) or as positions, {points.shape}; got {given.shape}.")
+            spreads = list(np.broadcast_to(given, points.shape))
+        frame = _Frame(float(time), False, points, spreads, [None] * len(points))
+        self.counts.positions += len(points)
+        self._refuse_unusable(frame)
+        gone = self._turn_clock(frame) if frame.open else []
+        if frame.open:
+            self._to_balls(frame, GATE, hit=False)
+            self._to_newcomers(frame)
+            self._to_balls(frame, HIT_GATE, hit=True)
+            self._begin_newcomers(frame)
+        return gone + [update for update in frame.updates if update is not None]
+
+    def tidy(self) -> None:
+        """Do what can wait: call it after the updates were used, and the next push is quicker. Nothing else changes."""
+        for ball in self._balls:
+            ball.tidy()
+
+    def end(self) -> list[BallUpdate]:
+        """Drop all balls, at the end of a stream: what comes next has nothing to do with them.
+
+        Returns: one update for each ball.
+        """
+        gone = [self._lost(ball) for ball in self._balls]
+        self._begin()
+        return gone
+
+    def _refuse_unusable(self, frame: _Frame) -> None:
+        good = [bool((np.abs(position) <= FARTHEST).all()) for position in frame.positions]  # NaN is not
+        for k, (point, sigma) in enumerate(zip(frame.positions, frame.sigmas, strict=True)):
+            if not np.isfinite(frame.time):
+                reason = "the stamp is not finite"
+            elif not good[k]:
+                far = np.isfinite(point).all()
+                reason = f"a coordinate is beyond {FARTHEST:g} m" if far else "a coordinate is not finite"
+            elif sigma is not None and not (np.isfinite(sigma) & (sigma > 0.0)).all():
+                reason = "a standard deviation is not positive and finite"
+            else:
+                continue
+            self.counts.malformed += 1
+            frame.updates[k] = BallUpdate("refused", frame.time, position=point, reason=reason)
+
+    def _turn_clock(self, frame: _Frame) -> list[BallUpdate]:
+        """Find out what the stamp is; drop what it leaves behind."""
+        stamp = self._clock.tell(frame.time)
+        gone: list[BallUpdate] = []
+        if stamp is Stamp.OLD:
+            self.counts.old += len(frame.open)
+            reason = f"older than the newest stamp by more than the lag of {self.lag:g} s"
+            for k in frame.open:
+                frame.updates[k] = BallUpdate("refused", frame.time, position=frame.positions[k], reason=reason)
+        elif stamp is Stamp.RESTART:
+            self.counts.restarts += 1
+            gone = [self._lost(ball) for ball in self._balls]
+            self._balls, self._newcomers = [], []
+        elif stamp is Stamp.BACK:
+            self.counts.stray += 1
+            gone = self._undo_after(self._clock.newest)
+        frame.late = stamp is Stamp.LATE
+        self.counts.late += len(frame.open) if frame.late else 0
+        return gone + self._drop_unseen()
+
+    def _undo_after(self, time: float) -> list[BallUpdate]:
+        """Take back what a stamp astray has done; a ball of nothing else is lost."""
+        self._newcomers = [newcomer for newcomer in self._newcomers if newcomer.last <= time]
+        gone = []
+        for ball in list(self._balls):
+            farewell, left = self._farewell(ball), False
+            try:
+                left = ball.forget_after(time)
+            except (ValueError, RuntimeError):
+                self.counts.failed += 1
+            if not left:
+                self._balls.remove(ball)
+                self.counts.lost += 1
+                gone.append(farewell)
+        return gone
+
+    def _drop_unseen(self) -> list[BallUpdate]:
+        now = self._clock.safe
+        gone = [ball for ball in self._balls if ball.last < now - self.gap]
+        if gone:
+            self._balls = [ball for ball in self._balls if ball not in gone]
+        self._newcomers = [newcomer for newcomer in self._newcomers if newcomer.last >= now - newcomer.patience]
+        return [self._lost(ball) for ball in gone]
+
+    def _lost(self, ball: Ball) -> BallUpdate:
+        self.counts.lost += 1
+        return self._farewell(ball)
+
+    def _farewell(self, ball: Ball) -> BallUpdate:
+        return BallUpdate("lost", ball.last, ball.number, state=ball.states[-1], samples=ball.samples)
+
+    def _to_balls(self, frame: _Frame, gate: float, hit: bool) -> None:
+        """Give open positions to the balls that they fit: on their path, or as after a hit."""
+        rows, t = frame.open, frame.time
+        balls = [ball for ball in self._balls if ball.accepts(t) and abs(t - ball.last) <= self.gap]
+        costs = np.full((len(rows), len(balls)), FAR)
+        for j, ball in enumerate(balls):
+            held = ball.at(t)
+            if held is not None and (hit or not held.by_hit):
+                continue
+            known = ball.known(t)
+            costs[:, j] = (self.gate.if_hit if hit else self.gate.on_path)(known, t, frame.positions[rows])
+        for i, j in assign(costs, gate):
+            k = rows[i]
+            frame.updates[k] = self._taken(balls[j], frame, k, Kept(t, frame.positions[k], frame.sigmas[k], hit))
+        if not hit:
+            self._refuse_repeated(frame)
+
+    def _refuse_repeated(self, frame: _Frame) -> None:
+        """A position beside the one that a ball has of that stamp already is the same ball, measured twice."""
+        for k in frame.open:
+            for ball in self._balls:
+                held = ball.at(frame.time)
+                if held is None:
+                    continue
+                near = self.gate.on_path(ball.known(frame.time), frame.time, frame.positions[[k]])[0] <= GATE
+                same = np.array_equal(held.position, frame.positions[k])
+                apart = float(np.linalg.norm(held.position - frame.positions[k]))
+                if same or (near and apart < 2 * self.estimator.model.radius):  # two balls cannot be closer
+                    self._refuse(frame, k, f"ball {ball.number} has a position of this stamp")
+                    break
+
+    def _refuse(self, frame: _Frame, k: int, reason: str) -> None:
+        self.counts.repeated += 1
+        frame.updates[k] = BallUpdate("refused", frame.time, position=frame.positions[k], reason=reason)
+
+    def _taken(self, ball: Ball, frame: _Frame, k: int, kept: Kept) -> BallUpdate:
+        """A ball's update with a sample; where nothing can be made of it, the ball begins anew with it."""
+        reason, displaced = "", ball.at(kept.time)
+        try:
+            state = ball.take(kept) if displaced is None else ball.replace(kept)
+        except (ValueError, RuntimeError) as error:
+            self.counts.failed += 1
+            reason = f"the estimator began anew: {' '.join(str(error).split())}"
+            try:
+                state = ball.start_anew(kept)
+            except (ValueError, RuntimeError):
+                self._balls.remove(ball)
+                return BallUpdate("refused", frame.time, ball.number, kept.position, reason=reason)
+        if displaced is not None:
+            self._newcomers.append(Newcomer(displaced, self.gate))
+        return BallUpdate(
+            "state", frame.time, ball.number, kept.position, state, ball.samples, ball.news(), frame.late, reason
+        )
+
+    def _to_newcomers(self, frame: _Frame) -> None:
+        """Give open positions to the newcomers that they fit; those with enough samples become balls."""
+        rows, t = frame.open, frame.time
+        newcomers = [newcomer for newcomer in self._newcomers if not newcomer.has(t)]
+        costs = np.full((len(rows), len(newcomers)), FAR)
+        for j, newcomer in enumerate(newcomers):
+            costs[:, j] = newcomer.distances(t, frame.positions[rows])
+        for i, j in assign(costs, GATE):
+            k, newcomer = rows[i], newcomers[j]
+            newcomer.take(Kept(t, frame.positions[k], frame.sigmas[k]))
+            frame.updates[k] = self._grown(newcomer, frame, k)
+        for k in frame.open:
+            if any(newcomer.repeats(t, frame.positions[k]) for newcomer in self._newcomers):
+                self._refuse(frame, k, "a newcomer has this position already")
+
+    def _grown(self, newcomer: Newcomer, frame: _Frame, k: int) -> BallUpdate:
+        """A newcomer's update with a sample: it may be a ball now."""
+        position, count = frame.positions[k], len(newcomer.samples)
+        if count < self.confirm:
+            return BallUpdate("newcomer", frame.time, position=position, samples=count, late=frame.late)
+        self._newcomers = [other for other in self._newcomers if other is not newcomer]
+        if len(self._balls) >= self.most:
+            reason = f"{self.most} balls are followed already"
+            return BallUpdate("refused", frame.time, position=position, reason=reason)
+        self.counts.balls += 1
+        ball = Ball(self.counts.balls, self.estimator, self.lag)
+        self._balls.append(ball)
+        for kept in newcomer.samples:
+            update = self._taken(ball, frame, k, kept)
+            if update.kind == "refused":
+                break
+        return update
+
+    def _begin_newcomers(self, frame: _Frame) -> None:
+        """What fits nothing may be a new ball."""
+        for k in frame.open:
+            newcomer = Newcomer(Kept(frame.time, frame.positions[k], frame.sigmas[k]), self.gate)
+            self._newcomers.append(newcomer)
+            frame.updates[k] = self._grown(newcomer, frame, k)
+        del self._newcomers[:-MOST_NEWCOMERS]

@@ -1,0 +1,72 @@
+"""The balls in the viewer rerun, as they fly: the extra `viewer`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from ballfg.live.outlook import Outlook, unusable
+from ballfg.live.tracker import BallUpdate
+from ballfg.prediction import Crossing
+
+EVERY = 3
+"""Of so many states one gets its path drawn: the eye sees no more, and the stream has other things to do."""
+SIGMAS = 2.0
+"""Radius of an event's ball in standard deviations of its place."""
+
+
+class Viewer:
+    """Shows measured positions, states, paths ahead and their events, on the stream's own clock.
+
+    Args: horizon: s, of the paths.  save: a file .rrd to write to, in place of a window.
+    Raises: ValueError: the package `rerun-sdk` is missing.
+    """
+
+    def __init__(self, horizon: float, save: Path | None = None) -> None:
+        try:
+            import rerun
+        except ImportError as error:
+            raise ValueError(
+                f"viewer must have the package rerun-sdk; got {error}. Install it: pip install 'ballfg[viewer]'."
+            ) from None
+        self.horizon = horizon
+        self._rerun = rerun
+        self._recording = rerun.RecordingStream("ballfg live")
+        if save is None:
+            self._recording.spawn()
+        else:
+            self._recording.save(str(save))
+
+    def see(self, update: BallUpdate, outlook: Outlook | None) -> None:
+        """Draw one update."""
+        show, state = self._recording, update.state
+        show.set_time("stream", duration=update.time)
+        if update.position is not None:
+            show.log("measured", self._rerun.Points3D([update.position], radii=0.004))
+        if update.ball is None or state is None:
+            return
+        name = f"ball_{update.ball}"
+        if update.kind == "lost":
+            show.log(name, self._rerun.Clear(recursive=True))
+            return
+        show.log(f"{name}/state", self._rerun.Points3D([state.position], radii=0.02))
+        show.log(f"{name}/velocity", self._rerun.Arrows3D(origins=[state.position], vectors=[0.05 * state.velocity]))
+        for event in update.events:
+            show.log(f"{name}/events", self._rerun.TextLog(f"{event.kind} at {event.time:.4f} s"))
+        if outlook is not None and not outlook.note and update.samples % EVERY == 0 and not unusable(state):
+            path = np.vstack((state.position, state.predict(self.horizon, step=0.02).positions))
+            show.log(f"{name}/path", self._rerun.LineStrips3D([path]))
+            for what in ("bounce", "apex", "crossing"):
+                self._show_event(f"{name}/{what}", getattr(outlook, what))
+
+    def _show_event(self, name: str, event: Crossing | None) -> None:
+        if event is None:
+            self._recording.log(name, self._rerun.Clear(recursive=False))
+            return
+        radius = SIGMAS * float(np.sqrt(np.trace(event.covariance[:3, :3]) / 3))
+        self._recording.log(name, self._rerun.Points3D([event.state[:3]], radii=max(radius, 0.005)))
+
+    def close(self) -> None:
+        """Bring out what is still held back."""
+        self._recording.flush()

@@ -1,0 +1,49 @@
+"""What lies ahead: the events of the prediction, or a sentence on why there are none."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ballfg.estimation import Online, Status
+from ballfg.estimation.online.online import OnlineState
+from ballfg.live.outlook import Plane, look_out
+from tests.live.shots import SURFACES, ball_model, ball_settings, shots
+
+
+@pytest.fixture(scope="module")
+def state() -> OnlineState:
+    track, online = shots(1)[0], Online(ball_model(), SURFACES, ball_settings())
+    return [online.push(t, p) for t, p in zip(track.times[:20], track.positions[:20], strict=True)][-1]
+
+
+def test_events_are_those_of_the_prediction(state: OnlineState) -> None:
+    ahead, seen = state.predict(0.5), look_out(state, 0.5, Plane("x", 1.5))
+    assert seen.note == ""
+    for mine, theirs in ((seen.bounce, ahead.next_contact), (seen.crossing, ahead.crossing(x=1.5))):
+        assert mine is not None
+        assert theirs is not None
+        assert mine.time == pytest.approx(theirs.time, abs=1e-9)
+        np.testing.assert_allclose(mine.state, theirs.state, atol=1e-9)
+    assert (seen.apex is None) == (ahead.apex is None)
+    assert look_out(state, 0.01, Plane("x", 50.0)).crossing is None
+
+
+def test_what_cannot_be_predicted_says_why(state: OnlineState) -> None:
+    assert "too few samples" in look_out(replace(state, status=Status.NO_VELOCITY), 0.5, None).note
+    vague = replace(state, joint=state.joint * 1e6)
+    assert "the velocity is not known to 3 m/s" in look_out(vague, 0.5, None).note
+    lost = replace(state, mean=np.full_like(state.mean, np.nan))
+    assert "not finite" in look_out(lost, 0.5, None).note
+    nowhere = look_out(replace(state, world=None), 0.5, None)
+    assert nowhere.note.startswith("no prediction: ValueError: the state knows no model")
+    assert nowhere.bounce is nowhere.apex is nowhere.crossing is None
+
+
+def test_planes_are_read() -> None:
+    assert Plane.parse(" y = -0.5 ") == Plane("y", -0.5)
+    for text in ("x", "w=1", "x=one", "x=nan", "x=1=2"):
+        with pytest.raises(ValueError, match=r"plane must be an axis and a place in m; got .* Write x=2\.0"):
+            Plane.parse(text)

@@ -1,0 +1,190 @@
+"""The tracker: balls are begun, kept apart and dropped; late stamps find their place; what is wrong does no harm."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from ballfg.estimation import Online
+from ballfg.live import BallUpdate, Tracker
+from tests.live.shots import SURFACES, ball_model, ball_settings, rows, shots
+
+
+def tracker(**changes: float) -> Tracker:
+    return Tracker(ball_model(), SURFACES, ball_settings(), **changes)  # type: ignore[arg-type]
+
+
+def fed(into: Tracker, samples: np.ndarray) -> list[BallUpdate]:
+    """All updates of samples (n, 4), one push each."""
+    found = []
+    for t, *position in samples:
+        found += into.push(t, position)
+        into.tidy()
+    return found
+
+
+def of_ball(updates: list[BallUpdate], ball: int | None, kind: str = "state") -> list[BallUpdate]:
+    return [u for u in updates if u.ball == ball and u.kind == kind]
+
+
+def online(samples: np.ndarray) -> list:
+    estimator = Online(ball_model(), SURFACES, ball_settings())
+    return [estimator.push(t, position) for t, *position in samples]
+
+
+def same_state(one, other) -> None:
+    assert one.time == other.time
+    np.testing.assert_allclose(one.mean, other.mean, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(one.joint, other.joint, rtol=0, atol=1e-9)
+
+
+def test_states_are_those_of_the_estimator_and_a_new_ball_follows_the_old() -> None:
+    first, second = (rows(track, later) for track, later in zip(shots(2), (0.0, 1.5), strict=True))
+    live = tracker()
+    updates = fed(live, np.concatenate((first, second)))
+    for number, samples in ((1, first), (2, second)):
+        states, expected = of_ball(updates, number), online(samples)
+        assert [u.time for u in states] == samples[2:, 0].tolist()
+        for update, state in zip(states, expected[2:], strict=True):
+            assert update.state is not None
+            same_state(update.state, state)
+        assert [e.kind for u in states for e in u.events] == ["bounce"]
+        assert states[-1].samples == len(samples)
+    assert [u.ball for u in updates if u.kind == "lost"] == [1]
+    assert [u.ball for u in live.end()] == [2]
+    assert live.balls == {}
+    assert live.counts.balls == live.counts.lost == 2
+
+
+def test_a_ball_that_starts_elsewhere_0_3_s_after_another_was_last_seen_is_a_new_one() -> None:
+    first, second = rows(shots(2)[0])[:24], rows(shots(2)[1])
+    second[:, 0] += first[-1, 0] + 0.3
+    live = tracker()
+    updates = fed(live, np.concatenate((first, second)))
+    same_state(of_ball(updates, 2)[-1].state, online(second)[-1])
+    assert (live.counts.balls, live.counts.lost) == (2, 1)
+
+
+def test_a_ball_that_was_not_seen_for_0_2_s_is_the_same() -> None:
+    """The bounce lies in the gap."""
+    samples = rows(shots(1)[0])
+    seen = samples[(samples[:, 0] < 0.5) | (samples[:, 0] > 0.7)]
+    live = tracker()
+    updates = fed(live, seen)
+    same_state(of_ball(updates, 1)[-1].state, online(seen)[-1])
+    assert live.counts.balls == 1
+
+
+@pytest.mark.parametrize("together", [True, False], ids=["one push a stamp", "one push a position"])
+def test_two_balls_at_once_are_kept_apart(together: bool) -> None:
+    """The second flies 0.25 m beside the first, and begins later; its positions come first where stamps are shared."""
+    first, second = rows(shots(2)[0]), rows(shots(2)[1], beside=0.25)
+    stamps = np.arange(len(first)) / 60.0
+    first[:, 0], second[:, 0] = stamps, stamps[: len(second)] + stamps[7]
+    live, updates = tracker(), []
+    for t in sorted({*first[:, 0], *second[:, 0]}):
+        here = np.concatenate((second[second[:, 0] == t], first[first[:, 0] == t]))[:, 1:]
+        for positions in [here] if together else here:
+            updates += live.push(t, positions)
+    assert live.counts.balls == 2
+    for number, samples in ((1, first), (2, second)):
+        expected = online(samples)
+        same_state(of_ball(updates, number)[-1].state, expected[-1])
+
+
+def test_out_of_order_within_the_lag_equals_sorted() -> None:
+    samples = rows(shots(1)[0])
+    order = np.argsort(samples[:, 0] + np.random.default_rng(0).uniform(0.0, 0.09, len(samples)))
+    assert (np.diff(order) < 0).sum() > 10
+    live = tracker()
+    updates = fed(live, samples[order])
+    same_state(live.balls[1], online(samples)[-1])
+    assert live.counts.balls == 1
+    assert live.counts.late == sum(u.late for u in updates) > 10
+    assert live.counts.old == live.counts.repeated == 0
+
+
+def test_older_and_repeated_stamps_are_counted_and_dropped() -> None:
+    samples = rows(shots(1)[0])[:30]
+    disturbed = np.concatenate((samples[:20], samples[18:20], samples[3:4], samples[20:]))
+    live = tracker()
+    updates = fed(live, disturbed)
+    assert (live.counts.repeated, live.counts.old, live.counts.late) == (2, 1, 1)
+    refused = [u.reason for u in updates if u.kind == "refused"]
+    assert refused[:2] == ["ball 1 has a position of this stamp"] * 2
+    assert "older than the newest stamp by more than the lag of 0.1 s" in refused[2]
+    same_state(live.balls[1], online(samples)[-1])
+
+
+@pytest.mark.parametrize(
+    ("time", "position", "reason"),
+    [
+        (math.nan, [0.0, 0.0, 0.3], "the stamp is not finite"),
+        (0.3, [math.nan, 0.0, 0.3], "a coordinate is not finite"),
+        (0.3, [2000.0, 0.0, 300.0], "a coordinate is beyond 1000 m"),
+        (math.inf, [0.0, 0.0, 0.3], "the stamp is not finite"),
+    ],
+)
+def test_unusable_samples_change_nothing(time: float, position: list[float], reason: str) -> None:
+    samples = rows(shots(1)[0])[:24]
+    live = tracker()
+    fed(live, samples[:18])
+    (update,) = live.push(time, position)
+    assert (update.kind, update.reason) == ("refused", reason)
+    fed(live, samples[18:])
+    same_state(live.balls[1], online(samples)[-1])
+    assert live.counts.malformed == 1
+
+
+def test_a_stamp_astray_costs_no_ball_and_a_clock_that_begins_anew_no_more_than_two_samples() -> None:
+    first, second = rows(shots(2)[0], later=100.0)[:30], rows(shots(2)[1])
+    astray = first[20:21] + np.array([1e6, 0.0, 0.0, 0.0])
+    live = tracker()
+    updates = fed(live, np.concatenate((first[:20], astray, first[20:], second)))
+    assert live.counts.stray == live.counts.restarts == 1
+    same_state(of_ball(updates, 1)[-1].state, online(first)[-1])
+    assert live.counts.old == 2
+    same_state(live.balls[2], online(second[2:])[-1])
+
+
+def test_outliers_begin_no_ball_and_clutter_stays_bounded() -> None:
+    samples, random = rows(shots(1)[0]), np.random.default_rng(1)
+    live = tracker()
+    for t, *position in samples:
+        clutter = random.uniform([-5.0, -5.0, 0.0], [5.0, 5.0, 3.0], size=(3, 3))
+        live.push(t, np.concatenate((clutter, [position])))
+    assert np.abs(live.balls[1].position - samples[-1, 1:]).max() < 0.02
+    assert len(live._newcomers) <= 32
+
+
+def test_wrong_shapes_are_refused_at_the_edge() -> None:
+    with pytest.raises(ValueError, match=r"positions must be \(3,\) or \(n, 3\) m; got \(2,\)"):
+        tracker().push(0.0, [1.0, 2.0])
+    with pytest.raises(ValueError, match=r"sigmas must be \(3,\) or as positions"):
+        tracker().push(0.0, [1.0, 2.0, 3.0], [0.1])
+    with pytest.raises(ValueError, match="lag must be at least 0"):
+        tracker(lag=-1.0)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_any_stream_is_answered_position_by_position(seed: int) -> None:
+    """Three balls, shuffled beyond the lag, with outliers, wild stamps and numbers, repeats and odd sigmas."""
+    random = np.random.default_rng(seed)
+    samples = np.concatenate([rows(track, random.uniform(0, 0.3), 0.5 * k)[:16] for k, track in enumerate(shots(3, 5))])
+    samples = samples[np.argsort(samples[:, 0] + random.uniform(0, 0.2, len(samples)))]
+    live = tracker(lag=float(random.choice([0.0, 0.05, 1.0])), most=2)
+    for sample in samples:
+        wild = random.random()
+        if wild < 0.1:
+            sample[random.integers(4)] = random.choice([np.nan, np.inf, -1e300, 1e9, 0.4])
+        elif wild < 0.2:
+            sample += random.normal(0.0, 0.4, 4)
+        sigma = None if random.random() < 0.9 else np.full(3, random.choice([0.0, np.nan, 1e-9, 10.0]))
+        for _ in range(1 + (random.random() < 0.1)):
+            updates = live.push(sample[0], sample[1:], sigma)
+            assert [u.kind for u in updates if u.kind != "lost"] == [updates[-1].kind]
+            assert all(np.isfinite(u.state.mean).all() for u in updates if u.state is not None)
+    live.end()
+    assert live.counts.balls == live.counts.lost
