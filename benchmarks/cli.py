@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ballfg.cli.errors import guarded
-from ballfg.cli.inputs import CORES
+from ballfg.cli.inputs import CORES, Address, Cluster, workers
 
 if TYPE_CHECKING:
     from ballfg.benchmarks.results import Results
@@ -56,7 +56,13 @@ def _root(context: typer.Context) -> None:
 
 @app.command()
 def estimators(
-    data: Data = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = CORES
+    data: Data = None,
+    out: Out = Path("results"),
+    quick: Quick = False,
+    seed: Seed = 0,
+    jobs: Jobs = CORES,
+    cluster: Cluster = None,
+    address: Address = None,
 ) -> None:
     """Comparison of sliding window, EKF, RTS, online estimator and smoother on the same tracks.
 
@@ -69,16 +75,24 @@ def estimators(
 
     results = _start("estimators", [] if data is None else [data], quick, seed)
     size = QUICK if quick else FULL
-    if data is None:
-        pictures = run_synthetic(results, _folder(out), size, jobs)
-    else:
-        dataset = _open(data)  # before the folder: a wrong path leaves nothing behind
-        pictures = run_dataset(results, dataset, _folder(out), size, jobs)
+    dataset = None if data is None else _open(data)  # before the folder: a wrong path leaves nothing behind
+    with workers(cluster, address, jobs) as processes:
+        if dataset is None:
+            pictures = run_synthetic(results, _folder(out), size, processes)
+        else:
+            pictures = run_dataset(results, dataset, _folder(out), size, processes)
     _finish(results, out, pictures)
 
 
 @app.command()
-def cameras(out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = CORES) -> None:
+def cameras(
+    out: Out = Path("results"),
+    quick: Quick = False,
+    seed: Seed = 0,
+    jobs: Jobs = CORES,
+    cluster: Cluster = None,
+    address: Address = None,
+) -> None:
     """Tracking from rendered videos of three cameras: points, velocities and clocks against the truth.
 
     The recordings have one shutter or three, one ball or two, dropped frames, a clock that is late, and a camera that
@@ -89,7 +103,9 @@ def cameras(out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jo
     from ballfg.benchmarks.cameras.suite import FULL, QUICK, run_cameras
 
     results = _start("cameras", [], quick, seed)
-    _finish(results, out, run_cameras(results, _folder(out), QUICK if quick else FULL, jobs))
+    with workers(cluster, address, jobs) as processes:
+        pictures = run_cameras(results, _folder(out), QUICK if quick else FULL, processes)
+    _finish(results, out, pictures)
 
 
 @app.command()
@@ -102,6 +118,8 @@ def dynamics(
     quick: Quick = False,
     seed: Seed = 0,
     jobs: Jobs = CORES,
+    cluster: Cluster = None,
+    address: Address = None,
 ) -> None:
     """Comparison of dynamics models that are trained on the same tracks and predict the same others.
 
@@ -125,12 +143,20 @@ def dynamics(
     other = None if transfer is None else _open(transfer)
     measured = Measured([_open(one) for one in data], other, transfer_tracks) if data else None
     plan = QUICK if quick else FULL
-    _finish(results, out, run_dynamics(results, measured, _folder(out), plan, jobs, method))
+    with workers(cluster, address, jobs) as processes:
+        pictures = run_dynamics(results, measured, _shared(_folder(out), cluster), plan, processes, method)
+    _finish(results, out, pictures)
 
 
 @app.command()
 def loop(
-    data: Beside = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0, jobs: Jobs = CORES
+    data: Beside = None,
+    out: Out = Path("results"),
+    quick: Quick = False,
+    seed: Seed = 0,
+    jobs: Jobs = CORES,
+    cluster: Cluster = None,
+    address: Address = None,
 ) -> None:
     """Test of the diagnosis: planted effects that it names, false alarms, and models that it repairs.
 
@@ -147,7 +173,12 @@ def loop(
     results = _start("loop", data or [], quick, seed)
     for folder in data or []:
         _open(folder)  # a bad one is better known now than hours later
-    _finish(results, out, run_loop(results, data or [], _folder(out), QUICK if quick else FULL, jobs))
+    plan = QUICK if quick else FULL
+    with workers(cluster, address, jobs) as processes:
+        pictures = run_loop(
+            results, [_shared(one, cluster) for one in data or []], _shared(_folder(out), cluster), plan, processes
+        )
+    _finish(results, out, pictures)
 
 
 @app.command()
@@ -164,6 +195,8 @@ def intervals(
     quick: Quick = False,
     seed: Seed = 0,
     jobs: Jobs = CORES,
+    cluster: Cluster = None,
+    address: Address = None,
 ) -> None:
     """Coverage of 90 % prediction intervals, with the noise as usual and with the noise that tracks show.
 
@@ -181,13 +214,15 @@ def intervals(
     more = [*([] if tracks is None else ["--tracks", str(tracks)]), *(["--trained"] if trained else [])]
     more += ["--diagnosed"] if diagnosed else []
     results = _start("intervals", data or [], quick, seed, more)
-    if trained:
-        if tracks is not None:
-            raise typer.BadParameter("networks are judged on all tracks. Leave it out.", param_hint="--tracks")
-        networks.run_trained(results, data or [], networks.QUICK if quick else networks.FULL, jobs)
-    else:
-        datasets = [_open(one) for one in data or []]
-        suite.run_intervals(results, datasets, suite.QUICK if quick else suite.FULL, jobs, tracks, diagnosed)
+    if trained and tracks is not None:
+        raise typer.BadParameter("networks are judged on all tracks. Leave it out.", param_hint="--tracks")
+    datasets = [] if trained else [_open(one) for one in data or []]
+    with workers(cluster, address, jobs) as processes:
+        if trained:
+            networks.run_trained(results, data or [], networks.QUICK if quick else networks.FULL, processes)
+        else:
+            plan = suite.QUICK if quick else suite.FULL
+            suite.run_intervals(results, datasets, plan, processes, tracks, diagnosed)
     _finish(results, _folder(out), [])
 
 
@@ -235,6 +270,11 @@ def _folder(out: Path) -> Path:
         raise ValueError(f"--out must be a folder; {out} is a file. Choose another name.")
     out.mkdir(parents=True, exist_ok=True)
     return out
+
+
+def _shared(folder: Path, cluster: str | None) -> Path:
+    """The folder as workers find it: those of a cluster share it, and were started anywhere."""
+    return folder if cluster is None else folder.resolve()
 
 
 def _finish(results: Results, out: Path, pictures: Sequence[Path]) -> None:

@@ -1,14 +1,14 @@
 """Long runs that go on where they were stopped: records of finished parts, and processes for the missing ones."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
-import joblib
-import torch
-
 from ballfg.files.whole_file import whole_file
+from ballfg.parallel.executor import executor
+from ballfg.parallel.stream import finished
+from ballfg.parallel.work import on_one_thread
 from ballfg.progress import progress
 
 T = TypeVar("T")
@@ -19,15 +19,16 @@ RUNS_FOLDER = "runs"
 
 
 def in_processes(work: Callable[[T], R], items: Sequence[T], jobs: int, what: str) -> list[R]:
-    """The results of some work in the order of the items; `what` is finished stands in the progress lines."""
-    pool = joblib.Parallel(n_jobs=max(1, min(jobs, len(items))), return_as="generator_unordered", batch_size=1)
-    finished = pool(joblib.delayed(_numbered)(work, number, item) for number, item in enumerate(items))
-    return [result for _, result in sorted(progress(finished, len(items), what), key=lambda pair: pair[0])]
+    """The results of some work in the order of the items; `what` is finished stands in the progress lines.
 
-
-def _numbered(work: Callable[[T], R], number: int, item: T) -> tuple[int, R]:
-    torch.set_num_threads(1)  # the processes share the cores already
-    return number, work(item)
+    On a cluster they are made by its workers; one process stays in this one.
+    """
+    others = executor(min(jobs, len(items)), helped=False) if jobs > 1 else None
+    if others is None:
+        found: Iterator[tuple[int, R]] = ((number, on_one_thread(work, item)) for number, item in enumerate(items))
+    else:
+        found = finished(work, items, others)
+    return [result for _, result in sorted(progress(found, len(items), what), key=lambda pair: pair[0])]
 
 
 def collect(

@@ -11,6 +11,7 @@ ROOT = Path(__file__).parents[1]
 LEVELS = (
     ("state", "arrays", "checks", "progress", "registry", "machine"),
     ("files",),
+    ("parallel",),
     ("tracks",),
     ("vision",),
     ("dynamics",),

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.inputs import CORES, DatasetFolders, EffectsFiles, Jobs, open_inputs
+from ballfg.cli.inputs import CORES, Address, Cluster, DatasetFolders, EffectsFiles, Jobs, open_inputs, workers
 
 if TYPE_CHECKING:
     from ballfg.diagnosis.result import Diagnosis
@@ -21,6 +21,8 @@ def diagnose(
     model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal model of the ball.")] = None,
     effects_file: EffectsFiles = None,
     jobs: Jobs = CORES,
+    cluster: Cluster = None,
+    address: Address = None,
 ) -> None:
     """Find effects that the model lacks, with their evidence, their alternatives and the gain in prediction.
 
@@ -52,12 +54,13 @@ def diagnose(
             "Give the analytic model that you believe in."
         )
     rooms: dict[str, AnalyticModel] = {}
-    if others:
-        together = [inputs.dataset, *(other.dataset for other in others)]
-        joint = diagnose_jointly(together, inputs.model, jobs=jobs, watch=_say)
-        diagnosis, rooms = joint.whole, joint.rooms
-    else:
-        diagnosis = find(inputs.dataset, inputs.model, jobs=jobs, watch=_say)
+    with workers(cluster, address, jobs) as processes:
+        if others:
+            together = [inputs.dataset, *(other.dataset for other in others)]
+            joint = diagnose_jointly(together, inputs.model, jobs=processes, watch=_say)
+            diagnosis, rooms = joint.whole, joint.rooms
+        else:
+            diagnosis = find(inputs.dataset, inputs.model, jobs=processes, watch=_say)
     write_report(diagnosis, out, rooms)
     print(*_summary(diagnosis), sep="\n")
     if rooms:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections import Counter
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,7 +15,9 @@ from ballfg.progress import progress
 if TYPE_CHECKING:
     import numpy as np
 
-    from ballfg.estimation import Estimate
+    from ballfg.dynamics import BallModel
+    from ballfg.estimation import Estimate, Estimator
+    from ballfg.tracks import Track
 
 
 def estimate(
@@ -37,6 +40,8 @@ def estimate(
     ] = None,
     effects_file: inputs.EffectsFiles = None,
     jobs: inputs.Jobs = inputs.CORES,
+    cluster: inputs.Cluster = None,
+    address: inputs.Address = None,
 ) -> None:
     """Position, velocity and spin with standard deviations, one row per stamp.
 
@@ -48,31 +53,51 @@ def estimate(
 
     Example: ballfg estimate data/aimy --method smoother --out states.csv
     """
-    from ballfg.estimation import estimate_tracks, has_positions
-    from ballfg.estimation.outside import outside_of
+    from ballfg.estimation import has_positions
+    from ballfg.estimation.batch import map_tracks
     from ballfg.tracks import TableWriter
 
-    statuses: Counter[str] = Counter()
-    doubts: list[str] = []
-    outside: list[float] = []
+    outcome = inputs.Outcome()
     rows = hits = 0
-    with TableWriter(out) as table:
+    with TableWriter(out) as table, inputs.workers(cluster, address, jobs) as workers:
         inputs.check_out(out, dataset)
         positions = has_positions(dataset) if source is None else source is inputs.Source.POSITIONS
         open_dataset = inputs.open_inputs if positions else inputs.open_sighted
         opened = open_dataset(dataset, model, effects_file)
         count = len(opened.dataset)
-        estimates = estimate_tracks(opened.estimator(method), opened.dataset, count, jobs)
-        for result in progress(estimates, count, "tracks estimated"):
-            share = outside_of(opened.model, result.states)
-            table.write(_columns(result) | ({} if share is None else {"outside": share}))
-            outside += [] if share is None else [float(share.mean())]
-            statuses[result.status.value] += 1
-            doubts += [f"track {result.name!r}: {note}" for note in result.notes]
-            rows, hits = rows + len(result.times), hits + len(result.hits)
+        work = partial(_estimated, opened.estimator(method), opened.model)
+        results = map_tracks(work, opened.dataset, count, workers)
+        for result in progress(results, count, "tracks estimated"):
+            table.write(result.columns)
+            outcome.add(result.name, result.status, result.notes, result.outside)
+            rows, hits = rows + result.rows, hits + result.hits
     print(f"{out}: {rows} states of {count} tracks by {method}; {hits} hits found")
-    inputs.print_outcome(statuses, doubts)
-    inputs.print_outside(outside)
+    outcome.print()
+    outcome.print_outside()
+
+
+@dataclass(frozen=True)
+class _Estimated:
+    """What the table and the last lines need of an estimate: a tenth of it, to be sent between machines."""
+
+    name: str
+    columns: dict[str, str | np.ndarray]
+    status: str
+    notes: tuple[str, ...]
+    outside: float | None
+    rows: int
+    hits: int
+
+
+def _estimated(estimator: Estimator, model: BallModel, track: Track) -> _Estimated:
+    from ballfg.estimation.outside import outside_of
+
+    result = estimator.estimate(track)
+    share = outside_of(model, result.states)
+    columns = _columns(result) | ({} if share is None else {"outside": share})
+    outside = None if share is None else float(share.mean())
+    ended = result.status.value, result.notes, outside, len(result.times), len(result.hits)
+    return _Estimated(result.name, columns, *ended)
 
 
 def _columns(result: Estimate) -> dict[str, str | np.ndarray]:

@@ -6,8 +6,9 @@ import enum
 import math
 import sys
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
 
@@ -64,6 +65,13 @@ ModelFile = Annotated[
 ]
 CORES = usable_cores()
 Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Number of processes.", show_default="one per core")]
+Cluster = Annotated[
+    str | None, typer.Option("--cluster", help="Compute on a cluster in place of processes: dask or ray.")
+]
+Address = Annotated[
+    str | None,
+    typer.Option("--address", help="Address of the cluster: of dask's scheduler, such as tcp://10.0.0.1:8786."),
+]
 OutTable = Annotated[Path, typer.Option("--out", help="Output table, .csv or .parquet.")]
 Seed = Annotated[int, typer.Option("--seed", help="Random seed.")]
 DATASET_TABLES = ("tracks", "labels", "detections", "truth")
@@ -169,18 +177,59 @@ def print_notes(notes: Iterable[str]) -> None:
         print(f"note: {note}", file=sys.stderr)
 
 
-def print_outcome(statuses: Counter[str], doubts: list[str]) -> None:
-    """Prints how many tracks ended how, most first, and on stderr the first doubts about their frame."""
-    for text, number in statuses.most_common():
-        print(f"  {number} track{'s' if number > 1 else ''}: {text}")
-    print_notes(doubts[:MOST_DOUBTS])
-    if len(doubts) > MOST_DOUBTS:
-        print_notes([f"the same doubts about {len(doubts) - MOST_DOUBTS} more tracks"])
+@contextmanager
+def workers(cluster: str | None, address: str | None, jobs: int) -> Iterator[int]:
+    """Where the work of a command runs, until the block ends: on a cluster, or in `jobs` processes of this machine.
+
+    Returns: how many processes work.
+    Raises: ValueError, ConnectionError: as `ballfg.parallel.on_cluster`.
+    """
+    if cluster is None and address is None:
+        yield jobs
+        return
+    from ballfg.parallel import on_cluster
+
+    with on_cluster(cluster, address) as found:
+        print(f"{cluster} cluster: {found} workers", file=sys.stderr)
+        yield max(2, found or 0)  # several processes, even where there is one worker beside this one
 
 
-def print_outside(shares: list[float]) -> None:
-    """Prints how much of the tracks lies outside of a network's training data; nothing without shares, 0 to 1 each."""
-    if shares:
-        far = sum(share > 0.5 for share in shares)
-        mean = 100 * sum(shares) / len(shares)
-        print(f"  outside of the network's training data: {mean:.0f} % on average, {far} tracks for the greater part")
+@dataclass
+class Outcome:
+    """How tracks ended: sums, so that memory does not grow with their number."""
+
+    statuses: Counter[str] = field(default_factory=Counter)
+    doubts: list[str] = field(default_factory=list)
+    doubtful: int = 0
+    outside: int = 0
+    far: int = 0
+    shares: float = 0.0
+
+    def add(self, name: str, status: str, notes: Iterable[str], outside: float | None) -> None:
+        """Counts a track.
+
+        Args:
+            name: of the track.  status: how it ended.  notes: doubts about its frame.
+            outside: share of it outside of a network's training data, 0 to 1; None without a network.
+        """
+        self.statuses[status] += 1
+        for note in notes:
+            self.doubtful += 1
+            if self.doubtful <= MOST_DOUBTS:
+                self.doubts.append(f"track {name!r}: {note}")
+        if outside is not None:
+            self.outside, self.far, self.shares = self.outside + 1, self.far + (outside > 0.5), self.shares + outside
+
+    def print(self) -> None:
+        """Prints how many tracks ended how, most first, and on stderr the first doubts about their frame."""
+        for text, number in self.statuses.most_common():
+            print(f"  {number} track{'s' if number > 1 else ''}: {text}")
+        print_notes(self.doubts)
+        if self.doubtful > MOST_DOUBTS:
+            print_notes([f"the same doubts about {self.doubtful - MOST_DOUBTS} more tracks"])
+
+    def print_outside(self) -> None:
+        """Prints how much of the tracks lies outside of a network's training data; nothing without a network."""
+        if self.outside:
+            mean, text = 100 * self.shares / self.outside, "outside of the network's training data"
+            print(f"  {text}: {mean:.0f} % on average, {self.far} tracks for the greater part")

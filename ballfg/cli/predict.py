@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -37,6 +36,8 @@ def predict(
         Path | None, typer.Option(help="YAML file to keep the scales of --conformal in, for later predictions.")
     ] = None,
     jobs: inputs.Jobs = inputs.CORES,
+    cluster: inputs.Cluster = None,
+    address: inputs.Address = None,
 ) -> None:
     """Positions at every stamp after the observed part, with the standard deviation of a measurement there.
 
@@ -50,7 +51,7 @@ def predict(
     from ballfg.tracks import TableWriter
 
     outcome = _Outcome()
-    with TableWriter(out) as table:
+    with TableWriter(out) as table, inputs.workers(cluster, address, jobs) as workers:
         inputs.check_out(out, dataset)
         check_observe(observe)
         if save_conformal is not None:
@@ -62,15 +63,15 @@ def predict(
         estimator = opened.estimator(method)
         scales = None
         if conformal is not None:
-            scales = _conformal_scales(conformal, opened.dataset, estimator, method, observe, jobs)
-        predictions = predict_tracks(estimator, opened.dataset, count, observe, jobs=jobs)
+            scales = _conformal_scales(conformal, opened.dataset, estimator, method, observe, workers)
+        predictions = predict_tracks(estimator, opened.dataset, count, observe, jobs=workers)
         for plain in progress(predictions, count, "tracks predicted"):
             result = plain if scales is None else scales.scaled(plain)
             table.write(_columns(result))
             outcome.add(result, plain.sigmas)
     print(f"{out}: {outcome.rows} positions of {count} tracks, from the first {observe:g} s of each by {method}")
     outcome.print(observe)
-    inputs.print_outside(outcome.outside)
+    outcome.tracks.print_outside()
     if scales is not None:
         _print_conformal(scales, outcome)
         if save_conformal is not None:
@@ -118,7 +119,7 @@ def _print_conformal(scales: ConformalScales, outcome: _Outcome) -> None:
             print(f"  {number} calibration track{'s' if number > 1 else ''}: {text}")
     if outcome.finite:
         own, held = 100 * outcome.held_by_own / outcome.finite, 100 * outcome.held / outcome.finite
-        print(f"  90 % intervals on the {outcome.statuses.total()} predicted tracks: {what.format(own, held)}")
+        print(f"  90 % intervals on the {outcome.tracks.statuses.total()} predicted tracks: {what.format(own, held)}")
     infinite = 3 * outcome.rows - outcome.finite
     if infinite:
         inputs.print_notes(
@@ -139,9 +140,7 @@ class _Outcome:
     held: int = 0
     held_by_own: int = 0
     finite: int = 0
-    statuses: Counter[str] = field(default_factory=Counter)
-    doubts: list[str] = field(default_factory=list)
-    outside: list[float] = field(default_factory=list)
+    tracks: inputs.Outcome = field(default_factory=inputs.Outcome)
 
     def add(self, result: TrackPrediction, own_sigmas: np.ndarray) -> None:
         """Counts a track; coordinates in 90 % intervals are counted where the interval is finite."""
@@ -157,14 +156,12 @@ class _Outcome:
         self.finite += int(finite.sum())
         self.held += int((finite & (errors <= HALF_WIDTH * result.sigmas)).sum())
         self.held_by_own += int((finite & (errors <= HALF_WIDTH * own_sigmas)).sum())
-        self.statuses[result.status.value] += 1
-        if result.outside is not None and len(result.outside):
-            self.outside.append(float(result.outside.mean()))
-        self.doubts += [f"track {result.name!r}: {note}" for note in result.estimate.notes]
+        outside = None if result.outside is None or not len(result.outside) else float(result.outside.mean())
+        self.tracks.add(result.name, result.status.value, result.estimate.notes, outside)
 
     def print(self, observe: float) -> None:
         """Prints how the tracks ended and how far off their predictions are."""
-        inputs.print_outcome(self.statuses, self.doubts)
+        self.tracks.print()
         if self.rows:
             rmse = 1e3 * (self.squares / self.rows) ** 0.5
             print(f"  RMSE against what was measured there: {rmse:.1f} mm over all stamps")

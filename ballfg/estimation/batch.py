@@ -1,21 +1,22 @@
-"""Many tracks on several cores, one after the other out of a stream into a stream; and a few long tasks."""
+"""Many tracks, out of a stream into a stream, and a few long tasks: in this process, in several, or on a cluster."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 from typing import TypeVar
-
-import joblib
-import torch
 
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.result import Estimate
+from ballfg.parallel.executor import executor
+from ballfg.parallel.processes import Processes
+from ballfg.parallel.stream import finished, in_order, shared
+from ballfg.parallel.work import each, on_one_thread
 from ballfg.tracks import Track
 
+T = TypeVar("T")
 R = TypeVar("R")
-_started: set[int] = set()
-"""Numbers of processes that were started in this one; joblib keeps them for minutes."""
 
 PROBED = 10
 """Tracks done in this process first, to see how long one takes; the first of them warms up and does not count."""
@@ -23,8 +24,6 @@ START_UP = 5.0
 """s that worker processes take to start (they import torch and gtsam): less work than that stays here."""
 HAND_OVER = 0.3
 """s that it takes to hand work to processes that were started before."""
-BATCH = 16
-"""Tracks that go to a worker together, with one copy of the function."""
 
 
 def estimate_tracks(estimator: Estimator, tracks: Iterable[Track], count: int, jobs: int) -> Iterator[Estimate]:
@@ -44,7 +43,7 @@ def _without_world(estimator: Estimator, track: Track) -> Estimate:
 def map_tracks(function: Callable[[Track], R], tracks: Iterable[Track], count: int, jobs: int) -> Iterator[R]:
     """A function of each track, in the order of the tracks, a few tracks ahead of what is taken.
 
-    Worker processes are started only where they save more time than they take to start.
+    Worker processes are started only where they save more time than they take to start. A cluster gets all tracks.
 
     Args:
         function: copied to every process, so it must pickle.
@@ -52,26 +51,53 @@ def map_tracks(function: Callable[[Track], R], tracks: Iterable[Track], count: i
         count: how many tracks there are, about.
         jobs: processes; 1 stays in this one.
     """
-    stream = iter(tracks)
-    if jobs > 1:
-        spent = 0.0
-        for i in range(PROBED):
-            track = next(stream, None)
-            if track is None:
-                return
+    return _mapped(partial(each, function), tracks, count, jobs, None)
+
+
+def map_blocks(
+    function: Callable[[Sequence[Track]], Iterable[R]], tracks: Iterable[Track], count: int, jobs: int, block: int
+) -> Iterator[R]:
+    """`map_tracks` for a function of several tracks, whose results may depend on which of them come together.
+
+    Args:
+        function: of `block` tracks, fewer at the end; copied to every process, so it must pickle.
+        tracks: a stream; it is never held as a whole.
+        count: how many tracks there are, about.
+        jobs: processes; 1 stays in this one.
+        block: tracks that come together, whatever the number of processes.
+    """
+    return _mapped(function, tracks, count, jobs, block)
+
+
+def _mapped(
+    function: Callable[[Sequence[Track]], Iterable[R]],
+    tracks: Iterable[Track],
+    count: int,
+    jobs: int,
+    block: int | None,
+) -> Iterator[R]:
+    stream, others = iter(tracks), executor(jobs)
+    if isinstance(others, Processes):
+        spent = done = 0.0
+        for size in (1, PROBED - 1) if block is None else (block,):
             start = time.perf_counter()
-            result = function(track)
-            spent += (time.perf_counter() - start) * (i > 0)
-            yield result
-        left = spent / (PROBED - 1) * (count - PROBED)
-        jobs = jobs if left * (1.0 - 1.0 / jobs) > (HAND_OVER if jobs in _started else START_UP) else 1
-    if jobs == 1:
-        yield from map(function, stream)
+            probed = list(islice(stream, size))
+            yield from on_one_thread(function, probed) if probed else ()
+            spent, done = time.perf_counter() - start, done + len(probed)
+        left = spent / size * (count - done)
+        wait = HAND_OVER if others.started else START_UP
+        others = others if left * (1.0 - 1.0 / jobs) > wait else None
+    if others is None:
+        for chunk in _chunks(stream, block or 1):
+            yield from on_one_thread(function, chunk)
         return
-    _started.add(jobs)
-    batch = min(BATCH, max(1, -(-(count - PROBED) // (2 * jobs))))
-    parallel = joblib.Parallel(n_jobs=jobs, return_as="generator", pre_dispatch=f"{2 * batch}*n_jobs", batch_size=batch)
-    yield from parallel(joblib.delayed(_on_one_thread)(function, track) for track in stream)
+    size = block or max(1, min(others.batch, -(-count // (4 * (others.slots + others.helped)))))
+    yield from in_order(function, _chunks(stream, size), others)
+
+
+def _chunks(stream: Iterator[T], size: int) -> Iterator[list[T]]:
+    while chunk := list(islice(stream, size)):
+        yield chunk
 
 
 def do_all(tasks: Sequence[Callable[[], R]], jobs: int) -> list[R]:
@@ -81,12 +107,13 @@ def do_all(tasks: Sequence[Callable[[], R]], jobs: int) -> list[R]:
         tasks: functions without arguments (`functools.partial`), which must pickle.
         jobs: processes; with fewer than two of them, or of tasks, all are done in this process.
     """
-    if min(jobs, len(tasks)) < 2:
+    others = executor(jobs)
+    if others is None or len(tasks) < 2:
         return [task() for task in tasks]
-    _started.add(jobs)
-    return list(joblib.Parallel(n_jobs=jobs)(joblib.delayed(_on_one_thread)(task) for task in tasks))
+    if others.helped:
+        return shared(_done, tasks, others)
+    return [result for _, result in sorted(finished(_done, tasks, others), key=lambda pair: pair[0])]
 
 
-def _on_one_thread(function: Callable[..., R], *arguments: object) -> R:
-    torch.set_num_threads(1)  # the processes share the cores already
-    return function(*arguments)
+def _done(task: Callable[[], R]) -> R:
+    return task()

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import islice
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.estimation.batch import estimate_tracks
+from ballfg.estimation.batch import map_blocks
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.measurement.as_measured import measured_positions, true_times
 from ballfg.estimation.outside import outside_of
@@ -28,7 +27,7 @@ if TYPE_CHECKING:
     from ballfg.estimation.conformal import ConformalScales
 
 BLOCK = 64
-"""Tracks that are propagated together; memory grows with it."""
+"""Tracks that are propagated together, in one process; memory grows with it."""
 STAMP_TOLERANCE = 1e-9
 """s. A stamp this little after the end of the observed part belongs to it."""
 
@@ -80,11 +79,11 @@ def predict_tracks(
 
     Args:
         estimator: estimates the observed part of each track.
-        tracks: a stream; some tens at a time are in memory.
+        tracks: a stream; some tens at a time and process are in memory.
         count: how many there are, about.
         observe: s from the track's first stamp; a stamp at its end is observed. A function gives each track its own.
         horizon: s after the last observed stamp; later stamps are left out.
-        jobs: processes for the estimation.
+        jobs: processes.
 
     Raises: ValueError: if observe or horizon is not positive.
     """
@@ -117,16 +116,26 @@ def _predictions(
     jobs: int,
 ) -> Iterator[TrackPrediction]:
     propagator = Propagator(estimator.surfaces, estimator.settings.process)
-    waiting: deque[Track] = deque()
+    work = partial(_block, estimator, propagator, observe, horizon)
+    for one in map_blocks(work, tracks, count, jobs, BLOCK):
+        plain = one.estimate.world is None
+        yield replace(one, estimate=replace(one.estimate, world=estimator.world)) if plain else one
 
-    def observed() -> Iterator[Track]:
-        for track in tracks:
-            waiting.append(track)
-            yield track.until(float(track.times[0]) + observe(track) + _tolerance(track))
 
-    estimates = estimate_tracks(estimator, observed(), count, jobs)
-    while block := list(islice(estimates, BLOCK)):
-        yield from _predict_block(estimator, propagator, block, [waiting.popleft() for _ in block], horizon)
+def _block(
+    estimator: Estimator,
+    propagator: Propagator,
+    observe: Callable[[Track], float],
+    horizon: float,
+    tracks: Sequence[Track],
+) -> list[TrackPrediction]:
+    """Predictions of a block; without the model where it is that of all, which need not travel with every track."""
+    parts = [track.until(float(track.times[0]) + observe(track) + _tolerance(track)) for track in tracks]
+    estimates = [estimator.estimate(part) for part in parts]
+    found = list(_predict_block(estimator, propagator, estimates, list(tracks), horizon))
+    if estimator.model.variations:  # the world of each estimate is that of its track
+        return found
+    return [replace(one, estimate=replace(one.estimate, world=None)) for one in found]
 
 
 def _tolerance(track: Track) -> float:

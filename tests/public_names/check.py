@@ -23,6 +23,7 @@ from tests.public_names.source import (
 
 ROOMS = (
     "ballfg",
+    "ballfg.parallel",
     "ballfg.tracks",
     "ballfg.vision",
     "ballfg.dynamics",

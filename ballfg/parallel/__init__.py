@@ -1,0 +1,5 @@
+"""Where work runs: in this process, in processes of this machine, or on a cluster; docs/scale.md."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

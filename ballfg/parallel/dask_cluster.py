@@ -1,0 +1,165 @@
+"""A dask cluster: chunks are futures of `distributed`, which computes those of a lost worker again elsewhere.
+
+joblib's own dask backend is not used: it takes from the stream as fast as workers compute, however slowly results are
+taken, so that they pile up in memory.
+"""
+
+import logging
+import math
+import pickle
+import re
+import time
+import uuid
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+from ballfg.parallel.same_versions import HERE, differences, own_versions
+from ballfg.parallel.work import Work, compute, packed
+
+CONNECT: Final = 10.0
+"""s to wait for the scheduler, and for its first worker."""
+NOBODY: Final = 60.0
+"""s without any worker after which the work is given up."""
+LOOK: Final = 5.0
+"""s between two looks at the cluster while a chunk is waited for."""
+
+
+class DaskCluster:
+    """All workers of a scheduler.
+
+    Args: address: of the scheduler, such as tcp://10.0.0.1:8786.
+    Raises:
+        ValueError: no address, `distributed` is not installed, or workers with other versions.
+        ConnectionError: no scheduler or no worker is there.
+    """
+
+    batch, helped = 16, False
+
+    def __init__(self, address: str | None) -> None:
+        try:
+            import distributed
+        except ImportError:
+            raise ValueError(
+                'cluster dask needs dask, which is not installed. Run: pip install "ballfg[dask]"'
+            ) from None
+        if not re.fullmatch(r"(\w+://)?[^/]+:\d+", address or ""):
+            raise ValueError(
+                f"address must be that of a dask scheduler, such as tcp://10.0.0.1:8786; got {address}. "
+                "Copy it from what the scheduler prints."
+            )
+        self._address, self._workers = address, 0
+        self._looked, self._nobody_since = -LOOK, math.inf
+        logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what matters of it is raised here
+        try:
+            self._client = distributed.Client(address, timeout=CONNECT, set_as_default=False)
+        except (OSError, ValueError, TimeoutError) as error:
+            raise ConnectionError(
+                f"address must be that of a dask scheduler; nothing usable answers at {address} "
+                f"({_one_line(error)}). Start it: dask scheduler."
+            ) from None
+        try:
+            self._check_workers()
+        except BaseException:
+            self._client.close()
+            raise
+
+    @property
+    def slots(self) -> int:
+        """How many workers there were at the last look; each computes one chunk at a time."""
+        if time.monotonic() - self._looked > LOOK:
+            self.look()
+        return max(1, self._workers)
+
+    def sender(self, function: Callable[[Sequence[Any]], Any]) -> Callable[[Sequence[Any]], "_Chunk"]:
+        """Hands a function of a chunk over; see Executor.
+
+        The function is the result of a task of its own, not scattered data: if the worker that holds it dies, dask
+        makes it again.
+        """
+        work = Work.of(function)
+        content = self._client.submit(bytes, work.content, key=f"ballfg-{work.name}-{uuid.uuid4().hex[:8]}")
+
+        def send(chunk: Sequence[Any]) -> _Chunk:
+            call = (compute, work.name, content, packed(chunk), own_versions())
+            return _Chunk(self, self._client.submit(*call, key=f"ballfg-{uuid.uuid4().hex}"), chunk)
+
+        return send
+
+    def look(self) -> None:
+        """Counts the workers. Raises: ConnectionError: the scheduler or, for `NOBODY` s, every worker has left."""
+        try:
+            workers = len(self._client.nthreads()) if self._client.status == "running" else None
+        except (OSError, TimeoutError, RuntimeError):
+            workers = None
+        if workers is None:
+            raise ConnectionError(f"the dask scheduler at {self._address} must stay while it is in use; it left.")
+        self._workers, self._looked = workers, (now := time.monotonic())
+        self._nobody_since = math.inf if workers else min(now, self._nobody_since)
+        if now - self._nobody_since > NOBODY:
+            raise ConnectionError(
+                f"the dask scheduler at {self._address} must have workers; the last left {NOBODY:g} s ago."
+            )
+
+    def stop(self) -> None:
+        """Nothing: chunks are given up one by one, and the cluster goes on without them."""
+
+    def close(self) -> None:
+        """Leaves the cluster, which stays as it is."""
+        self._client.close()
+
+    def _check_workers(self) -> None:
+        try:
+            self._client.wait_for_workers(1, timeout=CONNECT)
+        except TimeoutError:
+            raise ConnectionError(
+                f"the dask scheduler at {self._address} must have workers; got none within {CONNECT:g} s. "
+                f"Start them: dask worker {self._address} --nworkers 4 --nthreads 1."
+            ) from None
+        for worker, theirs in self._client.run(eval, HERE).items():
+            different = differences(theirs, f"the worker {worker}")
+            if different:
+                raise ValueError(different)
+
+
+class _Chunk:
+    """A chunk on the cluster."""
+
+    def __init__(self, cluster: DaskCluster, future: Any, chunk: Sequence[Any]) -> None:
+        self._cluster, self._future, self._first = cluster, future, repr(chunk[0])
+
+    def done(self) -> bool:
+        """Whether the result is there, or an error."""
+        return bool(self._future.done())
+
+    def result(self) -> Any:
+        """The result; see Pending.
+
+        Raises: ChildProcessError: the chunk lost too many workers. ConnectionError: the cluster has left.
+        """
+        from distributed import KilledWorker
+
+        while not self._future.done():
+            try:
+                self._future.result(timeout=LOOK)
+            except TimeoutError:
+                self._cluster.look()
+            except Exception:  # raised again below
+                break
+        if self._future.cancelled():
+            self._cluster.look()
+            raise ConnectionError("the dask cluster gave a chunk up: its scheduler was probably started again.")
+        try:
+            return pickle.loads(self._future.result())
+        except KilledWorker:
+            raise ChildProcessError(
+                f"workers must live while they work; dask lost too many over a chunk that begins with {self._first}. "
+                "Memory is probably short: give workers more of it."
+            ) from None
+
+    def cancel(self) -> None:
+        """Gives the chunk up."""
+        self._future.cancel()
+
+
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split()).rstrip(".") or type(error).__name__

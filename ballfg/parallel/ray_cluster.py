@@ -1,0 +1,108 @@
+"""A ray cluster: chunks are ray tasks, which ray starts again where their worker dies."""
+
+import pickle
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+from ballfg.parallel.same_versions import HERE, differences, own_versions
+from ballfg.parallel.work import Work, compute, packed
+
+MOST_DEATHS: Final = 3
+"""Workers that a chunk may lose before it is given up."""
+
+
+class RayCluster:
+    """All processors of a ray cluster.
+
+    Args: address: of the cluster; None for the one that this machine belongs to, or that this process has joined.
+    Raises: ValueError: ray is not installed, or nodes with other versions. ConnectionError: no cluster is there.
+    """
+
+    batch, helped = 16, False
+
+    def __init__(self, address: str | None) -> None:
+        try:
+            import ray
+        except ImportError:
+            raise ValueError('cluster ray needs ray, which is not installed. Run: pip install "ballfg[ray]"') from None
+        self._ray, self._joined = ray, not ray.is_initialized()
+        if self._joined:
+            try:
+                ray.init(address=address or "auto", logging_level="CRITICAL", log_to_driver=False)
+            except (OSError, ValueError, RuntimeError, AssertionError) as error:
+                reason = " ".join(str(error).split()).rstrip(".")
+                raise ConnectionError(
+                    f"address must be that of a ray cluster; nothing usable answers at {address or 'this machine'} "
+                    f"({reason}). Start it: ray start --head."
+                ) from None
+        self._task = ray.remote(max_retries=MOST_DEATHS, num_cpus=1)(compute)
+        try:
+            self._check_nodes()
+        except BaseException:
+            self.close()
+            raise
+
+    @property
+    def slots(self) -> int:
+        """How many processors there are; each computes one chunk at a time."""
+        return max(1, int(self._ray.cluster_resources().get("CPU", 1)))
+
+    def sender(self, function: Callable[[Sequence[Any]], Any]) -> Callable[[Sequence[Any]], "_Chunk"]:
+        """Hands a function of a chunk over; see Executor."""
+        work = Work.of(function)
+        content = self._ray.put(work.content)
+
+        def send(chunk: Sequence[Any]) -> _Chunk:
+            sent = self._task.remote(work.name, content, packed(chunk), own_versions())
+            return _Chunk(self._ray, sent, chunk)
+
+        return send
+
+    def stop(self) -> None:
+        """Nothing: chunks are given up one by one, and the cluster goes on without them."""
+
+    def close(self) -> None:
+        """Leaves the cluster, which stays as it is."""
+        if self._joined:
+            self._ray.shutdown()
+
+    def _check_nodes(self) -> None:
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        def asked(expression: str) -> Any:  # travels as a whole: a node without ballfg could not import it
+            return eval(expression)
+
+        for node in self._ray.nodes():
+            if node["Alive"] and node["Resources"].get("CPU"):
+                there = NodeAffinitySchedulingStrategy(node["NodeID"], soft=False)
+                theirs = self._ray.get(self._ray.remote(asked).options(scheduling_strategy=there).remote(HERE))
+                different = differences(theirs, f"the node {node['NodeManagerAddress']}")
+                if different:
+                    raise ValueError(different)
+
+
+class _Chunk:
+    """A chunk on the cluster."""
+
+    def __init__(self, ray: Any, sent: Any, chunk: Sequence[Any]) -> None:
+        self._ray, self._sent, self._first = ray, sent, repr(chunk[0])
+
+    def done(self) -> bool:
+        """Whether the result is there, or an error."""
+        return bool(self._ray.wait([self._sent], timeout=0)[0])
+
+    def result(self) -> Any:
+        """The result; see Pending. Raises: ChildProcessError: if the chunk lost too many workers."""
+        try:
+            return pickle.loads(self._ray.get(self._sent))
+        except self._ray.exceptions.RayTaskError as error:
+            raise error.cause from None
+        except (self._ray.exceptions.WorkerCrashedError, self._ray.exceptions.OutOfMemoryError):
+            raise ChildProcessError(
+                f"workers must live while they work; ray lost too many over a chunk that begins with {self._first}. "
+                "Memory is probably short: give workers more of it."
+            ) from None
+
+    def cancel(self) -> None:
+        """Gives the chunk up."""
+        self._ray.cancel(self._sent)

@@ -1,0 +1,139 @@
+"""Chunks out of a stream, computed by an executor: in order with few of them in memory, or as they finish."""
+
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from threading import Thread
+from typing import Any, Final, TypeVar
+
+from ballfg.parallel.executor import Executor, Pending
+from ballfg.parallel.work import alone
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+AHEAD: Final = 3
+"""Chunks per worker that were handed over and not yet taken back. Memory is bounded by them."""
+HELPED: Final = 8
+"""Chunks that the process that asks computes ahead of what is taken, besides."""
+LOOK: Final = 0.02
+"""s between two looks at what has finished."""
+
+
+class _Here:
+    """A chunk that this process has computed."""
+
+    def __init__(self, value: Any) -> None:
+        self._value = value
+
+    def done(self) -> bool:
+        """It is."""
+        return True
+
+    def result(self) -> Any:
+        """The result."""
+        return self._value
+
+    def cancel(self) -> None:
+        """Nothing is left to give up."""
+
+
+def in_order(
+    function: Callable[[Sequence[T]], Iterable[R]], chunks: Iterator[Sequence[T]], executor: Executor
+) -> Iterator[R]:
+    """The results of chunks, one after the other, in the order of the stream.
+
+    However slowly they are taken, no more than `AHEAD` chunks per worker and `HELPED` more are begun.
+
+    Args: function: of a chunk; gives its results.  chunks: a stream.  executor: computes them.
+    Raises: what the function raises.
+    """
+    send = executor.sender(function)
+    pending: deque[Pending] = deque()
+    try:
+        while True:
+            most = AHEAD * executor.slots
+            while len(pending) < most and (chunk := next(chunks, None)) is not None:
+                pending.append(send(chunk))
+            if not pending:
+                return
+            if executor.helped and len(pending) < most + HELPED and not pending[0].done():
+                chunk = next(chunks, None)
+                if chunk is not None:
+                    pending.append(_Here(alone(function, chunk)))
+                    continue
+            yield from pending.popleft().result()
+    except KeyboardInterrupt:
+        executor.stop()
+        raise
+    finally:
+        for one in pending:
+            one.cancel()
+
+
+def finished(function: Callable[[T], R], items: Sequence[T], executor: Executor) -> Iterator[tuple[int, R]]:
+    """The number and the result of each item, as they finish; this process waits.
+
+    Args: function: of an item; takes seconds or more.  items: that are handed over at once.  executor: computes them.
+    Raises: what the function raises.
+    """
+    send = executor.sender(partial(_of_one, function))
+    pending = {number: send([item]) for number, item in enumerate(items)}
+    try:
+        while pending:
+            for number in [number for number, one in pending.items() if one.done()]:
+                yield number, pending.pop(number).result()
+            time.sleep(LOOK)
+    except KeyboardInterrupt:
+        executor.stop()
+        raise
+    finally:
+        for one in pending.values():
+            one.cancel()
+
+
+def shared(function: Callable[[T], R], items: Sequence[T], executor: Executor) -> list[R]:
+    """The results of items that take seconds or more, in their order; this process computes some of them too.
+
+    Args: function: of an item.  items: that are computed.  executor: whose processes take the next item when free.
+    Raises: what the function raises.
+    """
+    send = executor.sender(partial(_of_one, function))
+    waiting, found, errors = deque(enumerate(items)), dict[int, R](), list[Exception]()
+
+    def feed() -> None:
+        try:
+            while taken := _taken(waiting):
+                found[taken[0]] = send([taken[1]]).result()
+        except Exception as error:
+            errors.append(error)
+            waiting.clear()
+
+    feeders = [Thread(target=feed) for _ in range(min(executor.slots, len(items) - 1))]
+    for feeder in feeders:
+        feeder.start()
+    try:
+        while taken := _taken(waiting):
+            found[taken[0]] = alone(function, taken[1])
+        for feeder in feeders:
+            feeder.join()
+    except BaseException:
+        waiting.clear()
+        executor.stop()
+        raise
+    if errors:
+        raise errors[0]
+    return [found[number] for number in range(len(items))]
+
+
+def _taken(waiting: deque[T]) -> T | None:
+    try:
+        return waiting.popleft()
+    except IndexError:
+        return None
+
+
+def _of_one(function: Callable[[T], R], chunk: Sequence[T]) -> R:
+    (item,) = chunk
+    return function(item)
