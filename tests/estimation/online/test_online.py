@@ -365,6 +365,7 @@ class Broken(NetworkModel):
         return acceleration * torch.nan if bool((state[..., 3].abs() > self.limit).any()) else acceleration, spin
 
 
+@pytest.mark.filterwarnings("ignore:Broken runs in torch")
 def test_a_window_that_cannot_be_solved_says_so():
     track, _ = make_track(FLYING, n=20, surfaces=NOWHERE)
     model = Broken()
