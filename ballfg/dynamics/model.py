@@ -4,7 +4,7 @@ import functools
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Final, Self, TypeVar
+from typing import TYPE_CHECKING, ClassVar, Final, Self, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -50,9 +50,13 @@ class BallModel(nn.Module, ABC):
         trained: the noise and the launcher that were learned together with the model; None where nothing was.
         noise: how far tracks scatter about the model; None where nobody has looked.
         variations: coefficients that differ between tracks, by name as in `named_parameters()`.
+        random: whether it draws random numbers, so that the same state has another future each time; such a model is
+            not compiled.
 
     Raises: ValueError: if the radius is not within 0.001 to 1 m, or the inertia factor not within 0 to 1.
     """
+
+    random: ClassVar[bool] = False
 
     def __init__(self, radius: float, inertia_factor: float = THIN_SHELL) -> None:
         super().__init__()

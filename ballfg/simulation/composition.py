@@ -39,6 +39,8 @@ class KickedModel(BallModel):
     The upward speed after a bounce is reflected at zero if a kick would push the ball into the surface.
     """
 
+    random = True
+
     def __init__(self, model: BallModel, noise: MotionNoise, rng: np.random.Generator) -> None:
         super().__init__(model.radius, model.inertia_factor)
         self.model = model

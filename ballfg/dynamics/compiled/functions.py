@@ -104,7 +104,7 @@ def compiled(model: BallModel) -> CompiledModel | None:
     Args: model: without substituted parameters. Its structure must not change afterwards.
     """
     if model not in _by_model:
-        if is_substituted(model):
+        if model.random or is_substituted(model):
             return None
         try:
             key = _structure(model)
