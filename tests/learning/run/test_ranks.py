@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -98,7 +99,9 @@ def interrupted(folder: Path, *words: str) -> tuple[int, str]:
     """Ctrl-C after the second epoch. Returns: exit status and what it said."""
     given = [sys.executable, str(BALL), "train.yaml", "--data", "slow", "optimizer.epochs=300", *words]
     pipe = subprocess.PIPE
-    with subprocess.Popen(given, cwd=folder, stdout=pipe, stderr=pipe, text=True) as process:
+    # whoever starts the tests in the background has them ignore Ctrl-C, and their children too
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    with subprocess.Popen(given, cwd=folder, stdout=pipe, stderr=pipe, text=True, preexec_fn=heard) as process:
         assert process.stdout is not None
         _wait_for(iter(process.stdout), "epoch 2/300")
         process.send_signal(signal.SIGINT)
