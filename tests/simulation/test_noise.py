@@ -119,7 +119,9 @@ def test_kicked_contacts_leave_upwards_and_change_what_follows_only() -> None:
     kicked = run(20, process=MotionNoise(contact_velocity=0.1))
     for simulated, plain in zip(kicked, run(20), strict=True):
         contact = int(np.flatnonzero(np.diff(plain.true_states[:, 5]) > 0.5)[0])
-        np.testing.assert_array_equal(simulated.true_states[: contact + 1], plain.true_states[: contact + 1])
+        # not to the last bit: a model that draws random numbers runs in torch
+        before, same = simulated.true_states[: contact + 1], plain.true_states[: contact + 1]
+        np.testing.assert_allclose(before, same, rtol=1e-12, atol=1e-12)
         assert not np.array_equal(simulated.true_states[contact + 1], plain.true_states[contact + 1])
 
 
