@@ -28,6 +28,11 @@ def type_name(value: object) -> str:
     return "nothing" if value is None else type(value).__name__
 
 
+def one_line(error: object) -> str:
+    """The text of an error on one line, without its full stop."""
+    return " ".join(str(error).split()).rstrip(".")
+
+
 def check_text(label: str, value: object, *, optional: bool = False) -> None:
     """Refuses a value that is not text with something in it.
 

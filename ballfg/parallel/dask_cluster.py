@@ -13,6 +13,7 @@ import uuid
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
+from ballfg.checks import one_line
 from ballfg.parallel.same_versions import HERE, differences, own_versions
 from ballfg.parallel.work import Work, compute, packed
 
@@ -55,7 +56,7 @@ class DaskCluster:
         except (OSError, ValueError, TimeoutError) as error:
             raise ConnectionError(
                 f"address must be that of a dask scheduler; nothing usable answers at {address} "
-                f"({_one_line(error)}). Start it: dask scheduler."
+                f"({one_line(error) or type(error).__name__}). Start it: dask scheduler."
             ) from None
         try:
             self._check_workers()
@@ -159,7 +160,3 @@ class _Chunk:
     def cancel(self) -> None:
         """Gives the chunk up."""
         self._future.cancel()
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split()).rstrip(".") or type(error).__name__

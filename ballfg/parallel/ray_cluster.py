@@ -4,6 +4,7 @@ import pickle
 from collections.abc import Callable, Sequence
 from typing import Any, Final
 
+from ballfg.checks import one_line
 from ballfg.parallel.same_versions import HERE, differences, own_versions
 from ballfg.parallel.work import Work, compute, packed
 
@@ -30,10 +31,9 @@ class RayCluster:
             try:
                 ray.init(address=address or "auto", logging_level="CRITICAL", log_to_driver=False)
             except (OSError, ValueError, RuntimeError, AssertionError) as error:
-                reason = " ".join(str(error).split()).rstrip(".")
                 raise ConnectionError(
                     f"address must be that of a ray cluster; nothing usable answers at {address or 'this machine'} "
-                    f"({reason}). Start it: ray start --head."
+                    f"({one_line(error)}). Start it: ray start --head."
                 ) from None
         self._task = ray.remote(max_retries=MOST_DEATHS, num_cpus=1)(compute)
         try:

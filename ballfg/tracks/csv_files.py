@@ -13,7 +13,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 
-from ballfg.checks import did_you_mean
+from ballfg.checks import did_you_mean, one_line
 
 _NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 _NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|infinity)\s*", re.IGNORECASE)
@@ -23,11 +23,6 @@ _HEADER_LIMIT = 1 << 16  # bytes
 def is_number(cell: str) -> bool:
     """Whether a cell holds a finite decimal number with a point, such as 0.02 or 2e-2."""
     return _NUMBER.fullmatch(cell) is not None and math.isfinite(float(cell))
-
-
-def one_line(error: object) -> str:
-    """The text of an error on one line, without its full stop."""
-    return " ".join(str(error).split()).rstrip(".")
 
 
 def read_header(path: Path) -> list[str]:

@@ -12,6 +12,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
+from ballfg.checks import one_line
 from ballfg.tracks import csv_files
 
 KEY = "trajectory"
@@ -103,7 +104,7 @@ class ParquetRows(RowSource):
         try:
             schema = pq.read_schema(path)
         except (pa.ArrowException, OSError) as error:
-            raise ValueError(f"{path}: must be a Parquet file; {csv_files.one_line(error)}. Write it again.") from None
+            raise ValueError(f"{path}: must be a Parquet file; {one_line(error)}. Write it again.") from None
         super().__init__(path, schema.names)
         for name in self.columns:
             kind = schema.field(name).type
@@ -124,7 +125,7 @@ class ParquetRows(RowSource):
                     start += batch.num_rows
         except (pa.ArrowException, OSError) as error:
             raise ValueError(
-                f"{self.path}: cannot be read as a table of tracks; {csv_files.one_line(error)}. Write it again."
+                f"{self.path}: cannot be read as a table of tracks; {one_line(error)}. Write it again."
             ) from None
 
     def where(self, *rows: int) -> str:

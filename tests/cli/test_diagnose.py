@@ -9,24 +9,17 @@ from pathlib import Path
 import pytest
 
 import ballfg.diagnosis
-from ballfg.cli.main import run
 from ballfg.diagnosis.result import Diagnosis
 from ballfg.dynamics import AnalyticModel, Architecture, build, load_model, nominal_model, save_model
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import Dataset
+from tests.commands import status
 from tests.diagnosis.made_diagnosis import found, silent, unexplained
 
 Asked = list[tuple[str, tuple[str, ...], int]]
 """Dataset, flight effects of the model and jobs."""
 Answer = Callable[[Diagnosis], Asked]
 NAMES = ["model.yaml", "report.html", "report.json"]
-
-
-def status(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        run([str(argument) for argument in arguments])
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
 
 
 @pytest.fixture(scope="module")

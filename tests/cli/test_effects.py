@@ -10,18 +10,11 @@ import pytest
 import yaml
 
 import ballfg.diagnosis
-from ballfg.cli.main import run
 from ballfg.dynamics import EFFECTS
+from tests.commands import status
 from tests.places import DOCS
 
 GUIDE = DOCS / "add_an_effect.md"
-
-
-def status(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        run([str(argument) for argument in arguments])
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
 
 
 @pytest.fixture(autouse=True)

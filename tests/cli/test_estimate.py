@@ -12,21 +12,14 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 import pytest
 
-from ballfg.cli.main import run
 from ballfg.estimation import ESTIMATORS
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset
+from tests.commands import status
 
 METHODS = ("smoother", "online", "ekf", "sliding-window")
 STATE = ["x", "y", "z", "vx", "vy", "vz", "wx", "wy", "wz"]
 COLUMNS = ["trajectory", "t", *STATE, *(f"sigma_{name}" for name in STATE)]
-
-
-def status(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        run([str(argument) for argument in arguments])
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
 
 
 @pytest.fixture(scope="module")

@@ -6,17 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.cli.main import run
 from ballfg.dynamics import load_model
 from ballfg.simulation import MeasurementNoise, SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset
-
-
-def status(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        run([str(argument) for argument in arguments])
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
+from tests.commands import status
 
 
 @pytest.fixture(scope="module")

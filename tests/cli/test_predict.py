@@ -10,21 +10,14 @@ import pyarrow.parquet as pq
 import pytest
 import yaml
 
-from ballfg.cli.main import run
 from ballfg.estimation import ConformalScales, load_conformal
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import Dataset, read_dataset
+from tests.commands import status
 
 METHODS = ("smoother", "online", "ekf", "sliding-window")
 COLUMNS = ["trajectory", "t", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z"]
 TEXT = pa_csv.ConvertOptions(column_types={"trajectory": "string"})
-
-
-def status(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        run([str(argument) for argument in arguments])
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
 
 
 @pytest.fixture(scope="module")

@@ -8,17 +8,10 @@ import pyarrow.csv as pa_csv
 import pytest
 import yaml
 
-from ballfg.cli.main import run
 from ballfg.vision.camera_file import read_cameras
+from tests.commands import status
 
 FAST = ("--shots", 1, "--rate", 20, "--size", "160x90")
-
-
-def status(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        run([str(argument) for argument in arguments])
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
 
 
 def test_writes_a_scene_and_says_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

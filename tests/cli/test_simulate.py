@@ -8,15 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.cli.main import run
 from ballfg.tracks import TENNIS, read_dataset
-
-
-def status(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        run([str(argument) for argument in arguments])
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
+from tests.commands import status
 
 
 def test_writes_a_dataset_and_says_where(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -11,23 +11,16 @@ import cv2
 import numpy as np
 import pytest
 
-from ballfg.cli.main import run
 from ballfg.simulation.cameras import table_rig
 from ballfg.simulation.scene import SceneConfig, record, write_scene
 from ballfg.tracks import read_dataset
 from ballfg.vision import Camera
 from ballfg.vision.camera_file import read_cameras, write_cameras
+from tests.commands import status
 
 RATE = 100.0
 SIZE = (320, 180)
 SPAN = 0.5  # s
-
-
-def status(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        run([str(argument) for argument in arguments])
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
 
 
 def camera(name: str, turn: float) -> Camera:

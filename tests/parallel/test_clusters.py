@@ -11,24 +11,17 @@ from typing import Any
 
 import pytest
 
-from ballfg.cli.main import run
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Estimate, Estimator, dataset_settings, dataset_surfaces, make_estimator, predict_tracks
 from ballfg.estimation.batch import do_all, estimate_tracks
 from ballfg.parallel import on_cluster
 from ballfg.parallel.same_versions import HERE, differences, own_versions
 from ballfg.tracks import Dataset, read_dataset
+from tests.commands import status
 from tests.parallel.conftest import TRACKS
 
 needs_dask = pytest.mark.skipif(not find_spec("distributed"), reason="dask is not installed (pip install ballfg[dask])")
 needs_ray = pytest.mark.skipif(not find_spec("ray"), reason="ray is not installed (pip install ballfg[ray])")
-
-
-def status(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        run([str(argument) for argument in arguments])
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
 
 
 @pytest.fixture(scope="module")

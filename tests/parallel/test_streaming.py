@@ -7,15 +7,8 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 
-from ballfg.cli.main import run
 from ballfg.tracks import Dataset, Track, read_dataset, write_dataset
-
-
-def status(*arguments: object) -> int:
-    with pytest.raises(SystemExit) as exit_:
-        run([str(argument) for argument in arguments])
-    assert isinstance(exit_.value.code, int)
-    return exit_.value.code
+from tests.commands import status
 
 
 @pytest.fixture(scope="module")
