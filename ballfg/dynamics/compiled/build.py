@@ -25,7 +25,7 @@ import math
 
 import numpy as np
 from numba import njit, types
-
+{imports}
 ONE, TWO = types.Array(types.float64, 1, "C"), types.Array(types.float64, 2, "C")
 
 
@@ -74,7 +74,11 @@ def _type_of(code: Code, _context: Any) -> Any:
 
 def built(source: str) -> Code:
     """The compiled `compute` of some source."""
-    return _built(HEADER + source)
+    imports = ""
+    if "add_product(" in source:  # the hash of its file: code that was compiled with another one is not found
+        file = Path(__file__).with_name("product.py")
+        imports = f"from ballfg.dynamics.compiled.product import add_product  # {digest(file)}\n"
+    return _built(HEADER.format(imports=imports) + source)
 
 
 @cache
@@ -84,6 +88,12 @@ def _built(text: str) -> Code:
     if not path.exists():
         _write(path, text)
     return Code(_imported(name, path).compute)
+
+
+@cache
+def digest(file: Path) -> str:
+    """Hash of a file's content."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()[:12]
 
 
 def write_note(about: str, note: Mapping[str, Any]) -> None:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import hashlib
 import sys
 import warnings
 import weakref
 from collections.abc import Callable, Hashable
 from dataclasses import asdict, dataclass
-from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
@@ -17,7 +15,7 @@ import torch
 from torch import Tensor, nn
 
 from ballfg.arrays import Array
-from ballfg.dynamics.compiled.build import built, read_note, write_note
+from ballfg.dynamics.compiled.build import built, digest, read_note, write_note
 from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.compiled.translation.recipe import Recipe
 from ballfg.dynamics.model import BallModel, is_substituted, substitute
@@ -206,13 +204,8 @@ def _files_of(model: BallModel) -> str | None:
         file = getattr(sys.modules.get(type(part).__module__), "__file__", None)
         if file is None:
             return None
-        found.add(_digest(file))
+        found.add(digest(Path(file)))
     return ",".join(sorted(found))
-
-
-@cache
-def _digest(file: str) -> str:
-    return hashlib.sha256(Path(file).read_bytes()).hexdigest()[:12]
 
 
 def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -> tuple[str, Function]:

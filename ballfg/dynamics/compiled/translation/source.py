@@ -92,7 +92,7 @@ class _Writer:
                 if (source, by) not in self.moved:
                     self.moved.add((source, by))
                     lines += loops.moved(arrays, source, by, kind, self._slope)
-            return [*lines, f"{name} = {kind}{block}[{which}, {place}]"]
+            return [*lines, f"{name} = {kind}{block}[{which * arrays.sizes[block] + place}]"]
         return [f"{name} = {expression(self.traced.program, number, self.names, self.inputs)}"]
 
     def _slope(self, number: Number, by: Number) -> str:
