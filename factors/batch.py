@@ -2,7 +2,7 @@
 
 GTSAM asks one factor at a time; torch is quick only on batches. So factors of one sort are one object here. It computes
 whitened residuals and Jacobians of any of its rows in one call. The solver of this package takes those arrays
-as they are (`ballfg.factors.linear`); GTSAM's own solvers see one CustomFactor per row (`ballfg.factors.bridge`).
+as they are (`ballfg.factors.linear.step`); GTSAM's own solvers see one CustomFactor per row (`ballfg.factors.bridge`).
 
 What is learned through an estimate needs the same residuals once more, as a torch function of everything that can be
 learned: the values, the model's parameters, the noise.

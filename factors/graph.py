@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 
 from ballfg.factors.batch import FactorBatch, Rows, Values
-from ballfg.factors.linear import Step, solve
+from ballfg.factors.linear.step import Step, solve
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ EXACT: Final = 1e-12
 def time_gradients(watch: Stopwatch, model: LearnedModel, graph: BallGraph, start: Values) -> None:
     """Forward: from the first guess to the minimum. Backward: from a derivative by all states to one by all weights.
 
-    Building the torch objective and reading GTSAM's factorisation belong to the backward pass.
+    Building the torch objective belongs to the backward pass.
     """
     minimum, kind = TRAINING.minimize(graph, start), model.architecture.kind
     forward = watch.time(kind, "forward_time", lambda: TRAINING.minimize(graph, start))
@@ -52,7 +52,7 @@ def backward(
     assert minimum.step is not None
     objective = BatchObjective([graph], [minimum.values])
     layout, weights = objective.layout, [p for p in model.parameters() if p.requires_grad]
-    factors = GaussNewtonFactors([minimum.step.bayes_net], layout.lengths, layout.coefficients)
+    factors = GaussNewtonFactors([minimum.step.root])
     point = method(
         lambda: layout.pack([minimum.values]),
         lambda at: objective.gradient(at, Noise()),

@@ -32,8 +32,8 @@ from ballfg.estimation.smoother.initial import initial_states
 from ballfg.estimation.smoother.problem import Events
 from ballfg.factors.batch import Values
 from ballfg.factors.bridge import nonlinear_graph, to_gtsam
-from ballfg.factors.covariance import marginal_covariances
 from ballfg.factors.graph import BallGraph
+from ballfg.factors.linear.covariance import marginal_covariances
 from ballfg.learning.end_to_end.pretrain import pretrain
 from ballfg.prediction import Belief, Propagator
 from ballfg.progress import progress
@@ -171,9 +171,8 @@ def _time_minimisation(watch: Stopwatch, name: str, smoother: Smoother, graph: B
     minimum = optimizer.minimize(graph, values)
     step = minimum.step
     assert step is not None
-    n, p = values.states.shape[0], len(values.coefficients)
     watch.time(name, "lm_time", lambda: optimizer.minimize(graph, values))
-    watch.time(name, "covariances_time", lambda: marginal_covariances(step.bayes_net, n, p))
+    watch.time(name, "covariances_time", lambda: marginal_covariances(step.root))
     watch.add(name, "lm_iterations", minimum.iterations)
 
 

@@ -147,8 +147,8 @@ class EndToEnd(Trainee):
         graphs, minima = [s.solution.graph for s in solved], [s.solution.minimum.values for s in solved]
         objective = BatchObjective(graphs, minima)
         layout, leaves = objective.layout, self.learnables.leaves()
-        nets = [s.solution.minimum.step.bayes_net for s in solved if s.solution.minimum.step is not None]
-        factors = GaussNewtonFactors(nets, layout.lengths, layout.coefficients)
+        roots = [s.solution.minimum.step.root for s in solved if s.solution.minimum.step is not None]
+        factors = GaussNewtonFactors(roots)
         point = self.method(
             lambda: layout.pack(minima),
             lambda at: objective.gradient(at, self.learnables.noise.noise()),

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.arrays import Array
-from ballfg.factors.covariance import SquareRootInformation
+from ballfg.factors.linear.covariance import SquareRootInformation
+from ballfg.factors.linear.elimination import substitute_back, substitute_forward
 
 Product = Callable[[Tensor], Tensor]
 
@@ -36,36 +36,14 @@ class GaussNewtonFactors(SquareRootInformation):
 
     def solve(self, vector: Tensor) -> Tensor:
         """R^-1 R^-T times a vector (n,) in the order of `Layout`: the solution (n,), in SI units."""
-        given = vector.detach().numpy()
-        split = self.lengths.sum() * self.width
-        inside = np.arange(self.inverse.shape[1]) < self.lengths[:, None]
-        states = np.zeros((*inside.shape, self.width))
-        states[inside] = given[:split].reshape(-1, self.width)
-        shared = given[split:].reshape(self.tracks, self.coefficients).copy()
-        self._solve_transposed(states, shared)
-        self._solve(states, shared)
-        return torch.from_numpy(np.concatenate((states[inside].reshape(-1), shared.reshape(-1))))
-
-    def _solve_transposed(self, states: Array, shared: Array) -> None:
-        """R^T y = b in place: forwards along the tracks, then the coefficients."""
-        carried = np.zeros((self.tracks, self.width, 1))
-        for i in range(states.shape[1]):
-            carried = self.inverse[:, i].mT @ (states[:, i, :, None] - carried)
-            states[:, i] = carried[..., 0]
-            carried = self.following[:, i].mT @ carried
-        if self.coefficients:
-            shared -= np.einsum("tnip,tni->tp", self.shared, states)
-            shared[:] = (self.last.mT @ shared[..., None])[..., 0]
-
-    def _solve(self, states: Array, shared: Array) -> None:
-        """R x = y in place: the coefficients, then backwards along the tracks."""
-        if self.coefficients:
-            shared[:] = (self.last @ shared[..., None])[..., 0]
-            states -= np.einsum("tnip,tp->tni", self.shared, shared)
-        later = np.zeros((self.tracks, self.width, 1))
-        for i in range(states.shape[1] - 1, -1, -1):
-            later = self.inverse[:, i] @ (states[:, i, :, None] - self.following[:, i] @ later)
-            states[:, i] = later[..., 0]
+        solution = np.array(vector.detach().numpy())
+        split, ends = self.lengths.sum() * self.width, np.cumsum(self.lengths) * self.width
+        shared = solution[split:].reshape(self.tracks, self.coefficients)
+        for k, (root, end) in enumerate(zip(self.roots, ends, strict=True)):
+            states = solution[end - self.lengths[k] * self.width : end].reshape(-1, self.width)
+            substitute_forward(root.states, root.coefficients, states, shared[k])
+            substitute_back(root.states, root.coefficients, states, shared[k])
+        return torch.from_numpy(solution)
 
 
 @dataclass

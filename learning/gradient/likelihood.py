@@ -16,9 +16,9 @@ from torch import Tensor
 
 from ballfg.arrays import Array
 from ballfg.factors.batch import FactorBatch, Noise, Rows, Values
-from ballfg.factors.covariance import NeighbourCovariances
 from ballfg.factors.graph import BallGraph
-from ballfg.factors.linear import weighted
+from ballfg.factors.linear.covariance import NeighbourCovariances
+from ballfg.factors.linear.step import weighted
 from ballfg.factors.lockstep import linearize_together
 from ballfg.learning.gradient.conjugate_gradients import GaussNewtonFactors
 

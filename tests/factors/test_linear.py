@@ -6,11 +6,11 @@ import gtsam
 import numpy as np
 import pytest
 
-from ballfg.factors.batch import COEFFICIENTS, Values
-from ballfg.factors.covariance import marginal_covariances
+from ballfg.factors.batch import COEFFICIENTS, Rows, Values
 from ballfg.factors.dynamics import ContactFactors, FlightFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt
-from ballfg.factors.linear import solve, weighted
+from ballfg.factors.linear.covariance import marginal_covariances
+from ballfg.factors.linear.step import solve, weighted
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.factors.position import PositionFactors
@@ -113,7 +113,7 @@ def test_covariances_are_the_dense_inverse(problem) -> None:
     linearized = graph.linearize(values)
     step = solve(linearized, values)
     n, p = len(values.states), len(values.coefficients)
-    given = marginal_covariances(step.bayes_net, n, p)
+    given = marginal_covariances(step.root)
     _, J = dense(linearized, values)
     scale = np.linalg.norm(J, axis=0)
     inverse = np.linalg.inv(np.linalg.qr(J / scale, mode="r"))
@@ -141,7 +141,7 @@ def test_covariances_where_cholesky_fails(model, spin_density) -> None:
     graph, values = track(model, np.zeros(0), noise=ProcessNoise(spin=spin_density))
     linearized = graph.linearize(values)
     step = solve(linearized, values)
-    given = marginal_covariances(step.bayes_net, N, 0)
+    given = marginal_covariances(step.root)
     r, J = dense(linearized, values)
     chain = np.kron(np.tril(np.ones((N, N))), np.eye(9))
     changed = J @ chain
@@ -160,17 +160,53 @@ def test_covariances_where_cholesky_fails(model, spin_density) -> None:
 def test_gtsam_s_cholesky_does_fail_there(model) -> None:
     """The reason for QR: should this pass one day, QR may go."""
     graph, values = track(model, np.zeros(0), noise=ProcessNoise(spin=1e-5))
+    with pytest.raises(RuntimeError, match="Indetermin"):
+        in_gtsam(graph.linearize(values), N).eliminateMultifrontal()  # prefers Cholesky
+
+
+def test_the_elimination_is_gtsam_s(problem) -> None:
+    """The same rows through GTSAM's QR: the same triangle but for the signs of its rows, and the same solution."""
+    graph, values = problem
+    linearized = graph.linearize(values)
+    step = solve(linearized, values)
+    n, p = len(values.states), len(values.coefficients)
+    ordering = gtsam.Ordering()
+    for key in range(n + (p > 0)):
+        ordering.push_back(key)
+    net = in_gtsam(linearized, n).eliminateSequential(ordering, gtsam.EliminateQR)
+    solution = net.optimize()
+    for i in range(n):
+        np.testing.assert_allclose(step.states[i], solution.at(i), rtol=1e-6, atol=1e-9)
+        theirs, own = net.at(i).R(), step.root.states[i]
+        signs = np.sign(np.diag(theirs)) * np.sign(np.diag(own[:, :9]))
+        blocks = [theirs, *np.split(net.at(i).S(), [9] if i + 1 < n and net.at(i).S().shape[1] > p else [0], axis=1)]
+        if not blocks[1].shape[1]:
+            blocks[1] = np.zeros((9, 9))
+        given = np.concatenate((*blocks, net.at(i).d()[:, None]), axis=1)
+        size = np.abs(given).max(axis=1, keepdims=True)
+        np.testing.assert_allclose(signs[:, None] * own / size, given / size, atol=1e-8)
+    if p:
+        np.testing.assert_allclose(step.coefficients, solution.at(n), rtol=1e-6)
+
+
+def in_gtsam(linearized, n: int) -> gtsam.GaussianFactorGraph:
     gaussian = gtsam.GaussianFactorGraph()
-    for rows in graph.linearize(values):
+    for rows in linearized:
         residual, jacobians = weighted(rows)
         for i, variables in enumerate(rows.variables.tolist()):
-            terms = [(v, block[i]) for v, block in zip(variables, jacobians, strict=True)]
-            flat = [x for term in terms for x in term]
-            gaussian.push_back(
-                gtsam.JacobianFactor(*flat, -residual[i], gtsam.noiseModel.Unit.Create(len(residual[i])))
-            )
-    with pytest.raises(RuntimeError, match="Indetermin"):
-        gaussian.eliminateMultifrontal()  # prefers Cholesky
+            terms = [(n if v == COEFFICIENTS else v, b[i]) for v, b in zip(variables, jacobians, strict=True)]
+            unit = gtsam.noiseModel.Unit.Create(len(residual[i]))
+            gaussian.push_back(gtsam.JacobianFactor(*(x for term in terms for x in term), -residual[i], unit))
+    return gaussian
+
+
+def test_a_factor_between_states_apart_is_refused(model) -> None:
+    graph, values = track(model, np.zeros(0))
+    far = graph.linearize(values)
+    variables = far[1].variables.copy()
+    variables[1, 1] += 1
+    with pytest.raises(ValueError, match=r"one looks at the states \[1, 3\]\. Give it"):
+        solve([far[0], Rows(variables, far[1].residual, far[1].jacobians, far[1].loss)], values)
 
 
 def test_a_state_that_nothing_ties_down_is_a_status(model) -> None:

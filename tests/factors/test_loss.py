@@ -8,7 +8,7 @@ import pytest
 
 from ballfg.factors.batch import Rows, Values
 from ballfg.factors.graph import objective
-from ballfg.factors.linear import weighted
+from ballfg.factors.linear.step import weighted
 from ballfg.factors.loss import LEAST_STRETCH, Loss
 from ballfg.factors.position import PositionFactors
 

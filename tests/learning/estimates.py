@@ -147,9 +147,7 @@ def objective_of(found: Sequence[Solution]) -> BatchObjective:
 
 
 def factors_of(found: Sequence[Solution]) -> GaussNewtonFactors:
-    minima = [s.minimum for s in found]
-    lengths = [len(minimum.values.states) for minimum in minima]
-    return GaussNewtonFactors([m.step.bayes_net for m in minima], lengths, len(minima[0].values.coefficients))
+    return GaussNewtonFactors([s.minimum.step.root for s in found])
 
 
 def launcher() -> Launcher:

@@ -9,6 +9,7 @@ TWO: Final[Any] = types.Array(types.float64, 2, "C")
 THREE: Final[Any] = types.Array(types.float64, 3, "C")
 FOUR: Final[Any] = types.Array(types.float64, 4, "C")
 COUNTS: Final[Any] = types.Array(types.int64, 1, "C")
+INDEX: Final[Any] = types.Array(types.int64, 2, "C")
 REAL: Final[Any] = types.float64
 COUNT: Final[Any] = types.int64
 FLAG: Final[Any] = types.boolean

@@ -6,8 +6,8 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.factors.batch import FactorBatch, Rows
-from ballfg.factors.covariance import Covariances
-from ballfg.factors.linear import weighted
+from ballfg.factors.linear.covariance import Covariances
+from ballfg.factors.linear.step import weighted
 from ballfg.state import POSITION, STATE_DIM
 
 LEAST_INFORMATION = 1e-6

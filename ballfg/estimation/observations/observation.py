@@ -20,7 +20,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.estimation.observations.innovation import leave_one_out
 from ballfg.estimation.settings import Settings
 from ballfg.factors.batch import FactorBatch, Rows, Values
-from ballfg.factors.covariance import Covariances
+from ballfg.factors.linear.covariance import Covariances
 from ballfg.tracks import Track
 
 if TYPE_CHECKING:

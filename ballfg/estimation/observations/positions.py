@@ -12,7 +12,7 @@ from ballfg.estimation.observations.innovation import leave_one_out, leave_posit
 from ballfg.estimation.observations.observation import Context, Observation
 from ballfg.estimation.settings import stamp_covariance
 from ballfg.factors.batch import Rows, Values
-from ballfg.factors.covariance import Covariances
+from ballfg.factors.linear.covariance import Covariances
 from ballfg.factors.position import PositionFactors
 from ballfg.factors.tracker import BiasedPositionFactors
 from ballfg.state import STATE_DIM

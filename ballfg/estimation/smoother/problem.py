@@ -23,10 +23,10 @@ from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, tota
 from ballfg.estimation.smoother.initial import bridged_positions
 from ballfg.estimation.smoother.motion import motions_of
 from ballfg.factors.batch import FactorBatch, Values
-from ballfg.factors.covariance import Covariances
 from ballfg.factors.dynamics import ContactFactors, FlightFactors, RestFactors, model_width
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.launcher import LauncherSpinFactors
+from ballfg.factors.linear.covariance import Covariances
 from ballfg.factors.noise import Kicks
 from ballfg.factors.prior import (
     CoefficientPriorFactors,

@@ -27,9 +27,9 @@ from ballfg.estimation.smoother.solution import (
     timed_contacts,
 )
 from ballfg.factors.batch import FactorBatch, Values
-from ballfg.factors.covariance import Covariances, marginal_covariances
 from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum, Search, run
+from ballfg.factors.linear.covariance import Covariances, marginal_covariances
 from ballfg.factors.prior import PriorFactors
 from ballfg.factors.tracker import BiasStartFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
@@ -210,7 +210,7 @@ class Smoother(Estimator):
             known = None
             covariances = _prior_covariances(problem)
         else:
-            known = covariances = marginal_covariances(minimum.step.bayes_net, n, p)
+            known = covariances = marginal_covariances(minimum.step.root)
         own, rest = slice(0, problem.width), slice(problem.width, p)
         own_covariances = covariances.states[:, :STATE_DIM, :STATE_DIM]
         others = other_sides(track.times, values.states, own_covariances, contacts, self.model, self.surfaces)

@@ -120,8 +120,11 @@ def brute_force(model, surfaces: Surfaces, settings: Settings, track: Track, sam
 
 
 def _position_covariance(step, k: int) -> np.ndarray:
-    """From the dense inverse of R of the whole net."""
-    R, _ = step.bayes_net.matrix()
+    """From the dense inverse of the whole R."""
+    n = len(step.root.states)
+    R = np.zeros((9 * n, 9 * n))
+    for i, rows in enumerate(step.root.states):
+        R[9 * i : 9 * i + 9, 9 * i : 9 * i + 18] = rows[:, : min(18, 9 * (n - i))]
     inverse = np.linalg.inv(R)
     return (inverse @ inverse.T)[9 * k : 9 * k + 3, 9 * k : 9 * k + 3]
 

@@ -23,7 +23,7 @@ from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation.launcher import Launcher
 from ballfg.factors.batch import Noise, Values
 from ballfg.factors.graph import BallGraph
-from ballfg.factors.linear import solve as solve_linear
+from ballfg.factors.linear.step import solve as solve_linear
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import Kicks, whitening_tensor
 from ballfg.factors.position import PositionFactors
@@ -353,8 +353,8 @@ def between(spread: float) -> tuple[BallGraph, Values]:
 def backward(spreads: Sequence[float], max_iterations: int = 50) -> None:
     problems = [between(spread) for spread in spreads]
     objective = BatchObjective([g for g, _ in problems], [v for _, v in problems])
-    nets = [solve_linear(graph.linearize(values), values).bayes_net for graph, values in problems]
-    factors = GaussNewtonFactors(nets, objective.layout.lengths, 0)
+    roots = [solve_linear(graph.linearize(values), values).root for graph, values in problems]
+    factors = GaussNewtonFactors(roots)
     solver = ConjugateGradients(factors, objective.layout.owners(), 1e-12, max_iterations)
     scale = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
     point = ImplicitGradient()(

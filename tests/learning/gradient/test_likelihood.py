@@ -13,7 +13,7 @@ from torch import Tensor
 from ballfg.dynamics import Surfaces
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.segmentation import Segmentation
-from ballfg.factors.covariance import marginal_covariances
+from ballfg.factors.linear.covariance import marginal_covariances
 from ballfg.factors.loss import Loss
 from ballfg.learning.end_to_end.learnables import NoiseScales
 from ballfg.learning.gradient.likelihood import negative_log_likelihood
@@ -209,7 +209,7 @@ def test_posterior_covariances_are_the_smoother_s(coefficients) -> None:
     posterior = factors_of(found).covariances()
     for k, one in enumerate(found):
         n, p = len(one.minimum.values.states), int(coefficients)
-        expected = marginal_covariances(one.minimum.step.bayes_net, n, p)
+        expected = marginal_covariances(one.minimum.step.root)
         np.testing.assert_allclose(posterior.states[k, :n], expected.states, rtol=1e-9, atol=1e-12)
         np.testing.assert_allclose(posterior.coefficients[k], expected.coefficients, rtol=1e-9)
         size = 9 * n + p

@@ -1,0 +1,125 @@
+"""The linear subproblem: the step that minimises the linearised objective, by QR, state by state along the track."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ballfg.arrays import Array, Index
+from ballfg.factors.batch import Rows, Values
+from ballfg.factors.linear import elimination
+
+Piece = tuple[Index, Array, tuple[Array, ...]]
+"""Variables (m, a), weighted residuals (m, r) and weighted Jacobians of some factors."""
+
+
+@dataclass(frozen=True)
+class Root:
+    """The triangle R of one track, R^T R = J^T J, and the right side y of R d = y.
+
+    Attributes:
+        states: (n, w, 2 w + p + 1), of each state: its own triangle, the block that couples it to the next state, that
+            to the coefficients, y. Each per unit of its variable.
+        coefficients: (p, 2 w + p + 1), the same of the coefficients; the first 2 w columns are empty.
+    """
+
+    states: Array
+    coefficients: Array
+
+    @property
+    def width(self) -> int:
+        """Numbers w of a state, biases among them."""
+        return self.states.shape[1]
+
+
+@dataclass(frozen=True)
+class Step:
+    """A solution of the linear subproblem.
+
+    Attributes:
+        states: (n, 9 + b) m, m/s, rad/s, and m of biases: part of the step d that minimises |r + J d|^2 (+ damping).
+        coefficients: (p,) in their own units, the other part of it.
+        root: the triangle that the elimination leaves.
+        decrease: half of |r|^2 - |r + J d|^2, by which the linear model promises to reduce the objective.
+    """
+
+    states: Array
+    coefficients: Array
+    root: Root
+    decrease: float
+
+
+def weighted(rows: Rows) -> tuple[Array, tuple[Array, ...]]:
+    """Residuals and Jacobians such that J^T r is the gradient of the losses and J^T J close to their Hessian.
+
+    The weight w = rho'/d scales both; along the residual the Jacobian shrinks further, by the root of the loss's
+    `stretch`, and the residual grows by as much (Triggs et al., "Bundle adjustment - a modern synthesis", 2000, 4.3).
+    """
+    if rows.loss.name == "squared":
+        return rows.residual, rows.jacobians
+    norm = np.linalg.norm(rows.residual, axis=-1)
+    root, along = np.sqrt(rows.loss.weight(norm)), np.sqrt(rows.loss.stretch(norm))
+    unit = rows.residual / np.maximum(norm, np.finfo(float).tiny)[:, None]
+    radial = ((1.0 - along)[:, None] * unit)[..., None] * unit[:, None, :]
+    turn = root[:, None, None] * (np.eye(unit.shape[-1]) - radial)
+    return rows.residual * (root / along)[:, None], tuple(turn @ j for j in rows.jacobians)
+
+
+def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> Step | None:
+    """Minimise the linearised, reweighted objective.
+
+    Args:
+        linearized: all batches of a graph at `values`.
+        values: the point; its shapes give the variables.
+        damping: Marquardt's lambda, relative to the diagonal of J^T J.
+    Returns: None where the system is singular or its solution is not finite.
+    Raises: ValueError: if a factor links states that are not neighbours.
+    """
+    n, p, w = len(values.states), len(values.coefficients), values.width
+    pieces = [(rows.variables, *weighted(rows)) for rows in linearized]
+    system, start, free = _system(pieces, n, p, w, further=damping > 0.0)
+    diagonal = np.zeros((n + 1, w + p))
+    if damping:
+        elimination.damp(system, start, free, w, damping, diagonal)
+    root = Root(np.zeros((n, w, system.shape[1])), np.zeros((p, system.shape[1])))
+    elimination.eliminate(system, start, w, root.states, root.coefficients)
+    states, coefficients = root.states[..., -1].copy(), root.coefficients[:, -1].copy()
+    promised = float((states**2).sum() + (coefficients**2).sum())  # |J d|^2, and what the damping rows add to it
+    elimination.substitute_back(root.states, root.coefficients, states, coefficients)
+    if not (np.isfinite(states).all() and np.isfinite(coefficients).all()):
+        return None
+    if damping:
+        held = (diagonal[:n, :w] * states**2).sum() + (diagonal[n, :p] * coefficients**2).sum()
+        promised += damping * float(held)
+    return Step(states, coefficients, root, 0.5 * promised)
+
+
+def _system(pieces: Sequence[Piece], n: int, p: int, width: int, *, further: bool) -> tuple[Array, Index, Index]:
+    """All rows, ordered by their first states; where each state's rows begin, and where free ones do.
+
+    Args: further: leave room for a row for each unknown.
+    """
+    counts = np.zeros(n + 1, dtype=np.int64)
+    for variables, residual, _ in pieces:
+        wrong = elimination.count_rows(counts, _plain(variables), residual.shape[1])
+        if wrong >= 0:
+            linked = sorted({int(v) for v in variables[wrong] if v >= 0})
+            raise ValueError(
+                f"a factor must look at one state or at two neighbours; one looks at the states {linked}. Give it the "
+                "state before its last, or a coefficient, in place of those further away."
+            )
+    if further:
+        counts += np.append(np.full(n, width), p)
+    start = np.concatenate(([0], np.cumsum(counts)))
+    free, system = start[:-1].copy(), np.zeros((start[-1], 2 * width + p + 1))
+    for variables, residual, jacobians in pieces:
+        rows, firsts = np.empty(len(variables), dtype=np.int64), np.empty(len(variables), dtype=np.int64)
+        elimination.place_residuals(system, free, _plain(variables), _plain(residual), rows, firsts)
+        for which, block in enumerate(jacobians):
+            elimination.place_block(system, width, rows, firsts, _plain(variables), which, _plain(block))
+    return system, start, free
+
+
+def _plain(array: Array) -> Array:
+    """An array as machine code takes it: its rows one behind another, and open for writing."""
+    return array if array.flags.c_contiguous and array.flags.writeable else np.array(array, order="C")
