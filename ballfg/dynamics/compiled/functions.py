@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 import weakref
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -65,19 +65,35 @@ class CompiledModel:
 
     def weights(self, model: BallModel) -> tuple[Array, Array, Array]:
         """Those that rates, impact and surface take, from a model's tables as they are now."""
-        tables = list(numbers_of(model).tables().values())
+        tables = numbers_of(model).tables()
         now = tuple((id(table), table._version, table.data_ptr()) for table in tables)
-        if model not in _weights or _weights[model][0] != now:
+        known = _weights.get(model)
+        if known is None or known.stamp != now:
+            plain = [table.detach() for table in tables]
             parts = (self.rates, self.impact, self.surface)
-            rates, impact, surface = (NONE if p.weigh is None else p.weigh(*tables).numpy() for p in parts)
-            _weights[model] = now, (rates, impact, surface)
-        return _weights[model][1]
+            rates, impact, surface = (NONE if p.weigh is None else p.weigh(*plain).numpy() for p in parts)
+            known = _weights[model] = Weights(now, tables, (rates, impact, surface))
+        return known.of_parts
+
+
+@dataclass(frozen=True)
+class Weights:
+    """Weights that were made from a model's tables.
+
+    Attributes:
+        stamp: of the tables, which changes when they do.
+        tables: kept, so that no others can have their place in memory, and with it their stamp.
+        of_parts: of rates, impact and surface, (k,) each.
+    """
+
+    stamp: Hashable
+    tables: Sequence[Tensor]
+    of_parts: tuple[Array, Array, Array]
 
 
 NONE: Final = np.zeros(0)
 """The weights of a function without tables."""
-_weights: weakref.WeakKeyDictionary[BallModel, tuple[Hashable, tuple[Array, Array, Array]]]
-_weights = weakref.WeakKeyDictionary()
+_weights: weakref.WeakKeyDictionary[BallModel, Weights] = weakref.WeakKeyDictionary()
 _OF_TORCH: Final = frozenset(vars(nn.Module()))
 """What every module has; its parameters, buffers and parts are looked at by themselves."""
 _BESIDE: Final = frozenset({"trained", "noise", "variations", "measurement"})
@@ -214,17 +230,17 @@ def _traced(model: BallModel, function: Callable[[BallModel, Tensor], Tensor]) -
     from ballfg.dynamics.compiled.translation.trace import trace  # torch's tracer takes a second to import
 
     scalars = [name for name, parameter in model.named_parameters() if parameter.dim() == 0]
-    tables = numbers_of(model).tables()
+    arrays, tables = list(numbers_of(model).arrays), [table.detach() for table in numbers_of(model).tables()]
 
     def of_vectors(state: Tensor, coefficients: Tensor, *given: Tensor) -> Tensor:
         values = {name: coefficients[i] for i, name in enumerate(scalars)}
-        whole = substitute(model, values | dict(zip(tables, given, strict=True)))
+        whole = substitute(model, values | dict(zip(arrays, given, strict=True)))
         for part in whole.modules():
             if isinstance(part, MNN):
                 part.write_out()
         return function(whole, state)
 
-    traced = trace(of_vectors, [STATE_DIM, len(scalars)], list(tables.values()))
+    traced = trace(of_vectors, [STATE_DIM, len(scalars)], tables)
     state, coefficients = traced.inputs
     needed = set(traced.program.needed(traced.outputs))
     used = [(name, number) for name, number in zip(scalars, coefficients, strict=True) if number in needed]
@@ -243,7 +259,7 @@ def _compare(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], 
     if not parameters.keys() >= set(made.names):
         raise NotTheSameError(f"compiled {function.__name__} takes coefficients that the model does not have")
     own = np.array([float(parameters[name].detach()) for name in made.names])
-    weights = NONE if made.weigh is None else made.weigh(*numbers_of(model).tables().values()).numpy()
+    weights = NONE if made.weigh is None else made.weigh(*(t.detach() for t in numbers_of(model).tables())).numpy()
     for _ in range(4):
         state = rng.normal(size=STATE_DIM) * np.repeat((1.0, 5.0, 100.0), 3)
         coefficients = own + 0.05 * rng.normal(size=p)

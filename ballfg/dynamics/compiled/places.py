@@ -27,9 +27,9 @@ class Numbers:
         owner, key = self.scalars[name]
         return float(owner[key].item())
 
-    def tables(self) -> dict[str, Tensor]:
-        """The arrays by name, as they are now."""
-        return {name: owner[key].detach() for name, (owner, key) in self.arrays.items()}
+    def tables(self) -> list[Tensor]:
+        """The arrays as they are now."""
+        return [owner[key] for owner, key in self.arrays.values()]
 
 
 _numbers: weakref.WeakKeyDictionary[BallModel, Numbers] = weakref.WeakKeyDictionary()

@@ -7,7 +7,8 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.segmentation.bank import FLYING, Bank, concatenate
 from ballfg.estimation.segmentation.events import Event, EventKind, Node
-from ballfg.estimation.segmentation.evidence import OUTLIER, update
+from ballfg.estimation.segmentation.evidence import update
+from ballfg.estimation.segmentation.kernels import OUTLIER
 from ballfg.estimation.segmentation.motion import lift, put_down
 from ballfg.estimation.segmentation.scene import Scene
 

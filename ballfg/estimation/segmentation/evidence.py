@@ -5,12 +5,17 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.segmentation.bank import Bank, IntArray, concatenate
 from ballfg.estimation.segmentation.events import Event, EventKind
+from ballfg.estimation.segmentation.kernels import (
+    GOOD,
+    NOT_QUIET,
+    OUTLIER,
+    WIDE,
+    kept_rows,
+    quiet_sample,
+    weigh,
+)
 from ballfg.estimation.segmentation.scene import Scene
 from ballfg.estimation.segmentation.settings import SegmentationSettings
-
-GOOD, WIDE, OUTLIER = range(3)
-"""The components of the noise, as in `Scene.log_shares`."""
-
 
 NONE = np.zeros(0, dtype=np.int64)
 """No rows."""
@@ -21,8 +26,6 @@ def update(bank: Bank, position: Array, sigma: Array, scene: Scene, sample: int,
 
     Where the prediction is too vague to tell, the sample is also tried as an outlier: those hypotheses come last.
 
-    Constants that all hypotheses share (3/2 log 2 pi) are left out of the score.
-
     Args:
         bank: predicted hypotheses.
         position: (3,) m.
@@ -32,19 +35,10 @@ def update(bank: Bank, position: Array, sigma: Array, scene: Scene, sample: int,
         time: s, its stamp.
     Returns: the updated hypotheses, and (h,) the squared whitened innovation, as of a good sample.
     """
-    settings = scene.settings
-    innovation = position - bank.mean[:, :, 0]
-    known = bank.cov[:, :, 0, 0]
-    S = np.empty((3, *innovation.shape))
-    noise = settings.stamp_jitter * bank.mean[:, :, 1]
-    noise *= noise
-    noise += sigma * sigma
-    np.add(known, noise, out=S[GOOD])
-    noise *= settings.wide_factor**2
-    np.add(known, noise, out=S[WIDE])
-    np.add(known, settings.outlier_spread**2, out=S[OUTLIER])
-    whitened = innovation * innovation / S
-    evidence = scene.log_shares[:, None] - 0.5 * np.add.reduce(whitened + np.log(S), axis=-1)
+    settings, h = scene.settings, len(bank)
+    innovation, S = np.empty((h, 3)), np.empty((3, h, 3))
+    evidence, surprise = np.empty((3, h)), np.empty(h)
+    weigh(bank.mean, bank.cov, position, sigma, scene.numbers, scene.log_shares, innovation, S, evidence, surprise)
     component, rows, source = evidence.argmax(0), np.arange(len(bank)), bank
     best = evidence[component, rows]
     doubtful = _doubtful(bank.score, evidence[OUTLIER], best, settings)
@@ -70,7 +64,7 @@ def update(bank: Bank, position: Array, sigma: Array, scene: Scene, sample: int,
     for row, kind in enumerate(components):
         if kind != GOOD:
             updated.add_event(row, Event(EventKind.WIDE if kind == WIDE else EventKind.OUTLIER, sample, time))
-    return updated, np.add.reduce(whitened[GOOD], axis=-1)[rows]
+    return updated, surprise[rows]
 
 
 def _doubtful(score: Array, outlier: Array, best: Array, settings: SegmentationSettings) -> IntArray:
@@ -89,22 +83,25 @@ def _doubtful(score: Array, outlier: Array, best: Array, settings: SegmentationS
     return doubtful.nonzero()[0]
 
 
-def prune(bank: Bank, settings: SegmentationSettings) -> Bank:
-    """The hypotheses worth keeping, best first.
-
-    Hypotheses whose last event is old predict the same from now on if they are in the same mode, so the best of them
-    stands for all (the Viterbi step). A tracker that has been shifted for as long is believed.
-    """
-    if len(bank) == 1:
-        if bank.age[0] >= settings.mature:
-            bank.shift[:] = 0.0
-        return bank
-    order = np.argsort(-bank.score, kind="stable")
-    score, surface = bank.score[order], bank.surface[order]
-    keep = score >= score[0] - settings.margin
-    mature = keep & (bank.age[order] >= settings.mature)
-    for mode in set(surface[mature].tolist()):
-        keep[(mature & (surface == mode)).nonzero()[0][1:]] = False
-    kept = bank.take(order[keep][: settings.most])
-    kept.shift[kept.age >= settings.mature] = 0.0
+def prune(bank: Bank, scene: Scene) -> Bank:
+    """The hypotheses worth keeping, best first. A tracker that has been shifted for long is believed."""
+    rows = np.empty(len(bank), dtype=np.int64)
+    kept = bank.take(rows[: kept_rows(bank.score, bank.surface, bank.age, scene.numbers, rows)])
+    kept.shift[kept.age >= scene.settings.mature] = 0.0
     return kept
+
+
+def quiet_update(bank: Bank, position: Array, sigma: Array, dt: float, scene: Scene) -> Bank | None:
+    """The hypotheses after the next sample, pruned, where nothing happens; None where something may.
+
+    Args: bank: hypotheses, best first.  position, sigma: (3,) m.  dt: s, since the last sample.  scene: settings.
+    """
+    h = len(bank)
+    mean, cov, score = np.empty_like(bank.mean), np.empty_like(bank.cov), np.empty(h)
+    age, shift, rows = np.empty(h, dtype=np.int64), np.empty((h, 3)), np.empty(h, dtype=np.int64)
+    now = (bank.mean, bank.cov, bank.surface, bank.score, bank.age, bank.shift)
+    of_scene = (scene.numbers, scene.log_shares, scene.centres, scene.drift)
+    n = quiet_sample(*now, dt, position, sigma, *of_scene, mean, cov, score, age, shift, rows)
+    if n == NOT_QUIET:
+        return None
+    return Bank(mean[:n], cov[:n], bank.surface[:n], score[:n], age[:n], shift[:n], bank.tips[rows[:n]])

@@ -20,6 +20,7 @@ class Scene:
         restitution_sigmas: (s,).
         log_shares: (3,) log prior of good, wide and outlying samples.
         drift: (3, 3, 3) process noise of (p, v, b) per dt, dt^2, dt^3.
+        numbers: (11,) what machine code takes of the ball and the settings, see `kernels`.
     """
 
     physics: SegmentationPhysics
@@ -29,6 +30,7 @@ class Scene:
     restitution_sigmas: Array = field(init=False)
     log_shares: Array = field(init=False)
     drift: Array = field(init=False)
+    numbers: Array = field(init=False)
 
     def __post_init__(self) -> None:
         heights = np.array(self.surfaces.heights())
@@ -44,6 +46,12 @@ class Scene:
         drift[1, 0, 1] = drift[1, 1, 0] = walk / 2.0
         drift[2, 0, 0] = walk / 3.0
         object.__setattr__(self, "drift", drift)
+        physics, s = self.physics, self.settings
+        noise = (s.stamp_jitter, s.wide_factor, s.outlier_spread, s.outlier_doubt)
+        search = (s.surprise, s.contact_window, s.margin, s.mature, s.most)
+        object.__setattr__(
+            self, "numbers", np.array([physics.drag, physics.gravity, *noise, *search], dtype=np.float64)
+        )
 
     def height(self, surface: int) -> float:
         """m, declared height of a surface."""

@@ -12,7 +12,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.segmentation import branches
 from ballfg.estimation.segmentation.bank import FLYING, Bank, concatenate
 from ballfg.estimation.segmentation.events import Event, EventKind, Node, contains, copied, make_final, open_nodes
-from ballfg.estimation.segmentation.evidence import prune, update
+from ballfg.estimation.segmentation.evidence import prune, quiet_update, update
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.scene import Scene
 from ballfg.estimation.segmentation.settings import SegmentationSettings
@@ -83,11 +83,15 @@ class Segmenter:
         """
         point, noise = self._checked(time, position, sigma)
         noise = np.maximum(noise, self._scene.settings.sigma_floor)
-        if self._bank is None:
-            self._bank = branches.starts(None, 0.0, point, noise, self._scene, 0, time)
+        quiet, dt = None, time - self._time
+        if self._bank is not None and dt <= self._scene.settings.longest_step:
+            quiet = quiet_update(self._bank, point, noise, dt, self._scene)
+        if quiet is not None:
+            self._bank = quiet
+        elif self._bank is None:
+            self._bank = prune(branches.starts(None, 0.0, point, noise, self._scene, 0, time), self._scene)
         else:
-            self._bank = self._next(self._bank, point, noise, time)
-        self._bank = prune(self._bank, self._scene.settings)
+            self._bank = prune(self._next(self._bank, point, noise, time), self._scene)
         self._time = time
         self._count += 1
         return self._decide()

@@ -6,13 +6,12 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.estimation.segmentation.bank import FLYING, Bank, concatenate
 from ballfg.estimation.segmentation.events import Event, EventKind
+from ballfg.estimation.segmentation.kernels import SLOWEST_CLOSING
 from ballfg.estimation.segmentation.motion import carry, fly, put_down
 from ballfg.estimation.segmentation.scene import Scene
 
 LEAST_FALL = 0.05
 """m/s. A path that meets a surface more slowly grazes it: no contact."""
-SLOWEST_CLOSING = 0.2
-"""m/s. Bounds the time margin of a slow contact."""
 POSITION_JITTER = 1e-3
 """m, by which the horizontal position is less certain after a contact."""
 KNOWN_SPEED = 1.0
