@@ -13,8 +13,6 @@ from .camera import CameraFactors as CameraFactors
 from .check import BlockError as BlockError
 from .check import check_factor as check_factor
 from .check import jacobian_errors as jacobian_errors
-from .covariance import Covariances as Covariances
-from .covariance import marginal_covariances as marginal_covariances
 from .dynamics import ContactFactors as ContactFactors
 from .dynamics import FlightFactors as FlightFactors
 from .dynamics import RestFactors as RestFactors
@@ -25,8 +23,10 @@ from .graph import Minimum as Minimum
 from .graph import Search as Search
 from .graph import run as run
 from .launcher import LauncherSpinFactors as LauncherSpinFactors
-from .linear import Step as Step
-from .linear import solve as solve
+from .linear.covariance import Covariances as Covariances
+from .linear.covariance import marginal_covariances as marginal_covariances
+from .linear.step import Step as Step
+from .linear.step import solve as solve
 from .lockstep import run_together as run_together
 from .loss import Loss as Loss
 from .noise import Kicks as Kicks

@@ -2,12 +2,16 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
 from ballfg.factors.batch import Rows, Values
 from ballfg.factors.linear import elimination
+
+N = TypeVar("N", bound=np.generic)
 
 Piece = tuple[Index, Array, tuple[Array, ...]]
 """Variables (m, a), weighted residuals (m, r) and weighted Jacobians of some factors."""
@@ -120,6 +124,6 @@ def _system(pieces: Sequence[Piece], n: int, p: int, width: int, *, further: boo
     return system, start, free
 
 
-def _plain(array: Array) -> Array:
+def _plain(array: NDArray[N]) -> NDArray[N]:
     """An array as machine code takes it: its rows one behind another, and open for writing."""
     return array if array.flags.c_contiguous and array.flags.writeable else np.array(array, order="C")
