@@ -5,13 +5,13 @@ from functools import partial
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict
-from scipy.stats import norm
+from scipy.special import ndtri
 
 from ballfg.estimation import Estimator, Status, predict_tracks
 from ballfg.estimation.batch import map_tracks
 from ballfg.tracks import Track
 
-NINETY = float(norm.ppf(0.95))
+NINETY = float(ndtri(0.95))
 """Standard deviations to each side of a central 90 % interval."""
 
 

@@ -7,23 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
-import torch
-from filterpy.kalman import ExtendedKalmanFilter as FilterpyEKF
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.advance_jacobian import Motion, advance_jacobian
+from ballfg.dynamics.motion.advance_jacobian import Motion
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.rts import FilterRecord, fly_back, rts_smooth
 from ballfg.estimation.filters.sliding_window import SlidingWindow, first_pair
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
-from ballfg.estimation.observations.innovation import FilterInnovation
 from ballfg.estimation.observations.observation import Context, refuse_unknowns
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact, Quality
@@ -31,98 +27,21 @@ from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, stam
 from ballfg.estimation.smoother.near_contact import other_sides
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.factors.batch import FactorBatch
-from ballfg.factors.dynamics import model_width
 from ballfg.factors.tracker import bias_step
-from ballfg.state import POSITION, STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
+from ballfg.state import POSITION, STATE_DIM, VELOCITY, Z
 from ballfg.tracks import Ball, Track
 
-GATE_CHANCE = 1e-6
-"""Share of good measurements that are not used."""
-GATE = float(chi2.isf(GATE_CHANCE, 3))
-"""Squared whitened innovation, 30.7, beyond which a sample is not used: one good sample in a million."""
+if TYPE_CHECKING:
+    from ballfg.estimation.filters.ball_filter import BallFilter
+
 REJECTED_FOR_HIT = 4
 """So many samples in a row beyond the gate are no outliers: something hit the ball before the first of them."""
 HIT_POSITION = 1.0
 """m, standard deviation of the position after a hit: it starts anew at the measurement."""
-WIDE_VELOCITY = 1.0
-"""m/s. While the velocity is less well known, a step is linearised at the velocity that its sample suggests."""
 LEAST_USED = 0.5
 """Share of samples that must have passed the gate for the filter to have followed the ball."""
 NEAR_SURFACE = 0.05
 """m. Samples this close to a surface need not lie on one parabola with others: there may be a bounce."""
-
-
-class _BallFilter(FilterpyEKF):
-    """filterpy's filter with the ball's own prediction: x, P, F, Q, R are its attributes, the update is its own.
-
-    The first `width` numbers of x move with the ball: its state and the model's coefficients. The tracker's bias, where
-    it has one, stands behind them.
-
-    Its update uses the Joseph form (I - K H) P (I - K H)^T + K R K^T, positive definite under rounding.
-    """
-
-    def __init__(self, model: BallModel, surfaces: Surfaces, mean: Array, covariance: Array, H: Array) -> None:
-        super().__init__(dim_x=len(mean), dim_z=3)
-        self.model = model
-        self.surfaces = surfaces
-        self.x = mean
-        self.P = covariance
-        self.H = H
-        self.width = STATE_DIM + model_width(model)
-        self.predicted = mean
-
-    def move(self, point: Array, dt: float, decay: float) -> Motion:
-        """Sets F at the linearisation point, and the mean that `predict_x` will put into x."""
-        width = self.width
-        motion = advance_jacobian(self.model, torch.from_numpy(point[:width])[None], dt, self.surfaces)
-        self.F = np.diag(np.full(len(point), decay))
-        self.F[:width, :width] = motion.jacobian.numpy()
-        self.predicted = decay * self.x
-        self.predicted[:width] = motion.after[0].numpy() + self.F[:width, :width] @ (self.x - point)[:width]
-        return motion
-
-    @property
-    def velocity_is_wide(self) -> bool:
-        """Whether the velocity is hardly known."""
-        return bool(np.trace(self.P[VELOCITY, VELOCITY]) >= WIDE_VELOCITY**2)
-
-    def predict_x(self, u: float = 0) -> None:
-        """The mean follows the nonlinear motion, not F x."""
-        self.x = self.predicted
-
-    def linearisation_point(self, measured: Array, dt: float, R: Array) -> Array:
-        """(d,) the mean; while the velocity is wide, the mean given the interval's sample in drag-free flight.
-
-        It is no information, only the place of the tangent: the sample itself still updates the state once.
-        """
-        if not self.velocity_is_wide:
-            return self.x
-        P, H = self.P, self.H.copy()
-        H[:, VELOCITY] = dt * np.eye(3)
-        miss = measured - H @ self.x
-        miss[Z] += 0.5 * STANDARD_GRAVITY * dt**2
-        point = self.x.copy()
-        point[:6] += (P @ H.T @ np.linalg.solve(H @ P @ H.T + R, miss))[:6]
-        return point
-
-    def innovation(self, measured: Array) -> Array:
-        """(3,) whitened: measured minus predicted position over the root of its covariance H P H^T + R."""
-        root = np.linalg.cholesky(self.H @ self.P @ self.H.T + self.R)
-        return np.asarray(np.linalg.solve(root, measured - self.H @ self.x))
-
-    def correct(self, measured: Array) -> None:
-        """The update of filterpy with a measured position."""
-        self.update(measured, lambda _: self.H, lambda x: self.H @ x)
-
-    def correct_by(self, factor: FactorBatch, gated: bool) -> Array:
-        """(dim,) whitened innovation of a factor on the present state; the update of filterpy with its residual.
-
-        The factor's loss gives the noise its weight; with a gate, a measurement beyond it is not used.
-        """
-        found = FilterInnovation.of(factor, self.x, self.P, biases=len(self.x) - self.width)
-        if not gated or found.whitened @ found.whitened <= chi2.isf(GATE_CHANCE, factor.dim):
-            self.update(np.zeros(factor.dim), lambda _: found.H, lambda _: found.residual, R=found.R)
-        return found.whitened
 
 
 class ExtendedKalmanFilter(Estimator):
@@ -295,7 +214,7 @@ class _Run:
             else:
                 k += 1
 
-    def _begin(self) -> _BallFilter:
+    def _begin(self) -> BallFilter:
         """The filter at its first sample, or at the window's end."""
         record, owner = self.record, self.owner
         first, second = self._first_pair(0)
@@ -317,12 +236,14 @@ class _Run:
         record.start = start
         record.quality[:first] = Quality.OUTLIER
         self.skipped.update(range(first + 1, second))
-        ball = _BallFilter(owner.ball, owner.surfaces, mean, covariance, self.H)
+        from ballfg.estimation.filters.ball_filter import BallFilter  # filterpy takes half a second to import
+
+        ball = BallFilter(owner.ball, owner.surfaces, mean, covariance, self.H)
         self._correct_beside(ball, start)
         self._store(ball, start, used=True)
         return ball
 
-    def _hit(self, ball: _BallFilter, since: int) -> None:
+    def _hit(self, ball: BallFilter, since: int) -> None:
         """Back to before sample `since`; the flight begins anew at the first good one from there on."""
         first, second = self._first_pair(since)
         self.skipped.update(range(since, first))
@@ -341,7 +262,7 @@ class _Run:
         sigma = total_sigmas(self.settings, self.sigma, self.velocities)
         return first_pair(self.track.times, self.track.positions, sigma, near, first)
 
-    def _predict(self, ball: _BallFilter, k: int) -> None:
+    def _predict(self, ball: BallFilter, k: int) -> None:
         """To the time of sample k."""
         times, record = self.track.times, self.record
         used = next((i for i in range(k, len(times)) if i not in self.skipped), k)
@@ -374,18 +295,18 @@ class _Run:
         noise[renewed, renewed] = self.fading[1][k - 1] ** 2
         return noise
 
-    def _accept(self, ball: _BallFilter, k: int) -> bool:
+    def _accept(self, ball: BallFilter, k: int) -> bool:
         """Update with sample k unless it lies beyond the gate; the first sample after a hit always counts."""
         measured = self.track.positions[k]
         whitened = self.record.whitened[k] = ball.innovation(measured)
-        used = not self.settings.find_events or k - 1 in self.record.hits or bool(whitened @ whitened <= GATE)
+        used = not self.settings.find_events or k - 1 in self.record.hits or ball.passes(whitened)
         if used:
             ball.correct(measured)
         self._correct_beside(ball, k)
         self._store(ball, k, used)
         return used
 
-    def _correct_beside(self, ball: _BallFilter, k: int) -> None:
+    def _correct_beside(self, ball: BallFilter, k: int) -> None:
         """Update with everything else that was measured at sample k.
 
         At the first sample the velocity is still unknown: a speed, of which no tangent tells anything there, is left
@@ -396,10 +317,10 @@ class _Run:
             for row in observation.filter_rows(k):
                 one = batch.taken(np.array([row]))
                 whitened = ball.correct_by(one, self.settings.find_events or begins)
-                if not begins or whitened @ whitened <= chi2.isf(GATE_CHANCE, batch.dim):
+                if not begins or ball.passes(whitened):
                     self.innovations[observation.name][row] = whitened
 
-    def _store(self, ball: _BallFilter, k: int, used: bool) -> None:
+    def _store(self, ball: BallFilter, k: int, used: bool) -> None:
         self.record.mean[k] = ball.x
         self.record.covariance[k] = ball.P = (ball.P + ball.P.T) / 2
         self.record.quality[k] = Quality.GOOD if used else Quality.OUTLIER

@@ -2,7 +2,7 @@
 
 import numpy as np
 import torch
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
@@ -64,7 +64,7 @@ def other_sides(
 
 def _mixture(margin: float, jump: Array) -> Array:
     """(9, 9) what the other side adds; on the wrong side of its own contact a state has even chances."""
-    p = norm.cdf(max(margin, 0.0))
+    p = float(ndtr(max(margin, 0.0)))
     return np.asarray(p * (1.0 - p) * np.outer(jump, jump))
 
 
