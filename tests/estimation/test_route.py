@@ -18,7 +18,7 @@ def test_seven_functions_in_four_files_lead_to_the_linear_solve() -> None:
     routes: list[list[tuple[str, str]]] = []
 
     def watch(frame: FrameType, event: str, called: object) -> None:
-        if event == "c_call" and getattr(called, "__name__", "") == "eliminateSequential":
+        if event == "call" and (frame.f_code.co_name, Path(frame.f_code.co_filename).name) == ("solve", "step.py"):
             route, at = [], frame
             while at is not None and at.f_code.co_name != "test_seven_functions_in_four_files_lead_to_the_linear_solve":
                 route.append((Path(at.f_code.co_filename).name, at.f_code.co_name))

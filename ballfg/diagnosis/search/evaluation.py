@@ -165,8 +165,9 @@ def got_worse(after: Errors, before: Errors) -> bool:
     if ratio <= 1.0 or (ratio < FEW_WORSE and typical < MOST_BETTER):
         return False
     growth = np.square(after.by_track) - np.square(before.by_track)
-    others = np.delete(np.log(before.by_track / after.by_track), growth.argmax())
-    if growth.sum() < growth.max() and _sure(others) > SIGMAS:  # one ball misses the table's end, others are better
+    others = np.sign(np.delete(before.by_track - after.by_track, growth.argmax()))
+    # one ball misses the table's end, the others are better; by how much a few of them are would weigh too much
+    if growth.sum() < growth.max() and others.sum() > SIGMAS * np.sqrt(len(others)):
         return False
     return ratio > HARDLY or _sure(growth) > SURELY
 

@@ -145,7 +145,7 @@ class Segmenter:
 
 
 def _triple(name: str, value: ArrayLike) -> NDArray[np.float64]:
-    array = np.asarray(value, dtype=np.float64)
+    array = np.ascontiguousarray(value, dtype=np.float64)
     if array.shape != (3,) or not all(map(math.isfinite, array.tolist())):
         raise ValueError(f"{name} must be three finite numbers in m; got {value!r}. Drop samples without a position.")
     return array

@@ -201,6 +201,9 @@ def test_predictions_are_worse_where_chance_does_not_make_them_so():
     one[7] = 10 * before[7]  # misses the end of the table
     assert errors_of(one).prediction_rmse_mm > 1.3 * errors_of(before).prediction_rmse_mm
     assert not got_worse(errors_of(one), errors_of(before))
+    missed = before.copy()
+    missed[3] = 9 * before[3]  # another ball missed it before: its share in the scatter must not hide the others
+    assert not got_worse(errors_of(one), errors_of(missed))
     one[8] = 10 * before[8]
     assert got_worse(errors_of(one), errors_of(before))
 
