@@ -11,7 +11,8 @@ import numpy as np
 
 from ballfg.estimation.online.online import OnlineState
 from ballfg.estimation.result import Status
-from ballfg.prediction import BallState, Belief, Crossing, Propagator, apex, next_contact, plane_crossing
+from ballfg.prediction import BallState, Crossing, apex, next_contact, plane_crossing
+from ballfg.prediction.ahead import carried_by
 from ballfg.state import VELOCITY
 
 VAGUE = 3.0
@@ -74,7 +75,7 @@ def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook
     notes: list[str] = []
     with np.errstate(all="ignore"):
         try:
-            carried = _carried(state)
+            carried = carried_by(state)
         except Exception as error:  # a prediction must not end the stream
             return Outlook(note=f"no prediction: {_one_line(error)}")
         bounce = _tried(lambda: next_contact(*carried, horizon), "bounce", notes)
@@ -84,13 +85,6 @@ def look_out(state: OnlineState, horizon: float, plane: Plane | None) -> Outlook
             across, place = plane.normal, plane.place
             crossing = _tried(lambda: plane_crossing(*carried, across, place, horizon), "crossing", notes)
     return Outlook(bounce, top, crossing, "; ".join(notes))
-
-
-def _carried(state: BallState) -> tuple[Propagator, Belief]:
-    """What `state.predict` starts from, without the path that nobody asks for. Raises: ValueError: no model."""
-    if state.world is None:
-        raise ValueError("the state knows no model")
-    return Propagator(state.world.surfaces, state.world.process), Belief.of(state.world.model, [state])
 
 
 def unusable(state: BallState) -> str:

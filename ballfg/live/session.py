@@ -8,16 +8,12 @@ from dataclasses import dataclass
 from time import perf_counter
 from typing import Protocol
 
-import numpy as np
-
+from ballfg.estimation.online.warm_up import warmed_up
 from ballfg.live.answers import answer, encoded, refusal
 from ballfg.live.latency import Latencies
 from ballfg.live.outlook import Outlook, Plane, look_out
 from ballfg.live.sources.source import Arrival, Inbox
 from ballfg.live.tracker import BallUpdate, Tracker
-
-WARM_SAMPLES = 40
-"""Of the made-up ball that gets everything compiled and loaded before the first real one comes."""
 
 
 class Watcher(Protocol):
@@ -142,18 +138,8 @@ def warm_up(tracker: Tracker, wanted: Wanted) -> None:
 
     The tracker itself is left alone.
     """
-    estimator, gravity = tracker.estimator.copy(), tracker.estimator.physics.gravity
-    rise = tracker.estimator.surfaces.table_height + tracker.estimator.physics.radius
-    t = 0.01 * np.arange(WARM_SAMPLES)
-    height = 0.2 - 0.5 * gravity * t**2
-    contact, speed = np.sqrt(0.4 / gravity), np.sqrt(0.4 * gravity)
-    after = np.maximum(t - contact, 0.0)
-    height = np.where(t < contact, height, 0.9 * speed * after - 0.5 * gravity * after**2)
-    for k in range(WARM_SAMPLES):
-        state = estimator.push(t[k], [3.0 * t[k], 0.0, rise + height[k]])
-        if k in (15, WARM_SAMPLES - 1):
-            update = BallUpdate("state", state.time, 1, state.position, state)
-            encoded(answer(update, look_out(state, wanted.horizon, wanted.plane), ()), 0.0)
-    estimator.copy()
+    for state in warmed_up(tracker.estimator):
+        update = BallUpdate("state", state.time, 1, state.position, state)
+        encoded(answer(update, look_out(state, wanted.horizon, wanted.plane), ()), 0.0)
     gc.collect()
     gc.freeze()  # what lives until the end is not looked through again

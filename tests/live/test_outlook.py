@@ -38,7 +38,7 @@ def test_what_cannot_be_predicted_says_why(state: OnlineState) -> None:
     lost = replace(state, mean=np.full_like(state.mean, np.nan))
     assert "not finite" in look_out(lost, 0.5, None).note
     nowhere = look_out(replace(state, world=None), 0.5, None)
-    assert nowhere.note.startswith("no prediction: ValueError: the state knows no model")
+    assert nowhere.note.startswith("no prediction: ValueError: a state must know its model")
     assert nowhere.bounce is nowhere.apex is nowhere.crossing is None
 
 

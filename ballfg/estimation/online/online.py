@@ -18,6 +18,7 @@ from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unkno
 from ballfg.estimation.online.isam import Sample, Update
 from ballfg.estimation.online.measurement import Measurement
 from ballfg.estimation.online.stream import SightingStream
+from ballfg.estimation.online.warm_up import warmed_up
 from ballfg.estimation.online.window import Window
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import physics_of
@@ -129,6 +130,13 @@ class Online(Estimator):
         other._frozen = None if self._frozen is None else list(self._frozen)
         other._counts = self._counts.copy()
         return other
+
+    def warm_up(self) -> None:
+        """Run on a made-up ball what a stream will ask for, so that its first samples are no slower than later ones.
+
+        Updates through a bounce, predictions and events are compiled or loaded. The stream itself is left alone.
+        """
+        warmed_up(self)
 
     def push(
         self,

@@ -422,3 +422,21 @@ def test_lag_must_leave_something():
 def test_same_motion_at_another_moment_is_the_same():
     assert Motion((0.0,), (0.001,)).same(Motion((0.0,), (0.002,)))
     assert not Motion((0.0,), (0.001,)).same(FLIGHT)
+
+
+def test_a_warm_up_leaves_the_stream_alone() -> None:
+    """Before its first sample, and in the middle of it: the states are those of an estimator that was never warmed."""
+    times = 0.01 * np.arange(30)
+    with torch.no_grad():
+        start = torch.tensor([BOUNCING], dtype=torch.float64)
+        track = rollout(nominal_model(), start, torch.from_numpy(times), TABLE)
+    positions = track[0, :, :3].numpy() + SIGMA * np.random.default_rng(0).standard_normal((30, 3))
+    cold, warm = (Online(nominal_model(), TABLE, Settings(position_noise=(SIGMA,) * 3)) for _ in range(2))
+    warm.warm_up()
+    assert warm.window is None
+    for k, (time, position) in enumerate(zip(times.tolist(), positions, strict=True)):
+        if k == 20:
+            warm.warm_up()
+        expected, given = cold.push(time, position), warm.push(time, position)
+        np.testing.assert_array_equal(given.mean, expected.mean)
+        np.testing.assert_array_equal(given.joint, expected.joint)

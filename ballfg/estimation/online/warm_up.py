@@ -1,0 +1,44 @@
+"""A made-up ball, estimated and predicted through a bounce: the first real one then meets no compiler."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from ballfg.estimation.online.online import Online, OnlineState
+
+SAMPLES = 40
+PERIOD = 0.01
+"""s between them."""
+DROP = 0.2
+"""m, from which the ball falls."""
+LOOKED_AHEAD = (15, SAMPLES - 1)
+"""Samples from which the path is predicted: before the bounce, and after it."""
+HORIZON = 0.5
+"""s, long enough for the next bounce."""
+
+
+def warmed_up(online: Online) -> list[OnlineState]:
+    """Estimate a ball that falls onto the table and bounces, with a copy of an estimator, and predict it in every way.
+
+    Args: online: stays as it is.
+    Returns: its state before the bounce, and the last.
+    """
+    trial, states = online.copy(), []
+    trial.reset()
+    gravity, rise = online.physics.gravity, online.surfaces.table_height + online.physics.radius
+    t = PERIOD * np.arange(SAMPLES)
+    after = np.maximum(t - np.sqrt(2.0 * DROP / gravity), 0.0)
+    falling = DROP - 0.5 * gravity * t**2
+    rising = 0.9 * np.sqrt(2.0 * DROP * gravity) * after - 0.5 * gravity * after**2
+    height = np.where(after > 0.0, rising, falling)
+    for k in range(SAMPLES):
+        state = trial.push(t[k], [3.0 * t[k], 0.0, rise + height[k]])
+        if k in LOOKED_AHEAD:
+            ahead = state.predict(HORIZON)
+            _ = ahead.next_contact, ahead.apex, ahead.crossing(x=2.0)
+            states.append(state)
+    trial.copy()
+    return states
