@@ -9,6 +9,7 @@ import numpy as np
 
 from ballfg.benchmarks.metrics import Figure, median_and_quartiles
 from ballfg.benchmarks.results import Results
+from ballfg.benchmarks.speed.banded import BandedProblem
 
 CONTROL_SIZE = 512
 """Of the square float64 matrices whose product is the control."""
@@ -28,12 +29,14 @@ class Stopwatch:
     Attributes:
         results: gets the rows.  case: of all of them.
         runs: timed ones.  warm_up: runs before them, not counted.
+        banded: the problem that the control solves.
     """
 
     results: Results
     case: str
     runs: int
     warm_up: int
+    banded: BandedProblem
 
     def time(self, method: str, metric: str, action: Callable[[], object]) -> Figure:
         """Median and quartiles of an action's time, ms; adds them as a row."""
@@ -49,6 +52,7 @@ class Stopwatch:
         self.results.add(self.case, method, metric, "1", value, n)
 
     def control(self, method: str) -> None:
-        """Time one fixed matrix product."""
+        """Time one fixed matrix product, and a solver that is bound by Python's own speed."""
         a, b = np.random.default_rng(0).standard_normal((2, CONTROL_SIZE, CONTROL_SIZE))
         self.time(method, "matrix_product_time", lambda: a @ b)
+        self.time(method, "banded_time", self.banded.solve)

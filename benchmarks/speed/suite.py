@@ -12,6 +12,7 @@ import torch
 from ballfg.benchmarks.gaussian_settings import StepNoise, gaussian_settings
 from ballfg.benchmarks.metrics import median_and_quartiles
 from ballfg.benchmarks.results import Results
+from ballfg.benchmarks.speed.banded import BandedProblem
 from ballfg.benchmarks.speed.gradient_cost import time_gradients
 from ballfg.benchmarks.speed.network import FIT_ITERATIONS, fitted_network, parameter_count
 from ballfg.benchmarks.speed.stopwatch import Stopwatch, milliseconds
@@ -81,9 +82,9 @@ QUICK = Size(runs=5, warm_up=2)
 
 def run_speed(results: Results, dataset: Dataset | None, size: Size) -> None:
     """All times; a control before each model and at the end; with a dataset the time for each of some of its tracks."""
-    watch = Stopwatch(results, CASE, size.runs, size.warm_up)
     model = problem_model()
     track = problem_track(model)
+    watch = Stopwatch(results, CASE, size.runs, size.warm_up, banded_problem(track))
     parts = [
         partial(_time_model, watch, "analytic", model, track),
         partial(_time_network, watch, model, track, size.fit_iterations),
@@ -113,6 +114,12 @@ def problem_track(model: BallModel) -> Track:
     measured = truth[:, POSITION] + NOISE * rng.standard_normal((SAMPLES, 3))
     spin = np.add(START[6:], LABEL_OFFSET)
     return Track(times, measured, labels=dict(zip(SPIN_LABELS, map(float, spin), strict=True)), name="speed")
+
+
+def banded_problem(track: Track) -> BandedProblem:
+    """The same flight for the control."""
+    label = np.array([track.labels[name] for name in SPIN_LABELS])
+    return BandedProblem(track.positions, 1.0 / RATE, NOISE, label, LABEL_NOISE, DRAG, MAGNUS)
 
 
 def problem_settings(coefficients: Mapping[str, float] | None = None) -> Settings:

@@ -29,6 +29,7 @@ def test_speed_run_has_every_time() -> None:
     run_speed(results, None, replace(QUICK, fit_iterations=100))
     expected = {
         "matrix_product_time",
+        "banded_time",
         "lm_time",
         "lm_time_gtsam",
         "covariances_time",
@@ -42,5 +43,5 @@ def test_speed_run_has_every_time() -> None:
     for method in ("analytic", "network"):
         found = {row.metric for row in results.rows if row.method == method and row.unit == "ms"}
         assert found == expected
-    assert {row.metric for row in results.rows if row.method == "control"} == {"matrix_product_time"}
+    assert {row.metric for row in results.rows if row.method == "control"} == {"matrix_product_time", "banded_time"}
     assert all(row.value is not None and row.value > 0 for row in results.rows)
