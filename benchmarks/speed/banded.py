@@ -58,10 +58,8 @@ class BandedProblem:
         for count in range(1, MOST_STEPS + 1):
             step, turn = self._step(states, spin)
             states, spin = states + step, spin + turn
-            if (
-                max(np.abs(step / np.abs(states).max(axis=0)).max(), np.abs(turn / np.abs(spin).max()).max())
-                < TOLERANCE
-            ):
+            moved = np.abs(step).max(axis=0) / np.abs(states).max(axis=0)
+            if max(moved.max(), np.abs(turn).max() / np.abs(spin).max()) < TOLERANCE:
                 return states, spin, count
         raise RuntimeError(f"the banded Gauss-Newton did not converge in {MOST_STEPS} steps")
 
