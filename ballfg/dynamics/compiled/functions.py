@@ -65,8 +65,8 @@ class CompiledModel:
 
     def weights(self, model: BallModel) -> tuple[Array, Array, Array]:
         """Those that rates, impact and surface take, from a model's tables as they are now."""
-        tables = numbers_of(model).tables()
-        now = tuple((id(table), table._version, table.data_ptr()) for table in tables)
+        numbers = numbers_of(model)
+        tables, now = numbers.tables(), numbers.stamp()
         known = _weights.get(model)
         if known is None or known.stamp != now:
             plain = [table.detach() for table in tables]

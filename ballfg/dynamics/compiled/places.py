@@ -1,7 +1,7 @@
 """Where a model keeps its numbers, the coefficients and the tables of weights that machine code takes."""
 
 import weakref
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,6 +30,11 @@ class Numbers:
     def tables(self) -> list[Tensor]:
         """The arrays as they are now."""
         return [owner[key] for owner, key in self.arrays.values()]
+
+    def stamp(self) -> Hashable:
+        """Changes when a number does, as long as the `tables` of an earlier stamp are kept alive."""
+        values = tuple(self.value(name) for name in self.scalars)
+        return values, tuple((id(table), table._version, table.data_ptr()) for table in self.tables())
 
 
 _numbers: weakref.WeakKeyDictionary[BallModel, Numbers] = weakref.WeakKeyDictionary()

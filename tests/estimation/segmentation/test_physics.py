@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ballfg.dynamics import BallModel, model_from_dict
+from ballfg.dynamics import Architecture, BallModel, build, model_from_dict
 from ballfg.estimation.segmentation import SegmentationPhysics, physics_of
 
 
@@ -58,3 +58,19 @@ def test_learned_contacts_are_asked_what_they_may_know():
 
     inner = model_from_dict({"flight": {}, "bounce": {"restitution": {"e": 0.9}, "friction": {"mu": 0.2}}})
     assert physics_of(Learned(0.02)).friction == pytest.approx(0.2, rel=1e-9)
+
+
+def test_what_a_model_answered_is_asked_again_when_its_numbers_change():
+    model = model_from_dict({"flight": {"gravity": {}, "drag": {"k": 0.11}}, "bounce": {"restitution": {"e": 0.9}}})
+    assert physics_of(model) is physics_of(model)
+    with torch.no_grad():
+        dict(model.named_parameters())["flight.drag.k"].fill_(0.2)
+    assert physics_of(model).drag == pytest.approx(0.2, rel=1e-9)
+    dict(model.named_parameters())["flight.drag.k"].data.fill_(0.3)  # past the version counter
+    assert physics_of(model).drag == pytest.approx(0.3, rel=1e-9)
+    learned = build(Architecture.of("mlp", width_flight=8, width_contact=8, depth=1), radius=0.02, seed=1)
+    before = physics_of(learned)
+    with torch.no_grad():
+        for parameter in learned.parameters():
+            parameter.add_(0.1)
+    assert physics_of(learned) != before
