@@ -27,6 +27,19 @@ ARITHMETIC: Final = frozenset(
 """Functions of two or more operands, in which a plain operand is slow."""
 
 
+RULES: Final = {
+    function: (kind, swapped)
+    for kind, operator in (("add", "add"), ("sub", "sub"), ("mul", "mul"), ("div", "truediv"))
+    for function, swapped in (
+        (getattr(Tensor, kind), False),
+        (getattr(torch, kind), False),
+        (getattr(Tensor, f"__{operator}__"), False),
+        (getattr(Tensor, f"__r{operator}__"), True),
+    )
+}
+"""Kind of these functions, and whether their operands are swapped."""
+
+
 @contextmanager
 def dual_level() -> Iterator[None]:
     """A level of torch's forward mode, as `torch.autograd.forward_ad.dual_level`, in which plain operands are fast."""
@@ -46,7 +59,7 @@ def make_dual(primal: Tensor, tangent: Tensor) -> Tensor:
 
 
 class _WrittenZeros(TorchFunctionMode):
-    """Gives plain operands a tangent of zeros wherever another operand of the same operation has one."""
+    """Computes with a moving and a plain operand by rules of its own, or gives plain ones a tangent of zeros."""
 
     def __torch_function__(
         self,
@@ -57,9 +70,33 @@ class _WrittenZeros(TorchFunctionMode):
     ) -> Any:
         if func in ARITHMETIC:
             moving = [isinstance(a, Tensor) and forward.unpack_dual(a).tangent is not None for a in args]
+            if sum(moving) == 1 and len(args) == 2 and not kwargs and func in RULES:
+                return _one_moves(*RULES[func], args, moving.index(True))
             if any(moving):
                 args = [a if moves else _still(a) for a, moves in zip(args, moving, strict=True)]
         return func(*args, **(kwargs or {}))
+
+
+def _one_moves(kind: str, swapped: bool, args: Sequence[Any], which: int) -> Tensor:
+    """A sum, difference, product or quotient of two operands of which one moves: half the work, and no zeros."""
+    moving = forward.unpack_dual(args[which])
+    left, right = (moving.primal if k == which else a for k, a in enumerate(args))
+    first = which == 0
+    if swapped:
+        left, right, first = right, left, not first
+    match kind:
+        case "add":
+            value, tangent = left + right, moving.tangent
+        case "sub":
+            value, tangent = left - right, moving.tangent if first else -moving.tangent
+        case "mul":
+            value, tangent = left * right, moving.tangent * (right if first else left)
+        case _:
+            value = left / right
+            tangent = (moving.tangent if first else -value * moving.tangent) / right
+    if tangent.shape != value.shape:
+        tangent = tangent.expand(value.shape).contiguous()
+    return forward.make_dual(value, tangent)
 
 
 def _still(operand: Tensor | float) -> Tensor:
