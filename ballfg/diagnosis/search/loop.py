@@ -20,6 +20,7 @@ from ballfg.diagnosis.search.state import Confirmed, Search, left_out, without_n
 from ballfg.diagnosis.search.trial import try_further, try_hypotheses, try_varying
 from ballfg.diagnosis.search.varying import Grouping, groupings
 from ballfg.dynamics import AnalyticModel, BallModel, Effect
+from ballfg.estimation.batch import do_all
 
 MOST_EFFECTS = 4
 """Effects that are added before the search ends; further ones would be found in what earlier wrong ones left."""
@@ -33,6 +34,10 @@ PLAUSIBLE = 10.0
 stronger than that (air that moves at 20 m/s through a part of the room) stands for something else."""
 POORER = 0.3
 """Share of an effect's gain that is there without the effect too, from which the fit before was in a poor minimum."""
+
+
+Examined = Confirmed | tuple[Outcome, Fit]
+"""A refit with all that confirms it, or why it is no name and its fit then."""
 
 
 @dataclass(frozen=True)
@@ -165,21 +170,33 @@ class SearchLoop:
         better ones are added to `misleading`.
         """
         refused: dict[str, Refusal] = {}
-        for candidate in refits:
-            if candidate.delta_bic >= 0.0:
-                break
-            examined: Confirmed | tuple[Outcome, Fit] = (Outcome.SAME_PATTERN, candidate.fit)
-            if not any(says_the_same(candidate, better) for better in misleading):
-                examined = self._examined(search, candidate, on_before)
-            if isinstance(examined, Confirmed):
-                return examined, refused
-            outcomes[candidate.name], settled = examined
+        waiting, examined = [r for r in refits if r.delta_bic < 0.0], dict[int, Examined]()
+        while waiting:
+            candidate = waiting[0]
+            if any(says_the_same(candidate, better) for better in misleading):
+                examined[id(candidate)] = Outcome.SAME_PATTERN, candidate.fit
+            elif id(candidate) not in examined:
+                examined |= self._examined_together(search, waiting, on_before, misleading)
+            found = examined[id(candidate)]
+            if isinstance(found, Confirmed):
+                return found, refused
+            del waiting[0]
+            outcomes[candidate.name], settled = found
             misleading += [candidate] if outcomes[candidate.name] is Outcome.MISLEADING else []
             if outcomes[candidate.name] in NO_NAME:
                 refused[candidate.name] = self._refusal(candidate.scored.hypothesis, settled, outcomes[candidate.name])
         return None, refused
 
-    def _examined(self, search: Search, candidate: Refit, on_before: Fit) -> Confirmed | tuple[Outcome, Fit]:
+    def _examined_together(
+        self, search: Search, waiting: Sequence[Refit], on_before: Fit, misleading: Sequence[Refit]
+    ) -> dict[int, Examined]:
+        """The next refits examined, by their id, one a process: where the first is refused, the second is wanted."""
+        others = [r for r in waiting if not any(says_the_same(r, better) for better in misleading)][: self.jobs]
+        silent = replace(self, watch=str) if len(others) > 1 else self  # what is told of progress stays here
+        tasks = [partial(silent._examined, search, candidate, on_before) for candidate in others]
+        return dict(zip(map(id, others), do_all(tasks, self.jobs), strict=True))
+
+    def _examined(self, search: Search, candidate: Refit, on_before: Fit) -> Examined:
         """A refit with all that confirms it, or why it is no name and its fit then; cheap questions come first."""
         hypothesis = candidate.scored.hypothesis
         evidence = held_out_gain(search.fit, candidate.fit, self.holdout.held_out, on_before)
