@@ -192,7 +192,7 @@ class SearchLoop:
     ) -> dict[int, Examined]:
         """The next refits examined, by their id, one a process: where the first is refused, the second is wanted."""
         others = [r for r in waiting if not any(says_the_same(r, better) for better in misleading)][: self.jobs]
-        silent = replace(self, watch=str) if len(others) > 1 else self  # what is told of progress stays here
+        silent = replace(self, watch=_untold) if len(others) > 1 else self  # what is told of progress stays here
         tasks = [partial(silent._examined, search, candidate, on_before) for candidate in others]
         return dict(zip(map(id, others), do_all(tasks, self.jobs), strict=True))
 
@@ -280,6 +280,10 @@ class SearchLoop:
                 self.watch(f"{hypothesis.name} taken out again")
                 return self._pruned(left_out(search, hypothesis, fit, predictive, judged, refusal), examined=0)
         return replace(search, whole=whole)
+
+
+def _untold(_line: str) -> None:
+    """Nobody is told of progress."""
 
 
 def _same_change(search: Search, hypothesis: Hypothesis) -> bool:
