@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.online.online import OnlineState
+from ballfg.estimation.online.state import OnlineState
 from ballfg.files.whole_file import check_file, flush
 from ballfg.live.outlook import Outlook, unusable
 from ballfg.live.sources.bag import need_rosbags

@@ -11,7 +11,8 @@ from itertools import pairwise
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.online.online import Online, OnlineState
+from ballfg.estimation.online.online import Online
+from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.smoother.motion import Motion
 from ballfg.live.gate import Known
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ballfg.estimation.online.online import OnlineState
+from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.result import Status
 from ballfg.prediction import BallState, Crossing, apex, next_contact, plane_crossing
 from ballfg.prediction.ahead import carried_by

@@ -11,7 +11,8 @@ from numpy.typing import ArrayLike
 from ballfg.arrays import Array
 from ballfg.checks import check_count, check_range
 from ballfg.dynamics import BallModel, Surfaces
-from ballfg.estimation.online.online import Online, OnlineState
+from ballfg.estimation.online.online import Online
+from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.settings import Settings
 from ballfg.live.ball import Ball, BallEvent, Kept
 from ballfg.live.clock import Clock, Stamp

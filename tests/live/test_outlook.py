@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ballfg.estimation import Online, Status
-from ballfg.estimation.online.online import OnlineState
+from ballfg.estimation.online.state import OnlineState
 from ballfg.live.outlook import Plane, look_out
 from tests.live.shots import SURFACES, ball_model, ball_settings, shots
 

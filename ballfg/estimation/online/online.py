@@ -2,12 +2,11 @@
 
 import copy
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
@@ -17,6 +16,7 @@ from ballfg.estimation.online.events import SIGMA_FACTOR, EventTracker, contact_
 from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unknown
 from ballfg.estimation.online.isam import Sample, Update
 from ballfg.estimation.online.measurement import Measurement
+from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.online.stream import SightingStream
 from ballfg.estimation.online.warm_up import warmed_up
 from ballfg.estimation.online.window import Window
@@ -27,7 +27,6 @@ from ballfg.estimation.smoother.motion import FLIGHT, Motion, motions_of
 from ballfg.estimation.smoother.problem import trackwise_model
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import FactorBatch
-from ballfg.prediction.state import BallState
 from ballfg.tracks import Ball, Track
 from ballfg.vision.camera import Camera
 
@@ -37,29 +36,6 @@ LATEST_CHANGE = 80
 """Samples. The segmenter's events are final after 64; nothing older is built again."""
 YOUNG = 20
 """Samples after a contact in which the estimate may still move it to another interval."""
-
-
-@dataclass(frozen=True, kw_only=True, repr=False)
-class OnlineState(BallState):
-    """The state of the ball after a measurement, and what the update did.
-
-    Attributes:
-        innovation: (3,) the position against its prediction, whitened, (2,) of a sighting; NaN where nothing
-            predicted it.
-        motion: how the ball got here from the last observation.
-        revised: how many of the last samples were taken back and explained anew.
-        evaluated: factors of the motion evaluated.  calls: torch calls for them.
-        rebuilt: iSAM2 failed, and the window was built anew.
-        status: OK, or what to try.
-    """
-
-    innovation: Array
-    motion: Motion
-    revised: int
-    evaluated: int
-    calls: int
-    rebuilt: bool
-    status: Status
 
 
 class Online(Estimator):

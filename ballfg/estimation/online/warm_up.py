@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 if TYPE_CHECKING:
-    from ballfg.estimation.online.online import Online, OnlineState
+    from ballfg.estimation.online.online import Online
+from ballfg.estimation.online.state import OnlineState
 
 SAMPLES = 40
 PERIOD = 0.01

@@ -10,7 +10,8 @@ import pytest
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
 from ballfg.estimation.filters.sliding_window import SlidingWindow
-from ballfg.estimation.online.online import Online, OnlineState
+from ballfg.estimation.online.online import Online
+from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from ballfg.dynamics.compiled.translation.arrays import Arrays, Each, Load, Product, Total, View
+from ballfg.dynamics.compiled.translation.expression import expression
 from ballfg.dynamics.compiled.translation.program import Number, Program
 
 Names = Mapping[Number, str]
@@ -118,8 +119,6 @@ def _product(
 
 def _computed(program: Program, results: Sequence[Number], given: Names) -> tuple[list[str], dict[Number, str]]:
     """Lines that compute results of a small program, and how its numbers are called; `given` ones are known."""
-    from ballfg.dynamics.compiled.translation.source import expression
-
     needed, wanted = set[Number](), list(results)
     while wanted:
         number = wanted.pop()
