@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ballfg.estimation.online.state import OnlineState
+
 if TYPE_CHECKING:
     from ballfg.estimation.online.online import Online
-from ballfg.estimation.online.state import OnlineState
 
 SAMPLES = 40
 PERIOD = 0.01
