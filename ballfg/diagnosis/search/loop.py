@@ -171,16 +171,14 @@ class SearchLoop:
         """
         refused: dict[str, Refusal] = {}
         waiting, examined = [r for r in refits if r.delta_bic < 0.0], dict[int, Examined]()
-        while waiting:
-            candidate = waiting[0]
+        for place, candidate in enumerate(waiting):
             if any(says_the_same(candidate, better) for better in misleading):
                 examined[id(candidate)] = Outcome.SAME_PATTERN, candidate.fit
             elif id(candidate) not in examined:
-                examined |= self._examined_together(search, waiting, on_before, misleading)
+                examined |= self._examined_together(search, waiting[place:], on_before, misleading)
             found = examined[id(candidate)]
             if isinstance(found, Confirmed):
                 return found, refused
-            del waiting[0]
             outcomes[candidate.name], settled = found
             misleading += [candidate] if outcomes[candidate.name] is Outcome.MISLEADING else []
             if outcomes[candidate.name] in NO_NAME:
