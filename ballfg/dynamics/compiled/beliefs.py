@@ -10,7 +10,7 @@ import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contact_times, contacts
-from ballfg.dynamics.compiled.flight import fly_one
+from ballfg.dynamics.compiled.flight import evaluate, fly_one
 from ballfg.dynamics.compiled.signatures import (
     COUNT,
     FLAG,
@@ -78,7 +78,7 @@ def add_impact(covariance, since, noise):
 def gap_of(surface, x, s, ws, level, radius):
     """Gap (m) of a state to a surface."""
     offset = np.empty(3)
-    surface(x, s, ws, np.empty((9, 0)), np.empty((len(s), 0)), offset, np.empty((3, 0)))
+    evaluate(surface, x, s, ws, np.empty((9, 0)), np.empty((len(s), 0)), offset, np.empty((3, 0)))
     return x[2] - level - offset[0] - radius
 
 

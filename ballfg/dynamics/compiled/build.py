@@ -26,12 +26,14 @@ import math
 import numpy as np
 from numba import njit, types
 {imports}
-ONE, TWO = types.Array(types.float64, 1, "C"), types.Array(types.float64, 2, "C")
+ONE, TWO, THREE = (types.Array(types.float64, dimensions, "C") for dimensions in (1, 2, 3))
 
 
-@njit(types.void(ONE, ONE, ONE, TWO, TWO, ONE, TWO), error_model="numpy", cache=True)
+@njit(types.void(TWO, TWO, ONE, THREE, THREE, TWO, THREE), error_model="numpy", cache=True)
 '''
 """What comes before `compute` in a file. Without numpy's error model every division would be checked for a zero."""
+HELPERS: Final = {"add_product": "product", "tanh_all": "tanh"}
+"""Functions that generated ones may call, and the modules beside this one that they stand in."""
 
 
 def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -75,9 +77,10 @@ def _type_of(code: Code, _context: Any) -> Any:
 def built(source: str) -> Code:
     """The compiled `compute` of some source."""
     imports = ""
-    if "add_product(" in source:  # the hash of its file: code that was compiled with another one is not found
-        file = Path(__file__).with_name("product.py")
-        imports = f"from ballfg.dynamics.compiled.product import add_product  # {digest(file)}\n"
+    for helper, module in HELPERS.items():
+        if f"{helper}(" in source:  # the hash of its file: code that was compiled with another one is not found
+            file = Path(__file__).with_name(f"{module}.py")
+            imports += f"from ballfg.dynamics.compiled.{module} import {helper}  # {digest(file)}\n"
     return _built(HEADER.format(imports=imports) + source)
 
 

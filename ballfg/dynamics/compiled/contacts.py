@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.flight import fly_one
+from ballfg.dynamics.compiled.flight import evaluate, fly_one
 from ballfg.dynamics.compiled.signatures import COUNT, FUNCTION, NOTHING, ONE, REAL, THREE, TWO, several
 from ballfg.dynamics.motion.limits import (
     GAP_TOLERANCE,
@@ -25,8 +25,8 @@ LEAST = 1e-300
 def _approach(rates, surface, x, c, s, w, ws, height, radius):
     """Gap (m) of a state to a surface, its rate (m/s) and the acceleration (m/s^2) with which it closes."""
     none, a, o = np.empty((9, 0)), np.empty(6), np.empty(3)
-    rates(x, c, w, none, np.empty((len(c), 0)), a, np.empty((6, 0)))
-    surface(x, s, ws, none, np.empty((len(s), 0)), o, np.empty((3, 0)))
+    evaluate(rates, x, c, w, none, np.empty((len(c), 0)), a, np.empty((6, 0)))
+    evaluate(surface, x, s, ws, none, np.empty((len(s), 0)), o, np.empty((3, 0)))
     gap = x[2] - height - o[0] - radius
     rate = x[5] - o[1] * x[3] - o[2] * x[4]
     return gap, rate, -(a[2] - o[1] * a[0] - o[2] * a[1])
@@ -187,10 +187,10 @@ def contacts(
         later[:, :d], later[:, d] = startt[r], 0.0
         ct1[:, :d], st1[:, :d] = ct[r], st[r]
         fly_one(rates, x, c[r], w, later, ct1, found, by_time, steps)
-        surface(x, s[r], ws, later, st1, o, moved)
+        evaluate(surface, x, s[r], ws, later, st1, o, moved)
         speed = min(later[2, d] - moved[0, d], -MIN_SPEED)
         for q in range(d):  # at the contact the gap is zero: d gap + d gap / d tau d tau = 0
             taut[r, q] = -(later[2, q] - moved[0, q]) / speed
             for i in range(9):
                 xt[i, q] = later[i, q] + later[i, d] * taut[r, q]
-        impact(x, b[r], wb, xt, bt[r], after[r], aftert[r])
+        evaluate(impact, x, b[r], wb, xt, bt[r], after[r], aftert[r])

@@ -13,6 +13,7 @@ from ballfg.arrays import Array
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled.beliefs import carry
 from ballfg.dynamics.compiled.events import find
+from ballfg.dynamics.compiled.flight import evaluate
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.compiled.in_torch import in_torch, raise_errors
 from ballfg.dynamics.compiled.mixture import mix
@@ -140,13 +141,13 @@ class Carrier:
         gradient, rate, moved = np.zeros(width), np.zeros(width), np.zeros((3, width))
         rates, _, surface, c, _, _, _, s, st, w, _, ws = self._given
         if line is None:
-            surface(mean[:STATE_DIM].copy(), s[0], ws, np.eye(STATE_DIM, width), st[0], np.empty(3), moved)
+            evaluate(surface, mean[:STATE_DIM].copy(), s[0], ws, np.eye(STATE_DIM, width), st[0], np.empty(3), moved)
             gradient[Z] = 1.0
             gradient -= moved[0]
         else:
             gradient[:STATE_DIM] = line[0]
         change, nothing = np.empty(6), np.empty((STATE_DIM, 0))
-        rates(mean[:STATE_DIM].copy(), c[0], w, nothing, np.empty((c.shape[1], 0)), change, np.empty((6, 0)))
+        evaluate(rates, mean[:STATE_DIM].copy(), c[0], w, nothing, np.empty((c.shape[1], 0)), change, np.empty((6, 0)))
         rate[POSITION], rate[VELOCITY], rate[SPIN] = mean[VELOCITY], change[:3], change[3:]
         return gradient, rate
 

@@ -7,7 +7,7 @@ import numpy as np
 from ballfg.dynamics.compiled.beliefs import bounce, fly_belief, gap_of, share_over_table
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contact_times
-from ballfg.dynamics.compiled.flight import fly_one
+from ballfg.dynamics.compiled.flight import evaluate, fly_one
 from ballfg.dynamics.compiled.signatures import FLAG, FUNCTION, ONE, REAL, THREE, TWO, several
 from ballfg.dynamics.motion.limits import BEYOND, MAX_STEP, NEGLIGIBLE, REST_GAP, REST_SPEED
 
@@ -25,7 +25,7 @@ NONE, FOUND, HARD = 0.0, 1.0, 2.0
 def _value(rates, x, c, w, normal, offset):
     """Normal . x - offset of a state (9,), and its derivative by time."""
     a, value, rate = np.empty(6), -offset, 0.0
-    rates(x, c, w, np.empty((9, 0)), np.empty((len(c), 0)), a, np.empty((6, 0)))
+    evaluate(rates, x, c, w, np.empty((9, 0)), np.empty((len(c), 0)), a, np.empty((6, 0)))
     for i in range(9):
         value += normal[i] * x[i]
         rate += normal[i] * (x[3 + i] if i < 3 else a[i - 3])

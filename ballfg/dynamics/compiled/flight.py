@@ -10,11 +10,22 @@ import numpy as np
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, FOUR, FUNCTION, NOTHING, ONE, REAL, THREE, TWO
 
+TOGETHER = 96
+"""Balls whose layers of a network stay in a processor's own memory."""
+
+
+@machine_code(NOTHING(FUNCTION, ONE, ONE, ONE, TWO, TWO, ONE, TWO))
+def evaluate(function, x, c, w, xt, ct, y, yt):
+    """A model's function of one state x (9,) with coefficients c (p,): y (m,); tangents (9, d), (p, d), (m, d)."""
+    p, m, d = len(c), len(y), xt.shape[1]
+    one, moved = (x.reshape(1, 9), c.reshape(1, p)), (xt.reshape(1, 9, d), ct.reshape(1, p, d))
+    function(one[0], one[1], w, moved[0], moved[1], y.reshape(1, m), yt.reshape(1, m, d))
+
 
 @machine_code(NOTHING(FUNCTION, ONE, ONE, ONE, TWO, TWO, ONE, TWO, ONE, TWO))
 def slope_at(rates, x, c, w, xt, ct, k, kt, a, at):
     """The derivative k (9,) of a state by time, with tangents; a (6,) and at (6, d) are working memory."""
-    rates(x, c, w, xt, ct, a, at)
+    evaluate(rates, x, c, w, xt, ct, a, at)
     for i in range(3):
         k[i] = x[3 + i]
         for q in range(xt.shape[1]):
@@ -81,8 +92,53 @@ def fly_one(rates, x, c, w, xt, ct, duration, durationt, steps):
         step_on(rates, x, c, w, xt, ct, duration / steps, durationt / steps, k, kt, x, xt)
 
 
+@machine_code(NOTHING(FUNCTION, TWO, TWO, ONE, THREE, THREE, TWO, THREE, TWO, THREE))
+def slopes_at(rates, x, c, w, xt, ct, k, kt, a, at):
+    """As `slope_at`, of the rows of x (m, 9)."""
+    rates(x, c, w, xt, ct, a, at)
+    for r in range(len(x)):
+        for i in range(3):
+            k[r, i], k[r, 3 + i], k[r, 6 + i] = x[r, 3 + i], a[r, i], a[r, 3 + i]
+            for q in range(xt.shape[2]):
+                kt[r, i, q], kt[r, 3 + i, q], kt[r, 6 + i, q] = xt[r, 3 + i, q], at[r, i, q], at[r, 3 + i, q]
+
+
+@machine_code(NOTHING(FUNCTION, TWO, TWO, ONE, THREE, THREE, ONE, TWO, COUNT))
+def fly_side_by_side(rates, x, c, w, xt, ct, duration, durationt, steps):
+    """As `fly_one`, of the rows of x (m, 9), whose rates are computed together."""
+    n, d = len(x), xt.shape[2]
+    k, kt, a, at = np.empty((n, 9)), np.empty((n, 9, d)), np.empty((n, 6)), np.empty((n, 6, d))
+    x2, x2t, total, totalt = np.empty((n, 9)), np.empty((n, 9, d)), np.empty((n, 9)), np.empty((n, 9, d))
+    for _ in range(steps):
+        slopes_at(rates, x, c, w, xt, ct, k, kt, a, at)
+        total[:] = k
+        totalt[:] = kt
+        for stage in range(3):
+            share, weight = (1.0 if stage == 2 else 0.5), (1.0 if stage == 2 else 2.0)
+            for r in range(n):
+                h = duration[r] / steps
+                for i in range(9):
+                    x2[r, i] = x[r, i] + share * h * k[r, i]
+                    for q in range(d):
+                        x2t[r, i, q] = xt[r, i, q] + share * (h * kt[r, i, q] + durationt[r, q] / steps * k[r, i])
+            slopes_at(rates, x2, c, w, x2t, ct, k, kt, a, at)
+            for r in range(n):
+                for i in range(9):
+                    total[r, i] += weight * k[r, i]
+                    for q in range(d):
+                        totalt[r, i, q] += weight * kt[r, i, q]
+        for r in range(n):
+            h = duration[r] / steps
+            for i in range(9):
+                x[r, i] += h / 6.0 * total[r, i]
+                for q in range(d):
+                    xt[r, i, q] += (h * totalt[r, i, q] + durationt[r, q] / steps * total[r, i]) / 6.0
+
+
 @machine_code(NOTHING(FUNCTION, TWO, THREE, TWO, THREE, ONE, ONE, TWO, COUNT))
-def fly_rows(rates, state, statet, c, ct, w, dt, dtt, steps):
+def fly_together(rates, state, statet, c, ct, w, dt, dtt, steps):
     """Move m balls on by durations dt (m,) s with tangents dtt (m, d), in so many equal steps each, in place."""
-    for r in range(len(state)):
-        fly_one(rates, state[r], c[r], w, statet[r], ct[r], dt[r], dtt[r], steps)
+    for first in range(0, len(state), TOGETHER):
+        past = min(first + TOGETHER, len(state))
+        x, xt, own, ownt = state[first:past], statet[first:past], c[first:past], ct[first:past]
+        fly_side_by_side(rates, x, own, w, xt, ownt, dt[first:past], dtt[first:past], steps)

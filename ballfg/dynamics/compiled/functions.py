@@ -7,15 +7,16 @@ import warnings
 import weakref
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from ballfg.arrays import Array
-from ballfg.dynamics.compiled.build import built, digest, read_note, write_note
+from ballfg.dynamics.compiled.build import Code, built, digest, read_note, write_note
 from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.compiled.translation.recipe import Recipe
 from ballfg.dynamics.model import BallModel, is_substituted, substitute
@@ -27,6 +28,8 @@ VALUES_AGREE: Final = 1e-12
 """Relative difference up to which a compiled value is that of torch."""
 SLOPES_AGREE: Final = 1e-10
 """As `VALUES_AGREE`, of derivatives."""
+COMPARED: Final = 4
+"""Random states at which both are computed."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +37,14 @@ class Function:
     """A compiled function of a state and some coefficients.
 
     Attributes:
-        compute: `compute(x, c, w, xt, ct, y, yt)`: state x (9,), coefficients c (p,), weights w (k,), tangents xt
-            (9, d) and ct (p, d); writes the result y (m,) and its tangents yt (m, d).
+        compute: `compute(x, c, w, xt, ct, y, yt)`: n states x (n, 9), their coefficients c (n, p), weights w (k,),
+            tangents xt (n, 9, d) and ct (n, p, d); writes the results y (n, m) and their tangents yt (n, m, d).
         names: of the p coefficients that matter, as in `model.named_parameters()`.
         size: m.
         weigh: gives the weights from a model's tables; None where there are none.
     """
 
-    compute: Any
+    compute: Code
     names: tuple[str, ...]
     size: int
     weigh: Recipe | None = None
@@ -194,7 +197,7 @@ PARTS: Final = (_rates, _impact, _surface)
 def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], key: Hashable | None) -> Function:
     """A function, from disk where a model of this structure was traced before and torch still gives the same."""
     files = None if key is None else _files_of(model)
-    known = None if files is None else f"{function.__name__}, {key}, {files}, torch {torch.__version__}"
+    known = None if files is None else f"{function.__name__}, {key}, {files}, {_generator()}, torch {torch.__version__}"
     kept = None if known is None else read_note(known)
     if kept is not None:
         weigh = None if kept["weights"] is None else Recipe(**kept["weights"])
@@ -211,6 +214,13 @@ def _function(model: BallModel, function: Callable[[BallModel, Tensor], Tensor],
         weights = None if made.weigh is None else asdict(made.weigh)
         write_note(known, {"source": source, "names": made.names, "size": made.size, "weights": weights})
     return made
+
+
+@cache
+def _generator() -> str:
+    """Hashes of the files that decide what a function's source is, so that no older source is taken for it."""
+    folder = Path(__file__).parent
+    return ",".join(digest(file) for file in (folder / "build.py", *sorted((folder / "translation").glob("*.py"))))
 
 
 def _files_of(model: BallModel) -> str | None:
@@ -260,21 +270,22 @@ def _compare(model: BallModel, function: Callable[[BallModel, Tensor], Tensor], 
         raise NotTheSameError(f"compiled {function.__name__} takes coefficients that the model does not have")
     own = np.array([float(parameters[name].detach()) for name in made.names])
     weights = NONE if made.weigh is None else made.weigh(*(t.detach() for t in numbers_of(model).tables())).numpy()
-    for _ in range(4):
-        state = rng.normal(size=STATE_DIM) * np.repeat((1.0, 5.0, 100.0), 3)
-        coefficients = own + 0.05 * rng.normal(size=p)
-        tangents = np.eye(STATE_DIM + p)
-        x, c = torch.from_numpy(state), torch.from_numpy(coefficients)
+    states = rng.normal(size=(COMPARED, STATE_DIM)) * np.repeat((1.0, 5.0, 100.0), 3)
+    coefficients = own + 0.05 * rng.normal(size=(COMPARED, p))
 
-        def of_both(x: Tensor, c: Tensor) -> Tensor:
-            values = {name: c[i] for i, name in enumerate(made.names)}
-            return function(substitute(model, values), x)
+    def of_both(x: Tensor, c: Tensor) -> Tensor:
+        values = {name: c[i] for i, name in enumerate(made.names)}
+        return function(substitute(model, values), x)
 
+    moved = np.tile(np.eye(STATE_DIM + p), (COMPARED, 1, 1))
+    given = (states, coefficients, weights, moved[:, :STATE_DIM].copy(), moved[:, STATE_DIM:].copy())
+    y, yt = np.zeros((COMPARED, made.size)), np.zeros((COMPARED, made.size, STATE_DIM + p))
+    made.compute(*given, y, yt)
+    for k in range(COMPARED):
+        x, c = torch.from_numpy(states[k]), torch.from_numpy(coefficients[k])
         right = of_both(x, c).detach().numpy()
         rows = torch.cat([j.reshape(made.size, -1) for j in torch.autograd.functional.jacobian(of_both, (x, c))], dim=1)
-        y, yt = np.zeros(made.size), np.zeros((made.size, STATE_DIM + p))
-        made.compute(state, coefficients, weights, tangents[:STATE_DIM].copy(), tangents[STATE_DIM:].copy(), y, yt)
-        for got, wanted, limit in ((y, right, VALUES_AGREE), (yt, rows.numpy(), SLOPES_AGREE)):
+        for got, wanted, limit in ((y[k], right, VALUES_AGREE), (yt[k], rows.numpy(), SLOPES_AGREE)):
             scale = np.maximum(1.0, np.abs(wanted))
             if not (np.abs(got - wanted) <= limit * scale).all():
                 raise NotTheSameError(f"compiled {function.__name__} of {type(model).__name__} differs from torch")

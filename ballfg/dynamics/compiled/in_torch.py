@@ -21,7 +21,7 @@ from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import Code
 from ballfg.dynamics.compiled.functions import PARTS, CompiledModel, Function
 from ballfg.dynamics.compiled.places import numbers_of
-from ballfg.dynamics.compiled.signatures import ONE, TWO
+from ballfg.dynamics.compiled.signatures import ONE, THREE, TWO
 from ballfg.dynamics.model import BallModel, substitute
 
 SIZES: Final = (6, 9, 3)
@@ -56,10 +56,11 @@ def _answer(number, x, c, xt, ct, y, yt):  # type: ignore[no-untyped-def]
 
 @cache
 def _code() -> Code:
-    @njit(types.void(ONE, ONE, ONE, TWO, TWO, ONE, TWO))
+    @njit(types.void(TWO, TWO, ONE, THREE, THREE, TWO, THREE))
     def compute(x, c, w, xt, ct, y, yt):  # type: ignore[no-untyped-def]
         with objmode():
-            _answer(int(w[0]), x, c, xt, ct, y, yt)
+            for given in zip(x, c, xt, ct, y, yt, strict=True):
+                _answer(int(w[0]), *given)
 
     return Code(compute)
 

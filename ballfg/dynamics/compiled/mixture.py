@@ -11,7 +11,7 @@ import numpy as np
 from ballfg.dynamics.compiled.beliefs import add_impact, gap_of, through
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contacts
-from ballfg.dynamics.compiled.flight import fly_one
+from ballfg.dynamics.compiled.flight import evaluate, fly_one
 from ballfg.dynamics.compiled.signatures import (
     FLAG,
     FOUR,
@@ -40,7 +40,7 @@ def _below(surface, mean, covariance, s, st, ws, level, radius, k):
     xt, offset, moved, gradient = np.zeros((9, d)), np.empty(3), np.empty((3, d)), np.empty(d)
     for i in range(9):
         xt[i, i] = 1.0
-    surface(mean[:9], s, ws, xt, st, offset, moved)
+    evaluate(surface, mean[:9], s, ws, xt, st, offset, moved)
     for q in range(d):
         gradient[q] = xt[2, q] - moved[0, q]
     variance = 0.0

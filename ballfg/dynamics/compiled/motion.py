@@ -11,7 +11,7 @@ from torch import Tensor
 from ballfg.arrays import Array
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled.contacts import contact_times, contacts
-from ballfg.dynamics.compiled.flight import fly_rows
+from ballfg.dynamics.compiled.flight import fly_together
 from ballfg.dynamics.compiled.functions import CompiledModel, Function, compiled
 from ballfg.dynamics.compiled.places import numbers_of
 from ballfg.dynamics.model import BallModel
@@ -53,9 +53,8 @@ class Moving:
         left, earlier = np.ascontiguousarray(dt - self.elapsed), -self.slower
         steps = step_count(torch.from_numpy(left))
         rates = self.functions.rates
-        fly_rows(
-            rates.compute, self.states, self.moved, *self.coefficients(rates), self.weights[0], left, earlier, steps
-        )
+        given = (self.states, self.moved, *self.coefficients(rates), self.weights[0], left, earlier, steps)
+        fly_together(rates.compute, *given)
 
     def bounce(self, height: Array, longest: Array) -> None:
         """Move on through the next contact with surfaces at some heights (n,) m; NaN where there is none."""

@@ -12,9 +12,10 @@ LEAST_FOR_BLAS: Final = 256
 """Multiplications from which on a call of BLAS is quicker than loops; ten times so for layers of 80."""
 
 
-@machine_code(NOTHING(ONE, COUNT, *(ONE, *[COUNT] * 4) * 2, *[COUNT] * 4))
+@machine_code(NOTHING(ONE, COUNT, COUNT, *(ONE, *[COUNT] * 4) * 2, *[COUNT] * 4))
 def add_product(
     whole: Array,
+    whole_at: int,
     whole_step: int,
     left: Array,
     left_at: int,
@@ -35,7 +36,7 @@ def add_product(
 
     Args:
         whole, left, right: flat arrays in which the matrices lie; their numbers have the unit of what they stand for.
-        left_at, right_at: place of the first entry.
+        whole_at, left_at, right_at: place of the first entry.
         whole_step, left_step, right_step: from a matrix to the same one of the next product; 0 if it is the same.
         left_row, left_column, right_row, right_column: from an entry to that of the next row or column.
         count: number of products.
@@ -45,7 +46,7 @@ def add_product(
     if not (in_rows and (upright or turned) and m * k * n * count >= LEAST_FOR_BLAS):
         for q in range(count):
             for i in range(m):
-                into = q * whole_step + i * n
+                into = whole_at + q * whole_step + i * n
                 for r in range(k):
                     factor = left[left_at + q * left_step + i * left_row + r * left_column]
                     place = right_at + q * right_step + r * right_row
@@ -59,7 +60,7 @@ def add_product(
         one = left[at : at + rows * k].reshape(rows, k)
         at = right_at + q * right_step
         other = right[at : at + k * n]
-        into = q * whole_step
+        into = whole_at + q * whole_step
         sums = whole[into : into + rows * n].reshape(rows, n)
         if upright:
             sums += np.dot(one, other.reshape(k, n))

@@ -14,8 +14,8 @@ REAL: Final[Any] = types.float64
 COUNT: Final[Any] = types.int64
 FLAG: Final[Any] = types.boolean
 NOTHING: Final[Any] = types.void
-FUNCTION: Final[Any] = types.FunctionType(types.void(ONE, ONE, ONE, TWO, TWO, ONE, TWO))
-"""A compiled function of a model, `compute(x, c, w, xt, ct, y, yt)`."""
+FUNCTION: Final[Any] = types.FunctionType(types.void(TWO, TWO, ONE, THREE, THREE, TWO, THREE))
+"""A compiled function of a model, `compute(x, c, w, xt, ct, y, yt)`, of many states."""
 
 
 def several(kind: Any, count: int) -> Any:

@@ -70,15 +70,18 @@ def _reshaped(arrays: Arrays, view: View, shape: Sequence[int]) -> View:
     return same
 
 
-def _product(arrays: Arrays, left: View, right: View) -> View:
-    return arrays.make(Product(left, right, None), (left.shape[0], right.shape[1]))
+def _product(arrays: Arrays, left: View, right: View, plus: View | None = None) -> View:
+    shape = left.shape[0], right.shape[1]
+    plus = None if plus is None else plus.broadcast(shape)
+    if left.block is None and shape[1] == 1:  # rows of states times weights, so that many states are one product
+        left, right, plus = right.permuted((1, 0)), left.permuted((1, 0)), plus and plus.permuted((1, 0))
+    return arrays.make(Product(left, right, plus), shape)
 
 
 def _linear(arrays: Arrays, plus: View, left: View, right: View, beta: float = 1, alpha: float = 1) -> View:
     if beta != 1 or alpha != 1:
         raise UnknownOperationError("a matrix product with factors cannot be compiled")
-    shape = left.shape[0], right.shape[1]
-    return arrays.make(Product(left, right, plus.broadcast(shape)), shape)
+    return _product(arrays, left, right, plus)
 
 
 def _total(arrays: Arrays, view: View, dims: Sequence[int] | None = None, keep: bool = False, **_: Any) -> View:

@@ -1,7 +1,7 @@
 """Arrays in a program: layers of networks and other tables, which are too large to be taken apart into numbers.
 
 An array is made from numbers of the program and from weights by loops. It is read by numbers again. Its derivatives
-run forward, by the few numbers through which all of its inputs depend on those of the program.
+run forward, by the few numbers through which all of its inputs depend on those of the program, or backward.
 """
 
 from __future__ import annotations
@@ -155,11 +155,18 @@ def operands_of(making: Making) -> list[View]:
 
 @dataclass
 class Arrays:
-    """The blocks of a program: how each is made, and its size."""
+    """The blocks of a program.
+
+    Attributes:
+        program: that reads them.
+        makings: how each is made.  sizes: of each.
+        asked: places of a block that are read, where their derivatives run backward.
+    """
 
     program: Program
     makings: list[Making] = field(default_factory=list)
     sizes: list[int] = field(default_factory=list)
+    asked: dict[int, list[int]] = field(default_factory=dict)
 
     def make(self, making: Making, shape: Sequence[int]) -> View:
         """A new block of a shape."""
@@ -187,14 +194,21 @@ class Arrays:
         return list(found)
 
     def read(self, view: View) -> list[Number]:
-        """The numbers of an array, as numbers of the program."""
+        """The numbers of an array, as numbers of the program.
+
+        Their derivatives run forward by the fewest numbers through which the array depends on the inputs, or backward
+        from the numbers that are read, where these are fewer.
+        """
         assert view.block is not None
-        loaded = self.loaded(view.block)
+        loaded, places = self.loaded(view.block), view.places
         through = narrowest(self.program, loaded)
+        if len(set(places)) < len(through):
+            known = self.asked.setdefault(view.block, [])
+            known += [place for place in dict.fromkeys(places) if place not in known]
+            through = []
         operands = (*through, *loaded)
         return [
-            self.program.place(Operation("read", operands, where=(view.block, place, len(through))))
-            for place in view.places
+            self.program.place(Operation("read", operands, where=(view.block, place, len(through)))) for place in places
         ]
 
 

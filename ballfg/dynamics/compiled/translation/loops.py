@@ -1,123 +1,164 @@
-"""Python source, for numba, of the arrays of a program: loops that fill them, and their derivatives."""
+"""Python source, for numba, of the arrays of a program, for many states: loops that fill them, and their derivatives.
+
+Array `k` of all states lies one behind another in `a<k>`: number i of state r at r * size + i. Derivatives by (or of)
+`count` numbers lie in an array of another name, the q-th of state r at (r * count + q) * size + i.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from ballfg.dynamics.compiled.translation.arrays import Arrays, Each, Load, Product, Total, View
+from ballfg.dynamics.compiled.translation.arrays import Arrays, Each, Load, Making, Product, Total, View
 from ballfg.dynamics.compiled.translation.expression import expression
 from ballfg.dynamics.compiled.translation.program import Number, Program
 
-Names = Mapping[Number, str]
-"""How numbers of the program are called in the source."""
-
-
-def filled(arrays: Arrays, block: int, names: Names) -> list[str]:
-    """Lines that fill a block, `a<block>`, from numbers of the program, from weights `w` and from other blocks."""
-    making, values = arrays.makings[block], _Entries(arrays)
-    name = values.name(block)
-    lines = [f"{name} = np.{'zeros' if isinstance(making, Product | Total) else 'empty'}({arrays.sizes[block]})"]
-    match making:
-        case Load(numbers):
-            lines += [f"{name}[{i}] = {names[n]}" for i, n in enumerate(numbers)]
-        case Each():
-            whole = View.whole(block, making.operands[0].shape)
-            given = {n: values.at(v, "i") for n, v in zip(making.inputs, making.operands, strict=True)}
-            body, called = _computed(making.program, [making.result], given)
-            lines += _loops(whole.shape, "i", [*body, f"{values.at(whole, 'i')} = {called[making.result]}"])
-        case Product(left, right, plus):
-            if plus is not None:
-                whole = View.whole(block, plus.shape)
-                lines += _loops(plus.shape, "i", [f"{values.at(whole, 'i')} = {values.at(plus, 'i')}"])
-            lines.append(_product(block, values, (left, values), (right, values)))
-        case Total(of, summed):
-            whole = View.whole(block, of.shape[summed:])
-            lines += _loops(of.shape, "i", [f"{values.at(whole, 'i', summed)} += {values.at(of, 'i')}"])
-    return lines
-
-
-def moved(
-    arrays: Arrays, block: int, by: Sequence[Number], kind: str, slope: Callable[[Number, Number], str]
-) -> list[str]:
-    """Lines that fill the derivatives of a block by some numbers of the program, one after another.
-
-    Args: kind: what their names begin with.  slope: gives the name of a number's derivative by another.
-    """
-    making, values, moving = arrays.makings[block], _Entries(arrays), _Entries(arrays, kind)
-    name, size = moving.name(block), arrays.sizes[block]
-    lines = [f"{name} = np.zeros({len(by) * size})"]
-    each_by = f"for q in range({len(by)}):"
-    match making:
-        case Load(numbers):
-            for i, number in enumerate(numbers):
-                lines += [f"{name}[{q * size + i}] = {s}" for q, b in enumerate(by) if (s := slope(number, b)) != "0.0"]
-        case Each():
-            whole, program = View.whole(block, making.operands[0].shape), making.program
-            given = {n: values.at(v, "i") for n, v in zip(making.inputs, making.operands, strict=True)}
-            given[making.result] = values.at(whole, "i")  # computed already
-            blocks = [(n, v) for n, v in zip(making.inputs, making.operands, strict=True) if v.block is not None]
-            partials = {n: program.derivative(making.result, n) for n, _ in blocks}
-            body, called = _computed(program, list(partials.values()), given)
-            terms = [f"{called[partials[n]]} * {moving.at(v, 'i')}" for n, v in blocks]
-            if terms:
-                set_one = f"    {moving.at(whole, 'i')} = {' + '.join(terms)}"
-                lines += _loops(whole.shape, "i", [*body, each_by, set_one])
-        case Product(left, right, plus):
-            if plus is not None and plus.block is not None:
-                whole = View.whole(block, plus.shape)
-                lines.append(each_by)
-                lines += _indented(_loops(plus.shape, "i", [f"{moving.at(whole, 'i')} = {moving.at(plus, 'i')}"]))
-            if left.block is not None:
-                lines.append(_product(block, moving, (left, moving), (right, values), len(by)))
-            if right.block is not None:
-                lines.append(_product(block, moving, (left, values), (right, moving), len(by)))
-        case Total(of, summed):
-            whole = View.whole(block, of.shape[summed:])
-            inner = _loops(of.shape, "i", [f"{moving.at(whole, 'i', summed)} += {moving.at(of, 'i')}"])
-            lines += [each_by, *_indented(inner)]
-    return lines
+EACH_STATE = "for r in range(n):"
 
 
 @dataclass(frozen=True)
-class _Entries:
-    """How entries of blocks are called: their values, or (of another kind) their derivatives by number q."""
+class Entries:
+    """How entries of blocks are called: their values, or derivatives of which every state has `count`.
+
+    Attributes:
+        arrays: all of them.
+        kind: what the names of the blocks begin with.
+        count: of derivatives; None for values.
+    """
 
     arrays: Arrays
     kind: str = "a"
+    count: int | None = None
 
     def name(self, block: int | None) -> str:
         """Of a block, or of the weights."""
         return "w" if block is None else f"{self.kind}{block}"
 
     def step(self, block: int | None) -> int:
-        """How far the derivatives by the next number lie behind; 0 for values."""
-        return 0 if block is None or self.kind == "a" else self.arrays.sizes[block]
+        """How far the numbers of the next state, or of its next derivative, lie behind; 0 for weights."""
+        return 0 if block is None else self.arrays.sizes[block]
 
-    def at(self, view: View, index: str, first: int = 0) -> str:
-        """The entry of a view at the indices of its loops; the first loops are not its own."""
-        indices = [f"{index}{dim + first}" for dim in range(len(view.shape))]
+    def empty(self, block: int, how: str) -> str:
+        """A line that makes a block: `how` is "empty" or "zeros"."""
+        size = self.step(block) * (self.count or 1)
+        return f"{self.name(block)} = np.{how}(n * {size})"
+
+    def place(self, block: int | None, within: str, which: str = "q") -> str:
+        """Entry `within` of a block of state r, or of the derivative `which` there."""
+        if block is None:
+            return f"w[{within}]"
+        first = "r" if self.count is None else f"(r * {self.count} + {which})"
+        return f"{self.name(block)}[{first} * {self.step(block)} + {within}]"
+
+    def at(self, view: View, first: int = 0) -> str:
+        """The entry of a view at the indices i0, i1, ... of its loops; the first loops are not its own."""
+        indices = [f"i{dim + first}" for dim in range(len(view.shape))]
         terms = [i if s == 1 else f"{i} * {s}" for i, s in zip(indices, view.strides, strict=True) if s]
-        if step := self.step(view.block):
-            terms.append(f"q * {step}")
         if view.offset or not terms:
             terms.append(str(view.offset))
-        return f"{self.name(view.block)}[{' + '.join(terms)}]"
+        return self.place(view.block, " + ".join(terms))
 
 
-def _product(
-    block: int, whole: _Entries, left: tuple[View, _Entries], right: tuple[View, _Entries], count: int = 1
-) -> str:
-    """The call that adds a product of matrices to a block, or so many products to its derivatives."""
-    called = [whole.name(block), str(whole.step(block))]
-    for view, entries in (left, right):
-        places = (view.offset, entries.step(view.block), *view.strides)
-        called += [entries.name(view.block), *map(str, places)]
-    sizes = (count, *left[0].shape, right[0].shape[1])
-    return f"add_product({', '.join(called)}, {', '.join(map(str, sizes))})"
+def filled(arrays: Arrays, block: int) -> list[str]:
+    """Lines that fill a block from weights `w` and from other blocks; a `Load` is filled by whoever has its numbers."""
+    making, values = arrays.makings[block], Entries(arrays)
+    lines = [values.empty(block, "zeros" if isinstance(making, Product | Total) else "empty")]
+    match making:
+        case Load():
+            return lines
+        case Each() if _is_tanh(arrays, making):
+            return [*lines, f"tanh_all({values.name(making.operands[0].block)}, {values.name(block)})"]
+        case Each():
+            whole = View.whole(block, making.operands[0].shape)
+            body, called = computed(making.program, [making.result], given_names(making, values))
+            body.append(f"{values.at(whole)} = {called[making.result]}")
+        case Product(left, right, plus):
+            if plus is not None:
+                whole = View.whole(block, plus.shape)
+                lines += [EACH_STATE, *indented(loops(plus.shape, [f"{values.at(whole)} = {values.at(plus)}"]))]
+            whole = View.whole(block, (left.shape[0], right.shape[1]))
+            return [*lines, *product((whole, values), (left, values), (right, values))]
+        case Total(of, summed):
+            whole = View.whole(block, of.shape[summed:])
+            body = [f"{values.at(whole, summed)} += {values.at(of)}"]
+    return [*lines, EACH_STATE, *indented(loops(_shape(making), body))]
 
 
-def _computed(program: Program, results: Sequence[Number], given: Names) -> tuple[list[str], dict[Number, str]]:
+def moved(arrays: Arrays, block: int, moving: Entries) -> list[str]:
+    """Lines that fill the derivatives of a block, forward from those of the blocks that it is made from."""
+    making, values = arrays.makings[block], Entries(arrays)
+    each_one = f"for q in range({moving.count}):"
+    lines = [moving.empty(block, "zeros")]
+    match making:
+        case Load():
+            return lines
+        case Each():
+            whole, (body, called, blocks) = View.whole(block, making.operands[0].shape), slopes(making, block, values)
+            terms = [f"{called[slope]} * {moving.at(view)}" for view, slope in blocks]
+            if not terms:
+                return lines
+            body.append(f"{moving.at(whole)} = {' + '.join(terms)}")
+        case Product(left, right, plus):
+            whole = View.whole(block, (left.shape[0], right.shape[1]))
+            if plus is not None and plus.block is not None:
+                body = loops(plus.shape, [f"{moving.at(View.whole(block, plus.shape))} = {moving.at(plus)}"])
+                lines += [EACH_STATE, f"    {each_one}", *indented(body, 2)]
+            if left.block is not None:
+                lines += product((whole, moving), (left, moving), (right, values))
+            if right.block is not None:
+                lines += product((whole, moving), (left, values), (right, moving))
+            return lines
+        case Total(of, summed):
+            whole = View.whole(block, of.shape[summed:])
+            body = [f"{moving.at(whole, summed)} += {moving.at(of)}"]
+    return [*lines, EACH_STATE, f"    {each_one}", *indented(loops(_shape(making), body), 2)]
+
+
+def product(whole: tuple[View, Entries], left: tuple[View, Entries], right: tuple[View, Entries]) -> list[str]:
+    """Lines that add products of matrices (m, k) (k, n) to a block's own (m, n), whose rows lie one behind another.
+
+    There is one for every state, or as many as it has derivatives if these are those of `whole`.
+    """
+    (target, into), parts = whole, (left, right)
+    counts = {entries.count for view, entries in parts if view.block is not None}
+    together = counts <= {into.count}  # else values of a state stand beside its derivatives
+    many = into.count or 1
+    given = [into.name(target.block), _first(target, into, together), str(into.step(target.block))]
+    for view, entries in parts:
+        still = not together and entries.count is None
+        step = 0 if still else entries.step(view.block)
+        given += [entries.name(view.block), _first(view, entries, together), str(step), *map(str, view.strides)]
+    number = (f"n * {many}" if many > 1 else "n") if together else str(many)
+    sizes = (left[0].shape[0], left[0].shape[1], right[0].shape[1])
+    call = f"add_product({', '.join(given)}, {number}, {', '.join(map(str, sizes))})"
+    return [call] if together else [EACH_STATE, f"    {call}"]
+
+
+def _first(view: View, entries: Entries, together: bool) -> str:
+    """Place of the first entry of a view: of all states, or of state r."""
+    if together or view.block is None:
+        return str(view.offset)
+    return f"{view.offset} + r * {(entries.count or 1) * entries.step(view.block)}"
+
+
+def given_names(making: Each, values: Entries) -> dict[Number, str]:
+    """How the operands of an operation are called in its loops."""
+    return {n: values.at(v) for n, v in zip(making.inputs, making.operands, strict=True)}
+
+
+def slopes(making: Each, block: int, values: Entries) -> tuple[list[str], dict[Number, str], list[tuple[View, Number]]]:
+    """Derivatives of an operation by those of its operands that are blocks: lines, names, operands and numbers."""
+    given = given_names(making, values)
+    given[making.result] = values.at(View.whole(block, making.operands[0].shape))  # computed already
+    pairs = [(n, v) for n, v in zip(making.inputs, making.operands, strict=True) if v.block is not None]
+    found = [(view, making.program.derivative(making.result, n)) for n, view in pairs]
+    body, called = computed(making.program, [slope for _, slope in found], given)
+    return body, called, found
+
+
+def computed(
+    program: Program, results: Sequence[Number], given: Mapping[Number, str]
+) -> tuple[list[str], dict[Number, str]]:
     """Lines that compute results of a small program, and how its numbers are called; `given` ones are known."""
     needed, wanted = set[Number](), list(results)
     while wanted:
@@ -129,14 +170,26 @@ def _computed(program: Program, results: Sequence[Number], given: Names) -> tupl
     return [f"{names[n]} = {expression(program, n, names, {})}" for n in sorted(needed)], names
 
 
-def _loops(shape: Sequence[int], index: str, body: Sequence[str]) -> list[str]:
-    """Loops over all entries of a shape, the last dimension innermost."""
-    lines, depth = [], 0
-    for dim, length in enumerate(shape):
-        lines.append("    " * depth + f"for {index}{dim} in range({length}):")
-        depth += 1
-    return [*lines, *("    " * depth + line for line in body)]
+def loops(shape: Sequence[int], body: Sequence[str]) -> list[str]:
+    """Loops i0, i1, ... over all entries of a shape, the last dimension innermost."""
+    lines = ["    " * depth + f"for i{depth} in range({length}):" for depth, length in enumerate(shape)]
+    return [*lines, *indented(body, len(shape))]
 
 
-def _indented(lines: Sequence[str]) -> list[str]:
-    return [f"    {line}" for line in lines]
+def indented(lines: Sequence[str], depth: int = 1) -> list[str]:
+    """Lines within so many blocks."""
+    return ["    " * depth + line for line in lines]
+
+
+def _shape(making: Making) -> tuple[int, ...]:
+    """Of the loops of an operation number by number, or of a sum."""
+    assert isinstance(making, Each | Total)
+    return making.of.shape if isinstance(making, Total) else making.operands[0].shape
+
+
+def _is_tanh(arrays: Arrays, making: Each) -> bool:
+    """Whether an operation is the hyperbolic tangent of a whole block."""
+    operation, operand = making.program.operations[making.result], making.operands[0]
+    if operation.name != "tanh" or operation.operands != making.inputs or operand.block is None:
+        return False
+    return operand == View.whole(operand.block, operand.shape) and operand.size == arrays.sizes[operand.block]

@@ -40,7 +40,7 @@ class Operation:
         operands: the numbers it takes.
         constant: that belongs to it: an exponent, a value.
         where: of a number that is read from an array or from its derivatives: the array, the place in it, by how many
-            of the operands derivatives are taken, and by which of them.
+            of the operands derivatives are taken (0: they run backward, to each operand), and by which of them.
     """
 
     name: str
@@ -201,8 +201,13 @@ def _of_pow(p: Program, _: Number, operation: Operation, __: int) -> Number:
 
 
 def _of_read(p: Program, number: Number, operation: Operation, place: int) -> Number:
-    """The derivative by one of the numbers through which an array depends on others; for the others it is zero."""
+    """The derivative by one of the numbers through which an array depends on others; for the others it is zero.
+
+    Where derivatives run backward, it is that by a number that the array was made from.
+    """
     block, entry, through = operation.where
+    if not through:
+        return p.place(Operation("back", (number, operation.operands[place]), where=(block, entry)))
     if place >= through:
         return p.constant(0.0)
     by, loaded = operation.operands[:through], operation.operands[through:]

@@ -38,7 +38,7 @@ def whole(program, outputs):
 
 def run(program, outputs, state, others, x, c):
     """Values (m,) and the derivatives (m, len(x) + len(c)) that the generated code gives."""
-    compute = built(function_source(whole(program, outputs), state, others))
+    compute = built(function_source(whole(program, outputs), state, others)).compute
     eye = np.eye(len(x) + len(c))
     y, yt = np.zeros(len(outputs)), np.zeros((len(outputs), len(eye)))
     compute(np.array(x), np.array(c), np.zeros(0), eye[: len(x)].copy(), eye[len(x) :].copy(), y, yt)
