@@ -32,8 +32,8 @@ ONE, TWO, THREE = (types.Array(types.float64, dimensions, "C") for dimensions in
 @njit(types.void(TWO, TWO, ONE, THREE, THREE, TWO, THREE), error_model="numpy", cache=True)
 '''
 """What comes before `compute` in a file. Without numpy's error model every division would be checked for a zero."""
-HELPERS: Final = {"add_product": "product", "tanh_all": "tanh"}
-"""Functions that generated ones may call, and the modules beside this one that they stand in."""
+HELPERS: Final = ("add_product", "tanh_all")
+"""Functions of `layers.py` that generated ones may call."""
 
 
 def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -76,11 +76,10 @@ def _type_of(code: Code, _context: Any) -> Any:
 
 def built(source: str) -> Code:
     """The compiled `compute` of some source."""
-    imports = ""
-    for helper, module in HELPERS.items():
-        if f"{helper}(" in source:  # the hash of its file: code that was compiled with another one is not found
-            file = Path(__file__).with_name(f"{module}.py")
-            imports += f"from ballfg.dynamics.compiled.{module} import {helper}  # {digest(file)}\n"
+    called, imports = [helper for helper in HELPERS if f"{helper}(" in source], ""
+    if called:  # the hash of their file: code that was compiled with another one is not found
+        file = Path(__file__).with_name("layers.py")
+        imports = f"from ballfg.dynamics.compiled.layers import {', '.join(called)}  # {digest(file)}\n"
     return _built(HEADER.format(imports=imports) + source)
 
 

@@ -17,7 +17,7 @@ from ballfg.dynamics.compiled.flight import evaluate
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.compiled.in_torch import in_torch, raise_errors
 from ballfg.dynamics.compiled.mixture import mix
-from ballfg.dynamics.compiled.motion import Moving
+from ballfg.dynamics.compiled.motion import Moving, world_of
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, Z
@@ -83,11 +83,8 @@ class Carrier:
         moving = Moving(model, functions, torch.from_numpy(mean), mean.shape[1])
         parts = (functions.rates, functions.impact, functions.surface)
         coefficients = [array for part in parts for array in moving.coefficients(part)]
-        ends = surfaces.extent or (-np.inf, np.inf, -np.inf, np.inf)
-        levels = (surfaces.table_height, surfaces.lowest(), functions.radius)
-        world = np.array([*levels, *ends, *surfaces.edge_sigmas])
         self._given = (*(part.compute for part in parts), *coefficients, *moving.weights)
-        self._world, self._noise = world, noise
+        self._world, self._noise = world_of(surfaces, functions.radius), noise
         self._keeps = inner  # what torch computes is found by the model as long as it is there
 
     def carry(self, course: Course, h: Array) -> tuple[Course, Array]:

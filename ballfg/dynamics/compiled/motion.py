@@ -14,9 +14,11 @@ from ballfg.dynamics.compiled.contacts import contact_times, contacts
 from ballfg.dynamics.compiled.flight import fly_together
 from ballfg.dynamics.compiled.functions import CompiledModel, Function, compiled
 from ballfg.dynamics.compiled.places import numbers_of
+from ballfg.dynamics.compiled.roll_out import roll_out as roll_out_rows
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import step_count
 from ballfg.dynamics.motion.limits import BEYOND
+from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import STATE_DIM
 
 
@@ -141,6 +143,31 @@ def contact_time(
     shape = state.shape[:-1]
     moving = Moving(model, functions, state.detach().reshape(-1, state.shape[-1]), 0)
     return torch.from_numpy(moving.meets(*(_numbers(given, shape) for given in (height, longest)))).reshape(shape)
+
+
+def roll_out(
+    model: BallModel, functions: CompiledModel, state: Tensor, steps: Tensor, surfaces: Surfaces
+) -> tuple[Tensor, Tensor]:
+    """As `rollout.rollout`, of durations (n, k) s one after another: states (n, k, 9), and how many are right, (n,).
+
+    A ball that rests, or may come to rest, is left where that duration began.
+    """
+    n, width = state.shape
+    moving = Moving(model, functions, state.detach(), 0)
+    parts = (functions.rates, functions.impact, functions.surface)
+    values = tuple(moving.coefficients(part)[0] for part in parts)
+    states, reached = np.empty((n, steps.shape[1], STATE_DIM)), np.empty(n, dtype=np.int64)
+    computes, world = (part.compute for part in parts), world_of(surfaces, functions.radius)
+    durations = np.ascontiguousarray(steps.detach().numpy())
+    roll_out_rows(*computes, values, moving.weights, moving.states, durations, world, states, reached)
+    travelling = np.broadcast_to(moving.travelling[:, None], (n, steps.shape[1], width - STATE_DIM))
+    return torch.from_numpy(np.concatenate((states, travelling), axis=2)), torch.from_numpy(reached)
+
+
+def world_of(surfaces: Surfaces, radius: float) -> Array:
+    """(11,) m: heights of table and floor, radius, the table's ends, their standard deviations, for machine code."""
+    ends = surfaces.extent or (-np.inf, np.inf, -np.inf, np.inf)
+    return np.array([surfaces.table_height, surfaces.lowest(), radius, *ends, *surfaces.edge_sigmas])
 
 
 def _numbers(given: Tensor | float, shape: torch.Size) -> Array:

@@ -31,3 +31,7 @@ NEGLIGIBLE: Final = 1e-4
 add 0.05 m/s to a velocity."""
 LEAST_SIGMA: Final = 1e-12
 """m. A place known better than this has a sigma of this."""
+LONGEST_MOTION: Final = 20.0
+"""s. A ball that nobody touches lies still by then; over a longer interval it is taken to stay where it is."""
+MAX_CONTACTS: Final = 32
+"""In one step of 20 ms a ball that leaves at `REST_SPEED` under its weight alone bounces at most twice."""

@@ -15,8 +15,8 @@ from torch import Tensor
 from ballfg.dynamics.model import BallModel, take_rows
 from ballfg.dynamics.motion.contact import contact_time
 from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, fly, rk4_step
-from ballfg.dynamics.motion.limits import REST_SPEED
-from ballfg.dynamics.motion.rollout import LONGEST_MOTION, next_surface, rollout, stays
+from ballfg.dynamics.motion.limits import LONGEST_MOTION, REST_SPEED
+from ballfg.dynamics.motion.rollout import next_surface, rollout, stays
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import POSITION, VELOCITY, VZ
 

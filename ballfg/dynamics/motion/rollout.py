@@ -19,15 +19,10 @@ from torch import Tensor
 
 from ballfg.dynamics.model import BallModel, take_rows
 from ballfg.dynamics.motion.contact import contact_time
-from ballfg.dynamics.motion.integrate import RateFunction, fly, rk4_step, step_count
-from ballfg.dynamics.motion.limits import REST_GAP, REST_SPEED
+from ballfg.dynamics.motion.integrate import RateFunction, fly, followed, rk4_step, step_count
+from ballfg.dynamics.motion.limits import LONGEST_MOTION, MAX_CONTACTS, REST_GAP, REST_SPEED
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.state import VZ, Z
-
-LONGEST_MOTION = 20.0
-"""s. A ball that nobody touches lies still by then; over a longer interval it is taken to stay where it is."""
-MAX_CONTACTS = 32
-"""In one step of 20 ms a ball that leaves at `REST_SPEED` under its weight alone bounces at most twice."""
 
 
 def is_resting(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:
@@ -65,15 +60,19 @@ def advance(model: BallModel, state: Tensor, dt: Tensor, surfaces: Surfaces) -> 
     Returns: (n, 9), differentiable in the state and the parameters, through the contact times too.
     Raises: ValueError: if a dt is negative or not a number.
     """
-    if not bool(((dt >= 0) & (dt < math.inf)).all()):
-        raise ValueError(
-            f"dt must be finite and not negative; got {float(dt.min()):g} to {float(dt.max()):g} s. Sort the times."
-        )
+    _check_durations(dt)
     dt = dt.clamp_max(LONGEST_MOTION)
     steps = step_count(dt)
     for _ in range(steps):
         state = _advance_step(model, state, dt / steps, surfaces)
     return state
+
+
+def _check_durations(dt: Tensor) -> None:
+    if not bool(((dt >= 0) & (dt < math.inf)).all()):
+        raise ValueError(
+            f"dt must be finite and not negative; got {float(dt.min()):g} to {float(dt.max()):g} s. Sort the times."
+        )
 
 
 def _advance_step(model: BallModel, state: Tensor, h: Tensor, surfaces: Surfaces) -> Tensor:
@@ -151,8 +150,28 @@ def rollout(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) 
     steps = torch.diff(times, dim=-1, prepend=torch.zeros_like(times[:, :1]))
     if not bool((steps >= 0).all()):
         raise ValueError("times must start at 0 or later and must not decrease. Sort them.")
+    if steps.numel() and not followed(state, steps):
+        from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
+
+        functions = motion.functions_of(model)
+        if functions is not None:
+            _check_durations(steps)
+            return _rolled_out(
+                model, state, steps, surfaces, *motion.roll_out(model, functions, state, steps, surfaces)
+            )
     states = []
     for dt in steps.unbind(-1):
         state = advance(model, state, dt, surfaces)
         states.append(state)
     return torch.stack(states, dim=1)
+
+
+def _rolled_out(
+    model: BallModel, state: Tensor, steps: Tensor, surfaces: Surfaces, states: Tensor, reached: Tensor
+) -> Tensor:
+    """States (n, k, 9), the first (n,) of each ball from machine code; balls that come to rest go on from there."""
+    for k in range(int(reached.min()), steps.shape[1]):
+        rows = reached <= k
+        before = states[rows, k - 1] if k else state[rows]
+        states[rows, k] = advance(take_rows(model, rows, len(state)), before, steps[rows, k], surfaces)
+    return states

@@ -128,8 +128,8 @@ def test_code_that_differs_from_torch_is_refused(monkeypatch) -> None:
 
     def wrong(*args):
         source, made = right(*args)
-        source = source.replace("y[0] = ", "y[0] = 1e-6 + ")
-        return source, replace(made, built=built(source))
+        source = source.replace("y[r, 0] = ", "y[r, 0] = 1e-6 + ")
+        return source, replace(made, compute=built(source))
 
     monkeypatch.setattr(functions, "_traced", wrong)
     with pytest.warns(UserWarning, match="differs from torch"):

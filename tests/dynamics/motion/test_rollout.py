@@ -368,3 +368,19 @@ def test_a_ball_stays_where_it_is_after_the_longest_motion(model) -> None:
         later = advance(model, start, torch.tensor([1e6], dtype=torch.float64), surfaces)
     torch.testing.assert_close(later, by_then, rtol=0.0, atol=0.0)
     assert by_then[0, 3:6].norm() < 0.05  # it hardly moves any more
+
+
+@pytest.mark.parametrize(
+    "surfaces",
+    [Surfaces.table_tennis(0.0), Surfaces(0.0, -0.76, (0.0, 2.74, -0.76, 0.76)), Surfaces(0.0), Surfaces(-9.0)],
+)
+@pytest.mark.parametrize("dt", [0.0, 0.004, 0.05])
+def test_machine_code_goes_from_time_to_time_as_torch_does(any_model, states, surfaces, dt) -> None:
+    """Through bounces, over edges, into rest; `advance` takes the same steps one at a time."""
+    start, times = states(9), 0.01 + dt * torch.arange(60, dtype=torch.float64)
+    with torch.no_grad():
+        found = rollout(any_model, start, times, surfaces)
+        state = start
+        for k, step in enumerate(torch.diff(times, prepend=torch.zeros(1, dtype=torch.float64))):
+            state = advance(any_model, state, step.expand(9), surfaces)
+            torch.testing.assert_close(found[:, k], state, rtol=1e-12, atol=1e-12, equal_nan=True)

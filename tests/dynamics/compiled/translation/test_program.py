@@ -38,11 +38,12 @@ def whole(program, outputs):
 
 def run(program, outputs, state, others, x, c):
     """Values (m,) and the derivatives (m, len(x) + len(c)) that the generated code gives."""
-    compute = built(function_source(whole(program, outputs), state, others)).compute
-    eye = np.eye(len(x) + len(c))
-    y, yt = np.zeros(len(outputs)), np.zeros((len(outputs), len(eye)))
-    compute(np.array(x), np.array(c), np.zeros(0), eye[: len(x)].copy(), eye[len(x) :].copy(), y, yt)
-    return y, yt
+    compute = built(function_source(whole(program, outputs), state, others))
+    eye = np.eye(len(x) + len(c))[None]
+    y, yt = np.zeros((1, len(outputs))), np.zeros((1, len(outputs), eye.shape[1]))
+    given = (np.array([x], dtype=np.float64), np.array([c], dtype=np.float64), np.zeros(0))
+    compute(*given, eye[:, : len(x)].copy(), eye[:, len(x) :].copy(), y, yt)
+    return y[0], yt[0]
 
 
 @pytest.mark.parametrize("name", UNARY)

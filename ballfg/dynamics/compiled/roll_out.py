@@ -1,0 +1,107 @@
+"""Machine code that moves balls from time to time, through contacts, by the rules of `motion.rollout`."""
+
+import math
+
+import numpy as np
+
+from ballfg.dynamics.compiled.beliefs import gap_of
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.contacts import contacts
+from ballfg.dynamics.compiled.flight import fly_one, fly_together
+from ballfg.dynamics.compiled.signatures import (
+    COUNTS,
+    FLAG,
+    FUNCTION,
+    NOTHING,
+    ONE,
+    REAL,
+    THREE,
+    THREE_FUNCTIONS,
+    THREE_VALUES,
+    THREE_WEIGHTS,
+    TWO,
+)
+from ballfg.dynamics.motion.limits import LONGEST_FALL, LONGEST_MOTION, MAX_CONTACTS, MAX_STEP, REST_GAP, REST_SPEED
+
+
+@machine_code(FLAG(ONE, ONE))
+def _over_table(x, world):
+    return world[3] <= x[0] <= world[4] and world[5] <= x[1] <= world[6]
+
+
+@machine_code(FLAG(ONE, REAL))
+def _at_rest(x, gap):
+    return abs(gap) <= REST_GAP and abs(x[5]) <= REST_SPEED / 2.0
+
+
+@machine_code(FLAG(THREE_FUNCTIONS, THREE_VALUES, THREE_WEIGHTS, ONE, REAL, REAL, ONE, ONE))
+def _through(functions, values, weights, x, level, h, world, after):
+    """Move a ball x (9,) on by h s, one step at most, to `after` (9,); whether it rests or may come to rest on the way.
+
+    It starts in flight, and `after` is where it would be without the surface at `level` m.
+    """
+    rates, impact, surface = functions
+    c, b, s = values
+    w, wb, ws = weights
+    n, none = np.zeros((1, 0)), np.empty((1, 9, 0))
+    at, tau, bounced = x.copy().reshape(1, 9), np.empty(1), np.empty((1, 9))
+    ct, bt, st = np.empty((1, c.shape[1], 0)), np.empty((1, b.shape[1], 0)), np.empty((1, s.shape[1], 0))
+    longest, empty, remaining = np.full(1, LONGEST_FALL), np.empty((9, 0)), h
+    for _ in range(MAX_CONTACTS - 1):
+        contacts(
+            rates, impact, surface, at, none, c, ct, b, bt, s, st, w, wb, ws, np.full(1, level), longest, world[2],
+            tau, n, bounced, none.copy(),
+        )  # fmt: skip
+        if level == world[0] and not math.isnan(tau[0]):
+            touch = at[0].copy()
+            fly_one(rates, touch, c[0], w, empty, ct[0], tau[0], np.empty(0), 1)
+            if not _over_table(touch, world):  # beside the table: the floor is what it falls on
+                level = world[1]
+                if gap_of(surface, after, s[0], ws, level, world[2]) >= 0.0:
+                    return False
+                continue
+        if math.isnan(tau[0]) or bounced[0, 5] < REST_SPEED:
+            return True
+        at[:] = bounced
+        remaining -= tau[0]
+        after[:] = at[0]
+        fly_one(rates, after, c[0], w, empty, ct[0], remaining, np.empty(0), 1)
+        if _at_rest(at[0], gap_of(surface, at[0], s[0], ws, level, world[2])):
+            return True
+        if not (gap_of(surface, after, s[0], ws, level, world[2]) < 0.0 and after[5] < 0.0):
+            return False
+    return True
+
+
+@machine_code(NOTHING(*[FUNCTION] * 3, THREE_VALUES, THREE_WEIGHTS, TWO, TWO, ONE, THREE, COUNTS))
+def roll_out(rates, impact, surface, values, weights, start, durations, world, states, reached):
+    """Balls start (m, 9) after each of k durations (m, k) s, one after another.
+
+    Args: world: table's and floor's height and radius in m, the table's ends, as in `Course`.
+    Writes: states (m, k, 9); reached (m,), how many of them: a ball that rests is left where the duration began.
+    """
+    functions, (c, b, s), (w, _, ws) = (rates, impact, surface), values, weights
+    m, k = durations.shape
+    x, after, still = start.copy(), np.empty((m, 9)), np.zeros((m, 0))
+    none, ct, step = np.empty((m, 9, 0)), np.empty((m, c.shape[1], 0)), np.empty(m)
+    reached[:] = k
+    for j in range(k):
+        longest = min(durations[:, j].max(), LONGEST_MOTION)
+        steps = max(1, math.ceil(longest / MAX_STEP - 1e-9))
+        step[:] = np.minimum(durations[:, j], LONGEST_MOTION) / steps
+        for _ in range(steps):
+            after[:] = x
+            fly_together(rates, after, none, c, ct, w, step, still, 1)
+            for r in range(m):
+                if reached[r] <= j:
+                    continue
+                level = world[0] if x[r, 2] > world[0] else world[1]
+                hard = _at_rest(x[r], gap_of(surface, x[r], s[r], ws, level, world[2]))
+                if not hard and after[r, 5] < 0.0 and gap_of(surface, after[r], s[r], ws, level, world[2]) < 0.0:
+                    own = (c[r : r + 1], b[r : r + 1], s[r : r + 1])
+                    hard = _through(functions, own, weights, x[r], level, step[r], world, after[r])
+                if hard:
+                    reached[r] = j
+            x[:] = after
+        for r in range(m):
+            states[r, j] = x[r]
