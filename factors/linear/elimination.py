@@ -1,10 +1,10 @@
 """Elimination of a chain of states by Householder's QR, in machine code.
 
 Every factor looks at one state or at two neighbours, and perhaps at coefficients that all share. Its rows are kept with
-the first of its states, in a matrix with the columns (x_i, x_{i+1}, c, b). State by state these rows are reduced: first
-x_i goes, against the triangle that the states before left; what still looks at x_{i+1} becomes its triangle; the rest
-is known of the coefficients alone. Normal equations would halve the digits: a loose prior on a spin beside its tight
-process noise leaves none of them.
+the first of its states, in a matrix with the columns (x_i, x_{i+1}, c, 0, b), as many zeros as make their number a
+multiple of four. State by state these rows are reduced: first x_i goes, against the triangle that the states before
+left; what still looks at x_{i+1} becomes its triangle; the rest is known of the coefficients alone. Normal equations
+would halve the digits: a loose prior on a spin beside its tight process noise leaves none of them.
 """
 
 import math
@@ -14,6 +14,9 @@ import numpy as np
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, INDEX, NOTHING, ONE, REAL, THREE, TWO
+
+FOUR_AT_ONCE = 4
+"""Numbers that one instruction multiplies."""
 
 
 @machine_code(COUNT(COUNTS, INDEX, COUNT))
@@ -42,7 +45,7 @@ def place_residuals(system: Array, free: Index, variables: Index, residual: Arra
     """Give the rows of some factors their places, and write the right side.
 
     Args:
-        system: (r, 2 w + p + 1) rows of all factors, zeros to begin with; whitened, each column per unit of its number.
+        system: (r, k) rows of all factors, zeros to begin with; whitened, each column per unit of its number.
         free: (n + 1,) the next free row of each state, moved on.
         variables: (m, a).  residual: (m, d) whitened.
         rows, firsts: (m,) written: the first row of each factor, and its first state.
@@ -97,24 +100,29 @@ def damp(system: Array, start: Index, free: Index, width: int, damping: float, d
                 elif j >= 2 * width:
                     diagonal[n, j - 2 * width] += system[row, j] ** 2
     for i in range(n + 1):
-        for j in range(width if i < n else end - 2 * width):
+        for j in range(width if i < n else diagonal.shape[1] - width):
             system[free[i], j if i < n else 2 * width + j] = math.sqrt(damping * diagonal[i, j])
             free[i] += 1
 
 
 @machine_code(NOTHING(TWO, TWO, COUNT, COUNT, COUNT, COUNT, ONE))
-def absorb(upper: Array, system: Array, begin: int, end: int, first: int, count: int, sums: Array) -> None:
+def absorb(upper: Array, system: Array, begin: int, end: int, first: int, count: int, column: Array) -> None:
     """Reflect rows begin:end of the system into a triangle, until their columns first:first+count are zero.
 
-    Those columns are not written, nobody reads them again. Args: upper: (count, all columns), triangular from column
-    `first` on.  sums: (all columns,) room for sums.
+    Columns up to those are used up, nobody reads them again. Four columns at a time fill one register of a processor.
+
+    Args:
+        upper: (count, all columns), triangular from column `first` on.
+        system: (r, all columns), whose number `FOUR_AT_ONCE` divides.
+        column: (end - begin,) or more, room for a column.
     """
-    columns = system.shape[1]
     for j in range(count):
         c = first + j
         tail = 0.0
         for r in range(begin, end):
-            tail += system[r, c] * system[r, c]
+            f = system[r, c]
+            column[r - begin] = f
+            tail += f * f
         if tail == 0.0:
             continue
         pivot = upper[j, c]
@@ -122,19 +130,27 @@ def absorb(upper: Array, system: Array, begin: int, end: int, first: int, count:
         diagonal = -norm if pivot >= 0.0 else norm
         lead = pivot - diagonal
         scale = -1.0 / (diagonal * lead)
-        for k in range(c + 1, columns):
-            sums[k] = lead * upper[j, k]
-        for r in range(begin, end):
-            factor = system[r, c]
-            for k in range(c + 1, columns):
-                sums[k] += factor * system[r, k]
-        for k in range(c + 1, columns):
-            sums[k] *= scale
-            upper[j, k] -= lead * sums[k]
-        for r in range(begin, end):
-            factor = system[r, c]
-            for k in range(c + 1, columns):
-                system[r, k] -= factor * sums[k]
+        for k in range((c + 1) // FOUR_AT_ONCE * FOUR_AT_ONCE, system.shape[1], FOUR_AT_ONCE):
+            s0, s1, s2, s3 = lead * upper[j, k], lead * upper[j, k + 1], lead * upper[j, k + 2], lead * upper[j, k + 3]
+            for r in range(begin, end):
+                f = column[r - begin]
+                s0 += f * system[r, k]
+                s1 += f * system[r, k + 1]
+                s2 += f * system[r, k + 2]
+                s3 += f * system[r, k + 3]
+            s0 = s0 * scale if k > c else 0.0  # columns up to c are done
+            s1 = s1 * scale if k + 1 > c else 0.0
+            s2 = s2 * scale if k + 2 > c else 0.0
+            s3 *= scale
+            upper[j, k] -= lead * s0
+            upper[j, k + 1] -= lead * s1
+            upper[j, k + 2] -= lead * s2
+            upper[j, k + 3] -= lead * s3
+            for r in range(begin, end):
+                f = column[r - begin]
+                x0, x1 = system[r, k] - f * s0, system[r, k + 1] - f * s1
+                x2, x3 = system[r, k + 2] - f * s2, system[r, k + 3] - f * s3
+                system[r, k], system[r, k + 1], system[r, k + 2], system[r, k + 3] = x0, x1, x2, x3
         upper[j, c] = diagonal
 
 
@@ -144,22 +160,30 @@ def eliminate(system: Array, start: Index, width: int, root: Array, last: Array)
 
     Args:
         system, start, width: as above; the system is used up.
-        root: (n, w, 2 w + p + 1) zeros; becomes the rows of R of each state: by itself, by the next one, by the
+        root: (n, w, 2 w + p + 1), written: the rows of R of each state: by itself, by the next one, by the
             coefficients, the right side.
-        last: (p, 2 w + p + 1) zeros; becomes the rows of the coefficients, at the end.
+        last: (p, 2 w + p + 1), written: the rows of the coefficients, at the end.
     """
-    n, columns = len(start) - 2, system.shape[1]
-    sums, carry = np.empty(columns), np.empty((width, columns))
-    shared = columns - 1 - 2 * width
+    n, columns, p, most = len(start) - 2, system.shape[1], len(last), 0
+    for i in range(n + 1):
+        most = max(most, start[i + 1] - start[i])
+    column, end = np.empty(most), 2 * width + p
+    upper, carry = np.zeros((width, columns)), np.empty((width, columns))
+    shared = np.zeros((p, columns))
     for i in range(n):
-        absorb(root[i], system, start[i], start[i + 1], 0, width, sums)
+        absorb(upper, system, start[i], start[i + 1], 0, width, column)
+        root[i, :, :end] = upper[:, :end]
+        root[i, :, end] = upper[:, columns - 1]
+        upper[:] = 0.0
         if i + 1 < n:
             carry[:] = 0.0
-            absorb(carry, system, start[i], start[i + 1], width, width, sums)
-            root[i + 1, :, :width] = carry[:, width : 2 * width]
-            root[i + 1, :, 2 * width :] = carry[:, 2 * width :]
-        absorb(last, system, start[i], start[i + 1], 2 * width, shared, sums)
-    absorb(last, system, start[n], start[n + 1], 2 * width, shared, sums)
+            absorb(carry, system, start[i], start[i + 1], width, width, column)
+            upper[:, :width] = carry[:, width : 2 * width]
+            upper[:, 2 * width :] = carry[:, 2 * width :]
+        absorb(shared, system, start[i], start[i + 1], 2 * width, p, column)
+    absorb(shared, system, start[n], start[n + 1], 2 * width, p, column)
+    last[:, :end] = shared[:, :end]
+    last[:, end] = shared[:, columns - 1]
 
 
 @machine_code(NOTHING(THREE, TWO, TWO, ONE))

@@ -85,7 +85,7 @@ def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> S
     diagonal = np.zeros((n + 1, w + p))
     if damping:
         elimination.damp(system, start, free, w, damping, diagonal)
-    root = Root(np.zeros((n, w, system.shape[1])), np.zeros((p, system.shape[1])))
+    root = Root(np.empty((n, w, 2 * w + p + 1)), np.empty((p, 2 * w + p + 1)))
     elimination.eliminate(system, start, w, root.states, root.coefficients)
     states, coefficients = root.states[..., -1].copy(), root.coefficients[:, -1].copy()
     promised = float((states**2).sum() + (coefficients**2).sum())  # |J d|^2, and what the damping rows add to it
@@ -115,7 +115,8 @@ def _system(pieces: Sequence[Piece], n: int, p: int, width: int, *, further: boo
     if further:
         counts += np.append(np.full(n, width), p)
     start = np.concatenate(([0], np.cumsum(counts)))
-    free, system = start[:-1].copy(), np.zeros((start[-1], 2 * width + p + 1))
+    columns = -(-(2 * width + p + 1) // elimination.FOUR_AT_ONCE) * elimination.FOUR_AT_ONCE
+    free, system = start[:-1].copy(), np.zeros((start[-1], columns))
     for variables, residual, jacobians in pieces:
         rows, firsts = np.empty(len(variables), dtype=np.int64), np.empty(len(variables), dtype=np.int64)
         elimination.place_residuals(system, free, _plain(variables), _plain(residual), rows, firsts)
