@@ -8,7 +8,7 @@ SOURCES := ballfg factors learning benchmarks tests
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: bench test check format clean
+.PHONY: bench test check check-speed format clean
 
 bench: $(READY)  ## the estimator comparison: table, results/results.json, pictures; measured tracks too where they are
 	$(BIN)/ballfg-bench estimators --out results
@@ -24,6 +24,9 @@ check: $(READY)  ## format, lint, types (of the installed package: its folders l
 	$(BIN)/ruff check $(SOURCES)
 	rm -rf build/typed && $(BIN)/pip install --quiet --no-deps --no-build-isolation --target build/typed .
 	$(BIN)/mypy --config-file pyproject.toml --cache-dir .mypy_cache build/typed/ballfg
+
+check-speed: $(READY)  ## times as multiples of a control, against those of the baseline; two minutes, nothing else running
+	$(BIN)/ballfg-bench speed --gate benchmarks/speed/baseline.json --out results/speed
 
 format: $(READY)
 	$(BIN)/ruff format $(SOURCES)

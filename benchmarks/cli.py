@@ -227,18 +227,62 @@ def intervals(
 
 
 @app.command()
-def speed(data: Timed = None, out: Out = Path("results"), quick: Quick = False, seed: Seed = 0) -> None:
+def speed(
+    data: Timed = None,
+    peers: Annotated[
+        bool, typer.Option("--peers", help="Solve the same problems with ballfg, GTSAM and each --peer in turns.")
+    ] = False,
+    peer: Annotated[
+        list[str] | None,
+        typer.Option(help="LIBRARY=PATH_TO_PYTHON, for --peers: jaxls, theseus or pypose and an interpreter with it."),
+    ] = None,
+    gate: Annotated[
+        Path | None, typer.Option(help="An earlier results.json; fail where something has become slower since.")
+    ] = None,
+    out: Out = Path("results"),
+    quick: Quick = False,
+    seed: Seed = 0,
+) -> None:
     """Times of an estimate, an update and a prediction next to a control: one thread, warm, medians.
 
-    The problem is fixed: 80 observations of a free flight. --data adds the time per track of a dataset.
+    The problem is fixed: 80 observations of a free flight. --data adds the time per track of a dataset. With --gate
+    times are compared as multiples of the control, so that another machine's results.json serves too.
 
     Example: ballfg-bench speed --out results/speed
     """
+    from ballfg.benchmarks.speed.gate import SlowerError, check_ratios
+    from ballfg.benchmarks.speed.peers.suite import run_peers
     from ballfg.benchmarks.speed.suite import FULL, QUICK, run_speed
 
-    results = _start("speed", [] if data is None else [data], quick, seed)
-    run_speed(results, None if data is None else _open(data), QUICK if quick else FULL)
+    interpreters = _interpreters(peer or [])
+    if peer and not peers:
+        raise typer.BadParameter("it is for --peers. Give that too, or leave both out.", param_hint="--peer")
+    if peers and data is not None:
+        raise typer.BadParameter("peers solve the fixed problems only. Leave it out.", param_hint="--data")
+    words = [*(["--peers"] if peers else []), *(word for name in interpreters for word in ("--peer", name))]
+    results, size = _start("speed", [] if data is None else [data], quick, seed, words), QUICK if quick else FULL
+    if gate is not None and not gate.is_file():
+        raise typer.BadParameter(f"there is no file {gate}. Give an earlier results.json.", param_hint="--gate")
+    if peers:
+        run_peers(results, interpreters, size)
+    else:
+        run_speed(results, None if data is None else _open(data), size)
     _finish(results, _folder(out), [])
+    if gate is not None:
+        try:
+            print("\n" + "\n".join(check_ratios(results.rows, gate)))
+        except SlowerError as error:
+            print(f"ballfg: {error}", file=sys.stderr)
+            raise typer.Exit(1) from None
+
+
+def _interpreters(words: Sequence[str]) -> dict[str, Path]:
+    """Paths by library."""
+    pairs = [word.partition("=") for word in words]
+    for library, sign, path in pairs:
+        if not (library and sign and path):
+            raise typer.BadParameter("it is LIBRARY=PATH_TO_PYTHON.", param_hint="--peer")
+    return {library: Path(path) for library, _, path in pairs}
 
 
 def _start(command: str, data: Sequence[Path], quick: bool, seed: int, more: Sequence[str] = ()) -> Results:

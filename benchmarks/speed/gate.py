@@ -1,0 +1,69 @@
+"""Comparison of times with those of an earlier run, each as a multiple of the control that was timed beside it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+from ballfg.benchmarks.results import Row
+
+CONTROL: Final = "banded_time"
+"""Bound by Python's own speed, as the estimators are."""
+SLOWER: Final = 1.3
+"""Multiple of the earlier ratio from which on something has become slower; runs of the same code differ by 1.1."""
+
+
+class SlowerError(Exception):
+    """Something takes longer than it did."""
+
+
+def check_ratios(rows: Sequence[Row], baseline: Path) -> list[str]:
+    """One line for each time of the baseline: its ratio to the control then and now.
+
+    Args:
+        rows: of this run.
+        baseline: the `results.json` of an earlier run.
+    Raises:
+        SlowerError: if a ratio has grown by more than `SLOWER`; it names all of them.
+        ValueError: if the file holds no times that this run has too.
+    """
+    try:
+        earlier = [Row(**row) for row in json.loads(baseline.read_text(encoding="utf-8"))["rows"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise ValueError(
+            f"--gate must be the results.json of an earlier `ballfg-bench speed`; {baseline} is none ({error})."
+        ) from error
+    before, now = _ratios(earlier), _ratios(rows)
+    shared = [key for key in before if key in now]
+    if not shared:
+        raise ValueError(f"--gate must hold times beside a control, as this run has; {baseline} shares none with it.")
+    lines, slower = [], []
+    for key in shared:
+        grown = now[key] / before[key]
+        lines.append(f"{' '.join(key)}: {now[key]:.3g} times the control, {before[key]:.3g} before ({grown:.2f})")
+        if grown > SLOWER:
+            slower.append(lines[-1])
+    if slower:
+        raise SlowerError("slower than the baseline:\n" + "\n".join(slower))
+    return lines
+
+
+def _ratios(rows: Sequence[Row]) -> dict[tuple[str, str, str], float]:
+    """Times over the control of the same case, by case, method and metric."""
+    controls: Mapping[str, list[float]] = _controls(rows)
+    found: dict[tuple[str, str, str], Any] = {}
+    for row in rows:
+        timed = row.unit == "ms" and row.metric != CONTROL and not row.metric.startswith("matrix")
+        if timed and row.value is not None and row.case in controls:
+            found[row.case, row.method, row.metric] = row.value / min(controls[row.case])
+    return found
+
+
+def _controls(rows: Sequence[Row]) -> dict[str, list[float]]:
+    found: dict[str, list[float]] = {}
+    for row in rows:
+        if row.metric == CONTROL and row.value is not None:
+            found.setdefault(row.case, []).append(row.value)
+    return found

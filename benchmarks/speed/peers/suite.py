@@ -1,0 +1,216 @@
+"""The suite of `ballfg-bench speed --peers`: the same problems by every library that is installed, in turns."""
+
+from __future__ import annotations
+
+import sys
+import tempfile
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+import torch
+
+from ballfg.arrays import Array
+from ballfg.benchmarks.metrics import median_and_quartiles
+from ballfg.benchmarks.results import Results
+from ballfg.benchmarks.speed.banded import STEP_SIGMA, BandedProblem
+from ballfg.benchmarks.speed.network import NetworkFlight, fitted_network
+from ballfg.benchmarks.speed.peers.problem import LOSS_STEPS, Problem
+from ballfg.benchmarks.speed.peers.session import LibraryError, Session
+from ballfg.benchmarks.speed.stopwatch import milliseconds
+from ballfg.benchmarks.speed.suite import (
+    DRAG,
+    LABEL_NOISE,
+    MAGNUS,
+    NO_SURFACE,
+    NOISE,
+    RATE,
+    START,
+    Size,
+    problem_model,
+    problem_track,
+)
+from ballfg.dynamics import rollout
+from ballfg.progress import progress
+from ballfg.state import POSITION, STANDARD_GRAVITY
+from ballfg.tracks import SPIN_LABELS
+
+OWN: Final = ("ballfg", "gtsam")
+"""Libraries of this environment."""
+PEERS: Final = ("jaxls", "theseus", "pypose")
+"""Libraries of other environments."""
+MOST_TRACKS: Final = 64
+SAME: Final = 1e-6
+"""Largest difference from the reference, over the largest number of its kind, up to which a solution is the same."""
+DIFFERENCE_STEPS: Final = (1e-4, 1e-5)
+"""Steps of the central differences by the drag, 1/m, and the Magnus coefficient."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is solved.
+
+    Attributes:
+        name: of the rows' case.
+        kind: "estimate", "gradient" or "rollout".
+        network: whether the acceleration is the network's.
+        tracks: number of them.
+        turns, runs: timed solutions: so many turns of so many runs of each library.
+    """
+
+    name: str
+    kind: str
+    network: bool
+    tracks: int
+    turns: int
+    runs: int
+
+
+TASKS: Final = (
+    Task("A", "estimate", False, 1, 6, 20),
+    Task("B", "estimate", True, 1, 6, 10),
+    Task("64 x A", "estimate", False, 64, 3, 3),
+    Task("64 x B", "estimate", True, 64, 3, 2),
+    Task("gradient", "gradient", False, 1, 4, 8),
+    Task("rollout", "rollout", True, 1, 4, 10),
+)
+
+
+def run_peers(results: Results, peers: Mapping[str, Path], size: Size) -> None:
+    """Times of all libraries on all tasks; what is missing or differs is said on stderr and has no row.
+
+    Args:
+        peers: interpreters of other environments, by library.
+        size: how well the network is fitted, and whether this is a quick look.
+    Raises: ValueError: if an interpreter is of no library that is compared, or not there.
+    """
+    for library, python in peers.items():
+        if library not in PEERS:
+            raise ValueError(
+                f"--peer must be of {', '.join(PEERS)}; got {library!r}. Write --peer jaxls=PATH_TO_PYTHON."
+            )
+        if not python.is_file():
+            raise ValueError(f"--peer {library} must be the path of a Python interpreter; {python} is no file.")
+    pythons = {**{name: [sys.executable] for name in OWN}, **{name: [str(p)] for name, p in peers.items()}}
+    analytic, network = _problem(size, None), _problem(size, fitted_network(problem_model(), size.fit_iterations))
+    with tempfile.TemporaryDirectory() as folder:
+        for task in progress(TASKS, len(TASKS), "problems solved"):
+            whole = network if task.network else analytic
+            problem = replace(whole, measured=whole.measured[: task.tracks], label=whole.label[: task.tracks])
+            _run_task(results, task, problem, pythons, Path(folder))
+
+
+def _problem(size: Size, network: NetworkFlight | None) -> Problem:
+    """The track of the speed benchmark, and others that differ from it in their noise."""
+    model, rng = problem_model(), np.random.default_rng(1)
+    track = problem_track(model)
+    with torch.no_grad():
+        start = torch.tensor([START], dtype=torch.float64)
+        truth = rollout(model, start, torch.from_numpy(track.times), NO_SURFACE)[0, :, POSITION].numpy()
+    others = [truth + NOISE * rng.standard_normal(truth.shape) for _ in range(MOST_TRACKS - 1)]
+    label = np.array([track.labels[name] for name in SPIN_LABELS])
+    none, scalar = (np.zeros((0, 0)), np.zeros(0)) * 3, np.asarray
+    pairs = () if network is None else zip(network.weights, network.biases, strict=True)
+    layers = none if network is None else [part.detach().numpy() for pair in pairs for part in pair]
+    return Problem(
+        np.stack([track.positions, *others]),
+        np.tile(label, (MOST_TRACKS, 1)),
+        scalar(1.0 / RATE),
+        scalar(NOISE),
+        scalar(LABEL_NOISE),
+        STEP_SIGMA,
+        np.array((0.0, 0.0, -STANDARD_GRAVITY)),
+        scalar(DRAG),
+        scalar(MAGNUS),
+        *layers,
+        flight=np.array(START),
+    )
+
+
+def _run_task(
+    results: Results, task: Task, problem: Problem, pythons: Mapping[str, Sequence[str]], folder: Path
+) -> None:
+    path = folder / f"{task.name.replace(' ', '')}.npz"
+    problem.save(path)
+    control = BandedProblem(
+        problem.measured[0],
+        float(problem.dt),
+        float(problem.position_sigma),
+        problem.label[0],
+        float(problem.label_sigma),
+        float(problem.drag),
+        float(problem.magnus),
+    )
+    with ExitStack() as stack:
+        sessions = {}
+        for library, python in pythons.items():
+            try:
+                sessions[library] = stack.enter_context(Session(python, library, task.kind, path))
+            except LibraryError as error:
+                print(f"note: {task.name}: {error}", file=sys.stderr)
+        reference = _reference(task, problem, path, sessions["ballfg"])
+        times: dict[str, list[float]] = {library: [] for library in sessions}
+        controls = []
+        for _ in range(task.turns):
+            controls += [milliseconds(control.solve) for _ in range(5)]
+            for library, session in sessions.items():
+                times[library] += [1e3 * t for t in session.times(task.runs)]
+        results.add(task.name, "control", "banded_time", "ms", median_and_quartiles(controls), len(controls))
+        for library, session in sessions.items():
+            off = _difference(session.solution(folder), reference)
+            results.add(task.name, library, "difference", "1", off, 1)
+            if off > SAME and task.kind != "gradient":
+                print(f"note: {task.name}: {library} is {off:.1e} away from the minimum: no time", file=sys.stderr)
+                continue
+            figure = median_and_quartiles(times[library])
+            results.add(task.name, library, "time", "ms", figure, len(times[library]))
+            results.add(task.name, library, "compile_time", "s", max(session.first - 1e-3 * figure.value, 0.0), 1)
+            results.add(task.name, library, "cold_start", "s", session.cold, 1)
+            results.add(task.name, library, "memory", "MiB", session.peak, 1)
+
+
+def _reference(task: Task, problem: Problem, path: Path, own: Session) -> dict[str, Array]:
+    """What solutions are compared with: the banded solver's, and GTSAM's to the last digits for the network.
+
+    Of gradients central differences of the banded solver, of rollouts ballfg's own, which the others must meet.
+    """
+    if task.kind == "rollout":
+        return own.solution(path.parent)
+    if task.network:
+        with Session([sys.executable], "gtsam", "reference", path) as session:
+            return session.solution(path.parent)
+    if task.kind == "gradient":
+        laws = np.array((float(problem.drag), float(problem.magnus)))
+        return {"gradient": np.array([_slope(problem, laws, k) for k in range(len(laws))])}
+    solved = [_banded(problem, k, float(problem.drag), float(problem.magnus)) for k in range(task.tracks)]
+    states = np.stack([states for states, _ in solved])
+    return {"position": states[..., :3], "velocity": states[..., 3:], "spin": np.stack([spin for _, spin in solved])}
+
+
+def _banded(problem: Problem, track: int, drag: float, magnus: float) -> tuple[Array, Array]:
+    """States (n, 6) and spin (3,) by the banded solver."""
+    noise = float(problem.position_sigma), problem.label[track], float(problem.label_sigma)
+    return BandedProblem(problem.measured[track], float(problem.dt), *noise, drag, magnus).solve()[:2]
+
+
+def _slope(problem: Problem, laws: Array, which: int) -> float:
+    """Derivative of the loss by one of the laws' coefficients: central differences of fourth order."""
+
+    def loss(shift: float) -> float:
+        drag, magnus = laws + shift * DIFFERENCE_STEPS[which] * np.eye(2)[which]
+        states, spin = _banded(problem, 0, drag, magnus)
+        p, v, dt = states[-1, :3], states[-1, 3:], float(problem.dt)
+        for _ in range(LOSS_STEPS):
+            a = problem.gravity - drag * np.sqrt(v @ v) * v + magnus * np.cross(spin, v)
+            p, v = p + dt * v + 0.5 * dt**2 * a, v + dt * a
+        return float(p @ p)
+
+    return (8.0 * (loss(1.0) - loss(-1.0)) - (loss(2.0) - loss(-2.0))) / (12.0 * DIFFERENCE_STEPS[which])
+
+
+def _difference(found: Mapping[str, Array], wanted: Mapping[str, Array]) -> float:
+    """The largest, over the largest number of its kind."""
+    return max(float(np.abs(found[name] - right).max() / np.abs(right).max()) for name, right in wanted.items())

@@ -1,0 +1,181 @@
+"""ballfg: factors of the same residuals, its own Levenberg-Marquardt, derivatives in machine code."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from problem import LOSS_STEPS, ROLLOUT_STEPS, Array, Problem
+from torch import Tensor, nn
+
+from ballfg.arrays import Index
+from ballfg.dynamics import BallModel, Surfaces, model_from_dict, rollout
+from ballfg.dynamics.compiled.functions import compiled
+from ballfg.dynamics.model import Rates
+from ballfg.factors.batch import FactorBatch, Noise, Values
+from ballfg.factors.graph import BallGraph, LevenbergMarquardt
+from ballfg.factors.position import PositionFactors
+from ballfg.factors.prior import PriorFactors
+from ballfg.learning.gradient.conjugate_gradients import ConjugateGradients, GaussNewtonFactors
+from ballfg.learning.gradient.implicit import ImplicitGradient
+from ballfg.learning.gradient.objective import BatchObjective
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+
+torch.set_num_threads(1)
+EXACT = 1e-8
+"""Relative error of the linear solution of a gradient, in keeping with what is compared."""
+HELD = 1e-6
+"""rad/s, by which the spin may change over a step: one spin for the flight, within all digits that are compared."""
+
+
+class EulerFactors(FactorBatch):
+    """The state after one explicit step of the acceleration, as the problem has it; the spin stays.
+
+    Args:
+        problem: with the step's length and noise.
+        model: gives accelerations.
+        states: (m,) index of each step's first state.
+    """
+
+    def __init__(self, problem: Problem, model: BallModel, states: Index) -> None:
+        super().__init__(np.stack((states, states + 1), axis=1), STATE_DIM)
+        functions = compiled(model)
+        assert functions is not None
+        self.model, self.dt = model, float(problem.dt)
+        self.rates, self.weights = functions.rates, functions.weights(model)[0]
+        own = dict(model.named_parameters())
+        self.coefficients = np.array([float(own[name].detach()) for name in functions.rates.names])
+        self.root = 1.0 / np.concatenate((problem.step_sigma, np.full(3, HELD)))
+
+    def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
+        """Whitened residuals (k, 9) and Jacobians (k, 9, 9)."""
+        before, after = np.ascontiguousarray(inputs[0]), inputs[1]
+        n, dt = len(before), self.dt
+        moved = np.zeros((n, STATE_DIM, 6))
+        moved[:, 3:] = np.eye(6)
+        c = np.tile(self.coefficients, (n, 1))
+        a, slope = np.empty((n, 6)), np.empty((n, 6, 6))
+        self.rates.compute(before, c, self.weights, moved, np.zeros((n, c.shape[1], 6)), a, slope)
+        shift, by = np.zeros((n, STATE_DIM)), np.zeros((n, STATE_DIM, STATE_DIM))
+        shift[:, POSITION] = dt * before[:, VELOCITY] + 0.5 * dt**2 * a[:, :3]
+        shift[:, VELOCITY] = dt * a[:, :3]
+        by[:, range(STATE_DIM), range(STATE_DIM)] = 1.0
+        by[:, range(3), range(3, 6)] = dt
+        by[:, POSITION, 3:] += 0.5 * dt**2 * slope[:, :3]
+        by[:, VELOCITY, 3:] += dt * slope[:, :3]
+        own = np.broadcast_to(np.diag(self.root), by.shape)
+        return (after - before - shift) * self.root, (-by * self.root[:, None], own)
+
+    def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
+        """(m, 9) whitened residuals in torch."""
+        return (inputs[1] - _stepped(self.model, inputs[0], self.dt)) * torch.from_numpy(self.root)
+
+
+def _stepped(model: BallModel, state: Tensor, dt: float) -> Tensor:
+    """States (..., 9) after an explicit step."""
+    a, v = model.rates(state)[0], state[..., VELOCITY]
+    moved = (state[..., POSITION] + dt * v + 0.5 * dt**2 * a, v + dt * a, state[..., SPIN])
+    return torch.cat(moved, dim=-1)
+
+
+class Network(BallModel):
+    """Flight by the problem's network."""
+
+    def __init__(self, problem: Problem) -> None:
+        super().__init__(0.02, 2.0 / 3.0)
+        pairs = [(torch.from_numpy(w), torch.from_numpy(b)) for w, b in problem.layers]
+        self.tables = nn.ParameterList([part for pair in pairs for part in pair]).requires_grad_(False)
+
+    def rates(self, state: Tensor) -> Rates:
+        """Acceleration; the spin is constant."""
+        v, w = state[..., VELOCITY], state[..., SPIN]
+        x = torch.cat((v, w, torch.linalg.cross(w, v)), dim=-1)
+        w1, b1, w2, b2, w3, b3 = self.tables
+        x = torch.tanh(nn.functional.linear(torch.tanh(nn.functional.linear(x, w1, b1)), w2, b2))
+        return nn.functional.linear(x, w3, b3), None
+
+    def after_bounce(self, state: Tensor) -> Tensor:
+        """There is nothing to bounce on."""
+        return state
+
+
+def model_of(problem: Problem) -> BallModel:
+    """The problem's laws as a model."""
+    if problem.layers:
+        return Network(problem)
+    gravity = {"g": -float(problem.gravity[2])}
+    laws = {"gravity": gravity, "drag": {"k": float(problem.drag)}, "magnus": {"k": float(problem.magnus)}}
+    return model_from_dict({"flight": laws, "bounce": {}})
+
+
+def solver(problem: Problem, task: str):
+    """Graphs of all tracks, minimised in lockstep where there are several; or the network rolled out."""
+    model = model_of(problem)
+    if task == "rollout":
+        return _rollout(problem, model)
+    if task == "gradient":
+        return _gradient(problem, model)
+    optimizer, (p, v, w) = LevenbergMarquardt(), problem.start()
+    pairs = [(_graph(problem, model, k), _start(p[k], v[k], w[k])) for k in range(len(p))]
+
+    def solve() -> dict[str, Array]:
+        states = np.stack([optimizer.minimize(*pair).values.states for pair in pairs])
+        return {"position": states[..., :3], "velocity": states[..., 3:6], "spin": states[:, 0, 6:]}
+
+    return solve
+
+
+def _gradient(problem: Problem, model: BallModel):
+    """Forward, and backward through the converged estimate by the implicit function theorem."""
+    own = dict(model.named_parameters())
+    drag, magnus = (own[f"flight.{name}.k"].requires_grad_(True) for name in ("drag", "magnus"))
+    graph, start = _graph(problem, model, 0), _start(*(part[0] for part in problem.start()))
+    optimizer = LevenbergMarquardt()
+
+    def solve() -> dict[str, Array]:
+        minimum = optimizer.minimize(graph, start)
+        assert minimum.step is not None
+        objective = BatchObjective([graph], [minimum.values])
+        layout, factors = objective.layout, GaussNewtonFactors([minimum.step.root])
+        point = ImplicitGradient()(
+            lambda: layout.pack([minimum.values]),
+            lambda at: objective.gradient(at, Noise()),
+            ConjugateGradients(factors, layout.owners(), EXACT),
+            [drag, magnus],
+        )
+        state = layout.unpack(point)[0][-1:]
+        for _ in range(LOSS_STEPS):
+            state = _stepped(model, state, float(problem.dt))
+        loss = state[:, POSITION].square().sum()
+        return {"gradient": torch.stack(torch.autograd.grad(loss, (drag, magnus))).numpy()}
+
+    return solve
+
+
+def _start(p: Array, v: Array, w: Array) -> Values:
+    return Values(np.concatenate((p, v, np.tile(w, (len(p), 1))), axis=1), np.zeros(0))
+
+
+def _graph(problem: Problem, model: BallModel, track: int) -> BallGraph:
+    n = problem.measured.shape[1]
+    sigma = np.full((n, 3), float(problem.position_sigma))
+    label, root = np.zeros((1, STATE_DIM)), np.zeros((1, 3, STATE_DIM))
+    label[0, SPIN] = problem.label[track]
+    root[0, range(3), range(6, 9)] = 1.0 / float(problem.label_sigma)
+    return BallGraph(
+        (
+            EulerFactors(problem, model, np.arange(n - 1)),
+            PositionFactors(np.arange(n), problem.measured[track], sigma),
+            PriorFactors(np.zeros(1, dtype=np.int64), label, root),
+        )
+    )
+
+
+def _rollout(problem: Problem, model: BallModel):
+    start, nothing = torch.from_numpy(problem.flight)[None], Surfaces(-1e3)
+    times = torch.arange(1, ROLLOUT_STEPS + 1, dtype=torch.float64) * float(problem.dt)
+
+    def roll() -> dict[str, Array]:
+        with torch.no_grad():
+            return {"states": rollout(model, start, times, nothing)[0].numpy()}
+
+    return roll

@@ -1,0 +1,80 @@
+"""The problem's acceleration in torch, shared by the libraries that are built on it; torch itself rolls out."""
+
+from __future__ import annotations
+
+import torch
+from problem import LOSS_STEPS, ROLLOUT_STEPS, Problem
+from torch import Tensor
+
+torch.set_num_threads(1)
+torch.set_default_dtype(torch.float64)
+
+
+def acceleration_of(problem: Problem, drag: Tensor | None = None, magnus: Tensor | None = None):
+    """Accelerations (..., 3) of velocities and spins (..., 3); drag and Magnus coefficients (t, 1) may be tensors."""
+    layers = [(torch.from_numpy(w), torch.from_numpy(b)) for w, b in problem.layers]
+    gravity = torch.from_numpy(problem.gravity)
+    k = float(problem.drag) if drag is None else drag
+    m = float(problem.magnus) if magnus is None else magnus
+
+    def formula(v: Tensor, w: Tensor) -> Tensor:
+        return gravity - k * v.norm(dim=-1, keepdim=True) * v + m * torch.linalg.cross(w, v)
+
+    def network(v: Tensor, w: Tensor) -> Tensor:
+        x = torch.cat((v, w, torch.linalg.cross(w, v)), dim=-1)
+        for weight, bias in layers[:-1]:
+            x = torch.tanh(torch.nn.functional.linear(x, weight, bias))
+        return torch.nn.functional.linear(x, *layers[-1])
+
+    return network if layers else formula
+
+
+def loss_of(problem: Problem, drag: Tensor, magnus: Tensor, p: Tensor, v: Tensor, w: Tensor) -> Tensor:
+    """() m^2: the squared position `LOSS_STEPS` explicit steps after a state (1, 3) each."""
+    acceleration, dt = acceleration_of(problem, drag, magnus), float(problem.dt)
+    for _ in range(LOSS_STEPS):
+        a = acceleration(v, w)
+        p, v = p + dt * v + 0.5 * dt**2 * a, v + dt * a
+    return p.square().sum()
+
+
+def residual_of(problem: Problem):
+    """Whitened residuals over the steps (t, n - 1, 6) of positions and velocities (t, n, 3) and spins (t, 3)."""
+    dt, sigma, acceleration = float(problem.dt), torch.from_numpy(problem.step_sigma), acceleration_of(problem)
+
+    def residual(p: Tensor, v: Tensor, w: Tensor) -> Tensor:
+        before = v[:, :-1]
+        a = acceleration(before, w[:, None].expand_as(before))
+        steps = (p[:, 1:] - p[:, :-1] - dt * before - 0.5 * dt**2 * a, v[:, 1:] - before - dt * a)
+        return torch.cat(steps, dim=-1) / sigma
+
+    return residual
+
+
+def solver(problem: Problem, task: str):
+    """A rollout, step by step as torch runs it."""
+    if task != "rollout":
+        raise NotImplementedError(f"torch alone has no {task}")
+    return rollout(problem)
+
+
+def rollout(problem: Problem):
+    """The rollout in torch's eager mode."""
+    h, start, acceleration = float(problem.dt), torch.from_numpy(problem.flight)[None], acceleration_of(problem)
+
+    def rate(x: Tensor) -> Tensor:
+        v, w = x[:, 3:6], x[:, 6:]
+        return torch.cat((v, acceleration(v, w), torch.zeros_like(v)), dim=-1)
+
+    def roll():
+        x, states = start, []
+        with torch.no_grad():
+            for _ in range(ROLLOUT_STEPS):
+                k1 = rate(x)
+                k2 = rate(x + 0.5 * h * k1)
+                k3 = rate(x + 0.5 * h * k2)
+                x = x + h / 6.0 * (k1 + 2.0 * k2 + 2.0 * k3 + rate(x + h * k3))
+                states.append(x)
+        return {"states": torch.cat(states).numpy()}
+
+    return roll
