@@ -68,6 +68,8 @@ class CompiledModel:
 
     def weights(self, model: BallModel) -> tuple[Array, Array, Array]:
         """Those that rates, impact and surface take, from a model's tables as they are now."""
+        if all(part.weigh is None for part in (self.rates, self.impact, self.surface)):
+            return NONE, NONE, NONE
         numbers = numbers_of(model)
         tables, now = numbers.tables(), numbers.stamp()
         known = _weights.get(model)

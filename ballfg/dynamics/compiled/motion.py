@@ -184,16 +184,30 @@ def fly_jacobian(model: BallModel, functions: CompiledModel, state: Tensor, dt: 
     return moving.results()
 
 
+def fly_through(
+    model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, heights: Sequence[Tensor | float]
+) -> tuple[Tensor, Tensor]:
+    """As `contact.fly_through`, without derivatives."""
+    moving = Moving(model, functions, state.detach(), 0)
+    times = _through(moving, dt, heights)
+    return moving.whole(), times
+
+
 def fly_through_jacobian(
     model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor, heights: Sequence[Tensor | float]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """As `contact.fly_through_jacobian`."""
-    moving, whole = Moving(model, functions, state.detach(), state.shape[-1]), dt.detach().numpy()
-    times = []
+    moving = Moving(model, functions, state.detach(), state.shape[-1])
+    times = _through(moving, dt, heights)
+    after, jacobian = moving.results()
+    return after, times, jacobian
+
+
+def _through(moving: Moving, dt: Tensor, heights: Sequence[Tensor | float]) -> Tensor:
+    """Move balls on by dt (n,) s with a contact at each height on the way; the times of these (n, k) s."""
+    whole, times = np.ascontiguousarray(dt.detach().numpy()), []
     for height in heights:
-        level = np.full(whole.shape, height, dtype=np.float64)
-        moving.bounce(level, np.abs(whole) + BEYOND)
+        moving.bounce(np.full(whole.shape, height, dtype=np.float64), np.abs(whole) + BEYOND)
         times.append(torch.from_numpy(moving.elapsed))
     moving.fly(whole)
-    after, jacobian = moving.results()
-    return after, torch.stack(times, dim=-1) if times else dt.new_zeros((*dt.shape, 0)), jacobian
+    return torch.stack(times, dim=-1) if times else dt.new_zeros((*dt.shape, 0))

@@ -137,6 +137,12 @@ def fly_through(
     Returns: state after dt (n, 9), contact times since the start (n, len(heights)) s. NaN in rows in which a contact
         never comes; they have no part in any gradient.
     """
+    if not followed(state, dt, *heights):
+        from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
+
+        functions = motion.functions_of(model)
+        if functions is not None:
+            return motion.fly_through(model, functions, state, dt, heights)
     elapsed = torch.zeros_like(dt)
     lost = torch.zeros_like(dt, dtype=torch.bool)
     times = []
