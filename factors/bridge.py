@@ -104,6 +104,12 @@ class Bridge:
         self._inputs[row] = tuple([x.tobytes() for x in inputs])
         self._answers[row] = residual, jacobians
 
+    def kept(self, row: int) -> tuple[Array, tuple[Array, ...]]:
+        """Residual (r,) and Jacobians (r, d), whitened, of a row that was prepared or kept last."""
+        found = self._answers[row]
+        assert found is not None
+        return found
+
     def answer(self, row: int, keys: Sequence[int], values: gtsam.Values) -> tuple[Array, tuple[Array, ...]]:
         """Residual (r,) and Jacobians (r, d), whitened, of a row at GTSAM's values.
 
@@ -114,9 +120,7 @@ class Bridge:
         if asked != self._inputs[row]:
             self.misses += 1
             self._evaluate(row, keys, values)
-        found = self._answers[row]
-        assert found is not None
-        residual, blocks = found
+        residual, blocks = self.kept(row)
         return residual, tuple([_widened(block, len(v)) for block, v in zip(blocks, vectors, strict=True)])
 
     def _seen(self, key: int, vector: Array) -> Array:

@@ -19,6 +19,11 @@ FOUR_AT_ONCE = 4
 """Numbers that one instruction multiplies."""
 
 
+def padded(columns: int) -> int:
+    """The next multiple of `FOUR_AT_ONCE`."""
+    return -(-columns // FOUR_AT_ONCE) * FOUR_AT_ONCE
+
+
 @machine_code(COUNT(COUNTS, INDEX, COUNT))
 def count_rows(counts: Index, variables: Index, dim: int) -> int:
     """Add the rows of some factors to those of their first states.
@@ -154,36 +159,53 @@ def absorb(upper: Array, system: Array, begin: int, end: int, first: int, count:
         upper[j, c] = diagonal
 
 
+@machine_code(NOTHING(TWO, COUNTS, COUNT, THREE, THREE, THREE))
+def eliminate_on(system: Array, start: Index, width: int, carries: Array, shared: Array, root: Array) -> None:
+    """Reduce the rows of a part of the chain, from a state on to the last, after what the states before have left.
+
+    Args:
+        system: (r, k) as above; it is used up.  width: w.
+        start: (m + 1,) the first row of each of m states, and the end.
+        carries: (m + 1, w, k) triangle that the states before leave on the first one; those on the others are written.
+        shared: (m + 1, p, k) triangle of the coefficients before the first state; that after each state is written.
+        root: (m, w, 2 w + p + 1), written: the rows of R of each state: by itself, by the next one, by the
+            coefficients, the right side.
+    """
+    m, columns, p, most = len(start) - 1, system.shape[1], shared.shape[1], 0
+    for i in range(m):
+        most = max(most, start[i + 1] - start[i])
+    column, end = np.empty(most), 2 * width + p
+    upper, carry = np.empty((width, columns)), np.empty((width, columns))
+    for i in range(m):
+        upper[:] = carries[i]
+        absorb(upper, system, start[i], start[i + 1], 0, width, column)
+        root[i, :, :end] = upper[:, :end]
+        root[i, :, end] = upper[:, columns - 1]
+        carry[:] = 0.0
+        absorb(carry, system, start[i], start[i + 1], width, width, column)
+        carries[i + 1] = 0.0
+        carries[i + 1, :, :width] = carry[:, width : 2 * width]
+        carries[i + 1, :, 2 * width :] = carry[:, 2 * width :]
+        shared[i + 1] = shared[i]
+        absorb(shared[i + 1], system, start[i], start[i + 1], 2 * width, p, column)
+
+
 @machine_code(NOTHING(TWO, COUNTS, COUNT, THREE, TWO))
 def eliminate(system: Array, start: Index, width: int, root: Array, last: Array) -> None:
     """Reduce all rows to the triangle R with its right side.
 
     Args:
-        system, start, width: as above; the system is used up.
-        root: (n, w, 2 w + p + 1), written: the rows of R of each state: by itself, by the next one, by the
-            coefficients, the right side.
+        system, start, width: as above, with the rows of the coefficients alone behind those of the last state.
+        root: (n, w, 2 w + p + 1), written: as above.
         last: (p, 2 w + p + 1), written: the rows of the coefficients, at the end.
     """
-    n, columns, p, most = len(start) - 2, system.shape[1], len(last), 0
-    for i in range(n + 1):
-        most = max(most, start[i + 1] - start[i])
-    column, end = np.empty(most), 2 * width + p
-    upper, carry = np.zeros((width, columns)), np.empty((width, columns))
-    shared = np.zeros((p, columns))
-    for i in range(n):
-        absorb(upper, system, start[i], start[i + 1], 0, width, column)
-        root[i, :, :end] = upper[:, :end]
-        root[i, :, end] = upper[:, columns - 1]
-        upper[:] = 0.0
-        if i + 1 < n:
-            carry[:] = 0.0
-            absorb(carry, system, start[i], start[i + 1], width, width, column)
-            upper[:, :width] = carry[:, width : 2 * width]
-            upper[:, 2 * width :] = carry[:, 2 * width :]
-        absorb(shared, system, start[i], start[i + 1], 2 * width, p, column)
-    absorb(shared, system, start[n], start[n + 1], 2 * width, p, column)
-    last[:, :end] = shared[:, :end]
-    last[:, end] = shared[:, columns - 1]
+    n, columns, p = len(start) - 2, system.shape[1], len(last)
+    end = 2 * width + p
+    carries, shared = np.zeros((n + 1, width, columns)), np.zeros((n + 1, p, columns))
+    eliminate_on(system, start[: n + 1], width, carries, shared, root)
+    absorb(shared[n], system, start[n], start[n + 1], end - p, p, np.empty(start[n + 1] - start[n]))
+    last[:, :end] = shared[n, :, :end]
+    last[:, end] = shared[n, :, columns - 1]
 
 
 @machine_code(NOTHING(THREE, TWO, TWO, ONE))

@@ -115,8 +115,7 @@ def _system(pieces: Sequence[Piece], n: int, p: int, width: int, *, further: boo
     if further:
         counts += np.append(np.full(n, width), p)
     start = np.concatenate(([0], np.cumsum(counts)))
-    columns = -(-(2 * width + p + 1) // elimination.FOUR_AT_ONCE) * elimination.FOUR_AT_ONCE
-    free, system = start[:-1].copy(), np.zeros((start[-1], columns))
+    free, system = start[:-1].copy(), np.zeros((start[-1], elimination.padded(2 * width + p + 1)))
     for variables, residual, jacobians in pieces:
         rows, firsts = np.empty(len(variables), dtype=np.int64), np.empty(len(variables), dtype=np.int64)
         elimination.place_residuals(system, free, _plain(variables), _plain(residual), rows, firsts)

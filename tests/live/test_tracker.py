@@ -36,8 +36,8 @@ def online(samples: np.ndarray) -> list:
 
 def same_state(one, other) -> None:
     assert one.time == other.time
-    np.testing.assert_allclose(one.mean, other.mean, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(one.joint, other.joint, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(one.mean, other.mean, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(one.joint, other.joint, rtol=1e-9, atol=1e-9)
 
 
 def test_states_are_those_of_the_estimator_and_a_new_ball_follows_the_old() -> None:

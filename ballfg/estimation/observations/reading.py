@@ -54,6 +54,7 @@ class Reading(Observation):
         m, dim = np.size(state), len(self.columns)
         self.state: Index = np.asarray(state, dtype=np.int64).reshape(m)
         given = np.asarray(values, dtype=np.float64)
+        given = given[None] if given.ndim == 0 and np.ndim(state) == 0 else given  # one reading, as a plain number
         if given.shape not in ((m, dim), (m,) if dim == 1 else (m, dim)):
             raise ValueError(f"values of '{self.name}' must have shape ({m}, {dim}); got {given.shape}")
         self.values: Array = given.reshape(m, dim)

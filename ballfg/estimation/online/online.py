@@ -1,8 +1,9 @@
 """The online estimator: iSAM2, one observation at a time, within a window of bounded length."""
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Final, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -12,14 +13,15 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
 from ballfg.estimation.observations.observation import Context, Observation, refuse_unknowns
+from ballfg.estimation.online.chain import ChainWindow
 from ballfg.estimation.online.events import SIGMA_FACTOR, EventTracker, contact_step, first_difference
 from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unknown
-from ballfg.estimation.online.isam import Sample, Update
 from ballfg.estimation.online.measurement import Measurement
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.online.stream import SightingStream
+from ballfg.estimation.online.stream_window import Sample, StreamWindow, Update
 from ballfg.estimation.online.warm_up import warmed_up
-from ballfg.estimation.online.window import Window
+from ballfg.estimation.online.window import IsamWindow
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import physics_of
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
@@ -36,6 +38,8 @@ LATEST_CHANGE = 80
 """Samples. The segmenter's events are final after 64; nothing older is built again."""
 YOUNG = 20
 """Samples after a contact in which the estimate may still move it to another interval."""
+Solver = Literal["isam2", "chain"]
+WINDOWS: Final[Mapping[Solver, type[StreamWindow]]] = {"isam2": IsamWindow, "chain": ChainWindow}
 
 
 class Online(Estimator):
@@ -49,6 +53,8 @@ class Online(Estimator):
         settings: noise and priors; time offsets of cameras are not estimated here, see `estimate_time_offsets`.
         lag: the window is cut to this many states whenever it holds twice as many.
         cameras: that sightings come from.
+        solver: what holds the linear system: "isam2", GTSAM's, which can be opened up and takes further factors;
+            "chain", which gives the same answers in less time.
 
     Attributes:
         window: the samples, states and factors that are held; None before the first observation.
@@ -65,8 +71,11 @@ class Online(Estimator):
         settings: Settings | None = None,
         lag: int = LAG,
         cameras: Sequence[Camera] = (),
+        solver: Solver = "isam2",
     ) -> None:
         super().__init__(model, surfaces, settings)
+        if solver not in WINDOWS:
+            raise ValueError(f"solver must be one of {', '.join(WINDOWS)}; got {solver!r}")
         if lag < 2:
             raise ValueError(f"lag must be at least 2 states; got {lag}")
         if self.settings.time_offsets:
@@ -74,7 +83,7 @@ class Online(Estimator):
                 "settings.time_offsets must be empty for the estimator 'online': it cannot move stamps that have "
                 "passed. Find the offsets beforehand with estimate_time_offsets and give the cameras that it returns."
             )
-        self.cameras = tuple(cameras)
+        self.cameras, self.solver = tuple(cameras), solver
         self.ball = trackwise_model(self.model, self.settings)
         self.physics = physics_of(self.model)
         self.lag = lag
@@ -82,7 +91,7 @@ class Online(Estimator):
 
     def reset(self) -> None:
         """Forget everything: the next observation begins a new stream."""
-        self.window: Window | None = None
+        self.window: StreamWindow | None = None
         self.events = EventTracker(self.surfaces, self.physics, self.settings.find_events)
         self._samples: list[Sample] = []  # of the window, also while iSAM2 is out of order
         self._stream = SightingStream(self.cameras, self.settings.sighting_loss) if self.cameras else None
@@ -185,10 +194,10 @@ class Online(Estimator):
             status, update = self._repair(error, status)
         return self._state(self.window, self._samples[-1], update, revised, rebuilt, status)
 
-    def _new_window(self, sample: Sample) -> Window:
+    def _new_window(self, sample: Sample) -> StreamWindow:
         """A window that begins with a sample; only measured positions have a tracker's bias."""
         biased = self.settings.has_memory and sample.measured
-        return Window(self.ball, self.settings, float(sample.stated.min()), biased)
+        return WINDOWS[self.solver](self.ball, self.settings, float(sample.stated.min()), biased)
 
     def _tell_whole_error(self, sample: Sample) -> None:
         """Standard deviations of a new sample's whole error, and the rough velocity that its stamp's error needs."""
@@ -215,7 +224,7 @@ class Online(Estimator):
             status, update = self._repair(error, status)
         return self._state(self.window, sample, update, 0, rebuilt, status)
 
-    def _take_in(self, window: Window, sample: Sample, changed: bool) -> tuple[int, Update]:
+    def _take_in(self, window: StreamWindow, sample: Sample, changed: bool) -> tuple[int, Update]:
         """Explain, go back to where the explanation changed, append, move contacts, keep the window's length."""
         again = self._explain(window) if changed else []
         if self.settings.stamp_jitter > 0.0 and sample.measured:
@@ -231,7 +240,7 @@ class Online(Estimator):
             self._samples = list(window.samples)
         return max(len(again), moved), update
 
-    def _tell_velocities(self, window: Window) -> None:
+    def _tell_velocities(self, window: StreamWindow) -> None:
         """Rough velocities of the samples to come, by line fits between the events; they shape the errors of stamps.
 
         A start or a hit just before the last sample in the window left its velocity open; now there are more samples.
@@ -247,12 +256,12 @@ class Online(Estimator):
         if begins:
             window.reweigh([held - 1])
 
-    def _append(self, window: Window, sample: Sample) -> Update:
+    def _append(self, window: StreamWindow, sample: Sample) -> Update:
         update = window.append(sample)
         self._counts += update.evaluated, update.calls
         return update
 
-    def _explain(self, window: Window) -> list[Sample]:
+    def _explain(self, window: StreamWindow) -> list[Sample]:
         """Lay the events over the samples; those from the first difference on are taken back and returned."""
         samples, held = self._samples, len(window)
         times, positions = np.array([s.time for s in samples]), np.array([s.position for s in samples])
@@ -277,7 +286,7 @@ class Online(Estimator):
             window.reweigh(staying)
         return again
 
-    def _move_contacts(self, window: Window) -> int:
+    def _move_contacts(self, window: StreamWindow) -> int:
         """Put young contacts where the estimate says they are; the newest one may not have happened yet.
 
         Returns: how many samples were taken back for it.
@@ -321,7 +330,7 @@ class Online(Estimator):
             raise error from None
 
     def _state(
-        self, window: Window, sample: Sample, update: Update, revised: int, rebuilt: bool, status: Status
+        self, window: StreamWindow, sample: Sample, update: Update, revised: int, rebuilt: bool, status: Status
     ) -> OnlineState:
         mean, joint = window.newest_belief
         return OnlineState(

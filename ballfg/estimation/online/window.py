@@ -2,29 +2,28 @@
 
 import copy
 from collections.abc import Sequence
+from typing import Self
 
 import gtsam
-import numpy as np
 
-from ballfg.estimation.online.isam import IncrementalWindow, Sample, Update
+from ballfg.arrays import Array
+from ballfg.estimation.online.isam import IsamCore
+from ballfg.estimation.online.linear import LinearFactors
 from ballfg.estimation.online.measurement import Measurement, prepare
+from ballfg.estimation.online.stream_window import Sample, Update
 from ballfg.estimation.online.tracker import bias_start
+from ballfg.factors.batch import FactorBatch
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
 
 
-class Window(IncrementalWindow):
-    """The window of the online estimator: arguments and attributes as those of `IncrementalWindow`."""
+class IsamWindow(IsamCore):
+    """The window in iSAM2: arguments and attributes as those of `IsamCore`."""
 
-    def __len__(self) -> int:
-        return len(self.samples)
-
-    def copy(self, samples: Sequence[Sample]) -> "Window":
+    def copy(self, samples: Sequence[Sample]) -> Self:
         """A window with the same states and factors, which goes on by itself.
 
         iSAM2 is copied with its cliques. The factors are shared: their bridges answer for any state, from what they
         keep or by evaluating anew.
-
-        Args: samples: copies of the window's.
         """
         other = copy.copy(self)
         other.isam = gtsam.ISAM2(self.isam)
@@ -35,10 +34,7 @@ class Window(IncrementalWindow):
         return other
 
     def retract(self, count: int) -> None:
-        """Take the newest samples back, with their states and factors; iSAM2 forgets them.
-
-        Args: count: how many stay, at least 1.
-        """
+        """Take the newest samples back, with their states and factors; iSAM2 forgets them."""
         gone = self.samples[count:]
         slots = [slot for sample in gone for slot in sample.slots]
         slots += [i.slot for i in self.intervals[count - 1 :] if i is not None and i.slot is not None]
@@ -50,10 +46,7 @@ class Window(IncrementalWindow):
         self._read_back()
 
     def attach(self, measurement: Measurement) -> Update:
-        """One more measurement of the newest sample, which holds it already.
-
-        Raises: RuntimeError or ValueError: as `append`.
-        """
+        """One more measurement of the newest sample, which holds it already."""
         _, count, calls = self._relinearize(None)
         measurement.corrected(self.points[-1], self.newest_covariance[: self.width, : self.width])
         prepare([measurement], self.theta[-1:])
@@ -101,6 +94,16 @@ class Window(IncrementalWindow):
         except RuntimeError:
             self.first, self.samples, self.intervals, self.theta, self.delta, self.shared = before
             raise
+
+    def joint_covariances(self, count: int) -> list[Array]:
+        """(w + p, w + p) of each of the oldest states, with its bias and the coefficients."""
+        shared, first = [COEFFICIENT_KEY] * (self.p > 0), STATE_KEY + self.first
+        return [self.isam.jointMarginalCovariance([first + k, *shared]).fullMatrix() for k in range(count)]
+
+    def summaries(self) -> list[FactorBatch]:
+        """The linear factors that states left, about the present estimate."""
+        values = self.values if self.first else None
+        return [] if values is None else [LinearFactors.of_gtsam(f, values, self.first) for f in self.shared]
 
     def _summary(self, leaving: int) -> list[gtsam.NonlinearFactor]:
         """What the oldest states know, as linear factors on the first state that stays and on the coefficients."""
@@ -163,27 +166,6 @@ class Window(IncrementalWindow):
         if self.biased and not linked:
             self.samples[0].slots += (next(slots),)
         self._read_back()
-
-    def start_anew(self, samples: list[Sample]) -> Update:
-        """Throw iSAM2 away, after an error left it half-updated, and take in all samples again, oldest first.
-
-        Returns: of the last sample's update.
-        Raises: RuntimeError or ValueError: if that fails as well.
-        """
-        start, coefficients = self.points[:1], self.coefficients
-        self._clear()
-        self.samples, self.intervals = [], []
-        for sample in samples:
-            sample.slots, sample.bias_slot = (), None
-        update = Update(np.full(3, np.nan), 0, 0, 0)
-        if self.first:
-            self.coefficient_theta = coefficients
-        if any(STATE_KEY + self.first in list(factor.keys()) for factor in self.shared):
-            self._insert(samples[0], start[0], None)
-            samples = samples[1:]
-        for sample in samples:
-            update = self.append(sample)
-        return update
 
 
 def _jacobian_factor(conditional: gtsam.GaussianConditional) -> gtsam.JacobianFactor:

@@ -242,3 +242,10 @@ def test_what_cannot_be_turned_says_so() -> None:
 
     with pytest.raises(ValueError, match=r"the observation 'altitude' cannot be turned.*write Altitude.turned"):
         Altitude([0], [1.0], 0.1).turned(turn(1.0), torch.zeros(3))
+
+
+def test_one_reading_may_be_a_plain_number() -> None:
+    plain, listed = RadarSpeed(0, 6.2, 0.1), RadarSpeed([0], [6.2], 0.1)
+    np.testing.assert_array_equal(plain.values, listed.values)
+    with pytest.raises(ValueError, match="must have shape"):
+        RadarSpeed([0, 1], 6.2, 0.1)

@@ -10,14 +10,14 @@ import torch
 from torch import nn
 
 from ballfg.dynamics import BallModel, Surfaces, nominal_model, rollout
-from ballfg.estimation.online import isam as online_isam
+from ballfg.estimation.online import stream_window
 from ballfg.estimation.online.events import contact_step
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.motion import FLIGHT, Motion
 from ballfg.estimation.smoother.smoother import Smoother
-from ballfg.factors.bridge import Bridge
+from ballfg.factors.bridge import STATE_KEY, Bridge
 from ballfg.factors.loss import Loss
 from ballfg.tracks import Track
 
@@ -137,7 +137,7 @@ def test_relinearisation_is_real(monkeypatch):
     assert max(s.evaluated for s in states) > 3
     good = distance(online.window.states, expected)
     for name in ("VELOCITY_THRESHOLD", "SPIN_THRESHOLD", "POSITION_THRESHOLD"):
-        monkeypatch.setattr(online_isam, name, 1e9)
+        monkeypatch.setattr(stream_window, name, 1e9)
     frozen = Online(nominal_model(), NOWHERE, settings(loss=Loss()))
     assert max(s.evaluated for s in feed(frozen, track)) == 1
     assert distance(frozen.window.states, expected) > 10 * good
@@ -326,8 +326,8 @@ def test_rebuilds_after_gtsam_failed():
         if k == 25:
             graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
             loose = gtsam.noiseModel.Isotropic.Sigma(1, 1.0)
-            graph.push_back(gtsam.CustomFactor(loose, [online_isam.STATE_KEY + 25], _one_row))
-            values.insert(online_isam.STATE_KEY + 25, np.zeros(9))
+            graph.push_back(gtsam.CustomFactor(loose, [STATE_KEY + 25], _one_row))
+            values.insert(STATE_KEY + 25, np.zeros(9))
             with pytest.raises(RuntimeError, match="Indetermin"):
                 online.window.isam.update(graph, values)
         state = online.push(t, z)

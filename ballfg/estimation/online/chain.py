@@ -1,0 +1,278 @@
+"""A window whose linear system is a chain of triangles, eliminated from the oldest state to the newest.
+
+The triangle that the states before leave on each state is kept. A new sample then costs one step of the elimination,
+and states that move only the steps from the oldest of them on. Where the chain is cut, the triangle there is all that
+the states before know. The same factors at the same points have the same solution as in iSAM2 (`window.py`), to
+rounding and without its objects.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Sequence
+from typing import Self
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.estimation.online.interval import Interval
+from ballfg.estimation.online.linear import LinearFactors
+from ballfg.estimation.online.measurement import Measurement, prepare
+from ballfg.estimation.online.stream_window import Sample, StreamWindow, Update
+from ballfg.factors.batch import COEFFICIENTS, FactorBatch
+from ballfg.factors.dynamics import DynamicsFactors
+from ballfg.factors.linear.elimination import covariances_of, eliminate_on, padded, substitute_back
+from ballfg.factors.prior import coefficient_prior
+from ballfg.factors.tracker import BiasFactors, BiasStartFactors
+from ballfg.state import STATE_DIM
+
+Answer = tuple[Array, tuple[Array, ...]]
+"""Residuals and Jacobians, whitened."""
+
+
+class ChainWindow(StreamWindow):
+    """The window as a chain: arguments and attributes as those of `StreamWindow`."""
+
+    def _clear(self) -> None:
+        """No states; what states that left know of the first one stays."""
+        super()._clear()
+        self._columns = padded(2 * self.width + self.p + 1)
+        self._priors: list[list[FactorBatch]] = []  # of each state, and of its tracker's bias
+        self._positions: list[list[FactorBatch]] = []  # of each state that was measured
+        self._rows: list[Array] = []  # of each state: (r, columns) of all factors of which it is the first state
+        self._room(0)
+        self._answers: list[list[tuple[FactorBatch, Answer]]] = []  # of each: measurements and the interval after it
+        self._stale: dict[int, bool] = {}  # states whose rows are to be written, and whether their answers are new
+        if not self.first:
+            self._summary: LinearFactors | None = None  # of the first state and the coefficients
+
+    def _room(self, count: int) -> None:
+        """Arrays of the chain for twice as many states; what is eliminated stays."""
+        w, p, size = self.width, self.p, 2 * count + 64
+        old = (self._carries, self._shared, self._root) if count else ()
+        self._carries = np.zeros((size + 1, w, self._columns))
+        self._shared = np.zeros((size + 1, p, self._columns))
+        self._root = np.zeros((size, w, 2 * w + p + 1))
+        for new, kept in zip((self._carries, self._shared, self._root), old, strict=False):
+            new[: len(kept)] = kept
+
+    def copy(self, samples: Sequence[Sample]) -> Self:
+        """A window with the same states and factors, which goes on by itself."""
+        other, n = copy.copy(self), len(self.samples)
+        other.samples = list(samples)
+        other.intervals = [copy.copy(interval) for interval in self.intervals]
+        other._priors, other._rows = [list(batches) for batches in self._priors], list(self._rows)
+        other._positions, other._answers = list(self._positions), list(self._answers)
+        other._stale = dict(self._stale)
+        other._room(n)
+        for name, count in (("_carries", n + 1), ("_shared", n + 1), ("_root", n)):
+            getattr(other, name)[:count] = getattr(self, name)[:count]
+        return other
+
+    def _insert(
+        self, sample: Sample, state: Array, interval: Interval | None, priors: Sequence[FactorBatch] = ()
+    ) -> int:
+        """Take in a new state with its factors, and solve."""
+        prepare(sample.measurements, np.tile(state, (len(sample.measurements), 1)))
+        own = list(priors)
+        if self.biased and priors and not self.samples:
+            own.append(BiasStartFactors(np.zeros(1, dtype=np.int64), self.settings.bias_sigmas))
+        if self.samples:
+            self.intervals.append(interval)
+        self.samples.append(sample)
+        self._priors.append(own)
+        self._rows.append(np.empty((0, self._columns)))
+        self._answers.append([])
+        self._positions.append(self._measured(len(self.samples) - 1))
+        self.theta = np.concatenate((self.theta, state[None]))
+        self._renew([len(self.samples) - 1])
+        return self._solve()
+
+    def retract(self, count: int) -> None:
+        """Take the newest samples back, with their states and factors."""
+        self._move()
+        for held in (self.samples, self._priors, self._positions, self._answers, self._rows):
+            del held[count:]
+        del self.intervals[count - 1 :]
+        self.theta, self._stale = self.theta[:count], {k: new for k, new in self._stale.items() if k < count}
+        own = [batch for batch, _ in self._answers[-1] if not isinstance(batch, DynamicsFactors)]
+        self._answers[-1] = self._answers[-1][: len(own)]
+        self._renew([count - 1], moved=False)
+        self._solve()
+
+    def attach(self, measurement: Measurement) -> Update:
+        """One more measurement of the newest sample, which holds it already."""
+        count, calls = self._move()
+        measurement.corrected(self.points[-1], self.newest_covariance[: self.width, : self.width])
+        beside = self.samples[-1].measurements
+        prepare(beside, np.tile(self.theta[-1], (len(beside), 1)))
+        self._renew([len(self.samples) - 1])
+        return Update(measurement.innovation, count, calls, self._solve())
+
+    def reweigh(self, numbers: list[int]) -> None:
+        """Put in anew the factors of the positions of some samples of the window, whose noise has changed."""
+        self._move()
+        for k in numbers:
+            self._positions[k] = self._measured(k)
+        self._renew(numbers, moved=False)
+        self._solve()
+
+    def shorten(self, keep: int) -> None:
+        """Let go of all but the newest states; the triangle that is left where they end is what they know."""
+        leaving = len(self.samples) - keep
+        self._move()
+        self._solve()
+        w, p, linked = self.width, self.p, self.intervals[leaving - 1] is not None
+        known = np.concatenate(
+            (self._carries[leaving] if linked else np.zeros((0, self._columns)), self._shared[leaving])
+        )
+        blocks = [known[:, :w], known[:, 2 * w : 2 * w + p]]
+        points = [self.theta[leaving : leaving + 1], self.coefficient_theta[None]]
+        self._summary = LinearFactors([0, COEFFICIENTS], points, blocks, known[:, -1], self.biased)
+        self.first += leaving
+        self.samples, self.intervals = self.samples[leaving:], self.intervals[leaving:]
+        self._priors, self._positions = self._priors[leaving:], self._positions[leaving:]
+        self._rows, self._answers = self._rows[leaving:], self._answers[leaving:]
+        self.theta, self.delta = self.theta[leaving:], self.delta[leaving:]
+        if self.biased and not linked:
+            self._priors[0].append(BiasStartFactors(np.zeros(1, dtype=np.int64), self.settings.bias_sigmas))
+        self._room(0)
+        self._renew(range(keep), moved=False)
+        self._solve()
+
+    def joint_covariances(self, count: int) -> list[Array]:
+        """(w + p, w + p) of each of the oldest states, with its bias and the coefficients."""
+        n, w, p = len(self.samples), self.width, self.p
+        states, cross, shared = np.empty((n, w, w)), np.empty((n, w, w + p)), np.empty((p, p))
+        covariances_of(self._root[:n], self._last(), states, cross, shared)
+        return [_joint(states[k], cross[k, :, w:], shared) for k in range(count)]
+
+    def summaries(self) -> list[FactorBatch]:
+        """What states that left know, as one linear factor."""
+        if not self.first or self._summary is None:
+            return []
+        if self.p:
+            return [self._summary]
+        known = self._summary  # without coefficients
+        return [LinearFactors([0], known.points[:1], known.blocks[:1], known.b, known.sees_biases)]
+
+    def _first_is_known(self) -> bool:
+        return self._summary is not None and bool(self._summary.blocks[0].any())
+
+    def _move(self) -> tuple[int, int]:
+        """Relinearise what left the thresholds; factors evaluated, calls for them."""
+        _, count, calls = self._relinearize(None)
+        return count, calls
+
+    def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
+        """As the base's; the rows of all that was evaluated anew are no longer those of the chain."""
+        before, shared = self.theta, self.coefficient_theta
+        found = super()._relinearize(new)
+        if self.coefficient_theta is not shared:
+            self._renew(range(len(self.samples)))
+        elif self.theta is not before:
+            self._renew(np.flatnonzero((self.theta != before).any(axis=1)).tolist())
+        return found
+
+    def _renew(self, numbers: Sequence[int], moved: bool = True) -> None:
+        """Have the rows of some states written anew; where they moved, those of the states before see them too."""
+        for k in numbers:
+            self._stale[k] = moved or self._stale.get(k, False)
+            if moved and k:
+                self._stale[k - 1] = True
+
+    def _rows_of(self, k: int, moved: bool) -> Array:
+        """(r, columns) of all factors of which k is the first state; the right side last.
+
+        Args: moved: whether the factors that ask the model or a camera have been evaluated anew.
+        """
+        sample, interval = self.samples[k], self.intervals[k] if k < len(self.intervals) else None
+        if moved:  # bridges are shared with copies of the window, answers are not
+            asked = [(m.batch, m.bridge) for m in sample.measurements]
+            asked += [] if interval is None else [(interval.batch, interval.bridge)]
+            self._answers[k] = [(batch, _batched(bridge.kept(0))) for batch, bridge in asked]
+        pieces = list(self._answers[k])
+        for batch in (*self._positions[k], *self._priors[k]):
+            pieces.append((batch, batch.compute(slice(None), (self._seen(batch, k),))))
+        if self.biased and k + 1 < len(self.samples):
+            dt = np.array([self.samples[k + 1].time - sample.time])
+            link = BiasFactors(np.array([k]), dt, self.settings.bias_sigmas, self.settings.memory_time)
+            pieces.append((link, link.compute(slice(None), (self._seen(link, k), self._seen(link, k + 1)))))
+        if k == 0:
+            pieces += self._of_the_beginning()
+        written = np.zeros((sum(batch.dim for batch, _ in pieces), self._columns))
+        row = 0
+        for batch, (residual, blocks) in pieces:
+            weight = math.sqrt(float(batch.loss.weight(np.linalg.norm(residual, axis=1))[0]))  # as GTSAM's noise models
+            end, place = row + batch.dim, 0
+            for variable, (block,) in zip(batch.variables[0].tolist(), blocks, strict=True):
+                at = 2 * self.width if variable == COEFFICIENTS else place
+                written[row:end, at : at + block.shape[1]] = weight * block
+                place += self.width
+            written[row:end, -1] = -weight * residual[0]
+            row = end
+        return written
+
+    def _measured(self, k: int) -> list[FactorBatch]:
+        """The factor of a state's position, where it was measured."""
+        return [self._position_batch(self.samples[k], k)] if self.samples[k].measured else []
+
+    def _of_the_beginning(self) -> list[tuple[FactorBatch, Answer]]:
+        """What is known of the first state and of the coefficients from before."""
+        if self._summary is not None:
+            points = (self.theta[:1], self.coefficient_theta[None])
+            return [(self._summary, self._summary.compute(slice(None), points))]
+        if not self.p:
+            return []
+        prior = coefficient_prior(self._own_means, self._own_sigmas)
+        return [(prior, prior.compute(slice(None), (self.coefficient_theta[None],)))]
+
+    def _seen(self, batch: FactorBatch, k: int) -> Array:
+        """(1, d) what a batch sees of state k."""
+        return self.theta[k : k + 1] if batch.sees_biases else self.theta[k : k + 1, :STATE_DIM]
+
+    def _solve(self) -> int:
+        """Eliminate from the first state whose rows have changed; solutions and the newest covariance.
+
+        Returns: how many states were eliminated again.
+        Raises: RuntimeError: if the system is singular.
+        """
+        n, w, p = len(self.samples), self.width, self.p
+        begin = min(self._stale, default=n - 1)
+        if n > len(self._root):
+            self._room(n)
+        for k, moved in self._stale.items():
+            self._rows[k] = self._rows_of(k, moved)
+        self._stale.clear()
+        rows = self._rows[begin:]
+        start = np.zeros(len(rows) + 1, dtype=np.int64)
+        np.cumsum([len(part) for part in rows], out=start[1:])
+        carries, shared, root = self._carries[begin : n + 1], self._shared[begin : n + 1], self._root[begin:n]
+        eliminate_on(np.concatenate(rows), start, w, carries, shared, root)
+        last = self._last()
+        delta, coefficients = self._root[:n, :, -1].copy(), last[:, -1].copy()
+        substitute_back(self._root[:n], last, delta, coefficients)
+        if not (np.isfinite(delta).all() and np.isfinite(coefficients).all()):
+            raise RuntimeError("the linear system of the window is singular")
+        self.delta, self.coefficient_delta = delta, coefficients
+        states, cross, own = np.empty((1, w, w)), np.empty((1, w, w + p)), np.empty((p, p))
+        covariances_of(self._root[n - 1 : n], last, states, cross, own)
+        self.newest_covariance = _joint(states[0], cross[0, :, w:], own)
+        return n - begin
+
+    def _last(self) -> Array:
+        """(p, 2 w + p + 1) the triangle of the coefficients after all states."""
+        shared, end = self._shared[len(self.samples)], 2 * self.width + self.p
+        return np.concatenate((shared[:, :end], shared[:, -1:]), axis=1)
+
+
+def _batched(answer: Answer) -> Answer:
+    """One factor's answer as that of a batch."""
+    residual, blocks = answer
+    return residual[None], tuple([block[None] for block in blocks])
+
+
+def _joint(state: Array, cross: Array, coefficients: Array) -> Array:
+    """(w + p, w + p) from (w, w), (w, p) and (p, p)."""
+    return np.block([[state, cross], [cross.T, coefficients]]) if len(coefficients) else state

@@ -1,0 +1,353 @@
+"""A window of states that takes in one sample after another: what it predicts, evaluates and holds.
+
+The window keeps linearisation points and the linear solution about them. Before an update it knows which states have
+left the thresholds and moves them, and evaluates their factors, together with the new one, in one call of the model.
+How the linear system is kept and solved is another class's: iSAM2 (`window.py`) or a chain of triangles (`chain.py`).
+docs/derivations/online.md explains the choices.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Self
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.dynamics.model import BallModel
+from ballfg.estimation.launcher import SpinLabel
+from ballfg.estimation.online.interval import Interval, IntervalMaker, evaluate, store
+from ballfg.estimation.online.measurement import Measurement, prepare
+from ballfg.estimation.online.tracker import carried_with_bias, without_bias
+from ballfg.estimation.settings import Settings, stamp_covariance
+from ballfg.estimation.smoother.motion import FLIGHT, Motion
+from ballfg.estimation.smoother.problem import coefficient_means, start_priors
+from ballfg.factors.batch import FactorBatch, Values
+from ballfg.factors.dynamics import model_width
+from ballfg.factors.position import PositionFactors
+from ballfg.factors.tracker import BIAS_DIM, BiasedPositionFactors
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+
+VELOCITY_THRESHOLD = 0.3
+"""m/s. Linearised this far off, drag is wrong by k dv^2 = 0.012 m/s^2, and by 0.04 m/s^2 where the spin is off by
+`SPIN_THRESHOLD` as well: a third of the acceleration that the process noise allows over half a second, for as long as
+it takes the next state to be relinearised. Three times less costs twice the evaluations and changes nothing
+(docs/derivations/online.md)."""
+SPIN_THRESHOLD = 40.0
+"""rad/s. The Magnus force is linear in the spin: only its product with an error in velocity matters."""
+POSITION_THRESHOLD = 0.5
+"""Measurement standard deviations. Flight does not depend on the position; a robust loss's weight does."""
+COEFFICIENT_THRESHOLD = 0.5
+"""Prior standard deviations. The coefficients touch every factor: moving them relinearises the whole window."""
+WIDE_VELOCITY = 1.0
+"""m/s. A predicted velocity that is less well known does not tell along which way a stamp's error moved the ball."""
+
+
+@dataclass
+class Sample:
+    """One observation, and what is believed of it.
+
+    Attributes:
+        time: s.  position: (3,) m.
+        stated: (3,) m, standard deviation of its white error as stated.
+        whole: (3,) m, that of its whole error: with a lasting part and the error of the stamp.
+        velocity: (3,) m/s, rough, along which the stamp's error moves it.
+        factor: multiple of the whole error with which it takes part if it is not good; 1 if it is.
+        motion: how the ball got here from the sample before.
+        label: what is known of the spin, on the first sample of a track.
+        slots: where iSAM2 keeps the sample's own factors: its position's first, where it was measured.
+        bias_slot: where it keeps the factor that leads here from the bias of the sample before; None without.
+        measured: whether the position was measured; if not, it was made from the measurements and helps to find events.
+        measurements: everything else that was measured at this moment.
+    """
+
+    time: float
+    position: Array
+    stated: Array
+    factor: float = 1.0
+    motion: Motion = FLIGHT
+    label: SpinLabel | None = None
+    slots: tuple[int, ...] = ()
+    bias_slot: int | None = None
+    whole: Array = field(default_factory=lambda: np.zeros(3))
+    velocity: Array = field(default_factory=lambda: np.zeros(3))
+    measured: bool = True
+    measurements: list[Measurement] = field(default_factory=list)
+
+    @property
+    def sigma(self) -> Array:
+        """(3,) m, standard deviation of the white error with which it takes part."""
+        return self.stated if self.factor == 1.0 else self.whole * self.factor
+
+
+@dataclass(frozen=True)
+class Update:
+    """What one update did.
+
+    Attributes:
+        innovation: (dim,) whitened, of the position or of what stands for it; NaN where nothing predicted the sample.
+        evaluated: factors of the motion evaluated, the new one among them.
+        calls: torch calls for them.
+        variables: states that iSAM2 eliminated again.
+    """
+
+    innovation: Array
+    evaluated: int
+    calls: int
+    variables: int
+
+
+class StreamWindow(ABC):
+    """The last samples of a stream as a factor graph.
+
+    Args:
+        model: the ball, from `problem.trackwise_model`.  settings: noise and priors.
+        position_sigma: m, of a good measurement; scales the threshold of relinearisation in position.
+        biased: whether the tracker's bias, a vector of three, stands behind each state.
+
+    Attributes:
+        first: number of the window's first state since the stream began.
+        samples: n of them.  intervals: n - 1, None where nothing links two samples.
+        theta: (n, w) linearisation points of states and biases, w = 9 or 12.  delta: (n, w) solution about them.
+        coefficient_theta, coefficient_delta: (p,) the same for the coefficients.
+        newest_covariance: (w + p, w + p) of the newest state with its bias and the coefficients.
+    """
+
+    def __init__(self, model: BallModel, settings: Settings, position_sigma: float, biased: bool = False) -> None:
+        self.model = model
+        self.settings = settings
+        self.position_sigma = position_sigma
+        self.biased = biased
+        self.width = STATE_DIM + BIAS_DIM * biased
+        self.maker = IntervalMaker(model, settings.process)
+        self.p = model_width(model)
+        self._own_means = coefficient_means(model.model, settings) if self.p else np.zeros(0)  # type: ignore[arg-type]
+        self._own_sigmas = np.array(list(settings.coefficients.values()))
+        self.first = 0
+        self.samples: list[Sample] = []
+        self.intervals: list[Interval | None] = []
+        self.threshold = np.full(self.width, POSITION_THRESHOLD * position_sigma)
+        self.threshold[VELOCITY], self.threshold[SPIN] = VELOCITY_THRESHOLD, SPIN_THRESHOLD
+        self._clear()
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    @abstractmethod
+    def copy(self, samples: Sequence[Sample]) -> Self:
+        """A window with the same states and factors, which goes on by itself.
+
+        Args: samples: copies of the window's.
+        """
+
+    @abstractmethod
+    def retract(self, count: int) -> None:
+        """Take the newest samples back, with their states and factors.
+
+        Args: count: how many stay, at least 1.
+        """
+
+    @abstractmethod
+    def attach(self, measurement: Measurement) -> Update:
+        """One more measurement of the newest sample, which holds it already.
+
+        Raises: RuntimeError or ValueError: as `append`.
+        """
+
+    @abstractmethod
+    def reweigh(self, numbers: list[int]) -> None:
+        """Put in anew the factors of the positions of some samples of the window, whose noise has changed."""
+
+    @abstractmethod
+    def shorten(self, keep: int) -> None:
+        """Let go of all but the newest states; what the others know becomes a linear factor on the first that stays.
+
+        Raises: RuntimeError: when the leaving part is singular.
+        """
+
+    @abstractmethod
+    def joint_covariances(self, count: int) -> list[Array]:
+        """(w + p, w + p) of each of the oldest states, with its bias and the coefficients."""
+
+    @abstractmethod
+    def summaries(self) -> list[FactorBatch]:
+        """What the states that left know of the first state and of the coefficients, numbered as in the window."""
+
+    @abstractmethod
+    def _insert(
+        self, sample: Sample, state: Array, interval: Interval | None, priors: Sequence[FactorBatch] = ()
+    ) -> int:
+        """Take in a new state with its factors, and solve.
+
+        Returns: how many states were eliminated again.
+        """
+
+    @abstractmethod
+    def _first_is_known(self) -> bool:
+        """Whether states that left know something of the window's first state."""
+
+    def _clear(self) -> None:
+        """No states."""
+        self.theta, self.delta = np.zeros((0, self.width)), np.zeros((0, self.width))
+        self.coefficient_theta, self.coefficient_delta = self._own_means.copy(), np.zeros(self.p)
+        self.newest_covariance = np.zeros((0, 0))
+
+    def start_anew(self, samples: list[Sample]) -> Update:
+        """Throw the solution away, after an error left it half-updated, and take in all samples again, oldest first.
+
+        Returns: of the last sample's update.
+        Raises: RuntimeError or ValueError: if that fails as well.
+        """
+        start, coefficients = self.points[:1], self.coefficients
+        self._clear()
+        self.samples, self.intervals = [], []
+        for sample in samples:
+            sample.slots, sample.bias_slot = (), None
+        update = Update(np.full(3, np.nan), 0, 0, 0)
+        if self.first:
+            self.coefficient_theta = coefficients
+        if self._first_is_known():
+            self._insert(samples[0], start[0], None)
+            samples = samples[1:]
+        for sample in samples:
+            update = self.append(sample)
+        return update
+
+    @property
+    def points(self) -> Array:
+        """(n, w) the present estimate of states and biases."""
+        return self.theta + self.delta
+
+    @property
+    def states(self) -> Array:
+        """(n, 9) the present estimate."""
+        return self.points[:, :STATE_DIM]
+
+    @property
+    def values(self) -> Values:
+        """The present estimate of everything."""
+        return Values(self.states, self.coefficients, self.points[:, STATE_DIM:] if self.biased else None)
+
+    @property
+    def newest_belief(self) -> tuple[Array, Array]:
+        """Mean (9 + p,) and covariance (9 + p, 9 + p) of the newest state and the coefficients, without the bias."""
+        mean = np.concatenate((self.theta[-1, :STATE_DIM] + self.delta[-1, :STATE_DIM], self.coefficients))
+        return mean, without_bias(self.newest_covariance, self.width)
+
+    @property
+    def coefficients(self) -> Array:
+        """(p,) the present estimate."""
+        return self.coefficient_theta + self.coefficient_delta
+
+    @property
+    def times(self) -> Array:
+        """(n,) s."""
+        return np.array([sample.time for sample in self.samples])
+
+    def append(self, sample: Sample) -> Update:
+        """Take in a sample.
+
+        Raises: RuntimeError or ValueError: what GTSAM or the model raised; the window must then be built anew.
+        """
+        if not (sample.motion.linked and self.samples):
+            return self._append_start(sample)
+        dt = sample.time - self.samples[-1].time
+        interval = self.maker.make(self.first + len(self.samples) - 1, sample.motion, dt)
+        estimate = self.points[-1], self.coefficients
+        piece, count, calls = self._relinearize(interval)
+        away = np.concatenate((estimate[0] - self.theta[-1], estimate[1] - self.coefficient_theta))
+        carried, noise = piece, interval.covariance
+        if self.biased:
+            carried, noise = carried_with_bias(piece, noise, self.theta[-1, STATE_DIM:], dt, self.settings)
+        predicted = carried[:, 0] + carried[:, 1:] @ away
+        covariance = carried[:, 1:] @ self.newest_covariance @ carried[:, 1:].T + noise
+        if np.trace(covariance[VELOCITY, VELOCITY]) < WIDE_VELOCITY**2:
+            sample.velocity = predicted[VELOCITY]
+        state, innovation = self._corrected(predicted, covariance, sample)
+        store(interval, self.theta[-1], state, self.coefficient_theta, piece)
+        variables = self._insert(sample, state, interval)
+        return Update(innovation, count, calls, variables)
+
+    def _append_start(self, sample: Sample) -> Update:
+        """A sample that nothing predicts: its state has a wide prior of its own."""
+        state = np.zeros(self.width)
+        state[POSITION] = sample.position
+        if sample.label is not None:
+            state[SPIN] = sample.label.spin
+        priors = start_priors(0, sample.position, sample.label, self.settings)
+        _, count, calls = self._relinearize(None)
+        return Update(np.full(3, np.nan), count, calls, self._insert(sample, state, None, priors))
+
+    def _corrected(self, predicted: Array, covariance: Array, sample: Sample) -> tuple[Array, Array]:
+        """The predicted state moved by the measurement as a Kalman filter would, and the whitened innovation.
+
+        It is the new state's linearisation point only: closer to the final answer than the prediction, it saves
+        relinearisations, and a robust loss gets a weight near the one that it ends with.
+        """
+        if not sample.measured:
+            for measurement in sample.measurements:
+                predicted, covariance = measurement.corrected(predicted, covariance)
+            return predicted, sample.measurements[0].innovation
+        innovation = sample.position - self._measured_part(predicted)
+        noise = self._measurement_noise(sample)
+        cross, rows = self._measured_part(covariance.T).T, self._measured_part(covariance)
+        spread = self._measured_part(cross)
+        inverse = np.linalg.inv(np.linalg.cholesky(spread + noise))
+        whitened = inverse @ innovation
+        pull = whitened @ inverse
+        if self.settings.loss.name != "squared":
+            weight = self.settings.loss.weight(np.array([np.linalg.norm(whitened)]))
+            pull = np.asarray(np.linalg.solve(spread + noise / weight, innovation), dtype=np.float64)
+        state = predicted + cross @ pull
+        if sample.measurements:
+            gain = np.linalg.solve(spread + noise, rows).T
+            covariance = covariance - gain @ rows
+            for measurement in sample.measurements:
+                state, covariance = measurement.corrected(state, covariance)
+        return state, whitened
+
+    def _measured_part(self, rows: Array) -> Array:
+        """(3, ...) the rows (w, ...) that a measured position looks at: those of position and bias, added."""
+        return rows[POSITION] + rows[STATE_DIM:] if self.biased else rows[POSITION]
+
+    def _measurement_noise(self, sample: Sample) -> Array:
+        """(3, 3) m^2, of a position's white error and of that of its stamp."""
+        return np.diag(sample.sigma**2) + stamp_covariance(self.settings, sample.velocity)
+
+    def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
+        """Do ahead what iSAM2 will do: move the states whose solution left the thresholds, evaluate their factors.
+
+        Returns: the new interval's propagation (9, 1 + 9 + p), factors evaluated, torch calls.
+        """
+        moved = np.asarray((np.abs(self.delta) > self.threshold).any(axis=1), dtype=bool)
+        limit = COEFFICIENT_THRESHOLD * self._own_sigmas
+        shared = bool((np.abs(self.coefficient_delta) > limit).any())
+        if moved.any():
+            self.theta = np.where(moved[:, None], self.theta + self.delta, self.theta)
+            self.delta = np.where(moved[:, None], 0.0, self.delta)
+        if shared:
+            self.coefficient_theta = self.coefficient_theta + self.coefficient_delta
+            self.coefficient_delta = np.zeros(self.p)
+        seen = [(measurement, k) for k in np.flatnonzero(moved) for measurement in self.samples[k].measurements]
+        prepare([measurement for measurement, _ in seen], self.theta[[k for _, k in seen]])
+        either = moved[:-1] | moved[1:] | shared
+        touched = [interval for k in np.flatnonzero(either) if (interval := self.intervals[k]) is not None]
+        begins = [interval.index - self.first for interval in touched]
+        ends = [k + 1 for k in begins]
+        if new is not None:
+            touched.append(new)
+            begins.append(len(self.theta) - 1)  # its end comes out of this call: `store` puts it
+        if not touched:
+            return np.empty(0), 0, 0
+        pieces, calls = evaluate(touched, self.theta[begins], self.theta[ends], self.coefficient_theta)
+        return pieces[-1], len(touched), calls
+
+    def _position_batch(self, sample: Sample, state: int) -> FactorBatch:
+        """The factor of a measured position."""
+        where, position, loss = np.array([state]), sample.position[None], self.settings.loss
+        if self.biased or self.settings.stamp_jitter > 0.0:
+            stamps = stamp_covariance(self.settings, sample.velocity)[None]
+            return BiasedPositionFactors(where, position, sample.sigma[None], stamps, loss, self.biased)
+        return PositionFactors(where, position, sample.sigma[None], loss)
