@@ -13,6 +13,7 @@ import numpy as np
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.flight import put_all
 from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, INDEX, NOTHING, ONE, REAL, THREE, TWO
 
 FOUR_AT_ONCE = 4
@@ -159,6 +160,16 @@ def absorb(upper: Array, system: Array, begin: int, end: int, first: int, count:
         upper[j, c] = diagonal
 
 
+@machine_code(NOTHING(TWO, TWO))
+def _close(rows: Array, root: Array) -> None:
+    """Copy rows without the zeros before the right side."""
+    end = root.shape[1] - 1
+    for i in range(root.shape[0]):
+        for j in range(end):
+            root[i, j] = rows[i, j]
+        root[i, end] = rows[i, rows.shape[1] - 1]
+
+
 @machine_code(NOTHING(TWO, COUNTS, COUNT, THREE, THREE, THREE))
 def eliminate_on(system: Array, start: Index, width: int, carries: Array, shared: Array, root: Array) -> None:
     """Reduce the rows of a part of the chain, from a state on to the last, after what the states before have left.
@@ -174,19 +185,22 @@ def eliminate_on(system: Array, start: Index, width: int, carries: Array, shared
     m, columns, p, most = len(start) - 1, system.shape[1], shared.shape[1], 0
     for i in range(m):
         most = max(most, start[i + 1] - start[i])
-    column, end = np.empty(most), 2 * width + p
+    column = np.empty(most)
     upper, carry = np.empty((width, columns)), np.empty((width, columns))
     for i in range(m):
-        upper[:] = carries[i]
+        put_all(upper, carries[i])
         absorb(upper, system, start[i], start[i + 1], 0, width, column)
-        root[i, :, :end] = upper[:, :end]
-        root[i, :, end] = upper[:, columns - 1]
-        carry[:] = 0.0
+        _close(upper, root[i])
+        for j in range(width):
+            for k in range(columns):
+                carry[j, k] = 0.0
         absorb(carry, system, start[i], start[i + 1], width, width, column)
-        carries[i + 1] = 0.0
-        carries[i + 1, :, :width] = carry[:, width : 2 * width]
-        carries[i + 1, :, 2 * width :] = carry[:, 2 * width :]
-        shared[i + 1] = shared[i]
+        for j in range(width):
+            for k in range(width):
+                carries[i + 1, j, k], carries[i + 1, j, width + k] = carry[j, width + k], 0.0
+            for k in range(2 * width, columns):
+                carries[i + 1, j, k] = carry[j, k]
+        put_all(shared[i + 1], shared[i])
         absorb(shared[i + 1], system, start[i], start[i + 1], 2 * width, p, column)
 
 
@@ -200,12 +214,10 @@ def eliminate(system: Array, start: Index, width: int, root: Array, last: Array)
         last: (p, 2 w + p + 1), written: the rows of the coefficients, at the end.
     """
     n, columns, p = len(start) - 2, system.shape[1], len(last)
-    end = 2 * width + p
     carries, shared = np.zeros((n + 1, width, columns)), np.zeros((n + 1, p, columns))
     eliminate_on(system, start[: n + 1], width, carries, shared, root)
-    absorb(shared[n], system, start[n], start[n + 1], end - p, p, np.empty(start[n + 1] - start[n]))
-    last[:, :end] = shared[n, :, :end]
-    last[:, end] = shared[n, :, columns - 1]
+    absorb(shared[n], system, start[n], start[n + 1], 2 * width, p, np.empty(start[n + 1] - start[n]))
+    _close(shared[n], last)
 
 
 @machine_code(NOTHING(THREE, TWO, TWO, ONE))
@@ -262,13 +274,22 @@ def substitute_forward(root: Array, last: Array, states: Array, coefficients: Ar
 def invert(upper: Array, inverse: Array) -> None:
     """The inverse (m, m) of a triangle (m, m), in the inverse of its units."""
     m = len(upper)
-    inverse[:] = 0.0
     for column in range(m):
+        for j in range(m):
+            inverse[j, column] = 0.0
         for j in range(column, -1, -1):
             left = 1.0 if j == column else 0.0
             for k in range(j + 1, column + 1):
                 left -= upper[j, k] * inverse[k, column]
             inverse[j, column] = left / upper[j, j]
+
+
+@machine_code(NOTHING(TWO, COUNT, REAL, TWO))
+def _part(rows: Array, first: int, scale: float, part: Array) -> None:
+    """Copy columns from the first on, scaled, into an array of their own."""
+    for a in range(part.shape[0]):
+        for b in range(part.shape[1]):
+            part[a, b] = scale * rows[a, first + b]
 
 
 @machine_code(NOTHING(THREE, TWO, THREE, THREE, TWO))
@@ -286,16 +307,24 @@ def covariances_of(root: Array, last: Array, states: Array, cross: Array, coeffi
     n, w = root.shape[:2]
     p = len(coefficients)
     if p:
-        own = np.empty((p, p))
-        invert(last[:, 2 * w : 2 * w + p].copy(), own)
+        own, shared = np.empty((p, p)), np.empty((p, p))
+        _part(last, 2 * w, 1.0, shared)
+        invert(shared, own)
         coefficients[:] = np.dot(own, own.T)
     later, inverse = np.zeros((w + p, w + p)), np.empty((w, w))
-    later[w:, w:] = coefficients
+    upper, coupling = np.empty((w, w)), np.empty((w, w + p))
+    for a in range(p):
+        for b in range(p):
+            later[w + a, w + b] = coefficients[a, b]
     for i in range(n - 1, -1, -1):
-        invert(root[i, :, :w].copy(), inverse)
-        gain = -np.dot(inverse, root[i, :, w : 2 * w + p].copy())
-        cross[i] = np.dot(gain, later)
-        states[i] = np.dot(inverse, inverse.T) + np.dot(cross[i], gain.T)
-        later[:w, :w] = states[i]
-        later[:w, w:] = cross[i, :, w:]
-        later[w:, :w] = cross[i, :, w:].T
+        _part(root[i], 0, 1.0, upper)
+        _part(root[i], w, -1.0, coupling)
+        invert(upper, inverse)
+        gain = np.dot(inverse, coupling)
+        put_all(cross[i], np.dot(gain, later))
+        own_part, later_part = np.dot(inverse, inverse.T), np.dot(cross[i], gain.T)
+        for a in range(w):
+            for b in range(w):
+                states[i, a, b] = later[a, b] = own_part[a, b] + later_part[a, b]
+            for b in range(p):
+                later[a, w + b] = later[w + b, a] = cross[i, a, w + b]

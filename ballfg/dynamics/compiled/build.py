@@ -37,15 +37,34 @@ HELPERS: Final = ("add_product", "tanh_all")
 
 
 def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Numba's compiler for one signature; kept on disk where any folder for that can be written to."""
+    """Numba's compiler for one signature; kept on disk where any folder for that can be written to.
 
-    def compile_one(function: Callable[..., Any]) -> Any:
+    A function is compiled, or loaded, when it is first called or built into another one: a process pays for what it
+    uses.
+    """
+
+    def declared(function: Callable[..., Any]) -> Any:
         try:
-            return njit(signature, error_model="numpy", cache=True)(function)
+            dispatcher = njit(error_model="numpy", cache=True)(function)
         except RuntimeError:  # no folder: compiled anew by every process
-            return njit(signature, error_model="numpy")(function)
+            dispatcher = njit(error_model="numpy")(function)
 
-    return compile_one
+        def for_call(*_: Any, **__: Any) -> Any:
+            """The machine code, which numba asks for at the first call from Python."""
+            del dispatcher._compile_for_args, dispatcher.get_call_template
+            entry = dispatcher.compile(signature)
+            dispatcher.disable_compile()  # as of a function whose signature numba is given at once
+            return entry
+
+        def for_caller(args: Any, kwargs: Any) -> Any:
+            """What numba asks for when it compiles a function that calls this one."""
+            for_call()
+            return dispatcher.get_call_template(args, kwargs)
+
+        dispatcher._compile_for_args, dispatcher.get_call_template = for_call, for_caller
+        return dispatcher
+
+    return declared
 
 
 class Code(WrapperAddressProtocol):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.flight import evaluate, fly_one
+from ballfg.dynamics.compiled.flight import evaluate, fly_one, put, put_all
 from ballfg.dynamics.compiled.signatures import COUNT, FUNCTION, NOTHING, ONE, REAL, THREE, TWO, several
 from ballfg.dynamics.motion.limits import (
     GAP_TOLERANCE,
@@ -49,13 +49,15 @@ def _search(rates, surface, state, c, s, w, ws, heights, radius, longest, tau):
     All rows take the same number of integration steps, as they do in torch: a time is exact for its steps.
     """
     m = len(tau)
-    lost, arrived, none = np.isnan(tau), np.zeros(m, dtype=np.bool_), np.empty((9, 0))
+    lost, arrived, none = np.empty(m, dtype=np.bool_), np.zeros(m, dtype=np.bool_), np.empty((9, 0))
     nonec, at, still = np.empty((c.shape[1], 0)), np.empty(9), np.empty(0)
-    tau[lost] = 0.0
+    for r in range(m):
+        lost[r] = math.isnan(tau[r])
+        tau[r] = 0.0 if lost[r] else tau[r]
     for _ in range(SEARCH_STEPS):
-        steps = _common_steps(tau)
+        steps, searching = _common_steps(tau), False
         for r in range(m):
-            at[:] = state[r]
+            put(at, state[r])
             if tau[r] != 0.0:
                 fly_one(rates, at, c[r], w, none, nonec, tau[r], still, steps)
             gap, rate, fall = _approach(rates, surface, at, c[r], s[r], w, ws, heights[r], radius)
@@ -71,7 +73,8 @@ def _search(rates, surface, state, c, s, w, ws, heights, radius, longest, tau):
                 lost[r], tau[r] = True, 0.0
             else:
                 tau[r] += move
-        if (arrived | lost).all():
+            searching = searching or not (arrived[r] or lost[r])
+        if not searching:
             break
     for r in range(m):
         if lost[r] or not arrived[r]:
@@ -101,17 +104,20 @@ def _scan(rates, surface, state, c, s, w, ws, height, radius, longest):
 @machine_code(NOTHING(FUNCTION, FUNCTION, TWO, TWO, TWO, ONE, ONE, ONE, ONE, REAL, ONE))
 def contact_times(rates, surface, start, c, s, w, ws, heights, longest, radius, tau):
     """Times tau (m,) s to the next contacts of m falling balls; NaN where there is none. Arguments as `contacts`."""
-    tau[:] = 0.0
-    _search(rates, surface, start, c, s, w, ws, heights, radius, longest, tau)
-    if np.isnan(tau).any():
-        near = np.full(len(tau), np.nan)
-        for r in range(len(tau)):
-            if math.isnan(tau[r]):
-                near[r] = _scan(rates, surface, start[r], c[r], s[r], w, ws, heights[r], radius, longest[r])
+    near = np.zeros(len(tau))
+    for attempt in range(2):  # the second for those that the first does not find
         _search(rates, surface, start, c, s, w, ws, heights, radius, longest, near)
+        missing = False
         for r in range(len(tau)):
-            if math.isnan(tau[r]):
+            if attempt == 0 or math.isnan(tau[r]):
                 tau[r] = near[r]
+            missing = missing or math.isnan(tau[r])
+        if not missing:
+            return
+        for r in range(len(tau)):
+            near[r] = np.nan
+            if attempt == 0 and math.isnan(tau[r]):
+                near[r] = _scan(rates, surface, start[r], c[r], s[r], w, ws, heights[r], radius, longest[r])
 
 
 @machine_code(
@@ -181,11 +187,17 @@ def contacts(
     for r in range(len(start)):
         found = tau[r]
         if math.isnan(found):
-            after[r], aftert[r], taut[r] = np.nan, 0.0, 0.0
+            for i in range(9):
+                after[r, i] = np.nan
+                for q in range(d):
+                    aftert[r, i, q], taut[r, q] = 0.0, 0.0
             continue
-        x[:] = start[r]
-        later[:, :d], later[:, d] = startt[r], 0.0
-        ct1[:, :d], st1[:, :d] = ct[r], st[r]
+        put(x, start[r])
+        put_all(later, startt[r])
+        put_all(ct1, ct[r])
+        put_all(st1, st[r])
+        for i in range(9):
+            later[i, d] = 0.0
         fly_one(rates, x, c[r], w, later, ct1, found, by_time, steps)
         evaluate(surface, x, s[r], ws, later, st1, o, moved)
         speed = min(later[2, d] - moved[0, d], -MIN_SPEED)

@@ -14,6 +14,21 @@ TOGETHER = 96
 """Balls whose layers of a network stay in a processor's own memory."""
 
 
+@machine_code(NOTHING(ONE, ONE))
+def put(target, source):
+    """Copy numbers (m,); numba's own copy of an array takes a second to compile wherever it is used."""
+    for i in range(len(source)):
+        target[i] = source[i]
+
+
+@machine_code(NOTHING(TWO, TWO))
+def put_all(target, source):
+    """Copy numbers (m, d)."""
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
+
+
 @machine_code(NOTHING(FUNCTION, ONE, ONE, ONE, TWO, TWO, ONE, TWO))
 def evaluate(function, x, c, w, xt, ct, y, yt):
     """A model's function of one state x (9,) with coefficients c (p,): y (m,); tangents (9, d), (p, d), (m, d)."""
@@ -42,10 +57,10 @@ def step_on(rates, x, c, w, xt, ct, h, ht, k1, k1t, y, yt):
     d = xt.shape[1]
     x2, x2t, total, totalt = np.empty(9), np.empty((9, d)), np.empty(9), np.empty((9, d))
     k, kt, a, at = np.empty(9), np.empty((9, d)), np.empty(6), np.empty((6, d))
-    total[:] = k1
-    totalt[:] = k1t
-    k[:] = k1
-    kt[:] = k1t
+    for i in range(9):
+        total[i] = k[i] = k1[i]
+        for q in range(d):
+            totalt[i, q] = kt[i, q] = k1t[i, q]
     for stage in range(3):
         share = 1.0 if stage == 2 else 0.5
         for i in range(9):
@@ -73,8 +88,8 @@ def fly_arcs(rates, start, startt, c, ct, w, step, count, nodes, nodest, slopes,
     """
     a, at, still = np.empty(6), np.empty((6, startt.shape[2])), np.zeros(startt.shape[2])
     for r in range(len(start)):
-        nodes[r, 0] = start[r]
-        nodest[r, 0] = startt[r]
+        put(nodes[r, 0], start[r])
+        put_all(nodest[r, 0], startt[r])
         slope_at(rates, nodes[r, 0], c[r], w, nodest[r, 0], ct[r], slopes[r, 0], slopest[r, 0], a, at)
         for s in range(count):
             x, xt, y, yt = nodes[r, s], nodest[r, s], nodes[r, s + 1], nodest[r, s + 1]
@@ -111,8 +126,8 @@ def fly_side_by_side(rates, x, c, w, xt, ct, duration, durationt, steps):
     x2, x2t, total, totalt = np.empty((n, 9)), np.empty((n, 9, d)), np.empty((n, 9)), np.empty((n, 9, d))
     for _ in range(steps):
         slopes_at(rates, x, c, w, xt, ct, k, kt, a, at)
-        total[:] = k
-        totalt[:] = kt
+        put_all(total, k)
+        put_all(totalt.reshape(n * 9, d), kt.reshape(n * 9, d))
         for stage in range(3):
             share, weight = (1.0 if stage == 2 else 0.5), (1.0 if stage == 2 else 2.0)
             for r in range(n):

@@ -7,7 +7,7 @@ import numpy as np
 from ballfg.dynamics.compiled.beliefs import gap_of
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contacts
-from ballfg.dynamics.compiled.flight import fly_one, fly_together
+from ballfg.dynamics.compiled.flight import fly_one, fly_together, put, put_all
 from ballfg.dynamics.compiled.signatures import (
     COUNTS,
     FLAG,
@@ -62,9 +62,9 @@ def _through(functions, values, weights, x, level, h, world, after):
                 continue
         if math.isnan(tau[0]) or bounced[0, 5] < REST_SPEED:
             return True
-        at[:] = bounced
+        put(at[0], bounced[0])
         remaining -= tau[0]
-        after[:] = at[0]
+        put(after, at[0])
         fly_one(rates, after, c[0], w, empty, ct[0], remaining, np.empty(0), 1)
         if _at_rest(at[0], gap_of(surface, at[0], s[0], ws, level, world[2])):
             return True
@@ -84,13 +84,17 @@ def roll_out(rates, impact, surface, values, weights, start, durations, world, s
     m, k = durations.shape
     x, after, still = start.copy(), np.empty((m, 9)), np.zeros((m, 0))
     none, ct, step = np.empty((m, 9, 0)), np.empty((m, c.shape[1], 0)), np.empty(m)
-    reached[:] = k
+    for r in range(m):
+        reached[r] = k
     for j in range(k):
-        longest = min(durations[:, j].max(), LONGEST_MOTION)
+        longest = 0.0
+        for r in range(m):
+            longest = max(longest, min(durations[r, j], LONGEST_MOTION))
         steps = max(1, math.ceil(longest / MAX_STEP - 1e-9))
-        step[:] = np.minimum(durations[:, j], LONGEST_MOTION) / steps
+        for r in range(m):
+            step[r] = min(durations[r, j], LONGEST_MOTION) / steps
         for _ in range(steps):
-            after[:] = x
+            put_all(after, x)
             fly_together(rates, after, none, c, ct, w, step, still, 1)
             for r in range(m):
                 if reached[r] <= j:
@@ -102,6 +106,6 @@ def roll_out(rates, impact, surface, values, weights, start, durations, world, s
                     hard = _through(functions, own, weights, x[r], level, step[r], world, after[r])
                 if hard:
                     reached[r] = j
-            x[:] = after
+            put_all(x, after)
         for r in range(m):
-            states[r, j] = x[r]
+            put(states[r, j], x[r])

@@ -9,7 +9,6 @@ from typing import Final, TypeVar
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
@@ -213,6 +212,8 @@ class _Search:
 
         bounds = list(zip(self.low, self.high, strict=True))
         options = {"maxiter": MOST_ITERATIONS, "maxfun": 2 * MOST_ITERATIONS, "ftol": 1e-5}
+        from scipy.optimize import minimize  # it takes half a second to import
+
         found = minimize(told, self.start, jac=True, method="L-BFGS-B", bounds=bounds, options=options)
         return np.asarray(found.x)
 

@@ -8,7 +8,6 @@ from typing import Final
 
 import numpy as np
 import torch
-from scipy.optimize import minimize
 
 from ballfg.arrays import Array
 from ballfg.estimation.noise.linear_filter import LinearFilter, Noise
@@ -112,6 +111,8 @@ class MarginalFit:
             return value, turn.T @ gradient
 
         options = {"gtol": tolerance, "ftol": 0.0, "maxfun": most, "maxcor": len(begin)}
+        from scipy.optimize import minimize  # it takes half a second to import
+
         found = minimize(told, np.zeros(len(begin)), jac=True, method="L-BFGS-B", options=options)
         self.logs = begin + turn @ found.x
         self.losses, self.gradients = self.at(self.logs)
