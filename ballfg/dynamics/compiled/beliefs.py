@@ -10,7 +10,7 @@ import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contact_times, contacts
-from ballfg.dynamics.compiled.flight import evaluate, fly_one
+from ballfg.dynamics.compiled.flight import evaluate, fly_one, put
 from ballfg.dynamics.compiled.signatures import (
     COUNT,
     FLAG,
@@ -82,6 +82,12 @@ def gap_of(surface, x, s, ws, level, radius):
     return x[2] - level - offset[0] - radius
 
 
+@machine_code(FLAG(ONE, ONE))
+def over_table(x, world):
+    """Whether a state (9,) lies within the table's ends."""
+    return world[3] <= x[0] <= world[4] and world[5] <= x[1] <= world[6]
+
+
 @machine_code(REAL(ONE, TWO, ONE))
 def share_over_table(touch, covariance, world):
     """Probability that a ball which is at `touch` (9,) in the mean when it comes down is then above the table."""
@@ -102,6 +108,25 @@ def share_over_table(touch, covariance, world):
     return within
 
 
+@machine_code(REAL(FUNCTION, FUNCTION, ONE, TWO, TWO, ONE, ONE, REAL, ONE, ONE))
+def come_down(rates, surface, x, c, s, w, ws, level, world, touch):
+    """Time (s) at which a falling ball x (9,) reaches a level, NaN if it does not; writes its state there (9,)."""
+    tau, state = np.empty(1), x.copy().reshape((1, 9))
+    contact_times(rates, surface, state, c, s, w, ws, np.full(1, level), np.full(1, BEYOND), world[2], tau)
+    if math.isfinite(tau[0]):
+        put(touch, x)
+        fly_one(rates, touch, c[0], w, np.empty((9, 0)), np.empty((c.shape[1], 0)), tau[0], np.empty(0), 1)
+    return tau[0]
+
+
+@machine_code(FLAG(ONE, TWO, REAL, ONE))
+def falls_past(touch, covariance, tau, world):
+    """Whether a ball that reaches the table's level at `touch` after tau s falls past the table, all but certainly."""
+    if over_table(touch, world):
+        return False
+    return tau < 0.0 or share_over_table(touch, covariance, world) < NEGLIGIBLE
+
+
 @machine_code(
     FLAG(THREE_FUNCTIONS, THREE_VALUES, THREE_TANGENTS, THREE_WEIGHTS, ONE, TWO, REAL, REAL, ONE, ONE, ONE, TWO)
 )
@@ -109,7 +134,8 @@ def bounce(functions, values, tangents, weights, start, covariance, h, level, wo
     """One ball (9,), with its covariance, that comes down on a level within h s.
 
     Writes: its state x (9,) and covariance after (d, d) at the end.
-    Returns: whether this is a plain bounce: one, away from the table's edges, after which the ball rises.
+    Returns: whether this is a plain bounce: one, within the table's ends, after which the ball rises. The covariance
+        has the share of balls that fall past an end instead, as `prediction.edges` has it.
     """
     d, radius = len(covariance), world[2]
     tau, taut, there, moved = np.empty(1), np.empty((1, d)), np.empty((1, 9)), np.zeros((1, 9, d))
@@ -129,8 +155,11 @@ def bounce(functions, values, tangents, weights, start, covariance, h, level, wo
     fly_one(rates, touch[0], c[0], w, jacobian[0], ct[0], elapsed, still, 1)
     if not touch[0, 5] < 0.0:
         return False
-    if level == world[0] and not share_over_table(touch[0], covariance, world) > 1.0 - NEGLIGIBLE:
-        return False
+    past = 0.0  # share of balls that miss the table
+    if level == world[0]:
+        past = 1.0 - share_over_table(touch[0], covariance, world)
+        if not past < NEGLIGIBLE and not over_table(touch[0], world):
+            return False
     through(jacobian[0], covariance, gathered)
     add_flight(gathered, elapsed, noise)
     jacobian[:] = moved
@@ -167,6 +196,12 @@ def bounce(functions, values, tangents, weights, start, covariance, h, level, wo
     through(moved[0], gathered, after)
     add_flight(after, left, noise)
     add_impact(after, left, noise)
+    if not past < NEGLIGIBLE:
+        beside, none = start.copy(), np.empty((9, 0))
+        fly_one(rates, beside, c[0], w, none, np.empty((c.shape[1], 0)), h, np.empty(0), 1)
+        for i in range(9):
+            for j in range(9):
+                after[i, j] += past * (x[i] - beside[i]) * (x[j] - beside[j])
     return True
 
 
@@ -227,7 +262,7 @@ def carry(
     Returns: the number of steps done. Where that is less than k, hard (n,) tells which balls have not done the next
         one: 1 if their bounce is not a plain one, 2 if they rest.
     """
-    n = mean.shape[1]
+    n, touch = mean.shape[1], np.empty(9)
     for k in range(h.shape[1]):
         stop = False
         for r in range(n):
@@ -247,9 +282,13 @@ def carry(
                 continue
             if after[5] >= 0.0 or gap_of(surface, after[:9], s[r], ws, low, world[2]) >= 0.0:
                 continue
+            one = slice(r, r + 1)
+            if low == world[0] and gap_of(surface, after[:9], s[r], ws, world[1], world[2]) >= 0.0:
+                tau = come_down(rates, surface, x[:9], c[one], s[one], w, ws, low, world, touch)
+                if math.isfinite(tau) and falls_past(touch, covariance[k, r], tau, world):
+                    continue
             beside[k + 1, r], besides[k + 1, r] = after, covariance[k + 1, r]
             level[k + 1, r], age[k + 1, r] = low, 0.0
-            one = slice(r, r + 1)
             if not bounce(
                 (rates, impact, surface),
                 (c[one], b[one], s[one]),

@@ -4,12 +4,11 @@ import math
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs import bounce, fly_belief, gap_of, share_over_table
+from ballfg.dynamics.compiled.beliefs import bounce, come_down, falls_past, fly_belief, gap_of, over_table
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.contacts import contact_times
 from ballfg.dynamics.compiled.flight import evaluate, fly_one
 from ballfg.dynamics.compiled.signatures import FLAG, FUNCTION, ONE, REAL, THREE, TWO, several
-from ballfg.dynamics.motion.limits import BEYOND, MAX_STEP, NEGLIGIBLE, REST_GAP, REST_SPEED
+from ballfg.dynamics.motion.limits import MAX_STEP, REST_GAP, REST_SPEED
 
 LOOKS = 16
 """How often a step of `MAX_STEP` is looked at: two crossings within 1.25 ms may pass unseen."""
@@ -73,18 +72,24 @@ def _zero(rates, x, c, w, normal, offset, h, earliest, either_way):
     return np.nan
 
 
-@machine_code(several(REAL, 2)(FUNCTION, FUNCTION, ONE, TWO, TWO, ONE, ONE, REAL, ONE))
-def _contact_within(rates, surface, x, c, s, w, ws, h, world):
-    """The level (m) that a ball (9,) comes down on within h s and when; h where it does not, NaN where it rests."""
-    low, after = world[0] if x[2] > world[0] else world[1], x.copy()
+@machine_code(several(REAL, 2)(FUNCTION, FUNCTION, ONE, TWO, TWO, TWO, ONE, ONE, REAL, ONE))
+def _contact_within(rates, surface, x, covariance, c, s, w, ws, h, world):
+    """The level (m) that a ball (9,) comes down on within h s and when; h where it does not, NaN where it is unclear.
+
+    It is where the ball rests, or may fall past the table's edge or not.
+    """
+    low, after, touch = world[0] if x[2] > world[0] else world[1], x.copy(), np.empty(9)
     if abs(x[5]) <= REST_SPEED / 2 and abs(gap_of(surface, x, s[0], ws, low, world[2])) <= REST_GAP:
         return low, np.nan
     fly_one(rates, after, c[0], w, np.empty((9, 0)), np.empty((c.shape[1], 0)), h, np.empty(0), 1)
     if after[5] >= 0.0 or gap_of(surface, after, s[0], ws, low, world[2]) >= 0.0:
         return np.nan, h
-    tau, state = np.empty(1), x.copy().reshape((1, 9))
-    contact_times(rates, surface, state, c, s, w, ws, np.full(1, low), np.full(1, BEYOND), world[2], tau)
-    return low, tau[0]
+    tau = come_down(rates, surface, x, c, s, w, ws, low, world, touch)
+    if low == world[0] and math.isfinite(tau) and falls_past(touch, covariance, tau, world):
+        if gap_of(surface, after, s[0], ws, world[1], world[2]) >= 0.0:
+            return np.nan, h
+        return world[1], np.nan
+    return low, tau
 
 
 @machine_code(
@@ -131,7 +136,7 @@ def find(
     after, spread, x = np.empty(d), np.empty((d, d)), mean[:9]
     while passed < horizon:
         h = min(MAX_STEP, horizon - passed)
-        low, tau = _contact_within(rates, surface, x, c, s, w, ws, h, world)
+        low, tau = _contact_within(rates, surface, x, covariance, c, s, w, ws, h, world)
         if not 0.0 <= tau <= h:
             return HARD, passed
         h, event = tau, np.nan
@@ -152,7 +157,7 @@ def find(
         else:
             h = event if math.isfinite(event) else h
             fly_belief(rates, mean, covariance, c[0], ct[0], w, h, noise, after, spread)
-            if contact and low == world[0] and not share_over_table(after[:9], covariance, world) > 1.0 - NEGLIGIBLE:
+            if contact and low == world[0] and not over_table(after[:9], world):
                 return HARD, passed
         mean[:] = after
         covariance[:] = spread

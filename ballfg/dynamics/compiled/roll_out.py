@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs import gap_of
+from ballfg.dynamics.compiled.beliefs import gap_of, over_table
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contacts
 from ballfg.dynamics.compiled.flight import fly_one, fly_together, put, put_all
@@ -22,11 +22,6 @@ from ballfg.dynamics.compiled.signatures import (
     TWO,
 )
 from ballfg.dynamics.motion.limits import LONGEST_FALL, LONGEST_MOTION, MAX_CONTACTS, MAX_STEP, REST_GAP, REST_SPEED
-
-
-@machine_code(FLAG(ONE, ONE))
-def _over_table(x, world):
-    return world[3] <= x[0] <= world[4] and world[5] <= x[1] <= world[6]
 
 
 @machine_code(FLAG(ONE, REAL))
@@ -55,7 +50,7 @@ def _through(functions, values, weights, x, level, h, world, after):
         if level == world[0] and not math.isnan(tau[0]):
             touch = at[0].copy()
             fly_one(rates, touch, c[0], w, empty, ct[0], tau[0], np.empty(0), 1)
-            if not _over_table(touch, world):  # beside the table: the floor is what it falls on
+            if not over_table(touch, world):  # beside the table: the floor is what it falls on
                 level = world[1]
                 if gap_of(surface, after, s[0], ws, level, world[2]) >= 0.0:
                     return False
