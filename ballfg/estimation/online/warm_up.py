@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ballfg.estimation.online.state import OnlineState
+from ballfg.prediction import Crossing
 
 if TYPE_CHECKING:
     from ballfg.estimation.online.online import Online
@@ -39,8 +41,20 @@ def warmed_up(online: Online) -> list[OnlineState]:
     for k in range(SAMPLES):
         state = trial.push(t[k], [3.0 * t[k], 0.0, rise + height[k]])
         if k in LOOKED_AHEAD:
-            ahead = state.predict(HORIZON)
-            _ = ahead.next_contact, ahead.apex, ahead.crossing(x=2.0)
+            bounce = _looked_ahead(state)
             states.append(state)
+            end = (online.surfaces.extent or (0.0, np.inf))[1]
+            if bounce is not None and np.isfinite(end):  # the same ball as it comes down at the table's end
+                shift = end - bounce.state[0]
+                moved = replace(state, mean=state.mean + shift * np.eye(len(state.mean))[0])
+                _looked_ahead(moved)
+                states.append(moved)
     trial.copy()
     return states
+
+
+def _looked_ahead(state: OnlineState) -> Crossing | None:
+    """The next contact; everything else that is asked of a prediction is computed too."""
+    ahead = state.predict(HORIZON)
+    _ = ahead.apex, ahead.crossing(x=2.0)
+    return ahead.next_contact
