@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
+from typing import Final
 
 import gtsam
 import numpy as np
@@ -29,6 +30,7 @@ from ballfg.dynamics import (
 )
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.estimation import Online, Settings, Smoother, dataset_settings, dataset_surfaces
+from ballfg.estimation.online.online import Solver
 from ballfg.estimation.smoother.initial import initial_states
 from ballfg.estimation.smoother.problem import Events
 from ballfg.factors.batch import Values
@@ -56,6 +58,8 @@ DRAG, MAGNUS = 0.112, 0.0055
 HORIZON = 0.3
 """s that are predicted, at `RATE`."""
 NO_SURFACE = Surfaces(-1e3)
+ONLINE: Final[Mapping[Solver, str]] = {"isam2": "online_update", "chain": "online_chain_update"}
+"""What holds the window of the online estimator, and how its rows are called."""
 
 
 @dataclass(frozen=True)
@@ -146,7 +150,8 @@ def _time_model(watch: Stopwatch, name: str, model: BallModel, track: Track) -> 
     states, dt = torch.from_numpy(values.states[:-1].copy()), torch.full((SAMPLES - 1,), 1 / RATE, dtype=torch.float64)
     watch.time(name, "jacobians_time_79", lambda: fly_jacobian(model, states, dt))
     watch.time(name, "jacobian_time_1", lambda: fly_jacobian(model, states[:1], dt[:1]))
-    _time_online(watch, name, Online(model, NO_SURFACE, settings), track)
+    for solver, metric in ONLINE.items():
+        _time_online(watch, name, metric, Online(model, NO_SURFACE, settings, solver=solver), track)
     _time_prediction(watch, name, smoother, track)
 
 
@@ -197,7 +202,7 @@ def _time_gtsam(watch: Stopwatch, name: str, graph: BallGraph, values: Values) -
     watch.time(name, "lm_time_gtsam", minimise)
 
 
-def _time_online(watch: Stopwatch, name: str, online: Online, track: Track) -> None:
+def _time_online(watch: Stopwatch, name: str, metric: str, online: Online, track: Track) -> None:
     """Every update with its newest state and covariance, over whole streams; the first stream warms up."""
     times = []
     for run in range(1 + max(2, watch.runs // 10)):
@@ -205,8 +210,8 @@ def _time_online(watch: Stopwatch, name: str, online: Online, track: Track) -> N
         stream = zip(track.times.tolist(), track.positions, strict=True)
         spent = [milliseconds(partial(online.push, stamp, position)) for stamp, position in stream]
         times += spent if run else []
-    watch.results.add(CASE, name, "online_update_median", "ms", median_and_quartiles(times), len(times))
-    watch.results.add(CASE, name, "online_update_p99", "ms", float(np.quantile(times, 0.99)), len(times))
+    watch.results.add(CASE, name, f"{metric}_median", "ms", median_and_quartiles(times), len(times))
+    watch.results.add(CASE, name, f"{metric}_p99", "ms", float(np.quantile(times, 0.99)), len(times))
 
 
 def _time_prediction(watch: Stopwatch, name: str, smoother: Smoother, track: Track) -> None:

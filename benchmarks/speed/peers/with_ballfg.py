@@ -21,6 +21,8 @@ from ballfg.learning.gradient.objective import BatchObjective
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 torch.set_num_threads(1)
+TOLERANCE = 3e-6
+"""Posterior standard deviations to the minimum: the loosest that meets what is compared on all tracks."""
 EXACT = 1e-8
 """Relative error of the linear solution of a gradient, in keeping with what is compared."""
 HELD = 1e-6
@@ -114,7 +116,7 @@ def solver(problem: Problem, task: str):
         return _rollout(problem, model)
     if task == "gradient":
         return _gradient(problem, model)
-    optimizer, (p, v, w) = LevenbergMarquardt(), problem.start()
+    optimizer, (p, v, w) = LevenbergMarquardt(TOLERANCE), problem.start()
     pairs = [(_graph(problem, model, k), _start(p[k], v[k], w[k])) for k in range(len(p))]
 
     def solve() -> dict[str, Array]:

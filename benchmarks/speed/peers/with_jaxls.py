@@ -15,8 +15,8 @@ from problem import ROLLOUT_STEPS, Array, Problem
 
 jax.config.update("jax_enable_x64", True)
 
-TOLERANCE = 1e-9
-"""Of its relative change of the cost; looser ones stop up to 1e-5 away from the minimum."""
+TOLERANCE = 1e-10
+"""Of its relative change of the cost: the loosest power of ten that meets what is compared on all tracks."""
 
 
 class State(jaxls.Var[jax.Array], default_factory=lambda: jnp.zeros(6)):
@@ -71,7 +71,7 @@ def solver(problem: Problem, task: str):
             start,
             linear_solver=linear,
             trust_region=None,
-            termination=jaxls.TerminationConfig(cost_tolerance=TOLERANCE),
+            termination=jaxls.TerminationConfig(cost_tolerance=TOLERANCE, parameter_tolerance=TOLERANCE),
             verbose=False,
         )
         whole = np.asarray(found[states]).reshape(tracks, n, 6)

@@ -12,7 +12,7 @@ from with_torch import acceleration_of, loss_of, rollout
 
 warnings.simplefilter("ignore")
 STEPS = 20
-TOLERANCE = 1e-9
+TOLERANCE = 1e-10
 """Relative change of the error at which it stops."""
 
 
