@@ -44,6 +44,7 @@ def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
     """
 
     def declared(function: Callable[..., Any]) -> Any:
+        dispatcher: Any
         try:
             dispatcher = njit(error_model="numpy", cache=True)(function)
         except RuntimeError:  # no folder: compiled anew by every process

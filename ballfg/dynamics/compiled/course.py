@@ -83,7 +83,7 @@ class Carrier:
         moving = Moving(model, functions, torch.from_numpy(mean), mean.shape[1])
         parts = (functions.rates, functions.impact, functions.surface)
         coefficients = [array for part in parts for array in moving.coefficients(part)]
-        self._given = (*(part.compute for part in parts), *coefficients, *moving.weights)
+        self._given: tuple[Any, ...] = (*(part.compute for part in parts), *coefficients, *moving.weights)
         self._world, self._noise = world_of(surfaces, functions.radius), noise
         self._keeps = inner  # what torch computes is found by the model as long as it is there
 

@@ -50,24 +50,22 @@ class ChainWindow(StreamWindow):
     def _room(self, count: int) -> None:
         """Arrays of the chain for twice as many states; what is eliminated stays."""
         w, p, size = self.width, self.p, 2 * count + 64
-        old = (self._carries, self._shared, self._root) if count else ()
-        self._carries = np.zeros((size + 1, w, self._columns))
-        self._shared = np.zeros((size + 1, p, self._columns))
-        self._root = np.zeros((size, w, 2 * w + p + 1))
-        for new, kept in zip((self._carries, self._shared, self._root), old, strict=False):
-            new[: len(kept)] = kept
+        shapes = ((size + 1, w, self._columns), (size + 1, p, self._columns), (size, w, 2 * w + p + 1))
+        carries, shared, root = (np.zeros(shape) for shape in shapes)
+        for new, kept in zip((carries, shared, root), self._chain if count else (), strict=False):
+            held = min(len(new), len(kept))
+            new[:held] = kept[:held]
+        self._chain: tuple[Array, Array, Array] = carries, shared, root
 
     def copy(self, samples: Sequence[Sample]) -> Self:
         """A window with the same states and factors, which goes on by itself."""
-        other, n = copy.copy(self), len(self.samples)
+        other = copy.copy(self)
         other.samples = list(samples)
         other.intervals = [copy.copy(interval) for interval in self.intervals]
         other._priors, other._rows = [list(batches) for batches in self._priors], list(self._rows)
         other._positions, other._answers = list(self._positions), list(self._answers)
         other._stale = dict(self._stale)
-        other._room(n)
-        for name, count in (("_carries", n + 1), ("_shared", n + 1), ("_root", n)):
-            getattr(other, name)[:count] = getattr(self, name)[:count]
+        other._room(len(self.samples))
         return other
 
     def _insert(
@@ -124,9 +122,8 @@ class ChainWindow(StreamWindow):
         self._move()
         self._solve()
         w, p, linked = self.width, self.p, self.intervals[leaving - 1] is not None
-        known = np.concatenate(
-            (self._carries[leaving] if linked else np.zeros((0, self._columns)), self._shared[leaving])
-        )
+        carries, shared, _ = self._chain
+        known = np.concatenate((carries[leaving] if linked else carries[leaving, :0], shared[leaving]))
         blocks = [known[:, :w], known[:, 2 * w : 2 * w + p]]
         points = [self.theta[leaving : leaving + 1], self.coefficient_theta[None]]
         self._summary = LinearFactors([0, COEFFICIENTS], points, blocks, known[:, -1], self.biased)
@@ -145,7 +142,7 @@ class ChainWindow(StreamWindow):
         """(w + p, w + p) of each of the oldest states, with its bias and the coefficients."""
         n, w, p = len(self.samples), self.width, self.p
         states, cross, shared = np.empty((n, w, w)), np.empty((n, w, w + p)), np.empty((p, p))
-        covariances_of(self._root[:n], self._last(), states, cross, shared)
+        covariances_of(self._chain[2][:n], self._last(), states, cross, shared)
         return [_joint(states[k], cross[k, :, w:], shared) for k in range(count)]
 
     def summaries(self) -> list[FactorBatch]:
@@ -240,7 +237,7 @@ class ChainWindow(StreamWindow):
         """
         n, w, p = len(self.samples), self.width, self.p
         begin = min(self._stale, default=n - 1)
-        if n > len(self._root):
+        if n > len(self._chain[2]):
             self._room(n)
         for k, moved in self._stale.items():
             self._rows[k] = self._rows_of(k, moved)
@@ -248,22 +245,23 @@ class ChainWindow(StreamWindow):
         rows = self._rows[begin:]
         start = np.zeros(len(rows) + 1, dtype=np.int64)
         np.cumsum([len(part) for part in rows], out=start[1:])
-        carries, shared, root = self._carries[begin : n + 1], self._shared[begin : n + 1], self._root[begin:n]
-        eliminate_on(np.concatenate(rows), start, w, carries, shared, root)
+        carries, shared, root = self._chain
+        part = (carries[begin : n + 1], shared[begin : n + 1], root[begin:n])
+        eliminate_on(np.concatenate(rows), start, w, *part)
         last = self._last()
-        delta, coefficients = self._root[:n, :, -1].copy(), last[:, -1].copy()
-        substitute_back(self._root[:n], last, delta, coefficients)
+        delta, coefficients = root[:n, :, -1].copy(), last[:, -1].copy()
+        substitute_back(root[:n], last, delta, coefficients)
         if not (np.isfinite(delta).all() and np.isfinite(coefficients).all()):
             raise RuntimeError("the linear system of the window is singular")
         self.delta, self.coefficient_delta = delta, coefficients
         states, cross, own = np.empty((1, w, w)), np.empty((1, w, w + p)), np.empty((p, p))
-        covariances_of(self._root[n - 1 : n], last, states, cross, own)
+        covariances_of(root[n - 1 : n], last, states, cross, own)
         self.newest_covariance = _joint(states[0], cross[0, :, w:], own)
         return n - begin
 
     def _last(self) -> Array:
         """(p, 2 w + p + 1) the triangle of the coefficients after all states."""
-        shared, end = self._shared[len(self.samples)], 2 * self.width + self.p
+        shared, end = self._chain[1][len(self.samples)], 2 * self.width + self.p
         return np.concatenate((shared[:, :end], shared[:, -1:]), axis=1)
 
 

@@ -115,6 +115,7 @@ def _problem(size: Size, network: NetworkFlight | None) -> Problem:
     none, scalar = (np.zeros((0, 0)), np.zeros(0)) * 3, np.asarray
     pairs = () if network is None else zip(network.weights, network.biases, strict=True)
     layers = none if network is None else [part.detach().numpy() for pair in pairs for part in pair]
+    w1, b1, w2, b2, w3, b3 = layers
     return Problem(
         np.stack([track.positions, *others]),
         np.tile(label, (MOST_TRACKS, 1)),
@@ -125,8 +126,7 @@ def _problem(size: Size, network: NetworkFlight | None) -> Problem:
         np.array((0.0, 0.0, -STANDARD_GRAVITY)),
         scalar(DRAG),
         scalar(MAGNUS),
-        *layers,
-        flight=np.array(START),
+        *(w1, b1, w2, b2, w3, b3, np.array(START)),
     )
 
 

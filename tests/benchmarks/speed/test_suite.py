@@ -38,6 +38,8 @@ def test_speed_run_has_every_time() -> None:
         "jacobian_time_1",
         "online_update_median",
         "online_update_p99",
+        "online_chain_update_median",
+        "online_chain_update_p99",
         "prediction_time",
     }
     for method in ("analytic", "network"):

@@ -139,7 +139,7 @@ def test_what_cannot_be_solved_is_built_anew(track: Track, monkeypatch: pytest.M
         expected = undisturbed.push(time, position)
         if k == 20:
             assert isinstance(online.window, ChainWindow)
-            online.window._carries[:21] = np.nan
+            online.window._chain[0][:21] = np.nan
         state = online.push(time, position)
         assert state.rebuilt == (k == 20)
     assert (np.abs(state.mean - expected.mean) / np.sqrt(np.diag(expected.joint)) < 1.0).all()

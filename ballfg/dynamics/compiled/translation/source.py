@@ -150,10 +150,10 @@ class _Writer:
             return self._moving(operation.operands[1 : 1 + through]).place(block, str(place), str(which))
         if operation.name == "back":
             block, place = operation.where
-            which, adjoint, by = str(arrays.asked[block].index(place)), self._adjoint(block), operation.operands[1]
+            asked, adjoint, by = str(arrays.asked[block].index(place)), self._adjoint(block), operation.operands[1]
             loads = [(source, arrays.makings[source]) for source in arrays.sources(block)]
             return _sum(
-                adjoint.place(source, str(i), which)
+                adjoint.place(source, str(i), asked)
                 for source, load in loads
                 if isinstance(load, Load)
                 for i, loaded in enumerate(load.numbers)
