@@ -19,7 +19,8 @@ from ballfg.arrays import Array
 from ballfg.estimation.online.interval import Interval
 from ballfg.estimation.online.linear import LinearFactors
 from ballfg.estimation.online.measurement import Measurement, prepare
-from ballfg.estimation.online.stream_window import Sample, StreamWindow, Update
+from ballfg.estimation.online.sample import Sample, Update
+from ballfg.estimation.online.stream_window import StreamWindow
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch
 from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.linear.elimination import covariances_of, eliminate_on, padded, substitute_back

@@ -9,7 +9,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.online.stream_window import Sample
+from ballfg.estimation.online.sample import Sample
 from ballfg.estimation.segmentation import Event, EventKind, Segmentation, SegmentationPhysics, Segmenter
 from ballfg.estimation.segmentation.assembly import BREAKS, contacts_of, intervals_of, quality_of, rests_of
 from ballfg.estimation.segmentation.result import Quality

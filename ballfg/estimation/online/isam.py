@@ -13,7 +13,8 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.estimation.online.interval import Interval
 from ballfg.estimation.online.measurement import prepare
-from ballfg.estimation.online.stream_window import COEFFICIENT_THRESHOLD, Sample, StreamWindow
+from ballfg.estimation.online.sample import Sample
+from ballfg.estimation.online.stream_window import COEFFICIENT_THRESHOLD, StreamWindow
 from ballfg.estimation.online.tracker import bias_link, bias_start, linear_factor
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge

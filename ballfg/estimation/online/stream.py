@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from ballfg.estimation.observations.ray_path import AROUND, BEFORE, Path, Rays, rough_path
 from ballfg.estimation.observations.sightings import LOOSE, SAME_MOMENT, filled
 from ballfg.estimation.online.measurement import Measurement
-from ballfg.estimation.online.stream_window import Sample
+from ballfg.estimation.online.sample import Sample
 from ballfg.factors.camera import CameraFactors
 from ballfg.factors.loss import Loss
 from ballfg.tracks.sightings import Sightings

@@ -10,19 +10,17 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Self
 
 import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.online.interval import Interval, IntervalMaker, evaluate, store
 from ballfg.estimation.online.measurement import Measurement, prepare
+from ballfg.estimation.online.sample import Sample, Update
 from ballfg.estimation.online.tracker import carried_with_bias, without_bias
 from ballfg.estimation.settings import Settings, stamp_covariance
-from ballfg.estimation.smoother.motion import FLIGHT, Motion
 from ballfg.estimation.smoother.problem import coefficient_means, start_priors
 from ballfg.factors.batch import FactorBatch, Values
 from ballfg.factors.dynamics import model_width
@@ -43,60 +41,6 @@ COEFFICIENT_THRESHOLD = 0.5
 """Prior standard deviations. The coefficients touch every factor: moving them relinearises the whole window."""
 WIDE_VELOCITY = 1.0
 """m/s. A predicted velocity that is less well known does not tell along which way a stamp's error moved the ball."""
-
-
-@dataclass
-class Sample:
-    """One observation, and what is believed of it.
-
-    Attributes:
-        time: s.  position: (3,) m.
-        stated: (3,) m, standard deviation of its white error as stated.
-        whole: (3,) m, that of its whole error: with a lasting part and the error of the stamp.
-        velocity: (3,) m/s, rough, along which the stamp's error moves it.
-        factor: multiple of the whole error with which it takes part if it is not good; 1 if it is.
-        motion: how the ball got here from the sample before.
-        label: what is known of the spin, on the first sample of a track.
-        slots: where iSAM2 keeps the sample's own factors: its position's first, where it was measured.
-        bias_slot: where it keeps the factor that leads here from the bias of the sample before; None without.
-        measured: whether the position was measured; if not, it was made from the measurements and helps to find events.
-        measurements: everything else that was measured at this moment.
-    """
-
-    time: float
-    position: Array
-    stated: Array
-    factor: float = 1.0
-    motion: Motion = FLIGHT
-    label: SpinLabel | None = None
-    slots: tuple[int, ...] = ()
-    bias_slot: int | None = None
-    whole: Array = field(default_factory=lambda: np.zeros(3))
-    velocity: Array = field(default_factory=lambda: np.zeros(3))
-    measured: bool = True
-    measurements: list[Measurement] = field(default_factory=list)
-
-    @property
-    def sigma(self) -> Array:
-        """(3,) m, standard deviation of the white error with which it takes part."""
-        return self.stated if self.factor == 1.0 else self.whole * self.factor
-
-
-@dataclass(frozen=True)
-class Update:
-    """What one update did.
-
-    Attributes:
-        innovation: (dim,) whitened, of the position or of what stands for it; NaN where nothing predicted the sample.
-        evaluated: factors of the motion evaluated, the new one among them.
-        calls: torch calls for them.
-        variables: states that iSAM2 eliminated again.
-    """
-
-    innovation: Array
-    evaluated: int
-    calls: int
-    variables: int
 
 
 class StreamWindow(ABC):

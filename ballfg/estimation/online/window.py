@@ -10,7 +10,7 @@ from ballfg.arrays import Array
 from ballfg.estimation.online.isam import IsamCore
 from ballfg.estimation.online.linear import LinearFactors
 from ballfg.estimation.online.measurement import Measurement, prepare
-from ballfg.estimation.online.stream_window import Sample, Update
+from ballfg.estimation.online.sample import Sample, Update
 from ballfg.estimation.online.tracker import bias_start
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY

@@ -103,25 +103,6 @@ def test_sightings_that_join_a_sample(ball: World) -> None:
             same(*states)
 
 
-def test_copies_go_their_own_way(track: Track) -> None:
-    model = nominal_model()
-    settings = own(model, memory=(0.002,) * 3)
-    live, straight = (Online(model, 0.0, settings, lag=12, solver="chain") for _ in range(2))
-    kept, since = live.copy(), 0
-    for k, (time, position) in enumerate(zip(track.times, track.positions, strict=True)):
-        expected = straight.push(time, position)
-        live.push(time, position)
-        if k % 9 == 8:
-            astray = kept.copy()
-            for j in range(since, k + 1):
-                astray.push(track.times[j], track.positions[j] + 0.01 * (j - since))
-            live = kept.copy()
-            states = [live.push(track.times[j], track.positions[j]) for j in range(since, k + 1)]
-            np.testing.assert_array_equal(states[-1].mean, expected.mean)
-            np.testing.assert_array_equal(states[-1].joint, expected.joint)
-            kept, since = live.copy(), k + 1
-
-
 @pytest.mark.parametrize("lag", [12, 128])
 def test_estimates_of_whole_tracks(track: Track, lag: int) -> None:
     model = nominal_model()
