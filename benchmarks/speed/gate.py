@@ -55,7 +55,8 @@ def _ratios(rows: Sequence[Row]) -> dict[tuple[str, str, str], float]:
     controls: Mapping[str, list[float]] = _controls(rows)
     found: dict[tuple[str, str, str], Any] = {}
     for row in rows:
-        timed = row.unit == "ms" and row.metric != CONTROL and not row.metric.startswith("matrix")
+        steady = row.metric != CONTROL and not row.metric.startswith("matrix") and not row.metric.endswith("_p99")
+        timed = row.unit == "ms" and steady
         if timed and row.value is not None and row.case in controls:
             found[row.case, row.method, row.metric] = row.value / min(controls[row.case])
     return found
