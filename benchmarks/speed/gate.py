@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from ballfg.benchmarks.results import Row
 
@@ -52,8 +52,7 @@ def check_ratios(rows: Sequence[Row], baseline: Path) -> list[str]:
 
 def _ratios(rows: Sequence[Row]) -> dict[tuple[str, str, str], float]:
     """Times over the control of the same case, by case, method and metric."""
-    controls: Mapping[str, list[float]] = _controls(rows)
-    found: dict[tuple[str, str, str], Any] = {}
+    controls, found = _controls(rows), dict[tuple[str, str, str], float]()
     for row in rows:
         steady = row.metric != CONTROL and not row.metric.startswith("matrix") and not row.metric.endswith("_p99")
         timed = row.unit == "ms" and steady

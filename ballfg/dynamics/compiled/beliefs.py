@@ -82,6 +82,12 @@ def gap_of(surface, x, s, ws, level, radius):
     return x[2] - level - offset[0] - radius
 
 
+@machine_code(FLAG(ONE, REAL))
+def at_rest(x, gap):
+    """Whether a state (9,) lies on a surface with this gap (m) to it."""
+    return abs(gap) <= REST_GAP and abs(x[5]) <= REST_SPEED / 2
+
+
 @machine_code(FLAG(ONE, ONE))
 def over_table(x, world):
     """Whether a state (9,) lies within the table's ends."""
@@ -277,7 +283,7 @@ def carry(
                 age[k + 1, r] = np.nan
             low = world[0] if x[2] > world[0] else world[1]
             after = mean[k + 1, r]
-            if abs(x[5]) <= REST_SPEED / 2 and abs(gap_of(surface, x[:9], s[r], ws, low, world[2])) <= REST_GAP:
+            if at_rest(x[:9], gap_of(surface, x[:9], s[r], ws, low, world[2])):
                 hard[r], stop = 2.0, True
                 continue
             if after[5] >= 0.0 or gap_of(surface, after[:9], s[r], ws, low, world[2]) >= 0.0:

@@ -4,11 +4,11 @@ import math
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs import bounce, come_down, falls_past, fly_belief, gap_of, over_table
+from ballfg.dynamics.compiled.beliefs import at_rest, bounce, come_down, falls_past, fly_belief, gap_of, over_table
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.flight import evaluate, fly_one
 from ballfg.dynamics.compiled.signatures import FLAG, FUNCTION, ONE, REAL, THREE, TWO, several
-from ballfg.dynamics.motion.limits import MAX_STEP, REST_GAP, REST_SPEED
+from ballfg.dynamics.motion.limits import MAX_STEP
 
 LOOKS = 16
 """How often a step of `MAX_STEP` is looked at: two crossings within 1.25 ms may pass unseen."""
@@ -79,7 +79,7 @@ def _contact_within(rates, surface, x, covariance, c, s, w, ws, h, world):
     It is where the ball rests, or may fall past the table's edge or not.
     """
     low, after, touch = world[0] if x[2] > world[0] else world[1], x.copy(), np.empty(9)
-    if abs(x[5]) <= REST_SPEED / 2 and abs(gap_of(surface, x, s[0], ws, low, world[2])) <= REST_GAP:
+    if at_rest(x, gap_of(surface, x, s[0], ws, low, world[2])):
         return low, np.nan
     fly_one(rates, after, c[0], w, np.empty((9, 0)), np.empty((c.shape[1], 0)), h, np.empty(0), 1)
     if after[5] >= 0.0 or gap_of(surface, after, s[0], ws, low, world[2]) >= 0.0:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs import gap_of, over_table
+from ballfg.dynamics.compiled.beliefs import at_rest, gap_of, over_table
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contacts
 from ballfg.dynamics.compiled.flight import fly_one, fly_together, put, put_all
@@ -21,12 +21,7 @@ from ballfg.dynamics.compiled.signatures import (
     THREE_WEIGHTS,
     TWO,
 )
-from ballfg.dynamics.motion.limits import LONGEST_FALL, LONGEST_MOTION, MAX_CONTACTS, MAX_STEP, REST_GAP, REST_SPEED
-
-
-@machine_code(FLAG(ONE, REAL))
-def _at_rest(x, gap):
-    return abs(gap) <= REST_GAP and abs(x[5]) <= REST_SPEED / 2.0
+from ballfg.dynamics.motion.limits import LONGEST_FALL, LONGEST_MOTION, MAX_CONTACTS, MAX_STEP, REST_SPEED
 
 
 @machine_code(FLAG(THREE_FUNCTIONS, THREE_VALUES, THREE_WEIGHTS, ONE, REAL, REAL, ONE, ONE))
@@ -61,7 +56,7 @@ def _through(functions, values, weights, x, level, h, world, after):
         remaining -= tau[0]
         put(after, at[0])
         fly_one(rates, after, c[0], w, empty, ct[0], remaining, np.empty(0), 1)
-        if _at_rest(at[0], gap_of(surface, at[0], s[0], ws, level, world[2])):
+        if at_rest(at[0], gap_of(surface, at[0], s[0], ws, level, world[2])):
             return True
         if not (gap_of(surface, after, s[0], ws, level, world[2]) < 0.0 and after[5] < 0.0):
             return False
@@ -95,7 +90,7 @@ def roll_out(rates, impact, surface, values, weights, start, durations, world, s
                 if reached[r] <= j:
                     continue
                 level = world[0] if x[r, 2] > world[0] else world[1]
-                hard = _at_rest(x[r], gap_of(surface, x[r], s[r], ws, level, world[2]))
+                hard = at_rest(x[r], gap_of(surface, x[r], s[r], ws, level, world[2]))
                 if not hard and after[r, 5] < 0.0 and gap_of(surface, after[r], s[r], ws, level, world[2]) < 0.0:
                     own = (c[r : r + 1], b[r : r + 1], s[r : r + 1])
                     hard = _through(functions, own, weights, x[r], level, step[r], world, after[r])

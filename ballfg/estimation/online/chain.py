@@ -95,8 +95,7 @@ class ChainWindow(StreamWindow):
             del held[count:]
         del self.intervals[count - 1 :]
         self.theta, self._stale = self.theta[:count], {k: new for k, new in self._stale.items() if k < count}
-        own = [batch for batch, _ in self._answers[-1] if not isinstance(batch, DynamicsFactors)]
-        self._answers[-1] = self._answers[-1][: len(own)]
+        self._answers[-1] = [answer for answer in self._answers[-1] if not isinstance(answer[0], DynamicsFactors)]
         self._renew([count - 1], moved=False)
         self._solve()
 
@@ -136,7 +135,7 @@ class ChainWindow(StreamWindow):
         if self.biased and not linked:
             self._priors[0].append(BiasStartFactors(np.zeros(1, dtype=np.int64), self.settings.bias_sigmas))
         self._room(0)
-        self._renew(range(keep), moved=False)
+        self._renew([0], moved=False)  # the first one's rows alone change; all are eliminated again
         self._solve()
 
     def joint_covariances(self, count: int) -> list[Array]:

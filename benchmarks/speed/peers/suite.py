@@ -135,15 +135,7 @@ def _run_task(
 ) -> None:
     path = folder / f"{task.name.replace(' ', '')}.npz"
     problem.save(path)
-    control = BandedProblem(
-        problem.measured[0],
-        float(problem.dt),
-        float(problem.position_sigma),
-        problem.label[0],
-        float(problem.label_sigma),
-        float(problem.drag),
-        float(problem.magnus),
-    )
+    control = _banded(problem, 0, float(problem.drag), float(problem.magnus))
     with ExitStack() as stack:
         sessions = {}
         for library, python in pythons.items():
@@ -183,25 +175,26 @@ def _reference(task: Task, problem: Problem, path: Path, own: Session) -> dict[s
         with Session([sys.executable], "gtsam", "reference", path) as session:
             return session.solution(path.parent)
     if task.kind == "gradient":
-        laws = np.array((float(problem.drag), float(problem.magnus)))
-        return {"gradient": np.array([_slope(problem, laws, k) for k in range(len(laws))])}
-    solved = [_banded(problem, k, float(problem.drag), float(problem.magnus)) for k in range(task.tracks)]
-    states = np.stack([states for states, _ in solved])
-    return {"position": states[..., :3], "velocity": states[..., 3:], "spin": np.stack([spin for _, spin in solved])}
+        return {"gradient": np.array([_slope(problem, which) for which in range(2)])}
+    laws = float(problem.drag), float(problem.magnus)
+    solved = [_banded(problem, k, *laws).solve() for k in range(task.tracks)]
+    states = np.stack([states for states, _, _ in solved])
+    return {"position": states[..., :3], "velocity": states[..., 3:], "spin": np.stack([spin for _, spin, _ in solved])}
 
 
-def _banded(problem: Problem, track: int, drag: float, magnus: float) -> tuple[Array, Array]:
-    """States (n, 6) and spin (3,) by the banded solver."""
+def _banded(problem: Problem, track: int, drag: float, magnus: float) -> BandedProblem:
+    """A track for the banded solver."""
     noise = float(problem.position_sigma), problem.label[track], float(problem.label_sigma)
-    return BandedProblem(problem.measured[track], float(problem.dt), *noise, drag, magnus).solve()[:2]
+    return BandedProblem(problem.measured[track], float(problem.dt), *noise, drag, magnus)
 
 
-def _slope(problem: Problem, laws: Array, which: int) -> float:
-    """Derivative of the loss by one of the laws' coefficients: central differences of fourth order."""
+def _slope(problem: Problem, which: int) -> float:
+    """Derivative of the loss by the drag or the Magnus coefficient: central differences of fourth order."""
+    laws = np.array((float(problem.drag), float(problem.magnus)))
 
     def loss(shift: float) -> float:
         drag, magnus = laws + shift * DIFFERENCE_STEPS[which] * np.eye(2)[which]
-        states, spin = _banded(problem, 0, drag, magnus)
+        states, spin, _ = _banded(problem, 0, drag, magnus).solve()
         p, v, dt = states[-1, :3], states[-1, 3:], float(problem.dt)
         for _ in range(LOSS_STEPS):
             a = problem.gravity - drag * np.sqrt(v @ v) * v + magnus * np.cross(spin, v)

@@ -11,6 +11,8 @@ from with_torch import residual_of, rollout
 TOLERANCE = 1e-9
 """Relative change of the error at which it stops."""
 STEPS = 20
+MOST_TRACKS = 4
+"""At once; four take seconds."""
 DAMPING = 1e-10
 """Of the first step: as good as none, which is the quickest here."""
 
@@ -36,8 +38,10 @@ def solver(problem: Problem, task: str):
     """Steps until the error stays."""
     if task == "rollout":
         return rollout(problem)
-    if task != "estimate" or len(problem.measured) > 4:
-        raise NotImplementedError(f"no {task} of {len(problem.measured)} tracks: its Jacobian is dense")
+    if task != "estimate":
+        raise NotImplementedError(f"no {task}")
+    if len(problem.measured) > MOST_TRACKS:
+        raise NotImplementedError(f"its Jacobian is dense: too large for {len(problem.measured)} tracks")
 
     def solve() -> dict[str, Array]:
         flight = Flight(problem)
