@@ -1,88 +1,92 @@
-"""The hypotheses of a segmentation, as a struct of arrays."""
+"""Hypotheses, the events they pass through and the surfaces, as machine code keeps them: one record each."""
 
-from __future__ import annotations
-
-from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any, Final, TypeAlias
 
 import numpy as np
+from numba import from_dtype
 from numpy.typing import NDArray
 
-from ballfg.arrays import Array
-from ballfg.estimation.segmentation.events import Event, Node
+from ballfg.arrays import Index
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, REAL
 
-FLYING = -1
-"""Value of `Bank.surface` for a ball in the air."""
+FLYING: Final = -1
+"""Value of `surface` for a ball in the air."""
 
-IntArray = NDArray[np.int64]
+NO_EVENT: Final = -(2**62)
+"""The `tip` of a hypothesis before which nothing happened."""
+
+HYPOTHESIS: Final = np.dtype(
+    [
+        ("mean", np.float64, (3, 3)),
+        ("cov", np.float64, (3, 3, 3)),
+        ("shift", np.float64, (3,)),
+        ("score", np.float64),
+        ("surface", np.int64),
+        ("age", np.int64),
+        ("tip", np.int64),
+    ]
+)
+"""One explanation of the past. The axes x, y, z are filtered independently; (p, v, b) are position, velocity, slack.
+
+- mean: axis by (p m, v m/s, b m/s^2).  cov: axis by covariance of (p, v, b).
+- shift: m, by which the tracker is believed to be off; `mean` is what it sees, surfaces appear so moved.
+- score: nats, log evidence less the prices of events; a constant per sample is left out.
+- surface: index of the surface on which the ball rests, or `FLYING`.
+- age: samples used since the last event.
+- tip: its last event: the row of a log, or -1 - k for the last event of hypothesis k before the sample.
+"""
+
+LOGGED: Final = np.dtype(
+    [
+        ("kind", np.int64),
+        ("index", np.int64),
+        ("surface", np.int64),
+        ("before", np.int64),
+        ("time", np.float64),
+        ("offset", np.float64, (3,)),
+    ]
+)
+"""An event that some hypotheses pass through during one sample.
+
+- kind: value of an `EventKind`.  index: the interval, or the sample.  surface: its index, -1 where none is involved.
+- before: the event before, as the `tip` of a hypothesis.  time: s.  offset: m, of a shift.
+"""
+
+SURFACE: Final = np.dtype([("centre", np.float64), ("restitution_sigma", np.float64)])
+"""A surface: m, height of the ball's centre when it touches; spread of the restitution. The table comes first."""
+
+Records: TypeAlias = NDArray[np.void]
+"""Rows of one of these types."""
+Record: TypeAlias = Any
+"""One row; its fields are attributes in machine code, where a row does not keep its array alive: what may be the last
+use of an array hands on the array and the number of the row."""
+
+BANK: Final[Any] = from_dtype(HYPOTHESIS)[::1]
+ONE_HYPOTHESIS: Final[Any] = from_dtype(HYPOTHESIS)
+LOG: Final[Any] = from_dtype(LOGGED)[::1]
+SURFACES: Final[Any] = from_dtype(SURFACE)[::1]
+
+USED, WRITTEN = range(2)
+"""Places in the `fill` of a bank and its log: rows of each that are in use."""
 
 
-@dataclass(slots=True)
-class Bank:
-    """h hypotheses. The axes x, y, z are filtered independently; (p, v, b) are position, velocity and slack.
-
-    Attributes:
-        mean: (h, 3, 3) axis by (p m, v m/s, b m/s^2).
-        cov: (h, 3, 3, 3) axis by covariance of (p, v, b).
-        surface: (h,) index of the surface on which the ball rests, or `FLYING`.
-        score: (h,) nats, log evidence less the prices of events; a constant per sample is left out.
-        age: (h,) samples used since the last event.
-        shift: (h, 3) m, by which the tracker is believed to be off; `mean` is what it sees, surfaces appear so moved.
-        tips: (h,) the last `Node` of each hypothesis, or None.
-    """
-
-    mean: Array
-    cov: Array
-    surface: IntArray
-    score: Array
-    age: IntArray
-    shift: Array
-    tips: NDArray[np.object_]
-
-    def __len__(self) -> int:
-        return len(self.score)
-
-    @property
-    def resting(self) -> IntArray:
-        """Rows of the hypotheses that rest on a surface."""
-        return (self.surface != FLYING).nonzero()[0]
-
-    @property
-    def all_flying(self) -> bool:
-        """Whether no hypothesis rests: quicker than `resting` for the few rows there are."""
-        return self.surface.tolist() == [FLYING] * len(self)
-
-    def take(self, rows: IntArray | list[int]) -> Bank:
-        """A copy of some hypotheses."""
-        return Bank(
-            self.mean[rows],
-            self.cov[rows],
-            self.surface[rows],
-            self.score[rows],
-            self.age[rows],
-            self.shift[rows],
-            self.tips[rows],
-        )
-
-    def take_best(self) -> Bank:
-        """A copy of the hypothesis with the highest score."""
-        return self.take([int(self.score.argmax())])
-
-    def add_event(self, row: int, event: Event) -> None:
-        """Appends an event to the chain of one hypothesis."""
-        self.tips[row] = Node(event, self.tips[row])
+@machine_code(COUNT(BANK, COUNTS, BANK, COUNT))
+def add(bank: Records, fill: Index, source: Records, place: int) -> int:
+    """Puts a copy of one hypothesis of `source` behind the others of a bank; returns its row."""
+    row = fill[USED]
+    bank[row] = source[place]
+    fill[USED] += 1
+    return row
 
 
-def concatenate(banks: Sequence[Bank]) -> Bank:
-    """All hypotheses of some banks, in order."""
-    if len(banks) == 1:
-        return banks[0]
-    return Bank(
-        np.concatenate([b.mean for b in banks]),
-        np.concatenate([b.cov for b in banks]),
-        np.concatenate([b.surface for b in banks]),
-        np.concatenate([b.score for b in banks]),
-        np.concatenate([b.age for b in banks]),
-        np.concatenate([b.shift for b in banks]),
-        np.concatenate([b.tips for b in banks]),
-    )
+@machine_code(NOTHING(ONE_HYPOTHESIS, LOG, COUNTS, COUNT, COUNT, COUNT, REAL))
+def pass_through(h: Record, log: Records, fill: Index, kind: int, index: int, surface: int, time: float) -> None:
+    """Lets a hypothesis pass through an event, which is written to the log; arguments as in `LOGGED`."""
+    row = fill[WRITTEN]
+    fill[WRITTEN] += 1
+    event = log[row]
+    event.kind, event.index, event.surface, event.before, event.time = kind, index, surface, h.tip, time
+    for axis in range(3):
+        event.offset[axis] = 0.0
+    h.tip = row

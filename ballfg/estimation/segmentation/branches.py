@@ -1,135 +1,206 @@
 """Events that no surface explains: starts, hits, tracker shifts, a resting ball that leaves."""
 
 import math
+from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array
-from ballfg.estimation.segmentation.bank import FLYING, Bank, concatenate
-from ballfg.estimation.segmentation.events import Event, EventKind, Node
-from ballfg.estimation.segmentation.evidence import update
-from ballfg.estimation.segmentation.kernels import OUTLIER
+from ballfg.arrays import Array, Index
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, ONE, REAL
+from ballfg.estimation.segmentation.bank import (
+    BANK,
+    FLYING,
+    LOG,
+    ONE_HYPOTHESIS,
+    SURFACES,
+    USED,
+    WRITTEN,
+    Record,
+    Records,
+    add,
+    pass_through,
+)
+from ballfg.estimation.segmentation.events import HIT, LEAVE, OUTLIER, REST, SHIFT
+from ballfg.estimation.segmentation.evidence import AS_OUTLIER, rank, update
 from ballfg.estimation.segmentation.motion import lift, put_down
-from ballfg.estimation.segmentation.scene import Scene
+from ballfg.estimation.segmentation.scene import SCENE
 
-SHORTEST_STEP = 1e-3
+SHORTEST_STEP: Final = 1e-3
 """s. An event is not made dearer than this by stamps that lie closer."""
-SHIFTED_PREDICTIONS = 3
+SHIFTED_PREDICTIONS: Final = 3
 """How many of the best predictions are tried with a shift; beside a bounce the right one may be the third."""
+MOST_ADDED: Final = 2 + 2 * SHIFTED_PREDICTIONS
+"""Hypotheses that these events add at most, besides one for each surface."""
 
 
-def fresh(position: Array, position_variance: Array | float, scene: Scene) -> Bank:
-    """One flying hypothesis at a position (3,) with a variance (3,) m^2, of which nothing else is known."""
-    mean, cov = np.zeros((1, 3, 3)), np.zeros((1, 3, 3, 3))
-    mean[0, :, 0] = position
-    cov[0, :, 0, 0] = position_variance
-    cov[0, :, 1, 1] = scene.settings.velocity_spread**2
-    cov[0, :, 2, 2] = scene.settings.slack**2
-    return Bank(
-        mean,
-        cov,
-        surface=np.array([FLYING]),
-        score=np.zeros(1),
-        age=np.zeros(1, dtype=np.int64),
-        shift=np.zeros((1, 3)),
-        tips=np.array([None], dtype=object),
-    )
-
-
-def starts(
-    tip: Node | None, score: float, position: Array, sigma: Array, scene: Scene, sample: int, time: float
-) -> Bank:
+@machine_code(NOTHING(BANK, COUNTS, LOG, COUNT, REAL, ONE, ONE, COUNT, REAL, SCENE, SURFACES))
+def start(
+    bank: Records,
+    fill: Index,
+    log: Records,
+    tip: int,
+    score: float,
+    position: Array,
+    sigma: Array,
+    sample: int,
+    time: float,
+    scene: Record,
+    surfaces: Records,
+) -> None:
     """Hypotheses after a first sample: a flying ball, one that rests on a surface nearby, or the sample an outlier.
 
-    All three expect the ball within the spread of outliers of the sample, so that their evidence compares.
+    All expect the ball within the spread of outliers of the sample, so that their evidence compares.
 
     Args:
-        tip: last event before, or None.
+        bank, fill, log: empty; afterwards those hypotheses.
+        tip: the last event before.
         score: nats, carried on.
         position: (3,) m.
         sigma: (3,) m, its noise.
-        scene: ball, surfaces, settings.
         sample: index of the sample.
         time: s, its stamp.
+        scene, surfaces: of a `Scene`.
     """
-    settings = scene.settings
-    flying = fresh(position, settings.outlier_spread**2, scene)
-    flying.score[0] = score
-    flying.tips[0] = tip
-    banks = [flying, *_rested(flying, position, scene, sample - 1, time)]
-    lost = flying.take([0])
-    lost.score += scene.log_shares[OUTLIER] - 3.0 * math.log(settings.outlier_spread)
-    lost.add_event(0, Event(EventKind.OUTLIER, sample, time))
-    used, _ = update(concatenate(banks), position, sigma, scene, sample, time)
-    return concatenate([used, lost])
+    add(bank, fill, bank, 0)
+    _forget(bank[0], position, scene.outlier_spread**2, scene)
+    bank[0].score, bank[0].tip = score, tip
+    _rested(bank, fill, log, 0, position, sample - 1, time, scene, surfaces)
+    flying = bank[:1].copy()
+    update(bank, fill, log, 0, position, sigma, sample, time, scene)
+    lost = bank[add(bank, fill, flying, 0)]
+    lost.score += scene.log_shares[AS_OUTLIER] - 3.0 * math.log(scene.outlier_spread)
+    pass_through(lost, log, fill, OUTLIER, sample, -1, time)
 
 
-def hits(best: Bank, position: Array, dt: float, scene: Scene, interval: int, time: float) -> list[Bank]:
-    """The best explanation of the past, its velocity forgotten: in the air, and on a surface if it is near one.
+@machine_code(NOTHING(BANK, COUNTS, LOG, BANK, ONE, REAL, COUNT, REAL, SCENE, SURFACES))
+def hit(
+    bank: Records,
+    fill: Index,
+    log: Records,
+    before: Records,
+    position: Array,
+    dt: float,
+    interval: int,
+    time: float,
+    scene: Record,
+    surfaces: Records,
+) -> None:
+    """Adds the best explanation of the past, its velocity forgotten: in the air, and on a surface if it is near one.
 
     Over a short interval the ball reappears close to where it was; over a long one it may be anywhere.
     """
-    settings = scene.settings
-    short = dt < settings.short_gap
-    reach = settings.hit_spread**2 + (settings.velocity_spread * min(dt, settings.short_gap)) ** 2
-    bank = fresh(best.mean[0, :, 0] if short else position, reach, scene)
-    price = _rarity(settings.hit_rate, dt) + settings.hit_cost * math.exp(-dt / settings.short_gap)
-    bank.score = best.score - price
-    bank.tips = best.tips.copy()
-    bank.add_event(0, Event(EventKind.HIT, interval, time))
-    return [bank, *_rested(bank, position, scene, interval, time)]
+    row = add(bank, fill, before, 0)
+    h = bank[row]
+    at = h.mean[:, 0].copy() if dt < scene.short_gap else position
+    reach = scene.hit_spread**2 + (scene.velocity_spread * min(dt, scene.short_gap)) ** 2
+    _forget(h, at, reach, scene)
+    h.score -= _rarity(scene.hit_rate, dt) + scene.hit_cost * math.exp(-dt / scene.short_gap)
+    pass_through(h, log, fill, HIT, interval, -1, time)
+    _rested(bank, fill, log, row, position, interval, time, scene, surfaces)
 
 
-def shifts(
-    predicted: Bank, position: Array, sigma: Array, dt: float, scene: Scene, interval: int, time: float
-) -> list[Bank]:
-    """The best predictions, with the measurements jumping by an unknown offset: off from now on, or until now.
+@machine_code(NOTHING(BANK, COUNTS, LOG, BANK, ONE, ONE, REAL, COUNT, REAL, SCENE))
+def shift(
+    bank: Records,
+    fill: Index,
+    log: Records,
+    predicted: Records,
+    position: Array,
+    sigma: Array,
+    dt: float,
+    interval: int,
+    time: float,
+    scene: Record,
+) -> None:
+    """Adds the best predictions, with the measurements jumping by an unknown offset: off from now on, or until now.
 
     Which of the two shows at the next surface only.
     """
-    settings = scene.settings
-    if dt >= settings.short_gap:
-        return []
-    bank = predicted.take(np.argsort(-predicted.score, kind="stable")[:SHIFTED_PREDICTIONS])
-    bank.cov[:, :, 0, 0] += settings.shift_spread**2
-    bank.score = bank.score - _rarity(settings.shift_rate, dt) - settings.shift_cost
-    bank.age = np.zeros(len(bank), dtype=np.int64)
-    for row in range(len(bank)):
-        innovation = position - bank.mean[row, :, 0]
-        # the shift's expectation, not the innovation: after a gap most of that is the path's own uncertainty
-        offset = innovation * settings.shift_spread**2 / (bank.cov[row, :, 0, 0] + sigma**2)
-        bank.shift[row] += offset
-        bank.add_event(row, Event(EventKind.SHIFT, interval, time, offset=offset))
-    right = bank.take(np.arange(len(bank)))
-    right.shift[:] = 0.0
-    return [bank, right]
+    n, first = len(predicted), fill[USED]
+    rows = np.empty(n, np.int64)
+    rank(predicted, 0, n, rows)
+    for row in rows[:SHIFTED_PREDICTIONS]:
+        h = bank[add(bank, fill, predicted, row)]
+        h.score = h.score - _rarity(scene.shift_rate, dt) - scene.shift_cost
+        h.age = 0
+        pass_through(h, log, fill, SHIFT, interval, -1, time)
+        for axis in range(3):
+            h.cov[axis, 0, 0] += scene.shift_spread**2
+            # the shift's expectation, not the innovation: after a gap most of that is the path's own uncertainty
+            known = scene.shift_spread**2 / (h.cov[axis, 0, 0] + sigma[axis] ** 2)
+            offset = (position[axis] - h.mean[axis, 0]) * known
+            h.shift[axis] += offset
+            log[fill[WRITTEN] - 1].offset[axis] = offset
+    for row in range(first, fill[USED]):
+        right = bank[add(bank, fill, bank, row)]
+        for axis in range(3):
+            right.shift[axis] = 0.0
 
 
-def departures(predicted: Bank, dt: float, scene: Scene, interval: int, time: float) -> list[Bank]:
-    """The best resting prediction, in the air from now on."""
-    if predicted.all_flying:
-        return []
-    bank = predicted.take(predicted.resting).take_best()
-    height = scene.height(int(bank.surface[0]))
-    lift(bank, scene)
-    bank.score = bank.score - _rarity(scene.settings.hit_rate, dt) - scene.settings.leave_cost
-    bank.age = np.zeros(1, dtype=np.int64)
-    bank.add_event(0, Event(EventKind.LEAVE, interval, time, height))
-    return [bank]
+@machine_code(NOTHING(BANK, COUNTS, LOG, BANK, REAL, COUNT, REAL, SCENE))
+def leave(
+    bank: Records,
+    fill: Index,
+    log: Records,
+    predicted: Records,
+    dt: float,
+    interval: int,
+    time: float,
+    scene: Record,
+) -> None:
+    """Adds the best resting prediction, in the air from now on."""
+    best = -1
+    for row in range(len(predicted)):
+        if predicted[row].surface != FLYING and (best < 0 or predicted[row].score > predicted[best].score):
+            best = row
+    if best < 0:
+        return
+    h = bank[add(bank, fill, predicted, best)]
+    pass_through(h, log, fill, LEAVE, interval, h.surface, time)
+    lift(h, scene)
+    h.score = h.score - _rarity(scene.hit_rate, dt) - scene.leave_cost
+    h.age = 0
 
 
-def _rested(bank: Bank, position: Array, scene: Scene, interval: int, time: float) -> list[Bank]:
-    """A flying hypothesis as one that rests, for each surface that the sample is near."""
-    rested = []
-    for surface in (np.abs(position[2] - scene.centres) < scene.settings.rest_range).nonzero()[0]:
-        down = bank.take([0])
-        put_down(down, np.array([surface]), scene)
-        down.score = down.score - scene.settings.start_at_rest_cost
-        down.tips[0] = Node(Event(EventKind.REST, interval, time, scene.height(int(surface))), bank.tips[0])
-        rested.append(down)
-    return rested
+@machine_code(NOTHING(ONE_HYPOTHESIS, ONE, REAL, SCENE))
+def _forget(h: Record, position: Array, variance: float, scene: Record) -> None:
+    """Makes a hypothesis a flying one at a position (3,) m with a variance m^2, of which nothing else is known."""
+    h.surface, h.age = FLYING, 0
+    for axis in range(3):
+        h.shift[axis] = 0.0
+        for i in range(3):
+            h.mean[axis, i] = 0.0
+            for k in range(3):
+                h.cov[axis, i, k] = 0.0
+        h.mean[axis, 0] = position[axis]
+        h.cov[axis, 0, 0] = variance
+        h.cov[axis, 1, 1] = scene.velocity_spread**2
+        h.cov[axis, 2, 2] = scene.slack**2
 
 
+@machine_code(NOTHING(BANK, COUNTS, LOG, COUNT, ONE, COUNT, REAL, SCENE, SURFACES))
+def _rested(
+    bank: Records,
+    fill: Index,
+    log: Records,
+    row: int,
+    position: Array,
+    interval: int,
+    time: float,
+    scene: Record,
+    surfaces: Records,
+) -> None:
+    """Adds a flying hypothesis as one that rests, for each surface that the sample is near."""
+    for surface in range(len(surfaces)):
+        if abs(position[2] - surfaces[surface].centre) < scene.rest_range:
+            down = bank[add(bank, fill, bank, row)]
+            put_down(down, surface, surfaces)
+            down.score -= scene.start_at_rest_cost
+            pass_through(down, log, fill, REST, interval, surface, time)
+
+
+@machine_code(REAL(REAL, REAL))
 def _rarity(rate: float, dt: float) -> float:
     """nats, minus log probability that an event of a rate (1/s) falls into an interval."""
     return -math.log(-math.expm1(-rate * max(dt, SHORTEST_STEP)))

@@ -6,6 +6,7 @@ older nodes, so that a copy of a hypothesis costs one pointer.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum, auto
 
@@ -34,6 +35,10 @@ class EventKind(Enum):
     """At a sample: it says nothing."""
 
 
+CONTACT, HIT, RESTART, SHIFT, REST, LEAVE, WIDE, OUTLIER = (kind.value for kind in EventKind)
+"""The same as numbers, for machine code."""
+
+
 @dataclass(frozen=True, eq=False)
 class Event:
     """One event of an explanation.
@@ -54,14 +59,24 @@ class Event:
 
 
 class Node:
-    """An event and the one before it; `final` once every living hypothesis contains it."""
+    """An event and the one before it; `final` once every living hypothesis contains it.
 
-    __slots__ = ("event", "final", "parent")
+    The event is made when it is first asked for: most hypotheses are dropped before anybody does.
+    """
 
-    def __init__(self, event: Event, parent: Node | None) -> None:
-        self.event = event
+    __slots__ = ("_event", "final", "parent")
+
+    def __init__(self, event: Event | Callable[[], Event], parent: Node | None) -> None:
+        self._event = event
         self.parent = parent
         self.final = False
+
+    @property
+    def event(self) -> Event:
+        """What happened."""
+        if not isinstance(self._event, Event):
+            self._event = self._event()
+        return self._event
 
 
 def copied(node: Node | None, known: dict[int, Node]) -> Node | None:

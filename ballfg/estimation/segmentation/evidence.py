@@ -1,107 +1,158 @@
 """Evidence: what a sample says about each hypothesis, and which hypotheses are worth keeping."""
 
+import math
+from typing import Any, Final
+
 import numpy as np
 
-from ballfg.arrays import Array
-from ballfg.estimation.segmentation.bank import Bank, IntArray, concatenate
-from ballfg.estimation.segmentation.events import Event, EventKind
-from ballfg.estimation.segmentation.kernels import (
-    GOOD,
-    NOT_QUIET,
-    OUTLIER,
-    WIDE,
-    kept_rows,
-    quiet_sample,
-    weigh,
-)
-from ballfg.estimation.segmentation.scene import Scene
-from ballfg.estimation.segmentation.settings import SegmentationSettings
+from ballfg.arrays import Array, Index
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, ONE, REAL
+from ballfg.estimation.segmentation.bank import BANK, LOG, ONE_HYPOTHESIS, USED, Record, Records, add, pass_through
+from ballfg.estimation.segmentation.events import OUTLIER, WIDE
+from ballfg.estimation.segmentation.scene import SCENE
 
-NONE = np.zeros(0, dtype=np.int64)
-"""No rows."""
+AS_GOOD, AS_WIDE, AS_OUTLIER = range(3)
+"""The components of the noise, as in a scene's `log_shares`."""
+SURPRISE: Final = 3
+"""Behind the evidences of the components: squared whitened innovation of a good sample."""
 
 
-def update(bank: Bank, position: Array, sigma: Array, scene: Scene, sample: int, time: float) -> tuple[Bank, Array]:
-    """Takes a sample into every hypothesis: its most likely noise component, the Kalman update, the evidence.
+@machine_code(REAL(BANK, COUNTS, LOG, COUNT, ONE, ONE, COUNT, REAL, SCENE))
+def update(
+    bank: Records,
+    fill: Index,
+    log: Records,
+    first: int,
+    position: Array,
+    sigma: Array,
+    sample: int,
+    time: float,
+    scene: Record,
+) -> float:
+    """Takes a sample into every hypothesis from row `first` on: its noise component, the Kalman update, the evidence.
 
-    Where the prediction is too vague to tell, the sample is also tried as an outlier: those hypotheses come last.
-
-    Args:
-        bank: predicted hypotheses.
-        position: (3,) m.
-        sigma: (3,) m, stated noise.
-        scene: settings.
-        sample: index of the sample.
-        time: s, its stamp.
-    Returns: the updated hypotheses, and (h,) the squared whitened innovation, as of a good sample.
-    """
-    settings, h = scene.settings, len(bank)
-    innovation, S = np.empty((h, 3)), np.empty((3, h, 3))
-    evidence, surprise = np.empty((3, h)), np.empty(h)
-    weigh(bank.mean, bank.cov, position, sigma, scene.numbers, scene.log_shares, innovation, S, evidence, surprise)
-    component, rows, source = evidence.argmax(0), np.arange(len(bank)), bank
-    best = evidence[component, rows]
-    doubtful = _doubtful(bank.score, evidence[OUTLIER], best, settings)
-    if len(doubtful):
-        source = concatenate([bank, bank.take(doubtful)])
-        rows = np.concatenate([rows, doubtful])
-        component = np.concatenate([component, np.full(len(doubtful), OUTLIER)])
-        innovation, best = innovation[rows], evidence[component, rows]
-    gain = source.cov[..., 0] / S[component, rows][..., None]  # (h, axis, 3)
-    components = component.tolist()
-    used = component != OUTLIER
-    if OUTLIER in components:
-        gain[~used] = 0.0
-    updated = Bank(
-        mean=source.mean + gain * innovation[..., None],
-        cov=source.cov - gain[..., :, None] * source.cov[..., 0, None, :],
-        surface=source.surface,
-        score=source.score + best,
-        age=source.age + used,
-        shift=source.shift,
-        tips=source.tips.copy(),
-    )
-    for row, kind in enumerate(components):
-        if kind != GOOD:
-            updated.add_event(row, Event(EventKind.WIDE if kind == WIDE else EventKind.OUTLIER, sample, time))
-    return updated, surprise[rows]
-
-
-def _doubtful(score: Array, outlier: Array, best: Array, settings: SegmentationSettings) -> IntArray:
-    """Rows that take the sample for the ball, but barely rather than for an outlier: later samples have to decide.
-
-    That is so where little is known of where the ball is: its second sample, the first ones after a hit or a gap.
+    Where the prediction is too vague to tell, the sample is also tried as an outlier: those hypotheses come last. That
+    is so where little is known of where the ball is: its second sample, the first ones after a hit or a gap.
     Explanations that are far behind already are not multiplied.
 
-    Args: score: (h,) before the sample.  outlier: (h,) evidence of the sample as an outlier.  best: (h,) as what fits.
+    Args:
+        bank, fill, log: predicted hypotheses; afterwards the updated ones.
+        first: row.
+        position: (3,) m.  sigma: (3,) m, stated noise.
+        sample: its index.  time: s, its stamp.
+        scene: of a `Scene`.
+    Returns: squared whitened innovation, as of a good sample, of the hypothesis that is the best afterwards.
     """
-    margin = best - outlier
-    if float(margin.min()) >= settings.outlier_doubt:
-        return NONE
-    doubtful = (margin > 0.0) & (margin < settings.outlier_doubt)
-    doubtful &= score + outlier > (score + best).max() - settings.doubt_margin
-    return doubtful.nonzero()[0]
+    n, best, surprise = fill[USED], -math.inf, 0.0
+    evidence = np.empty((n - first, 4))
+    for row in range(first, n):
+        said = evidence[row - first]
+        weigh(bank[row], position, sigma, scene, said)
+        for component in range(3):
+            if bank[row].score + said[component] > best:
+                best, surprise = bank[row].score + said[component], said[SURPRISE]
+    for row in range(first, n):
+        said = evidence[row - first]
+        component = AS_GOOD
+        for other in (AS_WIDE, AS_OUTLIER):
+            component = other if said[other] > said[component] else component
+        margin = said[component] - said[AS_OUTLIER]
+        apart = 0.0 < margin < scene.outlier_doubt
+        if apart and bank[row].score + said[AS_OUTLIER] > best - scene.doubt_margin:
+            lost = bank[add(bank, fill, bank, row)]
+            lost.score += said[AS_OUTLIER]
+            pass_through(lost, log, fill, OUTLIER, sample, -1, time)
+        _take_in(bank[row], position, sigma, component, scene)
+        bank[row].score += said[component]
+        if component != AS_GOOD:
+            pass_through(bank[row], log, fill, WIDE if component == AS_WIDE else OUTLIER, sample, -1, time)
+    return surprise
 
 
-def prune(bank: Bank, scene: Scene) -> Bank:
-    """The hypotheses worth keeping, best first. A tracker that has been shifted for long is believed."""
-    rows = np.empty(len(bank), dtype=np.int64)
-    kept = bank.take(rows[: kept_rows(bank.score, bank.surface, bank.age, scene.numbers, rows)])
-    kept.shift[kept.age >= scene.settings.mature] = 0.0
-    return kept
+@machine_code(REAL(ONE_HYPOTHESIS, COUNT, REAL, COUNT, SCENE))
+def _variance(h: Record, axis: int, sigma: float, component: int, scene: Record) -> float:
+    """m^2, of the innovation of one coordinate, if the sample is of a component."""
+    if component == AS_OUTLIER:
+        return h.cov[axis, 0, 0] + scene.outlier_spread**2
+    noise = (scene.stamp_jitter * h.mean[axis, 1]) ** 2 + sigma**2
+    return h.cov[axis, 0, 0] + (noise * scene.wide_factor**2 if component == AS_WIDE else noise)
 
 
-def quiet_update(bank: Bank, position: Array, sigma: Array, dt: float, scene: Scene) -> Bank | None:
-    """The hypotheses after the next sample, pruned, where nothing happens; None where something may.
+@machine_code(NOTHING(ONE_HYPOTHESIS, ONE, ONE, SCENE, ONE))
+def weigh(h: Record, position: Array, sigma: Array, scene: Record, said: Array) -> None:
+    """What a sample says about a hypothesis; constants that all share (3/2 log 2 pi) are left out.
 
-    Args: bank: hypotheses, best first.  position, sigma: (3,) m.  dt: s, since the last sample.  scene: settings.
+    Args:
+        h: predicted.  position: (3,) m.  sigma: (3,) m.  scene: of a `Scene`.
+        said: (4,) written: nats, of a good sample, a wide one and an outlier; and the surprise.
     """
-    h = len(bank)
-    mean, cov, score = np.empty_like(bank.mean), np.empty_like(bank.cov), np.empty(h)
-    age, shift, rows = np.empty(h, dtype=np.int64), np.empty((h, 3)), np.empty(h, dtype=np.int64)
-    now = (bank.mean, bank.cov, bank.surface, bank.score, bank.age, bank.shift)
-    of_scene = (scene.numbers, scene.log_shares, scene.centres, scene.drift)
-    n = quiet_sample(*now, dt, position, sigma, *of_scene, mean, cov, score, age, shift, rows)
-    if n == NOT_QUIET:
-        return None
-    return Bank(mean[:n], cov[:n], bank.surface[:n], score[:n], age[:n], shift[:n], bank.tips[rows[:n]])
+    said[SURPRISE] = 0.0
+    for component in range(3):
+        said[component] = scene.log_shares[component]
+        for axis in range(3):
+            off = position[axis] - h.mean[axis, 0]
+            spread = _variance(h, axis, sigma[axis], component, scene)
+            said[component] -= 0.5 * (off * off / spread + math.log(spread))
+            if component == AS_GOOD:
+                said[SURPRISE] += off * off / spread
+
+
+@machine_code(NOTHING(ONE_HYPOTHESIS, ONE, ONE, COUNT, SCENE))
+def _take_in(h: Record, position: Array, sigma: Array, component: int, scene: Record) -> None:
+    """The Kalman update with a sample of a component; an outlier says nothing."""
+    if component == AS_OUTLIER:
+        return
+    h.age += 1
+    gain, first = np.empty(3), np.empty(3)
+    for axis in range(3):
+        spread = _variance(h, axis, sigma[axis], component, scene)
+        off = position[axis] - h.mean[axis, 0]
+        for i in range(3):
+            gain[i], first[i] = h.cov[axis, i, 0] / spread, h.cov[axis, 0, i]
+        for i in range(3):
+            h.mean[axis, i] += gain[i] * off
+            for k in range(3):
+                h.cov[axis, i, k] -= gain[i] * first[k]
+
+
+@machine_code(NOTHING(BANK, COUNT, COUNT, COUNTS))
+def rank(bank: Records, first: int, stop: int, rows: Index) -> None:
+    """Writes the rows first..stop - 1 of a bank, best first; of equals the earlier first."""
+    for row in range(first, stop):  # sorted as they come: few hypotheses, most of them in order
+        place = row - first
+        while place > 0 and bank[rows[place - 1]].score < bank[row].score:
+            rows[place] = rows[place - 1]
+            place -= 1
+        rows[place] = row
+
+
+@machine_code(BANK(BANK, COUNT, SCENE))
+def prune(bank: Records, n: int, scene: Record) -> Any:
+    """The hypotheses worth keeping of the first n, best first. A tracker that has been shifted for long is believed.
+
+    Hypotheses whose last event is old predict the same from now on if they are in the same mode, so the best of them
+    stands for all (the Viterbi step).
+    """
+    rows = np.empty(n, np.int64)
+    rank(bank, 0, n, rows)
+    most, count = int(scene.most), 0
+    kept = np.empty(min(n, most), bank.dtype)
+    least = bank[rows[0]].score - scene.margin
+    for place in range(n):
+        h = bank[rows[place]]
+        if not h.score >= least or count >= most:
+            break
+        old, twin = h.age >= scene.mature, False
+        if old:
+            for earlier in range(count):
+                other = kept[earlier]
+                twin = twin or (other.age >= scene.mature and other.surface == h.surface)
+        if twin:
+            continue
+        kept[count] = h
+        if old:
+            for axis in range(3):
+                kept[count].shift[axis] = 0.0
+        count += 1
+    return kept[:count]

@@ -1,57 +1,79 @@
-"""Flight and rest of all hypotheses over a time step: gravity, drag, and a slack acceleration per axis."""
+"""Flight and rest of one hypothesis over a time step: gravity, drag, and a slack acceleration per axis."""
+
+import math
+from typing import Final
 
 import numpy as np
 
-from ballfg.arrays import Array
-from ballfg.estimation.segmentation.bank import FLYING, Bank, IntArray
-from ballfg.estimation.segmentation.kernels import fly_all
-from ballfg.estimation.segmentation.scene import Scene
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import COUNT, NOTHING, REAL
+from ballfg.estimation.segmentation.bank import FLYING, ONE_HYPOTHESIS, SURFACES, Record, Records
+from ballfg.estimation.segmentation.scene import SCENE
 
-REST_SIGMA = 0.003
+STRONGEST_DRAG: Final = 0.5
+"""Largest share of its velocity that a ball may lose to drag in one step: keeps absurd velocities, as two outliers
+1 ms apart give them, from growing without bound."""
+REST_SIGMA: Final = 0.003
 """m. Spread of the measured height of a resting ball about its surface, constant during the rest."""
-REST_SLACK = 0.5
+REST_SLACK: Final = 0.5
 """m/s^2. Slack acceleration of a rolling ball: rolling resistance and friction."""
-LANDING_SIGMA = 0.2
+LANDING_SIGMA: Final = 0.2
 """m/s. Change of the horizontal velocity of a ball that stays down."""
 
 
-def fly(mean: Array, cov: Array, dt: Array, scene: Scene) -> tuple[Array, Array]:
-    """Free flight; negative steps go back, and add noise like positive ones.
+@machine_code(NOTHING(ONE_HYPOTHESIS, REAL, SCENE))
+def carry(h: Record, t: float, scene: Record) -> None:
+    """A hypothesis t s later, without an event: a flying ball flies, a resting one stays down; changes `h`.
 
-    Args: mean: (h, 3, 3).  cov: (h, 3, 3, 3).  dt: (h,) s.  scene: the ball.
-    Returns: mean and covariance after the step.
+    Drag is linearised at the present speed, the same on the three axes: v' = (1 - k |v| dt) v + (b - g) dt. Negative
+    steps go back, and add noise like positive ones.
     """
-    after = np.empty_like(mean), np.empty_like(cov)
-    fly_all(mean, cov, dt, scene.numbers, scene.drift, *after)
-    return after
+    step, half = abs(t), 0.5 * t * t
+    speed = math.sqrt(h.mean[0, 1] ** 2 + h.mean[1, 1] ** 2 + h.mean[2, 1] ** 2)
+    loss = min(max(scene.drag * speed * t, -STRONGEST_DRAG), STRONGEST_DRAG)
+    a, b = t * (1.0 - 0.5 * loss), 1.0 - loss
+    left = np.empty((3, 3))
+    for axis in range(3 if h.surface == FLYING else 2):
+        mean, cov = h.mean[axis], h.cov[axis]
+        mean[0] = mean[0] + a * mean[1] + half * mean[2]
+        mean[1] = b * mean[1] + t * mean[2]
+        for k in range(3):
+            left[0, k] = cov[0, k] + a * cov[1, k] + half * cov[2, k]
+            left[1, k] = b * cov[1, k] + t * cov[2, k]
+            left[2, k] = cov[2, k]
+        for i in range(3):
+            cov[i, 0] = left[i, 0] + a * left[i, 1] + half * left[i, 2]
+            cov[i, 1] = b * left[i, 1] + t * left[i, 2]
+            cov[i, 2] = left[i, 2]
+            for k in range(3):
+                cov[i, k] += step * (scene.drift[0, i, k] + step * (scene.drift[1, i, k] + step * scene.drift[2, i, k]))
+        if axis == 2:
+            mean[0] -= scene.gravity * half
+            mean[1] -= scene.gravity * t
 
 
-def carry(bank: Bank, dt: float, scene: Scene) -> Bank:
-    """All hypotheses after dt s without an event: the flying fly, the resting stay down."""
-    mean, cov = fly(bank.mean, bank.cov, np.array([dt] * len(bank)), scene)
-    if not bank.all_flying:
-        down = bank.resting
-        mean[down, 2] = bank.mean[down, 2]
-        cov[down, 2] = bank.cov[down, 2]
-    return Bank(mean, cov, bank.surface, bank.score, bank.age, bank.shift, bank.tips)
+@machine_code(NOTHING(ONE_HYPOTHESIS, COUNT, SURFACES))
+def put_down(h: Record, surface: int, surfaces: Records) -> None:
+    """Makes a hypothesis one that rests on a surface."""
+    h.surface = surface
+    h.mean[2, 0] = surfaces[surface].centre + h.shift[2]
+    h.mean[2, 1] = h.mean[2, 2] = 0.0
+    for i in range(3):
+        for k in range(3):
+            h.cov[2, i, k] = 0.0
+    h.cov[2, 0, 0] = REST_SIGMA**2
+    for axis in range(2):
+        h.mean[axis, 2] = 0.0
+        for k in range(3):
+            h.cov[axis, 2, k] = h.cov[axis, k, 2] = 0.0
+        h.cov[axis, 2, 2] = REST_SLACK**2
+        h.cov[axis, 1, 1] += LANDING_SIGMA**2
 
 
-def put_down(bank: Bank, surfaces: IntArray, scene: Scene) -> None:
-    """Makes every hypothesis of a bank one that rests on a surface (h,); changes the bank."""
-    bank.surface = surfaces
-    bank.mean[:, 2] = 0.0
-    bank.mean[:, 2, 0] = scene.centres[surfaces] + bank.shift[:, 2]
-    bank.mean[:, :2, 2] = 0.0
-    bank.cov[:, 2] = 0.0
-    bank.cov[:, 2, 0, 0] = REST_SIGMA**2
-    bank.cov[:, :2, 2, :] = bank.cov[:, :2, :, 2] = 0.0
-    bank.cov[:, :2, 2, 2] = REST_SLACK**2
-    bank.cov[:, :2, 1, 1] += LANDING_SIGMA**2
-
-
-def lift(bank: Bank, scene: Scene) -> None:
-    """Makes every resting hypothesis of a bank a flying one, with a small unknown vertical speed; changes the bank."""
-    settings = scene.settings
-    bank.surface = np.full(len(bank), FLYING)
-    bank.cov[:, 2, 1, 1] += settings.leave_speed**2
-    bank.cov[:, :, 2, 2] += settings.slack**2
+@machine_code(NOTHING(ONE_HYPOTHESIS, SCENE))
+def lift(h: Record, scene: Record) -> None:
+    """Makes a resting hypothesis a flying one, with a small unknown vertical speed."""
+    h.surface = FLYING
+    h.cov[2, 1, 1] += scene.leave_speed**2
+    for axis in range(3):
+        h.cov[axis, 2, 2] += scene.slack**2

@@ -1,14 +1,30 @@
-"""Everything that stays the same during a segmentation: the ball, the surfaces, the settings."""
+"""What stays the same during a segmentation, as machine code takes it: the ball, the surfaces, the settings."""
 
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field, fields
+from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import from_dtype
 
-from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.segmentation.bank import SURFACE, Record, Records
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.settings import SegmentationSettings
+
+NUMBERS: Final = np.dtype(
+    [
+        *((one.name, np.float64) for one in (*fields(SegmentationPhysics), *fields(SegmentationSettings))),
+        ("log_shares", np.float64, (3,)),
+        ("drift", np.float64, (3, 3, 3)),
+        ("extent", np.float64, (4,)),
+    ]
+)
+"""The fields of `SegmentationPhysics` and of `SegmentationSettings` in their units, and what follows from them.
+
+- log_shares: log prior of good, wide and outlying samples.  drift: process noise of (p, v, b) per dt, dt^2, dt^3.
+- extent: m, (x low, x high, y low, y high) within which a contact with the table is tried.
+"""
+SCENE: Final[Any] = from_dtype(NUMBERS)
 
 
 @dataclass(frozen=True)
@@ -16,53 +32,35 @@ class Scene:
     """Ball, surfaces and settings.
 
     Attributes:
-        centres: (s,) m, height of the ball's centre when it touches each surface, table first.
-        restitution_sigmas: (s,).
-        log_shares: (3,) log prior of good, wide and outlying samples.
-        drift: (3, 3, 3) process noise of (p, v, b) per dt, dt^2, dt^3.
-        numbers: (11,) what machine code takes of the ball and the settings, see `kernels`.
+        numbers: one row of `NUMBERS`.
+        rows: (s,) of `SURFACE`, one a surface, table first.
     """
 
     physics: SegmentationPhysics
     surfaces: Surfaces
     settings: SegmentationSettings
-    centres: Array = field(init=False)
-    restitution_sigmas: Array = field(init=False)
-    log_shares: Array = field(init=False)
-    drift: Array = field(init=False)
-    numbers: Array = field(init=False)
+    numbers: Record = field(init=False)
+    rows: Records = field(init=False)
 
     def __post_init__(self) -> None:
-        heights = np.array(self.surfaces.heights())
-        object.__setattr__(self, "centres", heights + self.physics.surface_offset + self.physics.radius)
-        sigmas = np.full(len(heights), self.settings.floor_restitution_sigma)
-        sigmas[0] = self.settings.restitution_sigma
-        object.__setattr__(self, "restitution_sigmas", sigmas)
-        wide, out = self.settings.wide_share, self.settings.outlier_share
-        object.__setattr__(self, "log_shares", np.log([1.0 - wide - out, wide, out]))
+        s, walk = self.settings, self.settings.velocity_drift**2
         drift = np.zeros((3, 3, 3))
-        walk = self.settings.velocity_drift**2
-        drift[0, 1, 1], drift[0, 2, 2] = walk, self.settings.slack_drift**2
+        drift[0, 1, 1], drift[0, 2, 2] = walk, s.slack_drift**2
         drift[1, 0, 1] = drift[1, 1, 0] = walk / 2.0
         drift[2, 0, 0] = walk / 3.0
-        object.__setattr__(self, "drift", drift)
-        physics, s = self.physics, self.settings
-        noise = (s.stamp_jitter, s.wide_factor, s.outlier_spread, s.outlier_doubt)
-        search = (s.surprise, s.contact_window, s.margin, s.mature, s.most)
-        object.__setattr__(
-            self, "numbers", np.array([physics.drag, physics.gravity, *noise, *search], dtype=np.float64)
-        )
+        shares = np.log([1.0 - s.wide_share - s.outlier_share, s.wide_share, s.outlier_share])
+        extent = np.array((-np.inf, np.inf, -np.inf, np.inf) if (known := self.surfaces.extent) is None else known)
+        extent += s.extent_margin * np.array((-1.0, 1.0, -1.0, 1.0))
+        numbers = np.array([(*astuple(self.physics), *astuple(s), shares, drift, extent)], dtype=NUMBERS)
+        object.__setattr__(self, "numbers", numbers[0])
 
-    def height(self, surface: int) -> float:
-        """m, declared height of a surface."""
-        return self.surfaces.heights()[surface]
+        heights = np.array(self.surfaces.heights())
+        rows = np.zeros(len(heights), dtype=SURFACE)
+        rows["centre"] = heights + self.physics.surface_offset + self.physics.radius
+        rows["restitution_sigma"] = s.floor_restitution_sigma
+        rows["restitution_sigma"][0] = s.restitution_sigma
+        object.__setattr__(self, "rows", rows)
 
-    def reaches(self, surface: int, places: Array) -> NDArray[np.bool_]:
-        """(h,) whether x, y (h, 2) m lie within a surface, as far as is known."""
-        extent = self.surfaces.extent
-        if surface != 0 or extent is None:
-            return np.ones(len(places), dtype=bool)
-        margin = self.settings.extent_margin
-        x, y = places[:, 0], places[:, 1]
-        inside = (x >= extent[0] - margin) & (x <= extent[1] + margin)
-        return inside & (y >= extent[2] - margin) & (y <= extent[3] + margin)
+    def height(self, surface: int) -> float | None:
+        """m, declared height of a surface; None for -1."""
+        return None if surface < 0 else self.surfaces.heights()[surface]

@@ -3,20 +3,19 @@
 import copy
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.arrays import Array
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.segmentation import branches
-from ballfg.estimation.segmentation.bank import FLYING, Bank, concatenate
+from ballfg.estimation.segmentation.bank import HYPOTHESIS, NO_EVENT, Records
 from ballfg.estimation.segmentation.events import Event, EventKind, Node, contains, copied, make_final, open_nodes
-from ballfg.estimation.segmentation.evidence import prune, quiet_update, update
+from ballfg.estimation.segmentation.explain import explain
 from ballfg.estimation.segmentation.physics import SegmentationPhysics
 from ballfg.estimation.segmentation.scene import Scene
 from ballfg.estimation.segmentation.settings import SegmentationSettings
-from ballfg.estimation.segmentation.surface_contact import step
 
 
 @dataclass(frozen=True)
@@ -53,17 +52,16 @@ class Segmenter:
         settings: SegmentationSettings | None = None,
     ) -> None:
         self._scene = Scene(physics or SegmentationPhysics(), surfaces, settings or SegmentationSettings())
-        self._bank: Bank | None = None
+        self._bank: Records = np.empty(0, HYPOTHESIS)
+        self._tips: list[Node | None] = []
         self._count = 0
         self._time = -math.inf
 
     def copy(self) -> "Segmenter":
         """A segmenter that has taken in the same samples; what either takes in from now on is its own."""
         other = copy.copy(self)
-        if self._bank is not None:
-            known: dict[int, Node] = {}
-            other._bank = self._bank.take(list(range(len(self._bank))))
-            other._bank.tips[:] = [copied(tip, known) for tip in self._bank.tips]
+        known: dict[int, Node] = {}
+        other._tips = [copied(tip, known) for tip in self._tips]
         return other
 
     @property
@@ -83,65 +81,51 @@ class Segmenter:
         """
         point, noise = self._checked(time, position, sigma)
         noise = np.maximum(noise, self._scene.settings.sigma_floor)
-        quiet, dt = None, time - self._time
-        if self._bank is not None and dt <= self._scene.settings.longest_step:
-            quiet = quiet_update(self._bank, point, noise, dt, self._scene)
-        if quiet is not None:
-            self._bank = quiet
-        elif self._bank is None:
-            self._bank = prune(branches.starts(None, 0.0, point, noise, self._scene, 0, time), self._scene)
-        else:
-            self._bank = prune(self._next(self._bank, point, noise, time), self._scene)
+        last, scene = (self._bank, self._time), self._scene
+        self._bank, log = explain(*last, time, point, noise, self._count, scene.numbers, scene.rows)
+        self._tips = self._followed(self._bank["tip"].tolist(), log)
         self._time = time
         self._count += 1
         return self._decide()
 
-    def _next(self, bank: Bank, position: Array, sigma: Array, time: float) -> Bank:
-        """The hypotheses after the next sample, not pruned, from those before it, best first."""
-        scene, sample, dt = self._scene, self._count, time - self._time
-        settings = scene.settings
-        if dt > settings.longest_gap:
-            tip = Node(Event(EventKind.RESTART, sample - 1, time), bank.tips[0])
-            return branches.starts(tip, float(bank.score[0]), position, sigma, scene, sample, time)
-        predicted = self._predict(bank, dt)
-        updated, surprise = update(predicted, position, sigma, scene, sample, time)
-        extra = branches.departures(predicted, dt, scene, sample - 1, time)
-        if surprise[updated.score.argmax()] > settings.surprise or bank.surface[0] != FLYING:
-            best = bank.take([0])
-            extra += branches.hits(best, position, dt, scene, sample - 1, time)
-            extra += branches.shifts(predicted, position, sigma, dt, scene, sample - 1, time)
-        if not extra:
-            return updated
-        others, _ = update(concatenate(extra), position, sigma, scene, sample, time)
-        return concatenate([updated, others])
+    def _followed(self, tips: list[int], log: Records) -> list[Node | None]:
+        """The last node of each hypothesis after a sample; hypotheses that pass through the same event share its node.
 
-    def _predict(self, bank: Bank, dt: float) -> Bank:
-        """All hypotheses at the next stamp, through the contacts that may have happened on the way."""
-        settings = self._scene.settings
-        steps = max(1, math.ceil(dt / settings.longest_step))
-        for k in range(steps):
-            start = self._time + k * dt / steps
-            bank = step(bank, dt / steps, self._scene, self._count - 1, start, strict=steps > 1)
-            if len(bank) > settings.most:
-                bank = bank.take(np.argsort(-bank.score, kind="stable")[: settings.most])
-        return bank
+        Args: tips: as in `HYPOTHESIS`.  log: the events of the sample.
+        """
+        made: dict[int, Node | None] = {NO_EVENT: None}
+        before = log["before"].tolist()
+
+        def node(tip: int) -> Node | None:
+            if tip not in made:
+                event = partial(_event, log, tip, self._scene)
+                made[tip] = self._tips[-1 - tip] if tip < 0 else Node(event, node(before[tip]))
+            return made[tip]
+
+        return [node(tip) for tip in tips]
 
     def _decide(self) -> Decision:
         """Makes old events final, drops the hypotheses that deny them, and reports."""
-        assert self._bank is not None
-        pending = open_nodes(self._bank.tips[0])
+        pending = open_nodes(self._tips[0])
         cutoff = self._count - self._scene.settings.lag
         old = [node for node in pending if node.event.index < cutoff]
         if not old:
             return Decision((), tuple(node.event for node in pending))
-        agreeing = [row for row, tip in enumerate(self._bank.tips) if contains(tip, old[-1])]
-        self._bank = self._bank.take(agreeing)
+        agreeing = [row for row, tip in enumerate(self._tips) if contains(tip, old[-1])]
+        self._bank, self._tips = self._bank[agreeing], [self._tips[row] for row in agreeing]
         return Decision(make_final(old), tuple(node.event for node in pending[len(old) :]))
 
     def _checked(self, time: float, position: ArrayLike, sigma: ArrayLike) -> tuple[Array, Array]:
         if not math.isfinite(time) or time <= self._time:
             raise ValueError(f"time must be finite and increase; got {time} s after {self._time} s. Sort the samples.")
         return _triple("position", position), _triple("sigma", sigma)
+
+
+def _event(log: Records, row: int, scene: Scene) -> Event:
+    """What happened, as a row of a log says it."""
+    number, index, surface, _, time, offset = log[row].tolist()
+    kind = EventKind(number)
+    return Event(kind, index, time, scene.height(surface), np.array(offset) if kind is EventKind.SHIFT else None)
 
 
 def _triple(name: str, value: ArrayLike) -> NDArray[np.float64]:

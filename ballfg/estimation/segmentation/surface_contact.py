@@ -1,137 +1,184 @@
 """Contacts: a hypothesis that may meet a surface branches: it did not, it bounced, it stayed down."""
 
+import math
+from typing import Any, Final
+
 import numpy as np
-from numpy.typing import NDArray
 
-from ballfg.arrays import Array
-from ballfg.estimation.segmentation.bank import FLYING, Bank, concatenate
-from ballfg.estimation.segmentation.events import Event, EventKind
-from ballfg.estimation.segmentation.kernels import SLOWEST_CLOSING
-from ballfg.estimation.segmentation.motion import carry, fly, put_down
-from ballfg.estimation.segmentation.scene import Scene
+from ballfg.arrays import Index
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, FLAG, NOTHING, REAL, several
+from ballfg.estimation.segmentation.bank import (
+    BANK,
+    FLYING,
+    HYPOTHESIS,
+    LOG,
+    ONE_HYPOTHESIS,
+    SURFACES,
+    USED,
+    Record,
+    Records,
+    add,
+    pass_through,
+)
+from ballfg.estimation.segmentation.events import CONTACT, REST
+from ballfg.estimation.segmentation.motion import carry, put_down
+from ballfg.estimation.segmentation.scene import SCENE
 
-LEAST_FALL = 0.05
+SLOWEST_CLOSING: Final = 0.2
+"""m/s. Bounds the time margin of a slow contact."""
+LEAST_FALL: Final = 0.05
 """m/s. A path that meets a surface more slowly grazes it: no contact."""
-POSITION_JITTER = 1e-3
+POSITION_JITTER: Final = 1e-3
 """m, by which the horizontal position is less certain after a contact."""
-KNOWN_SPEED = 1.0
+KNOWN_SPEED: Final = 1.0
 """m/s. A path whose vertical speed is less certain, as after a single sample, is not said to land slowly."""
-BOUNCE_JITTER = 0.03
+BOUNCE_JITTER: Final = 0.03
 """m/s, of the normal velocity after a bounce, whatever its speed."""
-SLIDE_JITTER = 0.05
+SLIDE_JITTER: Final = 0.05
 """m/s, of the tangential velocity, likewise."""
-WEAKEST_FALL = 0.2
+WEAKEST_FALL: Final = 0.2
 """Share of gravity below which the slack is not believed to hold the ball up."""
 
 
-def step(bank: Bank, dt: float, scene: Scene, interval: int, start: float, *, strict: bool) -> Bank:
+@machine_code(NOTHING(BANK, COUNTS, LOG, REAL, COUNT, REAL, FLAG, SCENE, SURFACES))
+def step(
+    bank: Records,
+    fill: Index,
+    log: Records,
+    dt: float,
+    interval: int,
+    start: float,
+    strict: bool,
+    scene: Record,
+    surfaces: Records,
+) -> None:
     """All hypotheses after dt s, branched at the contacts that may have happened.
 
     Args:
-        bank: hypotheses at time `start`.
+        bank, fill, log: hypotheses at time `start`; those after the step.
         dt: s.
-        scene: ball, surfaces, settings.
         interval: index of the interval that this step is, or is a part of.
         start: s, on the track's clock.
         strict: only contacts inside the step; otherwise also such as the uncertainty of the path lets in. Parts of an
             interval are strict, or each contact would be tried by two of them.
+        scene, surfaces: of a `Scene`.
     """
-    free = carry(bank, dt, scene)
-    branches = [free]
-    for surface in _near(free, scene):
-        times, speeds, ok = _meetings(bank, surface, dt, scene, strict=strict)
-        rows = np.flatnonzero(ok)
-        if len(rows):
-            times = times[rows]
-            landed = _touch(bank.take(rows), times, surface, scene, interval, start)
-            slow = np.flatnonzero(
-                (speeds[rows] < scene.settings.rest_speed) & (landed.cov[:, 2, 1, 1] < KNOWN_SPEED**2)
-            )
-            if len(slow):
-                branches.append(_stay(landed.take(slow), dt - times[slow], surface, scene, interval, start + dt))
-            branches.append(_bounce(landed, dt - times, surface, scene))
-    return concatenate(branches)
+    h, lowest = fill[USED], math.inf
+    before = bank[:h].copy()
+    for row in range(h):
+        free = bank[row]
+        carry(free, dt, scene)
+        slope = min(free.mean[2, 1], -SLOWEST_CLOSING)
+        lowest = min(lowest, free.mean[2, 0] - free.shift[2] + scene.contact_window * slope)
+    for surface in range(len(surfaces)):
+        if lowest < surfaces[surface].centre:
+            _branch(before, bank, fill, log, surface, dt, interval, start, strict, scene, surfaces)
 
 
-def _near(after: Bank, scene: Scene) -> list[int]:
-    """The surfaces that some hypothesis, flown on without contact, would have met by now or within the window."""
-    mean = after.mean[:, 2]
-    low = mean[:, 0] - after.shift[:, 2] + scene.settings.contact_window * np.minimum(mean[:, 1], -SLOWEST_CLOSING)
-    lowest = float(low.min())
-    return [surface for surface, centre in enumerate(scene.centres.tolist()) if lowest < centre]
+@machine_code(NOTHING(BANK, BANK, COUNTS, LOG, COUNT, REAL, COUNT, REAL, FLAG, SCENE, SURFACES))
+def _branch(
+    before: Records,
+    bank: Records,
+    fill: Index,
+    log: Records,
+    surface: int,
+    dt: float,
+    interval: int,
+    start: float,
+    strict: bool,
+    scene: Record,
+    surfaces: Records,
+) -> None:
+    """Adds the hypotheses that meet one surface on the way: those that stay down, then those that bounce."""
+    h = len(before)
+    landed, times, count = np.empty(h, HYPOTHESIS), np.empty(h), 0
+    for row in range(h):
+        time, speed = _meeting(before[row], surfaces[surface].centre, scene)
+        if not _is_tried(before[row], time, speed, surface, dt, strict, scene):
+            continue
+        landed[count], times[count] = before[row], time
+        here = landed[count]
+        count += 1
+        carry(here, time, scene)
+        here.score -= scene.contact_cost
+        here.age = 0
+        pass_through(here, log, fill, CONTACT, interval, surface, start + time)
+        if speed < scene.rest_speed and here.cov[2, 1, 1] < KNOWN_SPEED**2:
+            down = bank[add(bank, fill, landed, count - 1)]
+            put_down(down, surface, surfaces)
+            carry(down, dt - time, scene)
+            down.score -= scene.rest_cost
+            pass_through(down, log, fill, REST, interval, surface, start + dt)
+    for k in range(count):
+        up = bank[add(bank, fill, landed, k)]
+        _bounce(up, surfaces[surface], scene)
+        carry(up, dt - times[k], scene)
 
 
-def _meetings(
-    bank: Bank, surface: int, dt: float, scene: Scene, *, strict: bool
-) -> tuple[Array, Array, NDArray[np.bool_]]:
-    """Time (h,) s and speed (h,) m/s at which each mean path comes down to a surface, and whether it is to be tried."""
-    height = bank.mean[:, 2, 0] - bank.shift[:, 2] - scene.centres[surface]
-    rise = bank.mean[:, 2, 1]
-    gravity = scene.physics.gravity
-    velocity = bank.mean[:, :, 1]
-    drag = scene.physics.drag * np.sqrt(np.einsum("ha,ha->h", velocity, velocity))
-    pull = np.maximum(gravity - bank.mean[:, 2, 2] + drag * rise, WEAKEST_FALL * gravity)
-    speed = np.sqrt(np.maximum(rise * rise + 2.0 * pull * height, 0.0))  # zero where the path stays below
-    time = (rise + speed) / pull
-    ok = (bank.surface == FLYING) & (speed > LEAST_FALL)
-    ok &= scene.reaches(surface, bank.mean[:, :2, 0] - bank.shift[:, :2] + bank.mean[:, :2, 1] * time[:, None])
+@machine_code(several(REAL, 2)(ONE_HYPOTHESIS, REAL, SCENE))
+def _meeting(h: Record, centre: float, scene: Record) -> Any:
+    """Time s and speed m/s at which the mean path comes down to a surface."""
+    height, rise = h.mean[2, 0] - h.shift[2] - centre, h.mean[2, 1]
+    drag = scene.drag * math.sqrt(h.mean[0, 1] ** 2 + h.mean[1, 1] ** 2 + rise**2)
+    pull = max(scene.gravity - h.mean[2, 2] + drag * rise, WEAKEST_FALL * scene.gravity)
+    speed = math.sqrt(max(rise * rise + 2.0 * pull * height, 0.0))  # zero where the path stays below
+    return (rise + speed) / pull, speed
+
+
+@machine_code(FLAG(ONE_HYPOTHESIS, REAL, REAL, COUNT, REAL, FLAG, SCENE))
+def _is_tried(
+    h: Record,
+    time: float,
+    speed: float,
+    surface: int,
+    dt: float,
+    strict: bool,
+    scene: Record,
+) -> bool:
+    """Whether a meeting lies in the step, and on the surface as far as is known."""
+    if h.surface != FLYING or not speed > LEAST_FALL:
+        return False
+    if surface == 0:
+        x = h.mean[0, 0] - h.shift[0] + h.mean[0, 1] * time
+        y = h.mean[1, 0] - h.shift[1] + h.mean[1, 1] * time
+        low_x, high_x, low_y, high_y = scene.extent[0], scene.extent[1], scene.extent[2], scene.extent[3]
+        if not (low_x <= x <= high_x and low_y <= y <= high_y):
+            return False
     if strict:
-        ok &= (time >= 0.0) & (time < dt)
-    else:
-        reach = 3.0 * np.sqrt(bank.cov[:, 2, 0, 0]) + 2.0 * scene.settings.surface_sigma
-        margin = np.minimum(reach / np.maximum(speed, SLOWEST_CLOSING), scene.settings.contact_window)
-        # one sample between two contacts, or one contact would be tried in two intervals running
-        ok &= (time > -margin) & (time < dt + margin) & (bank.age >= 1)
-    return time, speed, ok
+        return 0.0 <= time < dt
+    reach = 3.0 * math.sqrt(h.cov[2, 0, 0]) + 2.0 * scene.surface_sigma
+    margin = min(reach / max(speed, SLOWEST_CLOSING), scene.contact_window)
+    # one sample between two contacts, or one contact would be tried in two intervals running
+    return -margin < time < dt + margin and h.age >= 1
 
 
-def _touch(bank: Bank, times: Array, surface: int, scene: Scene, interval: int, start: float) -> Bank:
-    """The hypotheses just before their contacts, priced and with the event; changes and returns the bank."""
-    bank.mean, bank.cov = fly(bank.mean, bank.cov, times, scene)
-    bank.score -= scene.settings.contact_cost
-    bank.age[:] = 0
-    for row, time in enumerate(times.tolist()):
-        bank.add_event(row, Event(EventKind.CONTACT, interval, start + time, scene.height(surface)))
-    return bank
-
-
-def _bounce(bank: Bank, rest_of_step: Array, surface: int, scene: Scene) -> Bank:
-    """Hypotheses at a contact, bounced and flown on: mirrored in z, slowed by the friction of an unknown spin.
+@machine_code(NOTHING(ONE_HYPOTHESIS, SURFACES.dtype, SCENE))
+def _bounce(h: Record, surface: Record, scene: Record) -> None:
+    """A hypothesis at a contact, bounced: mirrored in z, slowed by the friction of an unknown spin.
 
     Friction changes the tangential velocity by mu (1 + e) v_n at most, either way: half of that is expected, but no
     more than a ball without spin would lose, and half is the spread.
     """
-    settings = scene.settings
-    e = scene.physics.restitution
-    mean, cov = bank.mean, bank.cov
-    speed = np.abs(mean[:, 2, 1])
-    friction = 0.5 * scene.physics.friction * (1.0 + e) * speed
-    sliding = np.maximum(np.hypot(mean[:, 0, 1], mean[:, 1, 1]), SLOWEST_CLOSING)
-    keep = 1.0 - np.minimum(friction / sliding, settings.most_slowing)
-    mean[:, :2, 1] *= keep[:, None]
-    mean[:, 2, 1] = e * speed
-    mean[:, 2, 0] = scene.centres[surface] + bank.shift[:, 2]
+    e, speed = scene.restitution, abs(h.mean[2, 1])
+    friction = 0.5 * scene.friction * (1.0 + e) * speed
+    sliding = max(math.hypot(h.mean[0, 1], h.mean[1, 1]), SLOWEST_CLOSING)
+    keep = 1.0 - min(friction / sliding, scene.most_slowing)
+    h.mean[2, 1] = e * speed
+    h.mean[2, 0] = surface.centre + h.shift[2]
     # the Jacobian is diagonal: (1, keep, 1) along the surface, (-e, -e, 1) along its normal, for late or early paths
-    J = np.ones((len(bank), 3, 3))
-    J[:, :2, 1] = keep[:, None]
-    J[:, 2, :2] = -e
-    cov *= J[..., :, None] * J[..., None, :]
-    cov[:, :2, 0, 0] += POSITION_JITTER**2
-    cov[:, :2, 1, 1] += (SLIDE_JITTER + friction[:, None]) ** 2
-    cov[:, 2, 0, 0] += ((1.0 + e) * settings.surface_sigma) ** 2
-    cov[:, 2, 1, 1] += (BOUNCE_JITTER + scene.restitution_sigmas[surface] * speed) ** 2
-    cov[:, :, 2, 2] += settings.slack_at_contact**2
-    bank.mean, bank.cov = fly(mean, cov, rest_of_step, scene)
-    return bank
-
-
-def _stay(bank: Bank, rest_of_step: Array, surface: int, scene: Scene, interval: int, time: float) -> Bank:
-    """Hypotheses at a contact that stay down for the rest of the step."""
-    put_down(bank, np.full(len(bank), surface), scene)
-    height_mean, height_cov = bank.mean[:, 2].copy(), bank.cov[:, 2].copy()
-    bank.mean, bank.cov = fly(bank.mean, bank.cov, rest_of_step, scene)
-    bank.mean[:, 2], bank.cov[:, 2] = height_mean, height_cov
-    bank.score -= scene.settings.rest_cost
-    for row in range(len(bank)):
-        bank.add_event(row, Event(EventKind.REST, interval, time, scene.height(surface)))
-    return bank
+    for axis in range(2):
+        h.mean[axis, 1] *= keep
+        for k in range(3):
+            h.cov[axis, 1, k] *= keep
+            h.cov[axis, k, 1] *= keep
+        h.cov[axis, 0, 0] += POSITION_JITTER**2
+        h.cov[axis, 1, 1] += (SLIDE_JITTER + friction) ** 2
+    for i in range(2):
+        for k in range(3):
+            h.cov[2, i, k] *= -e
+            h.cov[2, k, i] *= -e
+    h.cov[2, 0, 0] += ((1.0 + e) * scene.surface_sigma) ** 2
+    h.cov[2, 1, 1] += (BOUNCE_JITTER + surface.restitution_sigma * speed) ** 2
+    for axis in range(3):
+        h.cov[axis, 2, 2] += scene.slack_at_contact**2
