@@ -93,16 +93,19 @@ class Segmenter:
 
         Args: tips: as in `HYPOTHESIS`.  log: the events of the sample.
         """
+        old = self._tips
+        if not len(log):
+            return [old[-1 - tip] for tip in tips]
         made: dict[int, Node | None] = {NO_EVENT: None}
         before = log["before"].tolist()
 
         def node(tip: int) -> Node | None:
             if tip not in made:
                 event = partial(_event, log, tip, self._scene)
-                made[tip] = self._tips[-1 - tip] if tip < 0 else Node(event, node(before[tip]))
+                made[tip] = old[-1 - tip] if tip < 0 else Node(event, node(before[tip]))
             return made[tip]
 
-        return [node(tip) for tip in tips]
+        return [old[-1 - tip] if NO_EVENT < tip < 0 else node(tip) for tip in tips]
 
     def _decide(self) -> Decision:
         """Makes old events final, drops the hypotheses that deny them, and reports."""
