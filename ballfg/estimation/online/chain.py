@@ -16,11 +16,10 @@ from typing import Self
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.online.interval import Interval
 from ballfg.estimation.online.linear import LinearFactors
 from ballfg.estimation.online.measurement import Measurement, prepare
 from ballfg.estimation.online.sample import Sample, Update
-from ballfg.estimation.online.stream_window import StreamWindow
+from ballfg.estimation.online.stream_window import Arrival, StreamWindow
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch
 from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.linear.elimination import covariances_of, eliminate_on, padded, substitute_back
@@ -69,23 +68,23 @@ class ChainWindow(StreamWindow):
         other._room(len(self.samples))
         return other
 
-    def _insert(
-        self, sample: Sample, state: Array, interval: Interval | None, priors: Sequence[FactorBatch] = ()
-    ) -> int:
-        """Take in a new state with its factors, and solve."""
-        prepare(sample.measurements, np.tile(state, (len(sample.measurements), 1)))
-        own = list(priors)
-        if self.biased and priors and not self.samples:
-            own.append(BiasStartFactors(np.zeros(1, dtype=np.int64), self.settings.bias_sigmas))
-        if self.samples:
-            self.intervals.append(interval)
-        self.samples.append(sample)
-        self._priors.append(own)
-        self._rows.append(np.empty((0, self._columns)))
-        self._answers.append([])
-        self._positions.append(self._measured(len(self.samples) - 1))
-        self.theta = np.concatenate((self.theta, state[None]))
-        self._renew([len(self.samples) - 1])
+    def _insert(self, arrivals: Sequence[Arrival]) -> int:
+        """Take in new states with their factors, one after another, and solve."""
+        first = len(self.samples)
+        for arrival in arrivals:
+            sample, own = arrival.sample, list(arrival.priors)
+            prepare(sample.measurements, np.tile(arrival.state, (len(sample.measurements), 1)))
+            if self.biased and own and not self.samples:
+                own.append(BiasStartFactors(np.zeros(1, dtype=np.int64), self.settings.bias_sigmas))
+            if self.samples:
+                self.intervals.append(arrival.interval)
+            self.samples.append(sample)
+            self._priors.append(own)
+            self._rows.append(np.empty((0, self._columns)))
+            self._answers.append([])
+            self._positions.append(self._measured(len(self.samples) - 1))
+        self.theta = np.concatenate((self.theta, np.array([arrival.state for arrival in arrivals])))
+        self._renew(range(first, len(self.samples)))
         return self._solve()
 
     def retract(self, count: int) -> None:

@@ -110,23 +110,30 @@ def evaluate(intervals: Sequence[Interval], start: Array, after: Array, coeffici
         count = sum(k < len(after) for k in members)  # the first ones: members ascend
         if count:
             ended = members[:count]
-            answers = _whitened(batch, pieces[:count], start[ended], after[ended], coefficients)
+            answers = _whitened(
+                batch, batch.whitening[:count], pieces[:count], start[ended], after[ended], coefficients
+            )
             for row, k in enumerate(ended):
                 _keep(intervals[k], answers, row)
     return result, len(groups)
 
 
-def store(interval: Interval, start: Array, after: Array, coefficients: Array, piece: Array) -> None:
-    """Whiten one interval's propagation and keep it for iSAM2's question; `piece` as from `evaluate`."""
-    _keep(interval, _whitened(interval.batch, piece[None], start[None], after[None], coefficients), 0)
+def store(intervals: Sequence[Interval], start: Array, after: Array, coefficients: Array, pieces: Array) -> None:
+    """Whiten the propagations of k intervals and keep them for iSAM2's questions; `pieces` as from `evaluate`."""
+    roots = np.concatenate([interval.batch.whitening for interval in intervals])
+    answers = _whitened(intervals[0].batch, roots, pieces, start, after, coefficients)
+    for row, interval in enumerate(intervals):
+        _keep(interval, answers, row)
 
 
 Answers = tuple[tuple[Array, ...], Array, tuple[Array, ...]]
 """Inputs (k, d) of the variables, residuals (k, 9), Jacobians (k, 9, d)."""
 
 
-def _whitened(batch: DynamicsFactors, pieces: Array, start: Array, after: Array, coefficients: Array) -> Answers:
-    root, start, after = batch.whitening[: len(pieces)], start[:, :STATE_DIM], after[:, :STATE_DIM]
+def _whitened(
+    batch: DynamicsFactors, root: Array, pieces: Array, start: Array, after: Array, coefficients: Array
+) -> Answers:
+    start, after = start[:, :STATE_DIM], after[:, :STATE_DIM]
     residual = (root @ (after - pieces[:, :, 0])[..., None])[..., 0]
     by_start = -(root @ pieces[:, :, 1:])
     inputs: tuple[Array, ...] = (start, after)

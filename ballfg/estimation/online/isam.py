@@ -11,12 +11,10 @@ import gtsam
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.online.interval import Interval
 from ballfg.estimation.online.measurement import prepare
 from ballfg.estimation.online.sample import Sample
-from ballfg.estimation.online.stream_window import COEFFICIENT_THRESHOLD, StreamWindow
+from ballfg.estimation.online.stream_window import COEFFICIENT_THRESHOLD, Arrival, StreamWindow
 from ballfg.estimation.online.tracker import bias_link, bias_start, linear_factor
-from ballfg.factors.batch import FactorBatch
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY, Bridge
 from ballfg.factors.prior import coefficient_prior
 
@@ -47,45 +45,50 @@ class IsamCore(StreamWindow):
     def _new_isam(self) -> gtsam.ISAM2:
         return gtsam.ISAM2(_parameters(self.threshold, COEFFICIENT_THRESHOLD * self._own_sigmas))
 
-    def _insert(
-        self,
-        sample: Sample,
-        state: Array,
-        interval: Interval | None,
-        priors: Sequence[FactorBatch] = (),
-    ) -> int:
-        """Give iSAM2 a new state with its factors, and read back the solution."""
-        key = STATE_KEY + self.first + len(self.samples)
-        graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-        if interval is not None:
-            graph.push_back(interval.bridge.factor(0))
-        prepare(sample.measurements, np.tile(state, (len(sample.measurements), 1)))
-        for factor in self._measured(sample, key - STATE_KEY):
-            graph.push_back(factor)
-        for prior in priors:
-            graph.push_back(Bridge(prior, "row").factor(0, [key - STATE_KEY]))
-        if self.biased and priors and not self.samples:
-            graph.push_back(bias_start(key, self.settings))
-        values.insert(key, state)
-        own = graph.size()
-        if self.biased and self.samples:
-            graph.push_back(bias_link(key, sample.time - self.samples[-1].time, self.settings))
-        if len(self.theta) == 0:
+    def _insert(self, arrivals: Sequence[Arrival]) -> int:
+        """Give iSAM2 new states with their factors, and read back the solution."""
+        graph, values, ends = gtsam.NonlinearFactorGraph(), gtsam.Values(), []
+        last = {STATE_KEY + self.first + len(self.samples) + len(arrivals) - 1: 1, COEFFICIENT_KEY: 2}
+        older = len(self.samples) > 0
+        for arrival in arrivals:
+            sample, key = arrival.sample, STATE_KEY + self.first + len(self.samples)
+            for factor in self._factors_of(arrival, key):
+                graph.push_back(factor)
+            ends.append(graph.size())
+            if self.biased and self.samples:
+                graph.push_back(bias_link(key, sample.time - self.samples[-1].time, self.settings))
+            values.insert(key, arrival.state)
+            if self.samples:
+                self.intervals.append(arrival.interval)
+            self.samples.append(sample)
+        if not older:
             for factor in self.shared:
                 graph.push_back(factor)
             if self.p:
                 values.insert(COEFFICIENT_KEY, self.coefficient_theta)
-        slots = self._update(graph, values, [], {key: 1, COEFFICIENT_KEY: 2} if self.p and len(self.theta) else {})
-        if interval is not None:
-            interval.slot = slots[0]
-        sample.slots = tuple(slots[interval is not None : own])
-        sample.bias_slot = slots[own] if self.biased and self.samples else None
-        if self.samples:
-            self.intervals.append(interval)
-        self.samples.append(sample)
-        self.theta = np.concatenate((self.theta, state[None]))
+        slots = self._update(graph, values, [], last if self.p and older else {})
+        begin = 0
+        for arrival, end in zip(arrivals, ends, strict=True):
+            linked = self.biased and (older or begin > 0)
+            if arrival.interval is not None:
+                arrival.interval.slot = slots[begin]
+            arrival.sample.slots = tuple(slots[begin + (arrival.interval is not None) : end])
+            arrival.sample.bias_slot = slots[end] if linked else None
+            begin = end + linked
+        self.theta = np.concatenate((self.theta, np.array([arrival.state for arrival in arrivals])))
         self._read_back()
         return int(self._result.getVariablesReeliminated())
+
+    def _factors_of(self, arrival: Arrival, key: int) -> list[gtsam.NonlinearFactor]:
+        """The factors that a new state brings: of its interval first, then those that look at it alone."""
+        factors = [] if arrival.interval is None else [arrival.interval.bridge.factor(0)]
+        measurements = arrival.sample.measurements
+        prepare(measurements, np.tile(arrival.state, (len(measurements), 1)))
+        factors += self._measured(arrival.sample, key - STATE_KEY)
+        factors += [Bridge(prior, "row").factor(0, [key - STATE_KEY]) for prior in arrival.priors]
+        if self.biased and arrival.priors and not self.samples:
+            factors.append(bias_start(key, self.settings))
+        return factors
 
     def _measured(self, sample: Sample, state: int) -> list[gtsam.NonlinearFactor]:
         """The factors of what was measured at a sample."""

@@ -230,8 +230,8 @@ class Online(Estimator):
         again = self._explain(window) if changed else []
         if self.settings.stamp_jitter > 0.0 and sample.measured:
             self._tell_velocities(window)
-        for old in again:
-            self._append(window, old)
+        if again:
+            self._append(window, *again)
         update = self._append(window, sample)
         moved = self._move_contacts(window)
         if len(window) > 2 * self.lag:
@@ -257,8 +257,8 @@ class Online(Estimator):
         if begins:
             window.reweigh([held - 1])
 
-    def _append(self, window: StreamWindow, sample: Sample) -> Update:
-        update = window.append(sample)
+    def _append(self, window: StreamWindow, *samples: Sample) -> Update:
+        update = window.append_all(samples)
         self._counts += update.evaluated, update.calls
         return update
 
@@ -307,8 +307,7 @@ class Online(Estimator):
                 shift = samples[k - 1].time - samples[other - 1].time
                 samples[k].motion, samples[other].motion = FLIGHT, Motion(motion.heights, (motion.times[0] + shift,))
                 window.retract(min(k, other))
-                for sample in samples[min(k, other) :]:
-                    self._append(window, sample)
+                self._append(window, *samples[min(k, other) :])
                 return n - min(k, other)
         return 0
 

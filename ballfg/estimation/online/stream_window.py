@@ -10,6 +10,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from typing import Self
 
 import numpy as np
@@ -27,6 +29,24 @@ from ballfg.factors.dynamics import model_width
 from ballfg.factors.position import PositionFactors
 from ballfg.factors.tracker import BIAS_DIM, BiasedPositionFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A sample that a window takes in.
+
+    Attributes:
+        sample: what came.
+        state: (w,) the point at which it is linearised.
+        interval: what leads to it from the sample before; None where nothing does.
+        priors: factors of its own, numbered 0.
+    """
+
+    sample: Sample
+    state: Array
+    interval: Interval | None = None
+    priors: Sequence[FactorBatch] = ()
+
 
 VELOCITY_THRESHOLD = 0.3
 """m/s. Linearised this far off, drag is wrong by k dv^2 = 0.012 m/s^2, and by 0.04 m/s^2 where the spin is off by
@@ -120,10 +140,8 @@ class StreamWindow(ABC):
         """What the states that left know of the first state and of the coefficients, numbered as in the window."""
 
     @abstractmethod
-    def _insert(
-        self, sample: Sample, state: Array, interval: Interval | None, priors: Sequence[FactorBatch] = ()
-    ) -> int:
-        """Take in a new state with its factors, and solve.
+    def _insert(self, arrivals: Sequence[Arrival]) -> int:
+        """Take in new states with their factors, one after another, and solve.
 
         Returns: how many states were eliminated again.
         """
@@ -153,7 +171,7 @@ class StreamWindow(ABC):
         if self.first:
             self.coefficient_theta = coefficients
         if self._first_is_known():
-            self._insert(samples[0], start[0], None)
+            self._insert([Arrival(samples[0], start[0])])
             samples = samples[1:]
         for sample in samples:
             update = self.append(sample)
@@ -195,24 +213,81 @@ class StreamWindow(ABC):
 
         Raises: RuntimeError or ValueError: what GTSAM or the model raised; the window must then be built anew.
         """
-        if not (sample.motion.linked and self.samples):
-            return self._append_start(sample)
-        dt = sample.time - self.samples[-1].time
-        interval = self.maker.make(self.first + len(self.samples) - 1, sample.motion, dt)
-        estimate = self.points[-1], self.coefficients
-        piece, count, calls = self._relinearize(interval)
-        away = np.concatenate((estimate[0] - self.theta[-1], estimate[1] - self.coefficient_theta))
-        carried, noise = piece, interval.covariance
-        if self.biased:
-            carried, noise = carried_with_bias(piece, noise, self.theta[-1, STATE_DIM:], dt, self.settings)
-        predicted = carried[:, 0] + carried[:, 1:] @ away
-        covariance = carried[:, 1:] @ self.newest_covariance @ carried[:, 1:].T + noise
-        if np.trace(covariance[VELOCITY, VELOCITY]) < WIDE_VELOCITY**2:
-            sample.velocity = predicted[VELOCITY]
-        state, innovation = self._corrected(predicted, covariance, sample)
-        store(interval, self.theta[-1], state, self.coefficient_theta, piece)
-        variables = self._insert(sample, state, interval)
+        return self.append_all([sample])
+
+    def append_all(self, samples: Sequence[Sample]) -> Update:
+        """Take in several samples and solve once: those that were taken back when an event changed.
+
+        An extended Kalman filter over them gives the points at which they are linearised. Where these turn out to be
+        too far from the solution, the next sample moves them, as it does after `append`.
+
+        Returns: of the last one.
+        Raises: RuntimeError or ValueError: as `append`.
+        """
+        update, begin = Update(np.full(3, np.nan), 0, 0, 0), 0
+        while begin < len(samples):
+            if not (samples[begin].motion.linked and self.samples):
+                update = self._append_start(samples[begin])
+                begin += 1
+                continue
+            end = begin + 1
+            while end < len(samples) and samples[end].motion.linked:
+                end += 1
+            update = self._append_linked(samples[begin:end])
+            begin = end
+        return update
+
+    def _append_linked(self, samples: Sequence[Sample]) -> Update:
+        """Take in samples that are linked to the newest one and to each other."""
+        mean, covariance = np.concatenate((self.points[-1], self.coefficients)), self.newest_covariance
+        points: list[Array] = []
+        intervals, pieces = [], []
+        for before, sample in pairwise((self.samples[-1], *samples)):
+            number = self.first + len(self.samples) + len(intervals)
+            interval = self.maker.make(number - 1, sample.motion, sample.time - before.time)
+            if not points:
+                piece, count, calls = self._relinearize(interval)
+                points.append(self.theta[-1])
+            else:
+                start, end = points[-1][None], np.empty((0, self.width))
+                (piece,), further = evaluate([interval], start, end, self.coefficient_theta)
+                count, calls = count + 1, calls + further
+            away = mean - np.concatenate((points[-1], self.coefficient_theta))
+            mean, covariance, innovation = self._filtered(piece, points[-1], away, covariance, interval, sample)
+            points.append(mean[: self.width])
+            intervals.append(interval)
+            pieces.append(piece)
+        states = np.array(points)
+        store(intervals, states[:-1], states[1:], self.coefficient_theta, np.array(pieces))
+        variables = self._insert([Arrival(*a) for a in zip(samples, states[1:], intervals, strict=True)])
         return Update(innovation, count, calls, variables)
+
+    def _filtered(
+        self, piece: Array, point: Array, away: Array, covariance: Array, interval: Interval, sample: Sample
+    ) -> tuple[Array, Array, Array]:
+        """One step of an extended Kalman filter, over an interval and with a sample.
+
+        Args:
+            piece: (9, 1 + 9 + p) propagation from `point` (w,) and the window's `coefficient_theta`.
+            away: (w + p,) how far the mean is from these.
+            covariance: (w + p, w + p) of state, bias and coefficients before.
+            interval: between the samples.  sample: gets the velocity along which its stamp's error moves it.
+        Returns: mean (w + p,) and covariance after the sample, and its whitened innovation.
+        """
+        carried, noise, w = piece, interval.covariance, self.width
+        if self.biased:
+            dt = float(interval.batch.dt[0])
+            carried, noise = carried_with_bias(piece, noise, point[STATE_DIM:], dt, self.settings)
+        F = carried[:, 1:]
+        predicted, spread = np.empty(w + self.p), np.empty_like(covariance)
+        predicted[:w] = carried[:, 0] + F @ away
+        predicted[w:] = self.coefficient_theta + away[w:]
+        moved = F @ covariance
+        spread[:w, :w] = moved @ F.T + noise
+        spread[:w, w:], spread[w:, :w], spread[w:, w:] = moved[:, w:], moved[:, w:].T, covariance[w:, w:]
+        if np.trace(spread[VELOCITY, VELOCITY]) < WIDE_VELOCITY**2:
+            sample.velocity = predicted[VELOCITY]
+        return self._corrected(predicted, spread, sample)
 
     def _append_start(self, sample: Sample) -> Update:
         """A sample that nothing predicts: its state has a wide prior of its own."""
@@ -222,39 +297,33 @@ class StreamWindow(ABC):
             state[SPIN] = sample.label.spin
         priors = start_priors(0, sample.position, sample.label, self.settings)
         _, count, calls = self._relinearize(None)
-        return Update(np.full(3, np.nan), count, calls, self._insert(sample, state, None, priors))
+        return Update(np.full(3, np.nan), count, calls, self._insert([Arrival(sample, state, None, priors)]))
 
-    def _corrected(self, predicted: Array, covariance: Array, sample: Sample) -> tuple[Array, Array]:
-        """The predicted state moved by the measurement as a Kalman filter would, and the whitened innovation.
+    def _corrected(self, predicted: Array, covariance: Array, sample: Sample) -> tuple[Array, Array, Array]:
+        """Predicted mean and covariance moved by a sample as a Kalman filter would, and the whitened innovation.
 
-        It is the new state's linearisation point only: closer to the final answer than the prediction, it saves
-        relinearisations, and a robust loss gets a weight near the one that it ends with.
+        What comes out is the new state's linearisation point only: closer to the final answer than the prediction, it
+        saves relinearisations, and a robust loss gets a weight near the one that it ends with.
         """
         if not sample.measured:
             for measurement in sample.measurements:
                 predicted, covariance = measurement.corrected(predicted, covariance)
-            return predicted, sample.measurements[0].innovation
+            return predicted, covariance, sample.measurements[0].innovation
         innovation = sample.position - self._measured_part(predicted)
-        noise = self._measurement_noise(sample)
-        cross, rows = self._measured_part(covariance.T).T, self._measured_part(covariance)
-        spread = self._measured_part(cross)
-        inverse = np.linalg.inv(np.linalg.cholesky(spread + noise))
-        whitened = inverse @ innovation
-        pull = whitened @ inverse
+        noise, rows = self._measurement_noise(sample), self._measured_part(covariance)
+        spread = self._measured_part(rows.T)
+        whitened = np.asarray(np.linalg.solve(np.linalg.cholesky(spread + noise), innovation))
         if self.settings.loss.name != "squared":
-            weight = self.settings.loss.weight(np.array([np.linalg.norm(whitened)]))
-            pull = np.asarray(np.linalg.solve(spread + noise / weight, innovation), dtype=np.float64)
-        state = predicted + cross @ pull
-        if sample.measurements:
-            gain = np.linalg.solve(spread + noise, rows).T
-            covariance = covariance - gain @ rows
-            for measurement in sample.measurements:
-                state, covariance = measurement.corrected(state, covariance)
-        return state, whitened
+            noise = noise / self.settings.loss.weight(np.array([np.linalg.norm(whitened)]))
+        gain = np.linalg.solve(spread + noise, rows)
+        state, covariance = predicted + innovation @ gain, covariance - rows.T @ gain
+        for measurement in sample.measurements:
+            state, covariance = measurement.corrected(state, covariance)
+        return state, covariance, whitened
 
     def _measured_part(self, rows: Array) -> Array:
-        """(3, ...) the rows (w, ...) that a measured position looks at: those of position and bias, added."""
-        return rows[POSITION] + rows[STATE_DIM:] if self.biased else rows[POSITION]
+        """(3, ...) the rows (w + p, ...) that a measured position looks at: those of position and bias, added."""
+        return rows[POSITION] + rows[STATE_DIM : STATE_DIM + BIAS_DIM] if self.biased else rows[POSITION]
 
     def _measurement_noise(self, sample: Sample) -> Array:
         """(3, 3) m^2, of a position's white error and of that of its stamp."""
