@@ -44,7 +44,9 @@ class Moving:
         self.weights = functions.weights(inner)
         self.functions, self.travelling = functions, states.numpy()[:, STATE_DIM:]
         self.states = np.array(states.numpy()[:, :STATE_DIM], order="C")  # moved in place
-        self.moved = np.tile(np.eye(STATE_DIM, width), (n, 1, 1))
+        self.moved = np.zeros((n, STATE_DIM, width))
+        own = range(min(STATE_DIM, width))
+        self.moved[:, own, own] = 1.0
         self.elapsed, self.slower = np.zeros(n), np.zeros((n, width))
         self._places = {name: k for k, name in enumerate(names)}
         self._numbers = numbers_of(inner)
@@ -53,7 +55,7 @@ class Moving:
     def fly(self, dt: Array) -> None:
         """Move on by dt (n,) s, less what has elapsed."""
         left, earlier = np.ascontiguousarray(dt - self.elapsed), -self.slower
-        steps = step_count(torch.from_numpy(left))
+        steps = step_count(left)
         rates = self.functions.rates
         given = (self.states, self.moved, *self.coefficients(rates), self.weights[0], left, earlier, steps)
         fly_together(rates.compute, *given)

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
+from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel, Rates
 from ballfg.dynamics.motion.limits import MAX_STEP
 from ballfg.state import POSITION, SPIN, VELOCITY
@@ -54,16 +55,17 @@ def stages_of(
     return torch.addcmul(state, h / 6, total), (state, x2, x3, x4)
 
 
-def step_count(dt: Tensor) -> int:
+def step_count(dt: Tensor | Array) -> int:
     """Number of equal steps, each at most `MAX_STEP`, that the longest of some intervals (s) needs.
 
     An interval that is NaN (a contact that never comes) needs none.
 
     Raises: ValueError: if an interval is infinite.
     """
-    longest = float(dt.detach().abs().max()) if dt.numel() else 0.0
+    durations = dt.detach().abs() if isinstance(dt, Tensor) else np.abs(dt)
+    longest = float(durations.max()) if 0 not in durations.shape else 0.0
     if math.isnan(longest):
-        longest = float(dt.detach().abs().nan_to_num(nan=0.0, posinf=math.inf).max())
+        longest = max((float(d) for d in durations.reshape(-1) if not math.isnan(d)), default=0.0)
     if math.isinf(longest):
         raise ValueError("dt must be finite; got inf. Check the times.")
     return steps_over(longest)

@@ -16,6 +16,7 @@ from typing import Self
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.estimation.online.interval import Interval
 from ballfg.estimation.online.linear import LinearFactors
 from ballfg.estimation.online.measurement import Measurement, prepare
 from ballfg.estimation.online.sample import Sample, Update
@@ -200,11 +201,10 @@ class ChainWindow(StreamWindow):
         written = np.zeros((sum(batch.dim for batch, _ in pieces), self._columns))
         row = 0
         for batch, (residual, blocks) in pieces:
-            weight = math.sqrt(float(batch.loss.weight(np.linalg.norm(residual, axis=1))[0]))  # as GTSAM's noise models
-            end, place = row + batch.dim, 0
+            weight, end, place = _weight(batch, residual[0]), row + batch.dim, 0
             for variable, (block,) in zip(batch.variables[0].tolist(), blocks, strict=True):
                 at = 2 * self.width if variable == COEFFICIENTS else place
-                written[row:end, at : at + block.shape[1]] = weight * block
+                written[row:end, at : at + block.shape[1]] = block if weight == 1.0 else weight * block
                 place += self.width
             written[row:end, -1] = -weight * residual[0]
             row = end
@@ -270,6 +270,18 @@ def _batched(answer: Answer) -> Answer:
     return residual[None], tuple([block[None] for block in blocks])
 
 
+def _weight(batch: FactorBatch, residual: Array) -> float:
+    """By which a batch's loss scales one factor, as GTSAM's noise models do; residual (r,)."""
+    if batch.loss.name == "squared":
+        return 1.0
+    return math.sqrt(float(batch.loss.weight(np.sqrt(residual @ residual))))
+
+
 def _joint(state: Array, cross: Array, coefficients: Array) -> Array:
     """(w + p, w + p) from (w, w), (w, p) and (p, p)."""
-    return np.block([[state, cross], [cross.T, coefficients]]) if len(coefficients) else state
+    if not len(coefficients):
+        return state
+    w = len(state)
+    joint = np.empty((w + len(coefficients),) * 2)
+    joint[:w, :w], joint[:w, w:], joint[w:, :w], joint[w:, w:] = state, cross, cross.T, coefficients
+    return joint
