@@ -82,16 +82,17 @@ def gap_of(surface, x, s, ws, level, radius):
     return x[2] - level - offset[0] - radius
 
 
-@machine_code(FLAG(ONE, REAL))
-def at_rest(x, gap):
-    """Whether a state (9,) lies on a surface with this gap (m) to it."""
-    return abs(gap) <= REST_GAP and abs(x[5]) <= REST_SPEED / 2
-
-
 @machine_code(FLAG(ONE, ONE))
 def over_table(x, world):
     """Whether a state (9,) lies within the table's ends."""
     return world[3] <= x[0] <= world[4] and world[5] <= x[1] <= world[6]
+
+
+@machine_code(FLAG(ONE, REAL, REAL, ONE))
+def at_rest(x, gap, level, world):
+    """Whether a state (9,) lies on the surface at a level (m), to which it has this gap (m)."""
+    beside = level == world[0] and not over_table(x, world)
+    return abs(gap) <= REST_GAP and abs(x[5]) <= REST_SPEED / 2 and not beside
 
 
 @machine_code(REAL(ONE, TWO, ONE))
@@ -116,28 +117,57 @@ def share_over_table(touch, covariance, world):
 
 @machine_code(REAL(FUNCTION, FUNCTION, ONE, TWO, TWO, ONE, ONE, REAL, ONE, ONE))
 def come_down(rates, surface, x, c, s, w, ws, level, world, touch):
-    """Time (s) at which a falling ball x (9,) reaches a level, NaN if it does not; writes its state there (9,)."""
+    """Time (s) at which a falling ball x (9,) reaches a level; writes its state there to touch (9,).
+
+    NaN, and its state as it is, where it never was above that level: it has come from below.
+    """
     tau, state = np.empty(1), x.copy().reshape((1, 9))
     contact_times(rates, surface, state, c, s, w, ws, np.full(1, level), np.full(1, BEYOND), world[2], tau)
+    put(touch, x)
     if math.isfinite(tau[0]):
-        put(touch, x)
         fly_one(rates, touch, c[0], w, np.empty((9, 0)), np.empty((c.shape[1], 0)), tau[0], np.empty(0), 1)
     return tau[0]
 
 
-@machine_code(FLAG(ONE, TWO, REAL, ONE))
-def falls_past(touch, covariance, tau, world):
-    """Whether a ball that reaches the table's level at `touch` after tau s falls past the table, all but certainly."""
+@machine_code(FLAG(THREE_FUNCTIONS, THREE_VALUES, THREE_WEIGHTS, TWO, ONE, REAL, REAL, ONE, ONE, TWO))
+def falls_past(functions, values, weights, covariance, touch, tau, h, world, after, spread):
+    """Whether a ball, in the mean, falls past the table whose level it reaches at `touch` (9,) after tau s.
+
+    Args: covariance (d, d): before the step of h s.  after (9,): its mean after the step.
+    Adds: to the covariance `spread` (d, d) after the step the share of balls that bounce on the table instead, as
+        `prediction.edges` has it. False also where their bounce is not a plain one.
+    """
     if over_table(touch, world):
         return False
-    return tau < 0.0 or share_over_table(touch, covariance, world) < NEGLIGIBLE
+    share = share_over_table(touch, covariance, world) if tau >= 0.0 else 0.0
+    if share < NEGLIGIBLE:
+        return True
+    rates, impact, surface = functions
+    c, b, s = values
+    w, wb, ws = weights
+    none, nonec, level = np.empty((1, 9, 0)), np.empty((1, c.shape[1], 0)), world[0]
+    noneb, nones, still = np.empty((1, b.shape[1], 0)), np.empty((1, s.shape[1], 0)), np.empty((1, 0))
+    at, sooner, there = touch.copy().reshape((1, 9)), np.empty(1), np.empty((1, 9))
+    contacts(
+        rates, impact, surface, at, none, c, nonec, b, noneb, s, nones, w, wb, ws, np.full(1, level),
+        np.full(1, BEYOND), world[2], sooner, still, there, none.copy(),
+    )  # fmt: skip
+    if not there[0, 5] >= REST_SPEED:
+        return False
+    fly_one(rates, there[0], c[0], w, none[0], nonec[0], h - tau - sooner[0], np.empty(0), 1)
+    if there[0, 5] < 0.0 and not gap_of(surface, there[0], s[0], ws, level, world[2]) >= 0.0:
+        return False
+    for i in range(9):
+        for j in range(9):
+            spread[i, j] += share * (there[0, i] - after[i]) * (there[0, j] - after[j])
+    return True
 
 
 @machine_code(
     FLAG(THREE_FUNCTIONS, THREE_VALUES, THREE_TANGENTS, THREE_WEIGHTS, ONE, TWO, REAL, REAL, ONE, ONE, ONE, TWO)
 )
 def bounce(functions, values, tangents, weights, start, covariance, h, level, world, noise, x, after):
-    """One ball (9,), with its covariance, that comes down on a level within h s.
+    """One ball (9,), with its covariance, that comes down on a level within h s, or has done so just before.
 
     Writes: its state x (9,) and covariance after (d, d) at the end.
     Returns: whether this is a plain bounce: one, within the table's ends, after which the ball rises. The covariance
@@ -152,7 +182,7 @@ def bounce(functions, values, tangents, weights, start, covariance, h, level, wo
     ct, bt, st = tangents
     w, wb, ws = weights
     contact_times(rates, surface, touch, c, s, w, ws, levels, longest, radius, tau)
-    if not 0.0 <= tau[0] <= h:
+    if not -BEYOND <= tau[0] <= h:
         return False
     elapsed = tau[0]
     for i in range(9):
@@ -162,12 +192,12 @@ def bounce(functions, values, tangents, weights, start, covariance, h, level, wo
     if not touch[0, 5] < 0.0:
         return False
     past = 0.0  # share of balls that miss the table
-    if level == world[0]:
+    if level == world[0] and elapsed >= 0.0:
         past = 1.0 - share_over_table(touch[0], covariance, world)
         if not past < NEGLIGIBLE and not over_table(touch[0], world):
             return False
     through(jacobian[0], covariance, gathered)
-    add_flight(gathered, elapsed, noise)
+    add_flight(gathered, max(elapsed, 0.0), noise)
     jacobian[:] = moved
     contacts(
         rates,
@@ -200,7 +230,7 @@ def bounce(functions, values, tangents, weights, start, covariance, h, level, wo
     if x[5] < 0.0 and not gap_of(surface, x, s[0], ws, level, radius) >= 0.0:
         return False
     through(moved[0], gathered, after)
-    add_flight(after, left, noise)
+    add_flight(after, min(left, h), noise)
     add_impact(after, left, noise)
     if not past < NEGLIGIBLE:
         beside, none = start.copy(), np.empty((9, 0))
@@ -283,23 +313,22 @@ def carry(
                 age[k + 1, r] = np.nan
             low = world[0] if x[2] > world[0] else world[1]
             after = mean[k + 1, r]
-            if at_rest(x[:9], gap_of(surface, x[:9], s[r], ws, low, world[2])):
+            if at_rest(x[:9], gap_of(surface, x[:9], s[r], ws, low, world[2]), low, world):
                 hard[r], stop = 2.0, True
                 continue
             if after[5] >= 0.0 or gap_of(surface, after[:9], s[r], ws, low, world[2]) >= 0.0:
                 continue
             one = slice(r, r + 1)
+            functions, values, weights = (rates, impact, surface), (c[one], b[one], s[one]), (w, wb, ws)
             if low == world[0] and gap_of(surface, after[:9], s[r], ws, world[1], world[2]) >= 0.0:
                 tau = come_down(rates, surface, x[:9], c[one], s[one], w, ws, low, world, touch)
-                if math.isfinite(tau) and falls_past(touch, covariance[k, r], tau, world):
+                before, spread = covariance[k, r], covariance[k + 1, r]
+                if falls_past(functions, values, weights, before, touch, tau, step, world, after, spread):
                     continue
             beside[k + 1, r], besides[k + 1, r] = after, covariance[k + 1, r]
             level[k + 1, r], age[k + 1, r] = low, 0.0
             if not bounce(
-                (rates, impact, surface),
-                (c[one], b[one], s[one]),
-                (ct[one], bt[one], st[one]),
-                (w, wb, ws),
+                *(functions, values, (ct[one], bt[one], st[one]), weights),
                 *(x[:9], covariance[k, r], step, low, world, noise, after[:9], covariance[k + 1, r]),
             ):
                 hard[r], stop = 1.0, True

@@ -16,6 +16,8 @@ NEWTON_STEPS = 20
 """Upper bound on the steps to a crossing, of which three or four are enough."""
 TIME_TOLERANCE = 1e-12
 """s. A crossing is known to this."""
+INSTANT = 1e-9
+"""s, in which a ball bounces that has touched a surface already."""
 NONE, FOUND, HARD = 0.0, 1.0, 2.0
 """What a search ends with: nothing within the horizon; the event; a step that is not one of flight or plain bounces."""
 
@@ -72,24 +74,25 @@ def _zero(rates, x, c, w, normal, offset, h, earliest, either_way):
     return np.nan
 
 
-@machine_code(several(REAL, 2)(FUNCTION, FUNCTION, ONE, TWO, TWO, TWO, ONE, ONE, REAL, ONE))
-def _contact_within(rates, surface, x, covariance, c, s, w, ws, h, world):
+@machine_code(several(REAL, 3)(FUNCTION, FUNCTION, ONE, TWO, TWO, ONE, ONE, REAL, ONE, ONE))
+def _contact_within(rates, surface, x, c, s, w, ws, h, world, touch):
     """The level (m) that a ball (9,) comes down on within h s and when; h where it does not, NaN where it is unclear.
 
-    It is where the ball rests, or may fall past the table's edge or not.
+    It is where the ball rests, or falls past the table to the floor within the step. The third number is the time at
+    which it falls past the table, NaN where it does not; writes its state there to touch (9,).
     """
-    low, after, touch = world[0] if x[2] > world[0] else world[1], x.copy(), np.empty(9)
-    if at_rest(x, gap_of(surface, x, s[0], ws, low, world[2])):
-        return low, np.nan
+    low, after = world[0] if x[2] > world[0] else world[1], x.copy()
+    if at_rest(x, gap_of(surface, x, s[0], ws, low, world[2]), low, world):
+        return low, np.nan, np.nan
     fly_one(rates, after, c[0], w, np.empty((9, 0)), np.empty((c.shape[1], 0)), h, np.empty(0), 1)
     if after[5] >= 0.0 or gap_of(surface, after, s[0], ws, low, world[2]) >= 0.0:
-        return np.nan, h
+        return np.nan, h, np.nan
     tau = come_down(rates, surface, x, c, s, w, ws, low, world, touch)
-    if low == world[0] and math.isfinite(tau) and falls_past(touch, covariance, tau, world):
+    if low == world[0] and not over_table(touch, world):
         if gap_of(surface, after, s[0], ws, world[1], world[2]) >= 0.0:
-            return np.nan, h
-        return world[1], np.nan
-    return low, tau
+            return np.nan, h, tau
+        return world[1], np.nan, tau
+    return low, tau, np.nan
 
 
 @machine_code(
@@ -133,23 +136,22 @@ def find(
     Returns: `NONE`, `FOUND` or `HARD`, and the time (s) since the start.
     """
     d, passed = len(mean), 0.0
-    after, spread, x = np.empty(d), np.empty((d, d)), mean[:9]
+    after, spread, x, touch = np.empty(d), np.empty((d, d)), mean[:9], np.empty(9)
+    functions, values, weights = (rates, impact, surface), (c, b, s), (w, wb, ws)
     while passed < horizon:
         h = min(MAX_STEP, horizon - passed)
-        low, tau = _contact_within(rates, surface, x, covariance, c, s, w, ws, h, world)
-        if not 0.0 <= tau <= h:
+        low, tau, past = _contact_within(rates, surface, x, c, s, w, ws, h, world, touch)
+        touched = tau < 0.0 and math.isfinite(low)  # before this moment: it bounces at once
+        if not (touched or 0.0 <= tau <= h):
             return HARD, passed
-        h, event = tau, np.nan
-        if not contact:
+        h, event = INSTANT if touched else tau, np.nan
+        if not contact and not touched:
             event = _zero(rates, x, c[0], w, normal, offset, h, earliest - passed, either_way)
-        elif math.isfinite(low) and passed + h > earliest:
+        elif contact and not touched and math.isfinite(low) and passed + h > earliest:
             event = h
         if math.isfinite(low) and not math.isfinite(event):
             if not bounce(
-                (rates, impact, surface),
-                (c, b, s),
-                (ct, bt, st),
-                (w, wb, ws),
+                *(functions, values, (ct, bt, st), weights),
                 *(x, covariance, h, low, world, noise, after[:9], spread),
             ):
                 return HARD, passed
@@ -158,6 +160,10 @@ def find(
             h = event if math.isfinite(event) else h
             fly_belief(rates, mean, covariance, c[0], ct[0], w, h, noise, after, spread)
             if contact and low == world[0] and not over_table(after[:9], world):
+                return HARD, passed
+            if past <= h and not falls_past(
+                functions, values, weights, covariance, touch, past, h, world, after, spread
+            ):
                 return HARD, passed
         mean[:] = after
         covariance[:] = spread

@@ -56,7 +56,7 @@ def _through(functions, values, weights, x, level, h, world, after):
         remaining -= tau[0]
         put(after, at[0])
         fly_one(rates, after, c[0], w, empty, ct[0], remaining, np.empty(0), 1)
-        if at_rest(at[0], gap_of(surface, at[0], s[0], ws, level, world[2])):
+        if at_rest(at[0], gap_of(surface, at[0], s[0], ws, level, world[2]), level, world):
             return True
         if not (gap_of(surface, after, s[0], ws, level, world[2]) < 0.0 and after[5] < 0.0):
             return False
@@ -90,7 +90,7 @@ def roll_out(rates, impact, surface, values, weights, start, durations, world, s
                 if reached[r] <= j:
                     continue
                 level = world[0] if x[r, 2] > world[0] else world[1]
-                hard = at_rest(x[r], gap_of(surface, x[r], s[r], ws, level, world[2]))
+                hard = at_rest(x[r], gap_of(surface, x[r], s[r], ws, level, world[2]), level, world)
                 if not hard and after[r, 5] < 0.0 and gap_of(surface, after[r], s[r], ws, level, world[2]) < 0.0:
                     own = (c[r : r + 1], b[r : r + 1], s[r : r + 1])
                     hard = _through(functions, own, weights, x[r], level, step[r], world, after[r])
