@@ -8,9 +8,12 @@ import torch
 from scipy.stats import norm
 
 from ballfg.dynamics import Surfaces, rollout
-from ballfg.prediction import Propagator
+from ballfg.dynamics.compiled.course import Course
+from ballfg.factors.noise import ProcessNoise
+from ballfg.prediction import Propagator, apex
 from tests.prediction.conftest import NEARLY_EXACT
 
+NOISY = ProcessNoise()
 START = [0.0, 0.0, 0.25, 4.0, 0.3, -1.0, 10.0, 30.0, 5.0]
 LANDS = 0.54
 """m, x at which it comes down."""
@@ -50,6 +53,39 @@ def test_far_from_an_edge_nothing_changes(model, beliefs):
     beside = Propagator(with_end(LANDS - 0.5, 0.02), NEARLY_EXACT).rollout(belief, TIMES)
     falling = Propagator(Surfaces(-5.0), NEARLY_EXACT).rollout(belief, TIMES)
     np.testing.assert_allclose(beside.covariances, falling.covariances, rtol=1e-9, atol=1e-15)
+
+
+STEPS = {
+    "falls past, some bounce": [0.9, 0.0, 0.03, 4.0, 0.3, -2.0, 10.0, 30.0, 5.0],
+    "bounces, some fall past": [0.98, 0.0, 0.03, 0.5, 0.3, -2.0, 10.0, 30.0, 5.0],
+    "turns beside the table, a little above it": [1.3, 0.0, 0.012, 1.0, 0.3, 0.05, 10.0, 30.0, 5.0],
+    "has touched it already": [0.5, 0.0, 0.009, 2.0, 0.3, -2.5, 10.0, 30.0, 5.0],
+}
+
+
+@pytest.mark.parametrize("start", STEPS.values(), ids=STEPS)
+def test_a_step_of_machine_code_is_that_of_torch(uncertain, beliefs, start):
+    propagator, h = Propagator(with_end(1.0 if start[0] != 0.9 else 0.935, 0.01), NOISY), 0.02
+    belief = beliefs(uncertain, start)
+    course, hard = propagator._carrier(belief).carry(
+        Course.start(belief.mean.numpy(), belief.covariance.numpy()), np.array([[h]])
+    )
+    (mean, covariance), _ = propagator._touch(uncertain, belief.mean, belief.covariance, h)
+    assert not hard.any()
+    np.testing.assert_allclose(course.mean[1, 0], mean, rtol=0, atol=1e-9)
+    sigmas = np.sqrt(np.diagonal(covariance))
+    assert (np.abs(course.covariance[1, 0] - covariance) / np.outer(sigmas, sigmas)).max() < 1e-6
+
+
+def test_a_ball_that_has_touched_the_table_rises_to_its_apex(uncertain, beliefs):
+    propagator = Propagator(with_end(1.0), NOISY)
+    touched, later = beliefs(uncertain, STEPS["has touched it already"]), torch.tensor([0.02], dtype=torch.float64)
+    one, other = apex(propagator, touched, 1.0), apex(propagator, propagator.forward(touched, later), 1.0)
+    assert one.time == pytest.approx(other.time, abs=1e-7)
+    np.testing.assert_allclose(one.state, other.state, atol=1e-6)
+    sigmas = np.sqrt(np.diagonal(other.covariance)) + 1e-9
+    difference = np.abs(one.covariance - other.covariance) / np.outer(sigmas, sigmas)
+    assert difference.max() < 0.02  # within a step the noise of an impact does not decay with velocity and spin
 
 
 def test_known_places_at_a_known_edge_have_no_doubt(model, beliefs):

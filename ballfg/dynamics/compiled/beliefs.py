@@ -231,7 +231,7 @@ def bounce(functions, values, tangents, weights, start, covariance, h, level, wo
         return False
     through(moved[0], gathered, after)
     add_flight(after, min(left, h), noise)
-    add_impact(after, left, noise)
+    add_impact(after, min(left, h), noise)
     if not past < NEGLIGIBLE:
         beside, none = start.copy(), np.empty((9, 0))
         fly_one(rates, beside, c[0], w, none, np.empty((c.shape[1], 0)), h, np.empty(0), 1)
