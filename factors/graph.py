@@ -1,5 +1,6 @@
 """A factor graph over one track: its factors, its objective, and the loop that minimises it."""
 
+import copy
 import enum
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass
@@ -74,6 +75,10 @@ class Minimum:
         step: the last undamped linear solution, there or one step before: its Bayes net holds the covariances.
         convergence: why it stopped.
         iterations: number of linear solutions.
+        linearized: the factors, linearised at the point or, where it is `beyond` them, one step before.
+        beyond: whether the last step was taken without another linearisation.
+        distance: about how far it is from the exact minimum, in posterior standard deviations; infinite if unknown.
+        last: length of the last step that was taken, for a search that goes on; infinite if it says nothing.
     """
 
     values: Values
@@ -81,6 +86,10 @@ class Minimum:
     step: Step | None
     convergence: Convergence
     iterations: int
+    linearized: Sequence[Rows] = ()
+    beyond: bool = False
+    distance: float = np.inf
+    last: float = np.inf
 
 
 AT_KINK = 1e-3
@@ -116,26 +125,33 @@ class LevenbergMarquardt:
         """Minimise a graph's objective from a starting point; see `search`."""
         return run(self.search(graph, values))
 
-    def search(self, graph: BallGraph, values: Values) -> Search[Minimum]:
+    def search(self, graph: BallGraph, start: Values | Minimum) -> Search[Minimum]:
         """Minimise a graph's objective from a starting point, asking for linearisations.
 
         Each iteration tries the Gauss-Newton step; where it does not reduce the objective, lambda grows until a
         step does. The length of an undamped step in the metric of J^T J, |J d|, is the distance to the minimum in
         posterior standard deviations: free of units, and what `tolerance` bounds. When the lengths fall so quickly that
         the next step would be within the tolerance, the present one is the last.
+
+        Args: graph: what is minimised.  start: where from; a minimum found with a larger tolerance is gone on from.
         """
-        point = _Point(values, (yield graph, values))
+        found = (
+            Minimum(start, np.inf, None, Convergence.CONVERGED, 0, beyond=True) if isinstance(start, Values) else start
+        )
+        known = None if found.beyond else found.linearized
+        point = _Point(found.values, (yield graph, found.values) if known is None else known)
         if not np.isfinite(point.error):
-            return Minimum(values, point.error, None, Convergence.NOT_FINITE, 1)
-        damping, growth, last = 0.0, 10.0, np.inf
-        for iteration in range(1, self.max_iterations + 1):
-            step = solve(point.linearized, point.values, damping)
+            return Minimum(point.values, point.error, None, Convergence.NOT_FINITE, 1, point.linearized)
+        damping, growth, last = 0.0, 10.0, found.last
+        for iteration in range(found.iterations + found.beyond, self.max_iterations + 1):
+            again = known is not None and iteration == found.iterations
+            step = found.step if again else solve(point.linearized, point.values, damping)
             length = np.sqrt(2 * abs(step.decrease)) if step is not None and damping == 0.0 else np.inf
             if step is not None and length < self.tolerance:
-                return Minimum(point.values, point.error, step, Convergence.CONVERGED, iteration)
-            if step is not None and RATE_MARGIN * length * (length / last) < self.tolerance and np.isfinite(last):
-                moved = point.values.moved(step.states, step.coefficients)
-                return Minimum(moved, point.error - step.decrease, step, Convergence.CONVERGED, iteration)
+                return point.minimum(step, Convergence.CONVERGED, iteration, float(length), last)
+            beyond = RATE_MARGIN * length * (length / last) if np.isfinite(last) else np.inf
+            if step is not None and beyond < self.tolerance:
+                return point.moved(step).minimum(step, Convergence.CONVERGED, iteration, float(beyond), float(length))
             trial = None if step is None else (yield from _tried(graph, point, step, damping))
             if step is not None and trial is not None and trial.error <= point.error * (1 + 1e-12):
                 gain = (point.error - trial.error) / max(step.decrease, np.finfo(float).tiny)
@@ -143,21 +159,40 @@ class LevenbergMarquardt:
                 damping, growth = damping * (0.1 if gain > WHOLE else 0.5), 10.0
                 damping = 0.0 if damping < self.first_damping else damping
             elif length < AT_KINK:
-                return Minimum(point.values, point.error, step, Convergence.AT_KINK, iteration)
+                return point.minimum(step, Convergence.AT_KINK, iteration)
             elif damping > MOST_DAMPING:
-                final = solve(point.linearized, point.values)
-                return Minimum(point.values, point.error, final, Convergence.STUCK, iteration)
+                return point.minimum(solve(point.linearized, point.values), Convergence.STUCK, iteration)
             else:
                 damping, growth = max(self.first_damping, growth * damping), 2.0 * growth
         final = solve(point.linearized, point.values)
-        return Minimum(point.values, point.error, final, Convergence.TOO_MANY_ITERATIONS, self.max_iterations)
+        return point.minimum(final, Convergence.TOO_MANY_ITERATIONS, self.max_iterations)
 
 
 class _Point:
-    """Values, the graph linearised there, the objective."""
+    """Values, the graph linearised there or, where they are `beyond` it, one step before, and the objective."""
 
     def __init__(self, values: Values, linearized: Sequence[Rows]) -> None:
         self.values, self.linearized, self.error = values, linearized, objective(linearized)
+        self.beyond = False
+
+    def moved(self, step: Step) -> "_Point":
+        """The point after a step that is not looked at, with the objective that it promises."""
+        after = copy.copy(self)
+        after.values, after.beyond = self.values.moved(step.states, step.coefficients), True
+        after.error = self.error - step.decrease
+        return after
+
+    def minimum(
+        self,
+        step: Step | None,
+        convergence: Convergence,
+        iterations: int,
+        distance: float = np.inf,
+        last: float = np.inf,
+    ) -> Minimum:
+        """The end of a search here."""
+        more = {"linearized": self.linearized, "beyond": self.beyond, "distance": distance, "last": last}
+        return Minimum(self.values, self.error, step, convergence, iterations, **more)
 
 
 def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> Search[_Point]:

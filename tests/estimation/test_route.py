@@ -30,7 +30,7 @@ def test_seven_functions_in_four_files_lead_to_the_linear_solve() -> None:
         front.estimate(track)
     finally:
         sys.setprofile(None)
-    (route, *others) = {tuple(route) for route in routes}
-    assert not others, "every linear solve is reached on the same way"
-    assert [name for _, name in route] == ["estimate", "estimate", "run", "search", "_settle", "search", "solve"]
-    assert len({file for file, _ in route}) == 4
+    ways = {tuple(name for _, name in route) for route in routes}
+    rough, last = ["_settle", "search", "solve"], ["search", "solve"]
+    assert ways <= {("estimate", "estimate", "run", "search", *way) for way in (rough, last)}
+    assert len({file for route in routes for file, _ in route}) == 4

@@ -35,6 +35,9 @@ from ballfg.factors.tracker import BiasStartFactors
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 from ballfg.tracks import Ball, Track
 
+ROUGH = 1e-2
+"""Posterior standard deviations. Where contacts and hits lie shows at minima that are known to this; only the last one
+is found to the optimizer's own tolerance."""
 MAX_REFINEMENTS = 6
 """How often contacts may move to a neighbouring interval; two were the most seen on measured tracks."""
 
@@ -164,10 +167,17 @@ class Smoother(Estimator):
                 break
             segmentation = replace(segmentation, hits=np.union1d(segmentation.hits, [interval]))
             solution = yield from self._settle(problem, segmentation, earlier)
-        return solution
+        found = solution.minimum
+        if found.convergence is not Convergence.CONVERGED or found.distance < self.optimizer.tolerance:
+            return solution
+        return replace(solution, minimum=(yield from self.optimizer.search(solution.graph, found)))
 
     def _settle(self, problem: TrackProblem, segmentation: Segmentation, earlier: Earlier | None) -> Search[Solution]:
-        """Minimise, move contacts to where the estimate says they are, and minimise again until they stay."""
+        """Minimise, move contacts to where the estimate says they are, and minimise again until they stay.
+
+        The minima are rough ones, see `ROUGH`.
+        """
+        rough = replace(self.optimizer, tolerance=max(ROUGH, self.optimizer.tolerance))
         track, ball = problem.track, problem.ball
         events = Events(segmentation.contacts, segmentation)
         if earlier is None:
@@ -180,9 +190,9 @@ class Smoother(Estimator):
         for _ in range(MAX_REFINEMENTS):
             graph = problem.graph(events)
             graph = graph if earlier is None else earlier.join(graph)
-            minimum = yield from self.optimizer.search(graph, values)
+            minimum = yield from rough.search(graph, values)
             if label_let_go(graph, minimum.values):
-                minimum = yield from minimise_with_restart(self.optimizer, graph, values, minimum)
+                minimum = yield from minimise_with_restart(rough, graph, values, minimum)
             solution = Solution(events, graph, minimum)
             seen[places_of(events.contacts)] = solution
             refined = refined_contacts(track.times, solution)
@@ -242,9 +252,9 @@ class Smoother(Estimator):
 def _worst_break(solution: Solution) -> int | None:
     """The interval whose dynamics factor is broken most, if any is; intervals with a hit have theirs in the noise."""
     worst, where = BROKEN, None
-    for batch in solution.graph.batches:
+    for batch, rows in zip((b for b in solution.graph.batches if len(b)), solution.minimum.linearized, strict=True):
         if isinstance(batch, DynamicsFactors):
-            norm = np.linalg.norm(batch.linearize(solution.minimum.values).residual, axis=-1)
+            norm = np.linalg.norm(rows.residual, axis=-1)
             norm[np.isin(batch.variables[:, 0], solution.events.segmentation.hits)] = 0.0
             if not norm.max() <= worst:
                 worst, where = norm.max(), int(batch.variables[norm.argmax(), 0])
