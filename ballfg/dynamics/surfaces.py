@@ -67,7 +67,7 @@ class Surfaces:
     def over_table(self, state: Tensor) -> Tensor:
         """(...) bool of states (..., 9): the ball's x, y lie within the table's extent."""
         if self.extent is None:
-            return torch.ones(state.shape[:-1], dtype=torch.bool)
+            return torch.ones(state.shape[:-1], dtype=torch.bool, device=state.device)
         x, y = state[..., 0], state[..., 1]
         low_x, high_x, low_y, high_y = self.extent
         return (x >= low_x) & (x <= high_x) & (y >= low_y) & (y <= high_y)

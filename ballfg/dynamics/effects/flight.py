@@ -35,7 +35,7 @@ class Gravity(FlightEffect):
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2, straight down."""
-        return self.g * _DOWN
+        return self.g * _DOWN.to(self.g.device)
 
 
 class Buoyancy(FlightEffect):
@@ -48,7 +48,7 @@ class Buoyancy(FlightEffect):
 
     def acceleration(self, flight: Flight) -> Tensor:
         """(..., 3) m/s^2, straight up."""
-        return self.a * _UP
+        return self.a * _UP.to(self.a.device)
 
 
 class Drag(FlightEffect):

@@ -25,7 +25,7 @@ _QUARTER_TURN = torch.tensor((-1.0, 1.0), dtype=torch.float64)  # times the flip
 
 def slip_velocity(velocity: Tensor, spin: Tensor, radius: float) -> Tensor:
     """(..., 2) m/s, velocity over the plane of the ball's lowest point: v_t + R (n x w)_t with n = z."""
-    return velocity[..., :2] + radius * (_QUARTER_TURN * spin[..., :2].flip(-1))
+    return velocity[..., :2] + radius * (_QUARTER_TURN.to(spin.device) * spin[..., :2].flip(-1))
 
 
 def apply_impulse(impact: Impact, radius: float, inertia_factor: float) -> tuple[Tensor, Tensor]:
@@ -46,7 +46,7 @@ def apply_impulse(impact: Impact, radius: float, inertia_factor: float) -> tuple
     slide = impact.friction * (1.0 + impact.restitution) * pressing / speed
     impulse = -_smooth_minimum(slide, grip) * slip
     velocity = torch.cat((impact.velocity[..., :2] + impulse, impact.restitution * normal_speed), dim=-1)
-    kick = (_QUARTER_TURN / (-inertia_factor * radius)) * impulse.flip(-1)
+    kick = (_QUARTER_TURN.to(impulse.device) / (-inertia_factor * radius)) * impulse.flip(-1)
     spin = torch.cat((impact.spin[..., :2] + kick, impact.spin[..., 2:]), dim=-1)
     return velocity, spin
 

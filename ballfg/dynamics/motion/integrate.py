@@ -99,10 +99,17 @@ def fly(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
 
 
 def followed(*tensors: Tensor | float) -> bool:
-    """Whether torch must do the work: it follows tensors for derivatives or to record them, or they are not float64."""
+    """Whether torch must do the work: it follows tensors for derivatives or to record them, or they lie elsewhere.
+
+    Machine code takes float64 in the memory of the processor.
+    """
     if torch.is_grad_enabled() or forward_ad._current_level >= 0:
         return True
-    return any(isinstance(t, Tensor) and not (type(t) is Tensor and t.dtype is torch.float64) for t in tensors)
+    return any(isinstance(t, Tensor) and not _is_plain(t) for t in tensors)
+
+
+def _is_plain(tensor: Tensor) -> bool:
+    return type(tensor) is Tensor and tensor.dtype is torch.float64 and tensor.is_cpu
 
 
 def fly_jacobian(model: BallModel, state: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:

@@ -80,7 +80,7 @@ def _advance_step(model: BallModel, state: Tensor, h: Tensor, surfaces: Surfaces
     height = surfaces.level_below(state.detach())
     remaining = h
     done = state
-    active = torch.arange(state.shape[0])
+    active = torch.arange(state.shape[0], device=state.device)
     for contacts in range(MAX_CONTACTS + 1):
         after = fly(model, state, remaining)
         resting = stays(model, state.detach(), height, surfaces)

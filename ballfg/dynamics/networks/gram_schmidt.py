@@ -64,7 +64,8 @@ def flight_frame(state: Tensor) -> FlightFrame:
     speed = velocity.square().sum(-1, keepdim=True) + LIFT**2
     along = helicity.square() / speed
     across = spin.square().sum(-1, keepdim=True) - along
-    features = torch.addcmul(_ONE, torch.cat((speed, along, across), dim=-1), _FLIGHT_SQUARES).reciprocal()
+    one, squares = _ONE.to(state.device), _FLIGHT_SQUARES.to(state.device)
+    features = torch.addcmul(one, torch.cat((speed, along, across), dim=-1), squares).reciprocal()
     return FlightFrame(features, velocity, spin, torch.linalg.cross(spin, velocity), helicity)
 
 
@@ -114,9 +115,10 @@ def contact_frame(state: Tensor, radius: float) -> ContactFrame:
     """
     velocity, fall = (state[..., VELOCITY] / CONTACT_SCALE).split((2, 1), dim=-1)
     spin, twist = (state[..., SPIN] * (radius / CONTACT_SCALE)).split((2, 1), dim=-1)
-    slip = velocity + _QUARTER_TURN * spin.flip(-1)
+    quarter_turn = _QUARTER_TURN.to(state.device)
+    slip = velocity + quarter_turn * spin.flip(-1)
     direction = slip * (slip.square().sum(-1, keepdim=True) + _SOFT**2).rsqrt()
-    normal = _QUARTER_TURN * direction.flip(-1)
+    normal = quarter_turn * direction.flip(-1)
     along, turn = (direction * velocity).sum(-1, keepdim=True), (normal * velocity).sum(-1, keepdim=True)
     across = velocity.square().sum(-1, keepdim=True) - along.square()
     squares = torch.cat((slip.square().sum(-1, keepdim=True), across, twist.square()), dim=-1) + _SOFT**2
@@ -136,5 +138,5 @@ def contact_change(frame: ContactFrame, coefficients: Tensor, radius: float) -> 
     a, b, c, d, e, f, g, h = coefficients.split(1, dim=-1)
     velocity = a * frame.direction + b * frame.velocity + c * frame.side
     rim = d * frame.direction + e * frame.velocity + f * frame.side
-    spin = torch.cat((rim.flip(-1) * -_QUARTER_TURN, g * frame.twist + h * frame.turn), dim=-1)
+    spin = torch.cat((rim.flip(-1) * -_QUARTER_TURN.to(rim.device), g * frame.twist + h * frame.turn), dim=-1)
     return CONTACT_SCALE * velocity, (CONTACT_SCALE / radius) * spin

@@ -47,7 +47,7 @@ class GramSchmidtFlight(nn.Module):
         """Acceleration and angular acceleration (or None) of states (..., 9)."""
         frame = gram_schmidt.flight_frame(state)
         coefficients = self.network(frame.features)
-        bias = self.bias * _UP
+        bias = self.bias * _UP.to(state.device)
         if not self.spin_rate:
             return gram_schmidt.acceleration(frame, coefficients, bias), None
         linear, angular = coefficients.split(gram_schmidt.FLIGHT_TERMS, dim=-1)
@@ -71,8 +71,8 @@ class RawFlight(nn.Module):
 
     def forward(self, state: Tensor) -> Rates:
         """Acceleration and angular acceleration (or None) of states (..., 9)."""
-        outputs = self.network(state[..., VELOCITY.start : SPIN.stop] * _RAW_SCALES)
-        rates = outputs * _RATE_SCALES[: outputs.shape[-1]]
+        outputs = self.network(state[..., VELOCITY.start : SPIN.stop] * _RAW_SCALES.to(state.device))
+        rates = outputs * _RATE_SCALES.to(state.device)[: outputs.shape[-1]]
         return rates[..., :3], rates[..., 3:] if self.spin_rate else None
 
 
@@ -118,8 +118,8 @@ class RawContact(nn.Module):
 
     def forward(self, state: Tensor, guess: Tensor) -> Tensor:
         """(..., 9) after the contact, from the states before it and a guess of those after it."""
-        outputs = self.network(state[..., VELOCITY.start : SPIN.stop] * _RAW_SCALES)
-        change = outputs[..., 1:] * _CHANGE_SCALES
+        outputs = self.network(state[..., VELOCITY.start : SPIN.stop] * _RAW_SCALES.to(state.device))
+        change = outputs[..., 1:] * _CHANGE_SCALES.to(state.device)
         return _changed(guess, change[..., :2], outputs[..., :1], change[..., 2:], self.first)
 
 

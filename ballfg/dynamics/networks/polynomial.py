@@ -12,6 +12,7 @@ from itertools import combinations_with_replacement
 import torch
 from torch import Tensor
 
+CPU = torch.device("cpu")
 Weights = tuple[Tensor, Tensor]
 """Of a linear layer: weight (outputs, inputs), bias (outputs,)."""
 
@@ -23,7 +24,7 @@ def expand(first: Weights, step: Weights, last: Weights, depth: int) -> Tensor:
     """
     start = torch.cat((first[1].unsqueeze(-1), first[0]), dim=-1)  # (width, 1 + features): degree one
     hidden = start
-    for table, size in _tables(start.shape[-1], depth).raised:
+    for table, size in _tables(start.shape[-1], depth, start.device).raised:
         stepped = step[0] @ hidden
         stepped = torch.cat((stepped[:, :1] + step[1].unsqueeze(-1), stepped[:, 1:]), dim=-1)
         product = (start.unsqueeze(-1) * stepped.unsqueeze(-2)).flatten(-2)
@@ -38,7 +39,7 @@ def evaluate(coefficients: Tensor, features: Tensor, depth: int) -> Tensor:
 
     Monomials of half the degree on either side of a matrix: fewer numbers than all monomials.
     """
-    tables = _tables(features.shape[-1] + 1, depth)
+    tables = _tables(features.shape[-1] + 1, depth, features.device)
     one = torch.nn.functional.pad(features, (1, 0), value=1.0)
     powers = [one]
     for low, high in tables.powers:
@@ -52,7 +53,7 @@ def evaluate(coefficients: Tensor, features: Tensor, depth: int) -> Tensor:
 
 def evaluation_cost(features: int, outputs: int, depth: int) -> int:
     """Multiplications that `evaluate` takes for each state, but for the few of the monomials."""
-    return outputs * _tables(features + 1, depth).pairs.numel()
+    return outputs * _tables(features + 1, depth, CPU).pairs.numel()
 
 
 @dataclass(frozen=True)
@@ -76,12 +77,13 @@ class _Tables:
 
 
 @functools.cache
-def _tables(variables: int, depth: int) -> _Tables:
+def _tables(variables: int, depth: int, device: torch.device) -> _Tables:
+    indices = functools.partial(torch.tensor, device=device)
     monomials = [combinations_with_replacement(range(variables), k) for k in range(depth + 2)]
     number = [{m: i for i, m in enumerate(of_degree)} for of_degree in monomials]
     raised = tuple(
         (
-            torch.tensor([[number[k + 1][tuple(sorted((*m, v)))] for m in number[k]] for v in range(variables)]),
+            indices([[number[k + 1][tuple(sorted((*m, v)))] for m in number[k]] for v in range(variables)]),
             len(number[k + 1]),
         )
         for k in range(1, depth + 1)
@@ -89,9 +91,9 @@ def _tables(variables: int, depth: int) -> _Tables:
     degree = depth + 1
     high = (degree + 1) // 2
     powers = tuple(
-        (torch.tensor([number[k - 1][m[:-1]] for m in number[k]]), torch.tensor([m[-1] for m in number[k]]))
+        (indices([number[k - 1][m[:-1]] for m in number[k]]), indices([m[-1] for m in number[k]]))
         for k in range(2, high + 1)
     )
-    pairs = torch.tensor([[number[degree][tuple(sorted(a + b))] for b in number[high]] for a in number[degree - high]])
+    pairs = indices([[number[degree][tuple(sorted(a + b))] for b in number[high]] for a in number[degree - high]])
     counts = torch.bincount(pairs.flatten())
     return _Tables(raised, powers, degree - high - 1, pairs, (1.0 / counts.double())[pairs])
