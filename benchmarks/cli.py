@@ -16,6 +16,8 @@ from ballfg.cli.errors import guarded
 from ballfg.cli.inputs import CORES, Address, Cluster, workers
 
 if TYPE_CHECKING:
+    import torch
+
     from ballfg.benchmarks.results import Results
     from ballfg.tracks import Dataset
 
@@ -239,6 +241,9 @@ def speed(
     gate: Annotated[
         Path | None, typer.Option(help="An earlier results.json; fail where something has become slower since.")
     ] = None,
+    device: Annotated[
+        str | None, typer.Option(help="cuda, for instance: time rollouts of up to 10,000 balls there as well.")
+    ] = None,
     out: Out = Path("results"),
     quick: Quick = False,
     seed: Seed = 0,
@@ -254,19 +259,22 @@ def speed(
     from ballfg.benchmarks.speed.peers.suite import run_peers
     from ballfg.benchmarks.speed.suite import FULL, QUICK, run_speed
 
-    interpreters = _interpreters(peer or [])
+    interpreters, there = _interpreters(peer or []), None if device is None else _device(device)
     if peer and not peers:
         raise typer.BadParameter("it is for --peers. Give that too, or leave both out.", param_hint="--peer")
     if peers and data is not None:
         raise typer.BadParameter("peers solve the fixed problems only. Leave it out.", param_hint="--data")
+    if peers and there is not None:
+        raise typer.BadParameter("peers run on the processor. Leave it out.", param_hint="--device")
     words = [*(["--peers"] if peers else []), *(word for name in interpreters for word in ("--peer", name))]
+    words += [] if device is None else ["--device", device]
     results, size = _start("speed", [] if data is None else [data], quick, seed, words), QUICK if quick else FULL
     if gate is not None and not gate.is_file():
         raise typer.BadParameter(f"there is no file {gate}. Give an earlier results.json.", param_hint="--gate")
     if peers:
         run_peers(results, interpreters, size)
     else:
-        run_speed(results, None if data is None else _open(data), size)
+        run_speed(results, None if data is None else _open(data), size, there)
     _finish(results, _folder(out), [])
     if gate is not None:
         try:
@@ -283,6 +291,19 @@ def _interpreters(words: Sequence[str]) -> dict[str, Path]:
         if not (library and sign and path):
             raise typer.BadParameter("it is LIBRARY=PATH_TO_PYTHON.", param_hint="--peer")
     return {library: Path(path) for library, _, path in pairs}
+
+
+def _device(name: str) -> torch.device:
+    """A device that torch can compute on."""
+    import torch
+
+    try:
+        device = torch.device(name)
+        torch.zeros(1, device=device).cpu()
+    except (RuntimeError, AssertionError, NotImplementedError) as error:  # torch's, for all that it cannot use
+        reason = str(error).splitlines()[0]
+        raise typer.BadParameter(f"torch cannot compute on {name!r}: {reason}", param_hint="--device") from None
+    return device
 
 
 def _start(command: str, data: Sequence[Path], quick: bool, seed: int, more: Sequence[str] = ()) -> Results:

@@ -1,5 +1,6 @@
 """The suite of `ballfg-bench speed`: times of an estimate, an update, a prediction and a Jacobian on one thread."""
 
+import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
@@ -16,6 +17,7 @@ from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.speed.banded import BandedProblem
 from ballfg.benchmarks.speed.gradient_cost import time_gradients
 from ballfg.benchmarks.speed.network import FIT_ITERATIONS, fitted_network, parameter_count
+from ballfg.benchmarks.speed.robot import time_bounces, time_events, time_growth, time_rollouts, time_stream
 from ballfg.benchmarks.speed.stopwatch import Stopwatch, milliseconds
 from ballfg.dynamics import (
     AnalyticModel,
@@ -71,6 +73,7 @@ class Size:
         fit_iterations: that fit the network to the analytic model.
         pretrain_iterations: that fit the learned model to the analytic one; after 200 its flight is off by 0.1 m/s^2.
         dataset_tracks: tracks of a dataset that are timed.
+        flights: simulated ones in a stream at 200 Hz; 80 last 61 s.
     """
 
     runs: int
@@ -78,22 +81,31 @@ class Size:
     fit_iterations: int = FIT_ITERATIONS
     pretrain_iterations: int = 200
     dataset_tracks: int = 20
+    flights: int = 80
 
 
 FULL = Size(runs=60, warm_up=5)
-QUICK = Size(runs=5, warm_up=2)
+QUICK = Size(runs=5, warm_up=2, flights=4)
 
 
-def run_speed(results: Results, dataset: Dataset | None, size: Size) -> None:
-    """All times; a control before each model and at the end; with a dataset the time for each of some of its tracks."""
+def run_speed(results: Results, dataset: Dataset | None, size: Size, device: torch.device | None = None) -> None:
+    """All times; a control before each model and at the end.
+
+    With a dataset the time for each of some of its tracks, with a device rollouts of many balls there.
+    """
     model = problem_model()
     track = problem_track(model)
     watch = Stopwatch(results, CASE, size.runs, size.warm_up, banded_problem(track))
     parts = [
         partial(_time_model, watch, "analytic", model, track),
+        partial(time_bounces, watch, "analytic", nominal_model(model.radius), NOISE, LABEL_NOISE),
         partial(_time_network, watch, model, track, size.fit_iterations),
         partial(_time_coefficients, watch, model, track),
         partial(_time_gradients, watch, model, track, size.pretrain_iterations),
+        partial(time_growth, watch, "analytic", model, START, NOISE),
+        *(partial(time_stream, watch, solver, size.flights) for solver in ONLINE),
+        partial(time_events, watch),
+        partial(time_rollouts, watch, device),
     ]
     for part in progress(parts, len(parts), "parts timed"):
         part()
@@ -159,6 +171,9 @@ def _time_network(watch: Stopwatch, model: AnalyticModel, track: Track, iteratio
     """The same for a network that is fitted to the analytic model."""
     network = fitted_network(model, iterations)
     _time_model(watch, "network", network, track)
+    bouncing = copy.deepcopy(network)
+    bouncing.bounces = nominal_model(model.radius)
+    time_bounces(watch, "network", bouncing, NOISE, LABEL_NOISE)
     watch.add("network", "parameters", parameter_count(network))
 
 

@@ -2,11 +2,14 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from ballfg.benchmarks.results import Results
+from ballfg.benchmarks.speed import robot
 from ballfg.benchmarks.speed.network import GRAVITY, fitted_network, parameter_count
-from ballfg.benchmarks.speed.suite import QUICK, problem_model, run_speed
+from ballfg.benchmarks.speed.stopwatch import Stopwatch
+from ballfg.benchmarks.speed.suite import QUICK, banded_problem, problem_model, problem_track, run_speed
 
 
 def test_network_is_the_same_each_time_and_close_to_the_model() -> None:
@@ -41,9 +44,24 @@ def test_speed_run_has_every_time() -> None:
         "online_chain_update_median",
         "online_chain_update_p99",
         "prediction_time",
+        "estimate_time_two_bounces",
     }
     for method in ("analytic", "network"):
         found = {row.metric for row in results.rows if row.method == method and row.unit == "ms"}
         assert found == expected
     assert {row.metric for row in results.rows if row.method == "control"} == {"matrix_product_time", "banded_time"}
     assert all(row.value is not None and row.value > 0 for row in results.rows)
+    found = {row.metric for row in results.rows}
+    assert {"stream_push_p999", "next_bounce_time", "plane_crossing_time", "rollout_time_torch"} <= found
+    assert {f"estimate_us_per_observation_{count}" for count in robot.LONG} <= found
+
+
+def test_rollouts_on_a_device_are_those_of_machine_code(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(robot, "BALLS", (1, 3))
+    results = Results("test", 0)
+    robot.time_rollouts(
+        Stopwatch(results, "test", 1, 1, banded_problem(problem_track(problem_model()))), torch.device("cpu")
+    )
+    off = {row.method: row.value for row in results.rows if row.metric == "rollout_difference_cpu"}
+    assert set(off) == {f"{name}, {count} balls" for name in ("nominal", "mnn+gs") for count in (1, 3)}
+    assert max(off.values()) < 1e-9

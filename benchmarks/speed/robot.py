@@ -1,0 +1,165 @@
+"""What a robot asks for while a ball flies: an estimate through bounces, a long stream, events ahead, many rollouts."""
+
+import gc
+from collections.abc import Sequence
+from functools import partial
+from typing import Final
+
+import numpy as np
+import torch
+
+from ballfg.benchmarks.gaussian_settings import StepNoise, gaussian_settings
+from ballfg.benchmarks.metrics import median_and_quartiles
+from ballfg.benchmarks.speed.stopwatch import Stopwatch, milliseconds
+from ballfg.dynamics import Architecture, BallModel, Surfaces, build, nominal_model, rollout
+from ballfg.estimation import Online, Settings, Smoother
+from ballfg.estimation.online.online import Solver
+from ballfg.prediction import next_contact, plane_crossing
+from ballfg.prediction.ahead import carried_by
+from ballfg.simulation import SimulationConfig, simulate
+from ballfg.tracks import SPIN_LABELS, Track
+
+RADIUS: Final = 0.02
+"""m."""
+GROUND: Final = Surfaces(0.0)
+BOUNCING: Final = (0.0, 0.0, 0.3, 5.0, 0.5, -0.5, 0.0, 80.0, 20.0)
+"""m, m/s, rad/s: a ball that bounces twice within 80 samples at 100 Hz."""
+LONG: Final = (20, 80, 320, 1280)
+"""Observations of one flight."""
+DENSE: Final = 400.0
+"""Hz, at which they are taken, so that the longest flight stays below a sensible speed."""
+STREAM_RATE: Final = 200.0
+"""Hz."""
+STREAM_NOISE: Final = 0.003
+"""m, as the simulation has it."""
+PAUSE: Final = 1.5
+"""s between two flights of a stream."""
+STEPS: Final = 300
+"""Of 10 ms, in a rollout."""
+BALLS: Final = (1, 100, 10_000)
+"""Rolled out together on a device."""
+SLOWEST: Final = 3
+"""Runs of what takes seconds."""
+
+
+def time_bounces(watch: Stopwatch, name: str, model: BallModel, noise: float, label_noise: float) -> None:
+    """A whole estimate through two bounces: events, graph, minimisation, covariances."""
+    times, rng = np.arange(80) / 100.0, np.random.default_rng(3)
+    positions = _path(nominal_model(RADIUS), BOUNCING, times) + noise * rng.standard_normal((80, 3))
+    spin = np.add(BOUNCING[6:], (30.0, -20.0, 10.0)).tolist()
+    track = Track(times, positions, labels=dict(zip(SPIN_LABELS, spin, strict=True)), name="bounces")
+    smoother = Smoother(model, GROUND, gaussian_settings(noise, StepNoise(), label_noise))
+    if len(smoother.estimate(track).contacts) != 2:
+        raise RuntimeError("the estimate must find two contacts, or its time says nothing")
+    watch.time(name, "estimate_time_two_bounces", lambda: smoother.estimate(track))
+
+
+def time_growth(watch: Stopwatch, name: str, model: BallModel, start: Sequence[float], noise: float) -> None:
+    """Time of an estimate for each of its observations."""
+    for count in LONG:
+        times, rng = np.arange(count) / DENSE, np.random.default_rng(0)
+        positions = _path(model, start, times, Surfaces(-1e3)) + noise * rng.standard_normal((count, 3))
+        smoother = Smoother(model, Surfaces(-1e3), gaussian_settings(noise, StepNoise(), 20.0))
+        track = Track(times, positions, name="long")
+        spent = median_and_quartiles([milliseconds(partial(smoother.estimate, track)) for _ in range(watch.runs)])
+        watch.add(name, f"estimate_us_per_observation_{count}", 1e3 * spent.value / count, watch.runs)
+
+
+def time_stream(watch: Stopwatch, solver: Solver, flights: int) -> None:
+    """Every push of a stream of simulated flights, with the state that it returns, after `Online.warm_up`."""
+    shots = [shot.track for shot in simulate(SimulationConfig(tracks=flights, rate=STREAM_RATE, seed=5))]
+    nominal, table = nominal_model(RADIUS), SimulationConfig().ball.surfaces
+    learned = build(Architecture.of("mnn+gs", residual=True), radius=RADIUS, base=nominal).requires_grad_(False)
+    for name, model in (("mnn+gs", learned), ("nominal", nominal)):
+        settings = Settings.for_measured(model, position_noise=(STREAM_NOISE,) * 3)
+        online = Online(model, table, settings, solver=solver)
+        online.warm_up()
+        gc.collect()
+        spent, begin = [], 0.0
+        for shot in shots:
+            for time, position in zip(shot.times, shot.positions, strict=True):
+                spent.append(milliseconds(partial(online.push, begin + time, position)))
+            begin += shot.times[-1] + PAUSE
+        row, count = f"{name}, {solver}", len(spent)
+        watch.results.add(watch.case, row, "stream_push_median", "ms", median_and_quartiles(spent), count)
+        for share, metric in ((0.99, "stream_push_p99"), (0.999, "stream_push_p999"), (1.0, "stream_push_worst")):
+            watch.results.add(watch.case, row, metric, "ms", float(np.quantile(spent, share)), count)
+
+
+def time_events(watch: Stopwatch) -> None:
+    """From a state in flight, with sigmas: the path of 0.3 s, the next bounce, the crossing of a plane."""
+    nominal = nominal_model(RADIUS)
+    online = Online(nominal, GROUND, gaussian_settings(0.002, StepNoise(), 20.0), solver="chain")
+    times = np.arange(40) / STREAM_RATE
+    start = (0.0, 0.0, 0.3, 4.0, 0.1, 1.0, 0.0, 50.0, 0.0)
+    for time, position in zip(times, _path(nominal, start, times), strict=True):
+        state = online.push(time, position)
+    for metric, ask in (
+        ("predict_30_stamps_time", lambda: state.predict(0.3)),
+        ("next_bounce_time", lambda: next_contact(*carried_by(state), 1.0)),
+        ("plane_crossing_time", lambda: plane_crossing(*carried_by(state), (1.0, 0.0, 0.0), 1.6, 1.0)),
+    ):
+        if ask() is None:
+            raise RuntimeError(f"{metric} must find its event, or its time says nothing")
+        watch.time("nominal", metric, ask)
+
+
+def time_rollouts(watch: Stopwatch, device: torch.device | None) -> None:
+    """300 steps of `mnn+gs` through bounces, by machine code and by torch; with a device, of many balls there too."""
+    model = build(Architecture.of("mnn+gs"), radius=RADIUS, seed=1).requires_grad_(False)
+    times = torch.arange(1, STEPS + 1, dtype=torch.float64) / 100.0
+    one = torch.tensor([(0.0, 0.0, 0.3, 3.0, 0.5, 2.0, 0.0, 80.0, 20.0)], dtype=torch.float64)
+    watch.time("mnn+gs", "rollout_time", torch.no_grad()(lambda: rollout(model, one, times, GROUND)))
+    spent = [milliseconds(torch.enable_grad()(lambda: rollout(model, one, times, GROUND))) for _ in range(SLOWEST)]
+    watch.results.add(watch.case, "mnn+gs", "rollout_time_torch", "ms", median_and_quartiles(spent), SLOWEST)
+    if device is None:
+        return
+    nominal = nominal_model(RADIUS).requires_grad_(False)
+    for name, mine, theirs in (
+        ("nominal", nominal, nominal_model(RADIUS).requires_grad_(False).to(device)),
+        ("mnn+gs", model, build(Architecture.of("mnn+gs"), radius=RADIUS, seed=1).requires_grad_(False).to(device)),
+    ):
+        for count in BALLS:
+            _time_on_device(watch, f"{name}, {count} balls", mine, theirs, one, count, times[::3], device)
+
+
+def _time_on_device(
+    watch: Stopwatch,
+    row: str,
+    here: BallModel,
+    there: BallModel,
+    start: torch.Tensor,
+    count: int,
+    times: torch.Tensor,
+    device: torch.device,
+) -> None:
+    """Rollouts of many different balls by machine code on one thread, and by torch on a device; they must agree."""
+    spread = torch.linspace(-0.2, 0.2, count, dtype=torch.float64)[:, None] * torch.ones(9, dtype=torch.float64)
+    states = start + spread
+
+    @torch.no_grad()
+    def by_machine_code() -> torch.Tensor:
+        return rollout(here, states, times, GROUND)
+
+    def on_device() -> torch.Tensor:
+        with torch.enable_grad():  # asks for torch where the device is the processor itself
+            found = rollout(there, states.to(device), times.to(device), GROUND)
+        return found.cpu()  # waits for the device
+
+    off = float((on_device() - by_machine_code()).abs().max())
+    if not off < 1e-6:
+        raise RuntimeError(f"rollouts on {device} must be those of machine code; they are {off:g} m or m/s off")
+    mine = [milliseconds(by_machine_code) for _ in range(SLOWEST)]
+    theirs = [milliseconds(on_device) for _ in range(SLOWEST)]
+    watch.results.add(watch.case, row, "rollout_100_stamps_time", "ms", median_and_quartiles(mine), SLOWEST)
+    watch.results.add(
+        watch.case, row, f"rollout_100_stamps_time_{device.type}", "ms", median_and_quartiles(theirs), SLOWEST
+    )
+    watch.results.add(watch.case, row, f"rollout_difference_{device.type}", "1", off, 1)
+
+
+def _path(model: BallModel, start: Sequence[float], times: np.ndarray, surfaces: Surfaces = GROUND) -> np.ndarray:
+    """(n, 3) m, where a ball is at times (n,) s."""
+    with torch.no_grad():
+        states = rollout(model, torch.tensor([list(start)], dtype=torch.float64), torch.from_numpy(times), surfaces)
+    return states[0, :, :3].numpy()
