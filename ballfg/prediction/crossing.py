@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ballfg.arrays import Array
-from ballfg.dynamics.compiled.events import FOUND, LOOKS, NONE, TIME_TOLERANCE
+from ballfg.dynamics.compiled.beliefs.events import FOUND, LOOKS, NONE, TIME_TOLERANCE
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import contact_time
 from ballfg.dynamics.motion.integrate import MAX_STEP, RateFunction, batch_jacobian, derivative, fly

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ballfg.arrays import Array
-from ballfg.dynamics.compiled.course import BOUNCES, Carrier, Course, density_of
+from ballfg.dynamics.compiled.beliefs.course import BOUNCES, Carrier, Course, density_of
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
 from ballfg.dynamics.motion.integrate import fly_jacobian

@@ -8,7 +8,7 @@ import torch
 from scipy.stats import norm
 
 from ballfg.dynamics import Surfaces, rollout
-from ballfg.dynamics.compiled.course import Course
+from ballfg.dynamics.compiled.beliefs.course import Course
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import Propagator, apex
 from tests.prediction.conftest import NEARLY_EXACT

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs import at_rest, gap_of, over_table
+from ballfg.dynamics.compiled.beliefs.edges import at_rest, gap_of, over_table
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contacts
 from ballfg.dynamics.compiled.flight import fly_one, fly_together, put, put_all

@@ -11,12 +11,12 @@ import torch
 
 from ballfg.arrays import Array
 from ballfg.dynamics.augmented import AugmentedModel
-from ballfg.dynamics.compiled.beliefs import carry
-from ballfg.dynamics.compiled.events import find
+from ballfg.dynamics.compiled.beliefs.carry import carry
+from ballfg.dynamics.compiled.beliefs.events import find
+from ballfg.dynamics.compiled.beliefs.mixture import mix
 from ballfg.dynamics.compiled.flight import evaluate
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.compiled.in_torch import in_torch, raise_errors
-from ballfg.dynamics.compiled.mixture import mix
 from ballfg.dynamics.compiled.motion import Moving, world_of
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces

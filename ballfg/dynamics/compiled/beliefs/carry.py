@@ -4,13 +4,12 @@ A ball that bounces has neighbours within its uncertainty that have not bounced 
 surface as if it were not there, *unbounced*, stands for them for a while: `mixture.py` makes use of it.
 """
 
-import math
-
 import numpy as np
 
+from ballfg.dynamics.compiled.beliefs.edges import at_rest, come_down, falls_past, gap_of, over_table, share_over_table
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contact_times, contacts
-from ballfg.dynamics.compiled.flight import evaluate, fly_one, put
+from ballfg.dynamics.compiled.flight import fly_one
 from ballfg.dynamics.compiled.signatures import (
     COUNT,
     FLAG,
@@ -26,7 +25,7 @@ from ballfg.dynamics.compiled.signatures import (
     THREE_WEIGHTS,
     TWO,
 )
-from ballfg.dynamics.motion.limits import BEYOND, LEAST_SIGMA, NEGLIGIBLE, REST_GAP, REST_SPEED
+from ballfg.dynamics.motion.limits import BEYOND, NEGLIGIBLE, REST_SPEED
 
 
 @machine_code(NOTHING(TWO, TWO, TWO))
@@ -72,95 +71,6 @@ def add_impact(covariance, since, noise):
         covariance[i, 3 + i] += since * velocity**2
         covariance[3 + i, 3 + i] += velocity**2
         covariance[6 + i, 6 + i] += noise[4] ** 2
-
-
-@machine_code(REAL(FUNCTION, ONE, ONE, ONE, REAL, REAL))
-def gap_of(surface, x, s, ws, level, radius):
-    """Gap (m) of a state to a surface."""
-    offset = np.empty(3)
-    evaluate(surface, x, s, ws, np.empty((9, 0)), np.empty((len(s), 0)), offset, np.empty((3, 0)))
-    return x[2] - level - offset[0] - radius
-
-
-@machine_code(FLAG(ONE, ONE))
-def over_table(x, world):
-    """Whether a state (9,) lies within the table's ends."""
-    return world[3] <= x[0] <= world[4] and world[5] <= x[1] <= world[6]
-
-
-@machine_code(FLAG(ONE, REAL, REAL, ONE))
-def at_rest(x, gap, level, world):
-    """Whether a state (9,) lies on the surface at a level (m), to which it has this gap (m)."""
-    beside = level == world[0] and not over_table(x, world)
-    return abs(gap) <= REST_GAP and abs(x[5]) <= REST_SPEED / 2 and not beside
-
-
-@machine_code(REAL(ONE, TWO, ONE))
-def share_over_table(touch, covariance, world):
-    """Probability that a ball which is at `touch` (9,) in the mean when it comes down is then above the table."""
-    within, along = 1.0, np.empty(9)
-    for axis in range(2):
-        along[:] = 0.0
-        along[axis], along[2] = 1.0, -touch[3 + axis] / touch[5]
-        variance = 0.0
-        for i in range(9):
-            for j in range(9):
-                variance += along[i] * covariance[i, j] * along[j]
-        below = np.empty(2)
-        for end in range(2):
-            spread = math.sqrt(max(variance, 0.0) + world[7 + 2 * axis + end] ** 2)
-            away = (world[3 + 2 * axis + end] - touch[axis]) / max(spread, LEAST_SIGMA)
-            below[end] = math.erfc(-away / math.sqrt(2.0)) / 2.0
-        within *= max(below[1] - below[0], 0.0)
-    return within
-
-
-@machine_code(REAL(FUNCTION, FUNCTION, ONE, TWO, TWO, ONE, ONE, REAL, ONE, ONE))
-def come_down(rates, surface, x, c, s, w, ws, level, world, touch):
-    """Time (s) at which a falling ball x (9,) reaches a level; writes its state there to touch (9,).
-
-    NaN, and its state as it is, where it never was above that level: it has come from below.
-    """
-    tau, state = np.empty(1), x.copy().reshape((1, 9))
-    contact_times(rates, surface, state, c, s, w, ws, np.full(1, level), np.full(1, BEYOND), world[2], tau)
-    put(touch, x)
-    if math.isfinite(tau[0]):
-        fly_one(rates, touch, c[0], w, np.empty((9, 0)), np.empty((c.shape[1], 0)), tau[0], np.empty(0), 1)
-    return tau[0]
-
-
-@machine_code(FLAG(THREE_FUNCTIONS, THREE_VALUES, THREE_WEIGHTS, TWO, ONE, REAL, REAL, ONE, ONE, TWO))
-def falls_past(functions, values, weights, covariance, touch, tau, h, world, after, spread):
-    """Whether a ball, in the mean, falls past the table whose level it reaches at `touch` (9,) after tau s.
-
-    Args: covariance (d, d): before the step of h s.  after (9,): its mean after the step.
-    Adds: to the covariance `spread` (d, d) after the step the share of balls that bounce on the table instead, as
-        `prediction.edges` has it. False also where their bounce is not a plain one.
-    """
-    if over_table(touch, world):
-        return False
-    share = share_over_table(touch, covariance, world) if tau >= 0.0 else 0.0
-    if share < NEGLIGIBLE:
-        return True
-    rates, impact, surface = functions
-    c, b, s = values
-    w, wb, ws = weights
-    none, nonec, level = np.empty((1, 9, 0)), np.empty((1, c.shape[1], 0)), world[0]
-    noneb, nones, still = np.empty((1, b.shape[1], 0)), np.empty((1, s.shape[1], 0)), np.empty((1, 0))
-    at, sooner, there = touch.copy().reshape((1, 9)), np.empty(1), np.empty((1, 9))
-    contacts(
-        rates, impact, surface, at, none, c, nonec, b, noneb, s, nones, w, wb, ws, np.full(1, level),
-        np.full(1, BEYOND), world[2], sooner, still, there, none.copy(),
-    )  # fmt: skip
-    if not there[0, 5] >= REST_SPEED:
-        return False
-    fly_one(rates, there[0], c[0], w, none[0], nonec[0], h - tau - sooner[0], np.empty(0), 1)
-    if there[0, 5] < 0.0 and not gap_of(surface, there[0], s[0], ws, level, world[2]) >= 0.0:
-        return False
-    for i in range(9):
-        for j in range(9):
-            spread[i, j] += share * (there[0, i] - after[i]) * (there[0, j] - after[j])
-    return True
 
 
 @machine_code(

@@ -4,7 +4,8 @@ import math
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs import at_rest, bounce, come_down, falls_past, fly_belief, gap_of, over_table
+from ballfg.dynamics.compiled.beliefs.carry import bounce, fly_belief
+from ballfg.dynamics.compiled.beliefs.edges import at_rest, come_down, falls_past, gap_of, over_table
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.flight import evaluate, fly_one
 from ballfg.dynamics.compiled.signatures import FLAG, FUNCTION, ONE, REAL, THREE, TWO, several

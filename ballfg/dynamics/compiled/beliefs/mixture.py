@@ -8,7 +8,8 @@ import math
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs import add_impact, gap_of, through
+from ballfg.dynamics.compiled.beliefs.carry import add_impact, through
+from ballfg.dynamics.compiled.beliefs.edges import gap_of
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contacts
 from ballfg.dynamics.compiled.flight import evaluate, fly_one

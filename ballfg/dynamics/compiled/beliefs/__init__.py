@@ -1,0 +1,1 @@
+"""Means and covariances of balls carried ahead in machine code: steps, table edges, mixtures, events on the way."""
