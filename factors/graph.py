@@ -191,8 +191,8 @@ class _Point:
         last: float = np.inf,
     ) -> Minimum:
         """The end of a search here."""
-        more = {"linearized": self.linearized, "beyond": self.beyond, "distance": distance, "last": last}
-        return Minimum(self.values, self.error, step, convergence, iterations, **more)
+        known = self.linearized, self.beyond
+        return Minimum(self.values, self.error, step, convergence, iterations, *known, distance, last)
 
 
 def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> Search[_Point]:

@@ -81,7 +81,9 @@ class IsamCore(StreamWindow):
 
     def _factors_of(self, arrival: Arrival, key: int) -> list[gtsam.NonlinearFactor]:
         """The factors that a new state brings: of its interval first, then those that look at it alone."""
-        factors = [] if arrival.interval is None else [arrival.interval.bridge.factor(0)]
+        factors: list[gtsam.NonlinearFactor] = []
+        if arrival.interval is not None:
+            factors.append(arrival.interval.bridge.factor(0))
         measurements = arrival.sample.measurements
         prepare(measurements, np.tile(arrival.state, (len(measurements), 1)))
         factors += self._measured(arrival.sample, key - STATE_KEY)

@@ -241,7 +241,8 @@ class StreamWindow(ABC):
         """Take in samples that are linked to the newest one and to each other."""
         mean, covariance = np.concatenate((self.points[-1], self.coefficients)), self.newest_covariance
         points: list[Array] = []
-        intervals, pieces = [], []
+        intervals: list[Interval] = []
+        pieces: list[Array] = []
         for before, sample in pairwise((self.samples[-1], *samples)):
             number = self.first + len(self.samples) + len(intervals)
             interval = self.maker.make(number - 1, sample.motion, sample.time - before.time)
