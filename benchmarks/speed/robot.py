@@ -1,6 +1,5 @@
 """What a robot asks for while a ball flies: an estimate through bounces, a long stream, events ahead, many rollouts."""
 
-import gc
 from collections.abc import Sequence
 from functools import partial
 from typing import Final
@@ -74,7 +73,6 @@ def time_stream(watch: Stopwatch, solver: Solver, flights: int) -> None:
         settings = Settings.for_measured(model, position_noise=(STREAM_NOISE,) * 3)
         online = Online(model, table, settings, solver=solver)
         online.warm_up()
-        gc.collect()
         spent, begin = [], 0.0
         for shot in shots:
             for time, position in zip(shot.times, shot.positions, strict=True):
