@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array, Index
 from ballfg.estimation.online.events import SIGMA_FACTOR
 from ballfg.estimation.online.sample import Sample
-from ballfg.estimation.online.stream_window import StreamWindow
 from ballfg.estimation.online.tracker import without_bias
+from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation import Contact, Segmentation
 from ballfg.estimation.settings import Settings

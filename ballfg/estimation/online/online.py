@@ -14,16 +14,16 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
 from ballfg.estimation.observations.observation import Context, Observation, refuse_unknowns
-from ballfg.estimation.online.chain import ChainWindow
 from ballfg.estimation.online.events import SIGMA_FACTOR, EventTracker, contact_step, first_difference
 from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unknown
 from ballfg.estimation.online.measurement import Measurement
 from ballfg.estimation.online.sample import Sample, Update
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.online.stream import SightingStream
-from ballfg.estimation.online.stream_window import StreamWindow
 from ballfg.estimation.online.warm_up import warmed_up
-from ballfg.estimation.online.window import IsamWindow
+from ballfg.estimation.online.windows.chain import ChainWindow
+from ballfg.estimation.online.windows.stream_window import StreamWindow
+from ballfg.estimation.online.windows.window import IsamWindow
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import physics_of
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas

@@ -10,7 +10,7 @@ import pytest
 
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation import Online, RadarSpeed, Settings
-from ballfg.estimation.online.chain import ChainWindow
+from ballfg.estimation.online.windows.chain import ChainWindow
 from ballfg.estimation.result import Status
 from ballfg.factors.loss import Loss
 from ballfg.simulation import SimulationConfig, simulate

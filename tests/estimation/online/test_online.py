@@ -10,9 +10,9 @@ import torch
 from torch import nn
 
 from ballfg.dynamics import BallModel, Surfaces, nominal_model, rollout
-from ballfg.estimation.online import stream_window
 from ballfg.estimation.online.events import contact_step
 from ballfg.estimation.online.online import Online
+from ballfg.estimation.online.windows import stream_window
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.motion import FLIGHT, Motion

@@ -16,11 +16,11 @@ from typing import Self
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.estimation.online.interval import Interval
-from ballfg.estimation.online.linear import LinearFactors
 from ballfg.estimation.online.measurement import Measurement, prepare
 from ballfg.estimation.online.sample import Sample, Update
-from ballfg.estimation.online.stream_window import Arrival, StreamWindow
+from ballfg.estimation.online.windows.interval import Interval
+from ballfg.estimation.online.windows.linear import LinearFactors
+from ballfg.estimation.online.windows.stream_window import Arrival, StreamWindow
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch
 from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.linear.elimination import covariances_of, eliminate_on, padded, substitute_back

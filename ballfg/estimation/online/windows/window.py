@@ -7,11 +7,11 @@ from typing import Self
 import gtsam
 
 from ballfg.arrays import Array
-from ballfg.estimation.online.isam import IsamCore
-from ballfg.estimation.online.linear import LinearFactors
 from ballfg.estimation.online.measurement import Measurement, prepare
 from ballfg.estimation.online.sample import Sample, Update
 from ballfg.estimation.online.tracker import bias_start
+from ballfg.estimation.online.windows.isam import IsamCore
+from ballfg.estimation.online.windows.linear import LinearFactors
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.bridge import COEFFICIENT_KEY, STATE_KEY
 

@@ -18,10 +18,11 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
-from ballfg.estimation.online.interval import Interval, IntervalMaker, evaluate, store
 from ballfg.estimation.online.measurement import Measurement, prepare
 from ballfg.estimation.online.sample import Sample, Update
-from ballfg.estimation.online.tracker import carried_with_bias, without_bias
+from ballfg.estimation.online.tracker import without_bias
+from ballfg.estimation.online.windows.filter import WindowFilter
+from ballfg.estimation.online.windows.interval import Interval, IntervalMaker, evaluate, store
 from ballfg.estimation.settings import Settings, stamp_covariance
 from ballfg.estimation.smoother.problem import coefficient_means, start_priors
 from ballfg.factors.batch import FactorBatch, Values
@@ -59,8 +60,6 @@ POSITION_THRESHOLD = 0.5
 """Measurement standard deviations. Flight does not depend on the position; a robust loss's weight does."""
 COEFFICIENT_THRESHOLD = 0.5
 """Prior standard deviations. The coefficients touch every factor: moving them relinearises the whole window."""
-WIDE_VELOCITY = 1.0
-"""m/s. A predicted velocity that is less well known does not tell along which way a stamp's error moved the ball."""
 
 
 class StreamWindow(ABC):
@@ -87,6 +86,7 @@ class StreamWindow(ABC):
         self.width = STATE_DIM + BIAS_DIM * biased
         self.maker = IntervalMaker(model, settings.process)
         self.p = model_width(model)
+        self._filter = WindowFilter(settings, self.width)
         self._own_means = coefficient_means(model.model, settings) if self.p else np.zeros(0)  # type: ignore[arg-type]
         self._own_sigmas = np.array(list(settings.coefficients.values()))
         self.first = 0
@@ -253,8 +253,9 @@ class StreamWindow(ABC):
                 start, end = points[-1][None], np.empty((0, self.width))
                 (piece,), further = evaluate([interval], start, end, self.coefficient_theta)
                 count, calls = count + 1, calls + further
-            away = mean - np.concatenate((points[-1], self.coefficient_theta))
-            mean, covariance, innovation = self._filtered(piece, points[-1], away, covariance, interval, sample)
+            mean, covariance, innovation = self._filter.step(
+                piece, points[-1], mean, self.coefficient_theta, covariance, interval, sample
+            )
             points.append(mean[: self.width])
             intervals.append(interval)
             pieces.append(piece)
@@ -262,33 +263,6 @@ class StreamWindow(ABC):
         store(intervals, states[:-1], states[1:], self.coefficient_theta, np.array(pieces))
         variables = self._insert([Arrival(*a) for a in zip(samples, states[1:], intervals, strict=True)])
         return Update(innovation, count, calls, variables)
-
-    def _filtered(
-        self, piece: Array, point: Array, away: Array, covariance: Array, interval: Interval, sample: Sample
-    ) -> tuple[Array, Array, Array]:
-        """One step of an extended Kalman filter, over an interval and with a sample.
-
-        Args:
-            piece: (9, 1 + 9 + p) propagation from `point` (w,) and the window's `coefficient_theta`.
-            away: (w + p,) how far the mean is from these.
-            covariance: (w + p, w + p) of state, bias and coefficients before.
-            interval: between the samples.  sample: gets the velocity along which its stamp's error moves it.
-        Returns: mean (w + p,) and covariance after the sample, and its whitened innovation.
-        """
-        carried, noise, w = piece, interval.covariance, self.width
-        if self.biased:
-            dt = float(interval.batch.dt[0])
-            carried, noise = carried_with_bias(piece, noise, point[STATE_DIM:], dt, self.settings)
-        F = carried[:, 1:]
-        predicted, spread = np.empty(w + self.p), np.empty_like(covariance)
-        predicted[:w] = carried[:, 0] + F @ away
-        predicted[w:] = self.coefficient_theta + away[w:]
-        moved = F @ covariance
-        spread[:w, :w] = moved @ F.T + noise
-        spread[:w, w:], spread[w:, :w], spread[w:, w:] = moved[:, w:], moved[:, w:].T, covariance[w:, w:]
-        if np.trace(spread[VELOCITY, VELOCITY]) < WIDE_VELOCITY**2:
-            sample.velocity = predicted[VELOCITY]
-        return self._corrected(predicted, spread, sample)
 
     def _append_start(self, sample: Sample) -> Update:
         """A sample that nothing predicts: its state has a wide prior of its own."""
@@ -299,36 +273,6 @@ class StreamWindow(ABC):
         priors = start_priors(0, sample.position, sample.label, self.settings)
         _, count, calls = self._relinearize(None)
         return Update(np.full(3, np.nan), count, calls, self._insert([Arrival(sample, state, None, priors)]))
-
-    def _corrected(self, predicted: Array, covariance: Array, sample: Sample) -> tuple[Array, Array, Array]:
-        """Predicted mean and covariance moved by a sample as a Kalman filter would, and the whitened innovation.
-
-        What comes out is the new state's linearisation point only: closer to the final answer than the prediction, it
-        saves relinearisations, and a robust loss gets a weight near the one that it ends with.
-        """
-        if not sample.measured:
-            for measurement in sample.measurements:
-                predicted, covariance = measurement.corrected(predicted, covariance)
-            return predicted, covariance, sample.measurements[0].innovation
-        innovation = sample.position - self._measured_part(predicted)
-        noise, rows = self._measurement_noise(sample), self._measured_part(covariance)
-        spread = self._measured_part(rows.T)
-        whitened = np.asarray(np.linalg.solve(np.linalg.cholesky(spread + noise), innovation))
-        if self.settings.loss.name != "squared":
-            noise = noise / self.settings.loss.weight(np.array([np.linalg.norm(whitened)]))
-        gain = np.linalg.solve(spread + noise, rows)
-        state, covariance = predicted + innovation @ gain, covariance - rows.T @ gain
-        for measurement in sample.measurements:
-            state, covariance = measurement.corrected(state, covariance)
-        return state, covariance, whitened
-
-    def _measured_part(self, rows: Array) -> Array:
-        """(3, ...) the rows (w + p, ...) that a measured position looks at: those of position and bias, added."""
-        return rows[POSITION] + rows[STATE_DIM : STATE_DIM + BIAS_DIM] if self.biased else rows[POSITION]
-
-    def _measurement_noise(self, sample: Sample) -> Array:
-        """(3, 3) m^2, of a position's white error and of that of its stamp."""
-        return np.diag(sample.sigma**2) + stamp_covariance(self.settings, sample.velocity)
 
     def _relinearize(self, new: Interval | None) -> tuple[Array, int, int]:
         """Do ahead what iSAM2 will do: move the states whose solution left the thresholds, evaluate their factors.

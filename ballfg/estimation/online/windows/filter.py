@@ -1,0 +1,83 @@
+"""An extended Kalman filter ahead of a window: where a new state will be, to be linearised there."""
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.estimation.online.sample import Sample
+from ballfg.estimation.online.tracker import carried_with_bias
+from ballfg.estimation.online.windows.interval import Interval
+from ballfg.estimation.settings import Settings, stamp_covariance
+from ballfg.factors.tracker import BIAS_DIM
+from ballfg.state import POSITION, STATE_DIM, VELOCITY
+
+WIDE_VELOCITY = 1.0
+"""m/s. A predicted velocity that is less well known does not tell along which way a stamp's error moved the ball."""
+
+
+class WindowFilter:
+    """One step at a time over states of a window, with coefficients behind them.
+
+    What comes out is a linearisation point only: closer to the final answer than the prediction, it saves
+    relinearisations, and a robust loss gets a weight near the one that it ends with.
+
+    Args: settings: noise.  width: w, 9, or 12 where the tracker's bias stands behind each state.
+    """
+
+    def __init__(self, settings: Settings, width: int) -> None:
+        self.settings, self.width, self.biased = settings, width, width > STATE_DIM
+
+    def step(
+        self,
+        piece: Array,
+        point: Array,
+        mean: Array,
+        shared: Array,
+        covariance: Array,
+        interval: Interval,
+        sample: Sample,
+    ) -> tuple[Array, Array, Array]:
+        """Over an interval, and with the sample at its end.
+
+        Args:
+            piece: (9, 1 + 9 + p) propagation from `point` (w,) and the coefficients `shared` (p,).
+            mean, covariance: (w + p,) and (w + p, w + p) of state, bias and coefficients before.
+            interval: between the samples.  sample: gets the velocity along which its stamp's error moves it.
+        Returns: mean and covariance after the sample, and its whitened innovation.
+        """
+        carried, noise, w = piece, interval.covariance, self.width
+        if self.biased:
+            dt = float(interval.batch.dt[0])
+            carried, noise = carried_with_bias(piece, noise, point[STATE_DIM:], dt, self.settings)
+        F = carried[:, 1:]
+        predicted, spread = np.empty_like(mean), np.empty_like(covariance)
+        predicted[:w] = carried[:, 0] + F @ (mean - np.concatenate((point, shared)))
+        predicted[w:] = mean[w:]
+        moved = F @ covariance
+        spread[:w, :w] = moved @ F.T + noise
+        spread[:w, w:], spread[w:, :w], spread[w:, w:] = moved[:, w:], moved[:, w:].T, covariance[w:, w:]
+        if np.trace(spread[VELOCITY, VELOCITY]) < WIDE_VELOCITY**2:
+            sample.velocity = predicted[VELOCITY]
+        return self._with(sample, predicted, spread)
+
+    def _with(self, sample: Sample, mean: Array, covariance: Array) -> tuple[Array, Array, Array]:
+        """Mean and covariance moved by a sample, and its whitened innovation."""
+        if not sample.measured:
+            for measurement in sample.measurements:
+                mean, covariance = measurement.corrected(mean, covariance)
+            return mean, covariance, sample.measurements[0].innovation
+        innovation = sample.position - self._measured_part(mean)
+        noise = np.diag(sample.sigma**2) + stamp_covariance(self.settings, sample.velocity)
+        rows = self._measured_part(covariance)
+        spread = self._measured_part(rows.T)
+        whitened = np.asarray(np.linalg.solve(np.linalg.cholesky(spread + noise), innovation))
+        if self.settings.loss.name != "squared":
+            noise = noise / self.settings.loss.weight(np.array([np.linalg.norm(whitened)]))
+        gain = np.linalg.solve(spread + noise, rows)
+        mean, covariance = mean + innovation @ gain, covariance - rows.T @ gain
+        for measurement in sample.measurements:
+            mean, covariance = measurement.corrected(mean, covariance)
+        return mean, covariance, whitened
+
+    def _measured_part(self, rows: Array) -> Array:
+        """(3, ...) the rows (w + p, ...) that a measured position looks at: those of position and bias, added."""
+        return rows[POSITION] + rows[STATE_DIM : STATE_DIM + BIAS_DIM] if self.biased else rows[POSITION]
