@@ -62,7 +62,7 @@ def start(
         time: s, its stamp.
         scene, surfaces: of a `Scene`.
     """
-    add(bank, fill, bank, 0)
+    fill[USED] = 1
     _forget(bank[0], position, scene.outlier_spread**2, scene)
     bank[0].score, bank[0].tip = score, tip
     _rested(bank, fill, log, 0, position, sample - 1, time, scene, surfaces)

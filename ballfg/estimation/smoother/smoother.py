@@ -169,8 +169,9 @@ class Smoother(Estimator):
             solution = yield from self._settle(problem, segmentation, earlier)
         found = solution.minimum
         if found.convergence is not Convergence.CONVERGED or found.distance < self.optimizer.tolerance:
-            return solution
-        return replace(solution, minimum=(yield from self.optimizer.search(solution.graph, found)))
+            return replace(solution, minimum=found.bare())
+        minimum = yield from self.optimizer.search(solution.graph, found)
+        return replace(solution, minimum=minimum.bare())
 
     def _settle(self, problem: TrackProblem, segmentation: Segmentation, earlier: Earlier | None) -> Search[Solution]:
         """Minimise, move contacts to where the estimate says they are, and minimise again until they stay.
