@@ -124,3 +124,19 @@ def test_an_error_inside_a_search_is_heard() -> None:
     graph, values = BallGraph((state_prior(0, np.zeros(9), np.ones(9)),)), Values(np.ones((1, 9)), np.zeros(0))
     with pytest.raises(FloatingPointError, match="lost"):
         run_together([failing()])
+
+
+@pytest.mark.parametrize("rough", [1.0, 1e-2, 1e-4])
+@pytest.mark.parametrize("bare", [False, True])
+def test_a_search_goes_on_from_a_rough_minimum(problems, rough: float, bare: bool) -> None:
+    """To the same point, in as many linear solutions; without the rough linearisation, one more at most."""
+    optimizer = LevenbergMarquardt(tolerance=1e-6)
+    for graph, values in problems:
+        whole = optimizer.minimize(graph, values)
+        begun = LevenbergMarquardt(tolerance=rough).minimize(graph, values)
+        assert begun.iterations <= whole.iterations
+        ended = run(optimizer.search(graph, begun.bare() if bare else begun))
+        assert ended.convergence is Convergence.CONVERGED
+        assert ended.distance < optimizer.tolerance
+        assert abs(ended.iterations - whole.iterations) <= bare
+        np.testing.assert_allclose(ended.values.states, whole.values.states, rtol=1e-6, atol=1e-6)
