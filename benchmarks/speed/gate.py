@@ -13,6 +13,9 @@ CONTROL: Final = "banded_time"
 """Bound by Python's own speed, as the estimators are."""
 RARE: Final = ("_p99", "_p999", "_worst")
 """Ends of metrics of the slowest runs, which other work on the machine decides."""
+UNSTEADY: Final = ("matrix", "stream")
+"""Beginnings of metrics that differ by a third from run to run: of the other control, and of long streams, which depend on
+what the caches hold; so does the unrolled gradient, a reference."""
 SLOWER: Final = 1.3
 """Multiple of the earlier ratio from which on something has become slower; runs of the same code differ by 1.1."""
 
@@ -56,7 +59,8 @@ def _ratios(rows: Sequence[Row]) -> dict[tuple[str, str, str], float]:
     """Times over the control of the same case, by case, method and metric."""
     controls, found = _controls(rows), dict[tuple[str, str, str], float]()
     for row in rows:
-        steady = row.metric != CONTROL and not row.metric.startswith("matrix") and not row.metric.endswith(RARE)
+        steady = row.metric != CONTROL and not row.metric.startswith(UNSTEADY) and not row.metric.endswith(RARE)
+        steady = steady and not row.method.endswith("unrolled")
         timed = row.unit == "ms" and steady
         if timed and row.value is not None and row.case in controls:
             found[row.case, row.method, row.metric] = row.value / min(controls[row.case])
