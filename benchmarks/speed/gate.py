@@ -14,8 +14,8 @@ CONTROL: Final = "banded_time"
 RARE: Final = ("_p99", "_p999", "_worst")
 """Ends of metrics of the slowest runs, which other work on the machine decides."""
 UNSTEADY: Final = ("matrix", "stream")
-"""Beginnings of metrics that differ by a third from run to run: of the other control, and of long streams, which depend on
-what the caches hold; so does the unrolled gradient, a reference."""
+"""Beginnings of metrics that differ by a third from run to run: of the other control, and of long streams, which depend
+on what the caches hold. So does the unrolled gradient, a reference."""
 SLOWER: Final = 1.3
 """Multiple of the earlier ratio from which on something has become slower; runs of the same code differ by 1.1."""
 
