@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from ballfg.arrays import Array
 from ballfg.dynamics.compiled.build import Code, built, digest, read_note, write_note
-from ballfg.dynamics.compiled.places import numbers_of
+from ballfg.dynamics.compiled.places import Numbers, numbers_of
 from ballfg.dynamics.compiled.translation.recipe import Recipe
 from ballfg.dynamics.model import BallModel, is_substituted, substitute
 from ballfg.dynamics.networks.architecture import Architecture
@@ -113,27 +113,31 @@ class NotComparableError(Exception):
     """A module of which nobody can say whether another one computes the same."""
 
 
-_by_model: weakref.WeakKeyDictionary[BallModel, CompiledModel | None] = weakref.WeakKeyDictionary()
+_by_model: weakref.WeakKeyDictionary[BallModel, tuple[Numbers, CompiledModel | None]] = weakref.WeakKeyDictionary()
 _by_structure: dict[Hashable, CompiledModel | None] = {}
 
 
 def compiled(model: BallModel) -> CompiledModel | None:
     """The functions of a model, whose parameters they take as arguments; None where one cannot be compiled.
 
-    Args: model: without substituted parameters. Its structure must not change afterwards.
+    Args: model: without substituted parameters. Where another module is put into it, it gets other functions.
     """
-    if model not in _by_model:
-        if model.random or is_substituted(model):
-            return None
-        try:
-            key = _structure(model)
-        except NotComparableError:
-            _by_model[model] = _compiled(model, None)
-        else:
-            if key not in _by_structure:
-                _by_structure[key] = _compiled(model, key)
-            _by_model[model] = _by_structure[key]
-    return _by_model[model]
+    known = _by_model.get(model)
+    if known is not None and known[0] is numbers_of(model):
+        return known[1]
+    if model.random or is_substituted(model):
+        return None
+    numbers = numbers_of(model)
+    try:
+        key = _structure(model)
+    except NotComparableError:
+        found = _compiled(model, None)
+    else:
+        if key not in _by_structure:
+            _by_structure[key] = _compiled(model, key)
+        found = _by_structure[key]
+    _by_model[model] = numbers, found
+    return found
 
 
 def _structure(module: nn.Module) -> Hashable:

@@ -1,7 +1,7 @@
 """Where a model keeps its numbers, the coefficients and the tables of weights that machine code takes."""
 
 import weakref
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,10 +17,21 @@ class Numbers:
     Attributes:
         scalars: by name, the dictionary and the key at which a coefficient lies.
         arrays: the same for parameters that are no scalars, and buffers: derivatives by them are left to torch.
+        parts: of each module of the model, the dictionary of its sub-modules and what that held.
+        ball: radius (m) and inertia factor.
     """
 
     scalars: Mapping[str, tuple[dict[str, Any], str]]
     arrays: Mapping[str, tuple[dict[str, Any], str]]
+    parts: Sequence[tuple[dict[str, Any], tuple[Any, ...]]]
+    ball: tuple[float, float]
+
+    def are_of(self, model: BallModel) -> bool:
+        """Whether a model still consists of the same modules: someone may have put another effect in."""
+        for held, parts in self.parts:
+            if tuple(held.values()) != parts:
+                return False
+        return self.ball == (model.radius, model.inertia_factor)
 
     def value(self, name: str) -> float:
         """A coefficient as it is now."""
@@ -34,7 +45,8 @@ class Numbers:
     def stamp(self) -> Hashable:
         """Changes when a number does, as long as the `tables` of an earlier stamp are kept alive."""
         values = tuple(self.value(name) for name in self.scalars)
-        return values, tuple((id(table), table._version, table.data_ptr()) for table in self.tables())
+        tables = tuple((id(table), table._version, table.data_ptr()) for table in self.tables())
+        return self.ball, tuple(self.scalars), values, tables
 
 
 _numbers: weakref.WeakKeyDictionary[BallModel, Numbers] = weakref.WeakKeyDictionary()
@@ -45,7 +57,8 @@ def numbers_of(model: BallModel) -> Numbers:
 
     Args: model: without substituted parameters.
     """
-    if model not in _numbers:
+    known = _numbers.get(model)
+    if known is None or not known.are_of(model):
         parameters, buffers = dict(model.named_parameters()), dict(model.named_buffers())
         places = {}
         for name in (*parameters, *buffers):
@@ -54,5 +67,6 @@ def numbers_of(model: BallModel) -> Numbers:
             places[name] = (part._parameters if name in parameters else part._buffers, key)
         scalars = {name: places[name] for name, p in parameters.items() if not p.dim()}
         arrays = {name: place for name, place in places.items() if name not in scalars}
-        _numbers[model] = Numbers(scalars, arrays)
-    return _numbers[model]
+        held = [(part._modules, tuple(part._modules.values())) for part in model.modules()]
+        known = _numbers[model] = Numbers(scalars, arrays, held, (model.radius, model.inertia_factor))
+    return known

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ballfg.diagnosis.search.hypothesis import has_effect, with_effects
-from ballfg.dynamics import EFFECTS, AnalyticModel, nominal_model, substitute
+from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, nominal_model, rollout, substitute
 from ballfg.dynamics.compiled import functions
 from ballfg.dynamics.compiled.build import built, cache_folder
 from ballfg.dynamics.compiled.functions import compiled
@@ -18,6 +18,7 @@ from ballfg.dynamics.effect import Coefficient, FlightEffect
 from ballfg.dynamics.effects.registry import GENERIC
 from ballfg.dynamics.motion.contact import fly_through
 from ballfg.dynamics.motion.integrate import fly
+from ballfg.estimation.segmentation import physics_of
 
 MOTION = {name: effect for name, effect in {**EFFECTS, **GENERIC}.items() if effect.kind != "measurement"}
 
@@ -146,3 +147,25 @@ def test_an_effect_that_was_edited_is_traced_again(monkeypatch, tmp_path) -> Non
         agree(ball(Pull(7)))
     finally:
         cache_folder.cache_clear()
+
+
+def test_another_effect_or_radius_is_seen() -> None:
+    model = nominal_model().requires_grad_(False)
+    start = torch.tensor([[0.0, 0.0, 0.3, 3.0, 0.5, 2.0, 0.0, 80.0, 20.0]], dtype=torch.float64)
+    times = torch.tensor([0.4, 1.0], dtype=torch.float64)
+
+    def known() -> torch.Tensor:
+        with torch.no_grad():
+            quick = rollout(model, start, times, Surfaces(0.0))
+        with torch.enable_grad():  # torch does the work
+            torch.testing.assert_close(quick, rollout(model, start, times, Surfaces(0.0)), rtol=0, atol=1e-9)
+        return quick
+
+    before = known()
+    model.flight["drag"] = EFFECTS["drag"](k=0.5).requires_grad_(False)
+    slower = known()
+    assert (slower - before).abs().max() > 0.1
+    assert physics_of(model).drag == pytest.approx(0.5)
+    model.radius = 0.1
+    assert (known() - slower).abs().max() > 0.01
+    assert physics_of(model).radius == 0.1
