@@ -146,10 +146,11 @@ def find(
         if not (touched or 0.0 <= tau <= h):
             return HARD, passed
         h, event = INSTANT if touched else tau, np.nan
-        if not contact and not touched:
-            event = _zero(rates, x, c[0], w, normal, offset, h, earliest - passed, either_way)
-        elif contact and not touched and math.isfinite(low) and passed + h > earliest:
-            event = h
+        if not touched:
+            if not contact:
+                event = _zero(rates, x, c[0], w, normal, offset, h, earliest - passed, either_way)
+            elif math.isfinite(low) and passed + h > earliest:
+                event = h
         if math.isfinite(low) and not math.isfinite(event):
             if not bounce(
                 *(functions, values, (ct, bt, st), weights),
