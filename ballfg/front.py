@@ -1,5 +1,7 @@
 """The front door: estimate and predict for arrays, tracks, datasets and folders alike."""
 
+from collections.abc import Callable, Iterator
+from functools import partial
 from os import PathLike
 from pathlib import Path
 from typing import TypeAlias, TypedDict, Unpack, overload
@@ -26,6 +28,7 @@ from ballfg.estimation import (
     predict_tracks,
     read,
 )
+from ballfg.estimation.batch import check_device, estimate_together
 from ballfg.prediction import Ahead, BallState
 from ballfg.tracks import TABLE_TENNIS, Dataset, Track
 
@@ -45,6 +48,7 @@ class Options(TypedDict, total=False):
     surfaces: Surfaces | float | None
     settings: Settings | None
     jobs: int
+    device: str | None
 
 
 class PredictOptions(Options, total=False):
@@ -66,6 +70,7 @@ def estimate(
     surfaces: Surfaces | float | None = None,
     settings: Settings | None = None,
     jobs: int = 1,
+    device: str | None = None,
 ) -> Estimate | dict[str, Estimate]:
     """Position, velocity and spin of the ball at every stamp, with covariances.
 
@@ -80,17 +85,20 @@ def estimate(
         surfaces: that the ball may bounce on; a number is the height of the table, m.
         settings: noise and priors; those of measured tracks where None.
         jobs: processes for a dataset.
+        device: torch device that computes motion and linear systems of a dataset's tracks together, as "cuda"; machine
+            code, track by track, where None. For the smoother alone.
     Returns: the estimate of a track; of a dataset, the estimates of all its tracks by name.
     Raises:
         TypeError: for anything else in place of a track.
         ValueError: an unknown method, or numbers that cannot be metres and seconds.
         FileNotFoundError: a folder or model file that is not there.
     """
+    check_device(method, device)
     data = _opened(measured)
     if isinstance(data, Track):
-        return estimator_for(data, method, model, surfaces, settings).estimate(data)
+        return estimate_together(estimator_for(data, method, model, surfaces, settings), [data], device)[0]
     estimator = estimator_for(data, method, model, surfaces, settings)
-    return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs)}
+    return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs, device)}
 
 
 @overload
@@ -112,6 +120,7 @@ def predict(
     settings: Settings | None = None,
     conformal: Conformal = None,
     jobs: int = 1,
+    device: str | None = None,
 ) -> Ahead | dict[str, TrackPrediction]:
     """The path of the ball ahead, with standard deviations.
 
@@ -123,7 +132,7 @@ def predict(
         conformal: for a dataset: calibration tracks of the same kind or their folder, scales that an earlier prediction
             has, or their file. The sigmas are scaled so that mean +- 1.645 sigma are conformal 90 % intervals
             (docs/predict.md); `conformal` of each prediction has the scales and the coverage on the calibration tracks.
-        method, model, surfaces, settings, jobs: as for `estimate`; the calibration tracks are estimated with the same.
+        method, model, surfaces, settings, jobs, device: as for `estimate`; the calibration tracks are estimated alike.
     Returns: the path ahead; of a dataset, the predicted measurements of each track by name.
     Raises:
         TypeError: for anything else in place of what is known or of the calibration tracks.
@@ -133,13 +142,16 @@ def predict(
     if isinstance(known, Estimate | BallState):
         _refuse(conformal)
         return known.predict(horizon)
+    check_device(method, device)
     data = _opened(known)
     if isinstance(data, Track):
         _refuse(conformal)
-        return estimator_for(data, method, model, surfaces, settings).estimate(data).predict(horizon)
+        estimator = estimator_for(data, method, model, surfaces, settings)
+        return estimate_together(estimator, [data], device)[0].predict(horizon)
     estimator = estimator_for(data, method, model, surfaces, settings, observe)
-    scales = _scales(conformal, data, estimator, method, observe, horizon, jobs)
-    found = predict_tracks(estimator, data, len(data), observe, horizon=horizon, jobs=jobs)
+    predicted = partial(predict_tracks, estimator, observe=observe, horizon=horizon, jobs=jobs, device=device)
+    scales = _scales(conformal, data, predicted, method, observe)
+    found = predicted(data, len(data))
     return {one.name: one if scales is None else scales.scaled(one) for one in found}
 
 
@@ -152,7 +164,11 @@ def _refuse(conformal: Conformal) -> None:
 
 
 def _scales(
-    conformal: Conformal, data: Tracks, estimator: Estimator, method: str, observe: float, horizon: float, jobs: int
+    conformal: Conformal,
+    data: Tracks,
+    predicted: Callable[[Tracks, int], Iterator[TrackPrediction]],
+    method: str,
+    observe: float,
 ) -> ConformalScales | None:
     """The scales of predictions of `data`: those given, or from the calibration tracks that are given."""
     if isinstance(conformal, str | PathLike) and Path(conformal).is_file():
@@ -165,8 +181,7 @@ def _scales(
     if isinstance(calibration, Track):
         raise TypeError("conformal must be a dataset of calibration tracks or its folder; got a track. Give a dataset.")
     check_calibration_tracks(calibration, data)
-    predictions = predict_tracks(estimator, calibration, len(calibration), observe, horizon=horizon, jobs=jobs)
-    return ConformalScales.of(predictions, calibration.info.name, observe, method)
+    return ConformalScales.of(predicted(calibration, len(calibration)), calibration.info.name, observe, method)
 
 
 def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) -> Diagnosis:

@@ -1,9 +1,15 @@
 """The machine and the installed packages, as results and runs record them."""
 
+from __future__ import annotations
+
 import os
 import platform
 from collections.abc import Iterable
 from importlib import metadata
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
 
 
 def usable_cores() -> int:
@@ -14,3 +20,19 @@ def usable_cores() -> int:
 def versions(packages: Iterable[str]) -> dict[str, str]:
     """Versions of Python and of installed packages, by name."""
     return {"python": platform.python_version()} | {name: metadata.version(name) for name in packages}
+
+
+def usable_device(name: str) -> torch.device:
+    """A torch device by its name.
+
+    Raises: ValueError: if torch cannot compute on it.
+    """
+    import torch
+
+    try:
+        device = torch.device(name)
+        torch.zeros(1, dtype=torch.float64, device=device).cpu()
+    except (RuntimeError, AssertionError, NotImplementedError, TypeError) as error:  # torch's, for all it cannot use
+        reason = str(error).splitlines()[0]
+        raise ValueError(f"device must be one that torch computes on; got {name!r}: {reason}") from None
+    return device

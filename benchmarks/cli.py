@@ -14,10 +14,9 @@ import typer
 
 from ballfg.cli.errors import guarded
 from ballfg.cli.inputs import CORES, Address, Cluster, workers
+from ballfg.machine import usable_device
 
 if TYPE_CHECKING:
-    import torch
-
     from ballfg.benchmarks.results import Results
     from ballfg.tracks import Dataset
 
@@ -242,7 +241,7 @@ def speed(
         Path | None, typer.Option(help="An earlier results.json; fail where something has become slower since.")
     ] = None,
     device: Annotated[
-        str | None, typer.Option(help="cuda, for instance: time rollouts of up to 10,000 balls there as well.")
+        str | None, typer.Option(help="cuda, for instance: time rollouts and estimates of many balls there as well.")
     ] = None,
     out: Out = Path("results"),
     quick: Quick = False,
@@ -259,7 +258,7 @@ def speed(
     from ballfg.benchmarks.speed.peers.suite import run_peers
     from ballfg.benchmarks.speed.suite import FULL, QUICK, run_speed
 
-    interpreters, there = _interpreters(peer or []), None if device is None else _device(device)
+    interpreters, there = _interpreters(peer or []), None if device is None else usable_device(device)
     if peer and not peers:
         raise typer.BadParameter("it is for --peers. Give that too, or leave both out.", param_hint="--peer")
     if peers and data is not None:
@@ -291,19 +290,6 @@ def _interpreters(words: Sequence[str]) -> dict[str, Path]:
         if not (library and sign and path):
             raise typer.BadParameter("it is LIBRARY=PATH_TO_PYTHON.", param_hint="--peer")
     return {library: Path(path) for library, _, path in pairs}
-
-
-def _device(name: str) -> torch.device:
-    """A device that torch can compute on."""
-    import torch
-
-    try:
-        device = torch.device(name)
-        torch.zeros(1, device=device).cpu()
-    except (RuntimeError, AssertionError, NotImplementedError) as error:  # torch's, for all that it cannot use
-        reason = str(error).splitlines()[0]
-        raise typer.BadParameter(f"torch cannot compute on {name!r}: {reason}", param_hint="--device") from None
-    return device
 
 
 def _start(command: str, data: Sequence[Path], quick: bool, seed: int, more: Sequence[str] = ()) -> Results:

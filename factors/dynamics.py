@@ -4,10 +4,11 @@ Three classes share everything but the motion over the interval: free flight, fl
 a surface. A hit is a flight whose process noise contains the hit.
 """
 
+import copy
 from abc import abstractmethod
 from collections.abc import Hashable
 from functools import partial
-from typing import ClassVar
+from typing import ClassVar, Self
 
 import numpy as np
 import torch
@@ -28,6 +29,11 @@ from ballfg.state import STATE_DIM
 def model_width(model: BallModel) -> int:
     """How many coefficients of a model travel with the state: those of an `AugmentedModel`."""
     return model.width if isinstance(model, AugmentedModel) else 0
+
+
+def _identity(model: BallModel) -> tuple[Hashable, ...]:
+    """What models that are one have in common: every track has an `AugmentedModel` of its own around the same model."""
+    return (id(model.model), model.names) if isinstance(model, AugmentedModel) else (id(model), ())
 
 
 class DynamicsFactors(FactorBatch):
@@ -63,6 +69,17 @@ class DynamicsFactors(FactorBatch):
         self.whitening = whitening(covariance)
         kicks = kicks or Kicks.none(len(states))
         self.kick_times, self.hit = kicks.times, kicks.hit
+        self.device = torch.device("cpu")
+
+    def on(self, device: torch.device) -> Self:
+        """The same factors with a copy of the model on a device; what `compute` returns lies in memory all the same."""
+        other = copy.copy(self)
+        other.model, other.device = copy.deepcopy(self.model).to(device), device
+        return other
+
+    def _tensor(self, array: Array) -> Tensor:
+        """An array where the model is."""
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self.device)
 
     @abstractmethod
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
@@ -78,7 +95,7 @@ class DynamicsFactors(FactorBatch):
     @property
     def group(self) -> Hashable:
         """Besides the usual: the model, and how many contacts and kicks there are in an interval."""
-        return (*super().group, id(self.model), self.kick_times.shape[1])  # type: ignore[misc]
+        return (*super().group, *_identity(self.model), self.kick_times.shape[1])  # type: ignore[misc]
 
     def residual(self, inputs: tuple[Tensor, ...]) -> Tensor:
         """(m, 9) whitened residuals in torch."""
@@ -101,10 +118,10 @@ class DynamicsFactors(FactorBatch):
     def compute(self, rows: Index | slice, inputs: tuple[Array, ...]) -> tuple[Array, tuple[Array, ...]]:
         """Whitened residuals (k, 9) and Jacobians (k, 9, 9), (k, 9, 9) and, with coefficients, (k, 9, p)."""
         start = inputs[0] if len(inputs) == 2 else np.concatenate((inputs[0], inputs[2][:, : self.width]), axis=-1)
-        after, jacobian = self.propagate(torch.from_numpy(np.ascontiguousarray(start)), rows)
+        after, jacobian = (tensor.cpu().numpy() for tensor in self.propagate(self._tensor(start), rows))
         root = self.whitening[rows]
-        residual = np.einsum("nij,nj->ni", root, inputs[1] - after.numpy()[:, :STATE_DIM])
-        by_start = -(root @ jacobian.numpy()[:, :STATE_DIM])
+        residual = np.einsum("nij,nj->ni", root, inputs[1] - after[:, :STATE_DIM])
+        by_start = -(root @ jacobian[:, :STATE_DIM])
         if len(inputs) == 2:
             return residual, (by_start, root)
         by_coefficients = by_start[..., STATE_DIM:]
@@ -119,7 +136,7 @@ class FlightFactors(DynamicsFactors):
 
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
         """Flight over dt."""
-        return fly_jacobian(self.model, state, torch.from_numpy(self.dt[rows]))
+        return fly_jacobian(self.model, state, self._tensor(self.dt[rows]))
 
     def moved(self, state: Tensor) -> Tensor:
         """Flight over dt."""
@@ -172,7 +189,7 @@ class ContactFactors(SurfaceFactors):
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
         """Flight, impact, flight."""
         heights = self._surfaces(rows)
-        after, _, jacobian = fly_through_jacobian(self.model, state, torch.from_numpy(self.dt[rows]), heights)
+        after, _, jacobian = fly_through_jacobian(self.model, state, self._tensor(self.dt[rows]), heights)
         return after, jacobian
 
     def moved(self, state: Tensor) -> Tensor:
@@ -181,7 +198,7 @@ class ContactFactors(SurfaceFactors):
 
     def _surfaces(self, rows: Index | slice) -> tuple[Tensor, ...]:
         """The heights (k,) of some rows, one tensor for each of the c contacts."""
-        return tuple(torch.from_numpy(column) for column in self.heights[rows].T.copy())
+        return tuple(self._tensor(column) for column in self.heights[rows].T)
 
     def contact_times(self, values: Values) -> Array:
         """(m, c) s since the start of each interval; NaN where the ball never gets to the surface."""
@@ -200,7 +217,7 @@ class RestFactors(SurfaceFactors):
 
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
         """Rolling over dt; the surface holds the ball's height and stops its vertical motion."""
-        dt, height = torch.from_numpy(self.dt[rows]), torch.from_numpy(self.heights[rows])
+        dt, height = self._tensor(self.dt[rows]), self._tensor(self.heights[rows])
         return batch_jacobian(partial(_rolled, self.model, dt, height), state)
 
     def moved(self, state: Tensor) -> Tensor:

@@ -4,7 +4,7 @@ import copy
 import enum
 from collections.abc import Generator, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -39,18 +39,44 @@ def objective(linearized: Sequence[Rows]) -> float:
 
 R = TypeVar("R")
 
-Question = tuple[BallGraph, Values]
-Search = Generator[Question, list[Rows], R]
-"""A computation that asks for linearisations: it yields a graph and a point, and is sent the graph linearised there.
-Several searches can so share a torch call (`ballfg.factors.lockstep`)."""
+
+@dataclass(frozen=True)
+class Linearization:
+    """The question for a graph linearised at a point; the answer is a list of `Rows`, one for each batch."""
+
+    graph: BallGraph
+    values: Values
+
+    def answer(self) -> list[Rows]:
+        """All factors at the point."""
+        return self.graph.linearize(self.values)
+
+
+@dataclass(frozen=True)
+class LinearSolution:
+    """The question for the step that minimises linearised factors; the answer is a `Step`, or None."""
+
+    linearized: Sequence[Rows]
+    values: Values
+    damping: float = 0.0
+
+    def answer(self) -> Step | None:
+        """See `ballfg.factors.linear.step.solve`."""
+        return solve(self.linearized, self.values, self.damping)
+
+
+Question = Linearization | LinearSolution
+Search = Generator[Question, Any, R]
+"""A computation that asks for linearisations and for solutions of linear systems, and is sent them. Several searches
+can so be answered together (`ballfg.factors.lockstep`)."""
 
 
 def run(search: Search[R]) -> R:
     """The result of one search, answered as it asks."""
     try:
-        graph, values = next(search)
+        question = next(search)
         while True:
-            graph, values = search.send(graph.linearize(values))
+            question = search.send(question.answer())
     except StopIteration as end:
         return end.value
 
@@ -130,7 +156,7 @@ class LevenbergMarquardt:
         return run(self.search(graph, values))
 
     def search(self, graph: BallGraph, start: Values | Minimum) -> Search[Minimum]:
-        """Minimise a graph's objective from a starting point, asking for linearisations.
+        """Minimise a graph's objective from a starting point, asking for linearisations and solutions.
 
         Each iteration tries the Gauss-Newton step; where it does not reduce the objective, lambda grows until a
         step does. The length of an undamped step in the metric of J^T J, |J d|, is the distance to the minimum in
@@ -143,13 +169,13 @@ class LevenbergMarquardt:
             Minimum(start, np.inf, None, Convergence.CONVERGED, 0, beyond=True) if isinstance(start, Values) else start
         )
         known = None if found.beyond else found.linearized
-        point = _Point(found.values, (yield graph, found.values) if known is None else known)
+        point = _Point(found.values, (yield Linearization(graph, found.values)) if known is None else known)
         if not np.isfinite(point.error):
             return Minimum(point.values, point.error, None, Convergence.NOT_FINITE, 1, point.linearized)
         damping, growth, last = 0.0, 10.0, found.last
         for iteration in range(found.iterations + found.beyond, self.max_iterations + 1):
             again = known is not None and iteration == found.iterations
-            step = found.step if again else solve(point.linearized, point.values, damping)
+            step = found.step if again else (yield point.question(damping))
             length = np.sqrt(2 * abs(step.decrease)) if step is not None and damping == 0.0 else np.inf
             if step is not None and length < self.tolerance:
                 return point.minimum(step, Convergence.CONVERGED, iteration, float(length), last)
@@ -165,11 +191,10 @@ class LevenbergMarquardt:
             elif length < AT_KINK:
                 return point.minimum(step, Convergence.AT_KINK, iteration)
             elif damping > MOST_DAMPING:
-                return point.minimum(solve(point.linearized, point.values), Convergence.STUCK, iteration)
+                return point.minimum((yield point.question()), Convergence.STUCK, iteration)
             else:
                 damping, growth = max(self.first_damping, growth * damping), 2.0 * growth
-        final = solve(point.linearized, point.values)
-        return point.minimum(final, Convergence.TOO_MANY_ITERATIONS, self.max_iterations)
+        return point.minimum((yield point.question()), Convergence.TOO_MANY_ITERATIONS, self.max_iterations)
 
 
 class _Point:
@@ -178,6 +203,10 @@ class _Point:
     def __init__(self, values: Values, linearized: Sequence[Rows]) -> None:
         self.values, self.linearized, self.error = values, linearized, objective(linearized)
         self.beyond = False
+
+    def question(self, damping: float = 0.0) -> LinearSolution:
+        """The question for the step from here, held back by Marquardt's lambda."""
+        return LinearSolution(self.linearized, self.values, damping)
 
     def moved(self, step: Step) -> "_Point":
         """The point after a step that is not looked at, with the objective that it promises."""
@@ -206,11 +235,11 @@ def _tried(graph: BallGraph, point: _Point, step: Step, damping: float) -> Searc
     does), the whole step brings (2 - r) of its promise and 1 / r of it is best. Whole steps then creep or diverge.
     """
     values = point.values.moved(step.states, step.coefficients)
-    whole = _Point(values, (yield graph, values))
+    whole = _Point(values, (yield Linearization(graph, values)))
     gain = (point.error - whole.error) / max(step.decrease, np.finfo(float).tiny)
     if damping > 0.0 or gain > WHOLE or step.decrease > NEAR or not np.isfinite(whole.error):
         return whole
     share = 1.0 / (2.0 - gain)
     values = point.values.moved(share * step.states, share * step.coefficients)
-    nearer = _Point(values, (yield graph, values))
+    nearer = _Point(values, (yield Linearization(graph, values)))
     return nearer if nearer.error < min(point.error, whole.error) else whole

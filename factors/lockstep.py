@@ -1,66 +1,88 @@
 """Many minimisations in lockstep, so that they share torch calls.
 
-A search (`ballfg.factors.graph.Search`) asks for linearisations. `run_together` answers many searches at once: factors
-of the same sort, of whatever graph, are evaluated in one call, which costs little more than a single graph's.
+A search (`ballfg.factors.graph.Search`) asks for linearisations and for solutions of linear systems. `run_together`
+answers many searches at once: factors of the same sort, of whatever graph, are evaluated in one call, which costs
+little more than a single graph's. On a device the linear systems are solved together too.
 """
 
 from collections import defaultdict
 from collections.abc import Hashable, Sequence
 
 import numpy as np
+import torch
 
 from ballfg.factors.batch import FactorBatch, Rows, Values, merge
-from ballfg.factors.graph import Question, R, Search
+from ballfg.factors.graph import Linearization, LinearSolution, Question, R, Search
+from ballfg.factors.linear.step import Step
+from ballfg.factors.linear.together import solve_together
 
 
-def run_together(searches: Sequence[Search[R]]) -> list[R]:
-    """The results of several searches, in order; each is the same as by itself, up to rounding."""
+def run_together(searches: Sequence[Search[R]], device: torch.device | None = None) -> list[R]:
+    """The results of several searches, in order; each is the same as by itself, up to rounding.
+
+    Args:
+        searches: that ask for linearisations and solutions of linear systems.
+        device: computes motion and linear systems in torch, many at once. None: machine code, each system by itself.
+    """
     results: dict[int, R] = {}
     questions: dict[int, Question] = {}
 
-    def ask(number: int, rows: list[Rows] | None) -> None:
+    def ask(number: int, answer: list[Rows] | Step | None, *, first: bool = False) -> None:
         try:
-            questions[number] = next(searches[number]) if rows is None else searches[number].send(rows)
+            question = next(searches[number]) if first else searches[number].send(answer)
+            while device is None and isinstance(question, LinearSolution):
+                question = searches[number].send(question.answer())
+            questions[number] = question
         except StopIteration as end:
             questions.pop(number, None)
             results[number] = end.value
 
     for number in range(len(searches)):
-        ask(number, None)
+        ask(number, None, first=True)
     while questions:
-        open_numbers = list(questions)
-        for number, rows in zip(open_numbers, linearize_together(list(questions.values())), strict=True):
-            ask(number, rows)
+        points = {number: one for number, one in questions.items() if isinstance(one, Linearization)}
+        systems = {number: one for number, one in questions.items() if isinstance(one, LinearSolution)}
+        if device is None or len(points) >= len(systems):  # the larger half: the others wait for company
+            for number, rows in zip(points, linearize_together(list(points.values()), device), strict=True):
+                ask(number, rows)
+        else:
+            for number, step in zip(systems, solve_together(list(systems.values()), device), strict=True):
+                ask(number, step)
     return [results[number] for number in range(len(searches))]
 
 
-def linearize_together(questions: Sequence[Question]) -> list[list[Rows]]:
-    """Each graph linearised at its point, with one evaluation for all costly batches of the same group."""
+def linearize_together(questions: Sequence[Linearization], device: torch.device | None = None) -> list[list[Rows]]:
+    """Each graph linearised at its point, with one evaluation for all costly batches of the same group.
+
+    Args: questions: graphs and points.  device: where motion is computed; None: machine code.
+    """
     answers: list[list[Rows]] = [[] for _ in questions]
     groups: defaultdict[Hashable, list[tuple[int, int, FactorBatch]]] = defaultdict(list)
-    for number, (graph, values) in enumerate(questions):
-        for batch in graph.batches:
+    for number, question in enumerate(questions):
+        for batch in question.graph.batches:
             if not len(batch):
                 continue
             if batch.costly:
                 groups[batch.group].append((number, len(answers[number]), batch))
                 answers[number].append(Rows(batch.variables, np.empty(0), (), batch.loss))  # its place, filled below
             else:
-                answers[number].append(batch.linearize(values))
+                answers[number].append(batch.linearize(question.values))
     for members in groups.values():
-        points = [questions[number][1] for number, _, _ in members]
-        for (number, place, _), rows in zip(members, _evaluate([k for _, _, k in members], points), strict=True):
+        points = [questions[number].values for number, _, _ in members]
+        together = _evaluate([batch for _, _, batch in members], points, device)
+        for (number, place, _), rows in zip(members, together, strict=True):
             answers[number][place] = rows
     return answers
 
 
-def _evaluate(batches: Sequence[FactorBatch], points: Sequence[Values]) -> list[Rows]:
+def _evaluate(batches: Sequence[FactorBatch], points: Sequence[Values], device: torch.device | None) -> list[Rows]:
     """Batches of one group, each linearised at its own point."""
-    if len(batches) == 1:
+    if len(batches) == 1 and device is None:
         return [batches[0].linearize(points[0])]
     gathered = [batch.inputs(values) for batch, values in zip(batches, points, strict=True)]
     inputs = tuple(np.concatenate(pieces) for pieces in zip(*gathered, strict=True))
-    residual, jacobians = merge(batches).compute(slice(None), inputs)
+    whole = merge(batches) if device is None else merge(batches).on(device)
+    residual, jacobians = whole.compute(slice(None), inputs)
     ends = np.cumsum([len(batch) for batch in batches])[:-1]
     residuals = np.split(residual, ends)
     blocks = [np.split(jacobian, ends) for jacobian in jacobians]

@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ballfg.dynamics import BallModel
-    from ballfg.estimation import Estimate, Estimator
-    from ballfg.tracks import Track
+    from ballfg.estimation import Estimate
 
 
 def estimate(
@@ -42,6 +41,7 @@ def estimate(
     jobs: inputs.Jobs = inputs.CORES,
     cluster: inputs.Cluster = None,
     address: inputs.Address = None,
+    device: inputs.Device = None,
 ) -> None:
     """Position, velocity and spin with standard deviations, one row per stamp.
 
@@ -54,19 +54,20 @@ def estimate(
     Example: ballfg estimate data/aimy --method smoother --out states.csv
     """
     from ballfg.estimation import has_positions
-    from ballfg.estimation.batch import map_tracks
+    from ballfg.estimation.batch import check_device, map_estimates
     from ballfg.tracks import TableWriter
 
     outcome = inputs.Outcome()
     rows = hits = 0
     with TableWriter(out) as table, inputs.workers(cluster, address, jobs) as workers:
         inputs.check_out(out, dataset)
+        check_device(method, device)
         positions = has_positions(dataset) if source is None else source is inputs.Source.POSITIONS
         open_dataset = inputs.open_inputs if positions else inputs.open_sighted
         opened = open_dataset(dataset, model, effects_file)
         count = len(opened.dataset)
-        work = partial(_estimated, opened.estimator(method), opened.model)
-        results = map_tracks(work, opened.dataset, count, workers)
+        work = partial(_estimated, opened.model)
+        results = map_estimates(work, opened.estimator(method), opened.dataset, count, workers, device)
         for result in progress(results, count, "tracks estimated"):
             table.write(result.columns)
             outcome.add(result.name, result.status, result.notes, result.outside)
@@ -89,10 +90,9 @@ class _Estimated:
     hits: int
 
 
-def _estimated(estimator: Estimator, model: BallModel, track: Track) -> _Estimated:
+def _estimated(model: BallModel, result: Estimate) -> _Estimated:
     from ballfg.estimation.outside import outside_of
 
-    result = estimator.estimate(track)
     share = outside_of(model, result.states)
     columns = _columns(result) | ({} if share is None else {"outside": share})
     outside = None if share is None else float(share.mean())

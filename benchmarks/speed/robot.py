@@ -35,8 +35,6 @@ PAUSE: Final = 1.5
 """s between two flights of a stream."""
 STEPS: Final = 300
 """Of 10 ms, in a rollout."""
-BALLS: Final = (1, 100, 10_000)
-"""Rolled out together on a device."""
 SLOWEST: Final = 3
 """Runs of what takes seconds."""
 
@@ -102,58 +100,14 @@ def time_events(watch: Stopwatch) -> None:
         watch.time("nominal", metric, ask)
 
 
-def time_rollouts(watch: Stopwatch, device: torch.device | None) -> None:
-    """300 steps of `mnn+gs` through bounces, by machine code and by torch; with a device, of many balls there too."""
+def time_rollouts(watch: Stopwatch) -> None:
+    """300 steps of `mnn+gs` through bounces, by machine code and by torch."""
     model = build(Architecture.of("mnn+gs"), radius=RADIUS, seed=1).requires_grad_(False)
     times = torch.arange(1, STEPS + 1, dtype=torch.float64) / 100.0
     one = torch.tensor([(0.0, 0.0, 0.3, 3.0, 0.5, 2.0, 0.0, 80.0, 20.0)], dtype=torch.float64)
     watch.time("mnn+gs", "rollout_time", torch.no_grad()(lambda: rollout(model, one, times, GROUND)))
     spent = [milliseconds(torch.enable_grad()(lambda: rollout(model, one, times, GROUND))) for _ in range(SLOWEST)]
     watch.results.add(watch.case, "mnn+gs", "rollout_time_torch", "ms", median_and_quartiles(spent), SLOWEST)
-    if device is None:
-        return
-    nominal = nominal_model(RADIUS).requires_grad_(False)
-    for name, mine, theirs in (
-        ("nominal", nominal, nominal_model(RADIUS).requires_grad_(False).to(device)),
-        ("mnn+gs", model, build(Architecture.of("mnn+gs"), radius=RADIUS, seed=1).requires_grad_(False).to(device)),
-    ):
-        for count in BALLS:
-            _time_on_device(watch, f"{name}, {count} balls", mine, theirs, one, count, times[::3], device)
-
-
-def _time_on_device(
-    watch: Stopwatch,
-    row: str,
-    here: BallModel,
-    there: BallModel,
-    start: torch.Tensor,
-    count: int,
-    times: torch.Tensor,
-    device: torch.device,
-) -> None:
-    """Rollouts of many different balls by machine code on one thread, and by torch on a device; they must agree."""
-    spread = torch.linspace(-0.2, 0.2, count, dtype=torch.float64)[:, None] * torch.ones(9, dtype=torch.float64)
-    states = start + spread
-
-    @torch.no_grad()
-    def by_machine_code() -> torch.Tensor:
-        return rollout(here, states, times, GROUND)
-
-    def on_device() -> torch.Tensor:
-        with torch.enable_grad():  # asks for torch where the device is the processor itself
-            found = rollout(there, states.to(device), times.to(device), GROUND)
-        return found.cpu()  # waits for the device
-
-    off = float((on_device() - by_machine_code()).abs().max())
-    if not off < 1e-6:
-        raise RuntimeError(f"rollouts on {device} must be those of machine code; they are {off:g} m or m/s off")
-    mine = [milliseconds(by_machine_code) for _ in range(SLOWEST)]
-    theirs = [milliseconds(on_device) for _ in range(SLOWEST)]
-    watch.results.add(watch.case, row, "rollout_100_stamps_time", "ms", median_and_quartiles(mine), SLOWEST)
-    watch.results.add(
-        watch.case, row, f"rollout_100_stamps_time_{device.type}", "ms", median_and_quartiles(theirs), SLOWEST
-    )
-    watch.results.add(watch.case, row, f"rollout_difference_{device.type}", "1", off, 1)
 
 
 def _path(model: BallModel, start: Sequence[float], times: np.ndarray, surfaces: Surfaces = GROUND) -> np.ndarray:

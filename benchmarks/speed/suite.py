@@ -17,6 +17,7 @@ from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.speed.banded import BandedProblem
 from ballfg.benchmarks.speed.gradient_cost import time_gradients
 from ballfg.benchmarks.speed.network import FIT_ITERATIONS, fitted_network, parameter_count
+from ballfg.benchmarks.speed.on_device import time_on_device
 from ballfg.benchmarks.speed.robot import time_bounces, time_events, time_growth, time_rollouts, time_stream
 from ballfg.benchmarks.speed.stopwatch import Stopwatch, milliseconds
 from ballfg.dynamics import (
@@ -91,7 +92,7 @@ QUICK = Size(runs=5, warm_up=2, flights=4)
 def run_speed(results: Results, dataset: Dataset | None, size: Size, device: torch.device | None = None) -> None:
     """All times; a control before each model and at the end.
 
-    With a dataset the time for each of some of its tracks, with a device rollouts of many balls there.
+    With a dataset the time for each of some of its tracks, with a device those of many balls there.
     """
     model = problem_model()
     track = problem_track(model)
@@ -105,7 +106,8 @@ def run_speed(results: Results, dataset: Dataset | None, size: Size, device: tor
         partial(time_growth, watch, "analytic", model, START, NOISE),
         *(partial(time_stream, watch, solver, size.flights) for solver in ONLINE),
         partial(time_events, watch),
-        partial(time_rollouts, watch, device),
+        partial(time_rollouts, watch),
+        *(() if device is None else (partial(time_on_device, watch, device),)),
     ]
     for part in progress(parts, len(parts), "parts timed"):
         part()

@@ -1,5 +1,7 @@
 """The linear subproblem: the step that minimises the linearised objective, by QR, state by state along the track."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -52,6 +54,22 @@ class Step:
     root: Root
     decrease: float
 
+    @classmethod
+    def of(cls, root: Root, states: Array, coefficients: Array, damping: float, diagonal: Array) -> Step | None:
+        """The step R d = y with what it promises; None where it is not finite.
+
+        Args: root: R and y.  states, coefficients: d.  damping, diagonal: of `damped_rows`.
+        """
+        if not (np.isfinite(states).all() and np.isfinite(coefficients).all()):
+            return None
+        n, w, p = len(states), root.width, len(coefficients)
+        # |J d|^2 and what the damping rows add to it
+        promised = float((root.states[..., -1] ** 2).sum() + (root.coefficients[:, -1] ** 2).sum())
+        if damping:
+            held = (diagonal[:n, :w] * states**2).sum() + (diagonal[n, :p] * coefficients**2).sum()
+            promised += damping * float(held)
+        return cls(states, coefficients, root, 0.5 * promised)
+
 
 def weighted(rows: Rows) -> tuple[Array, tuple[Array, ...]]:
     """Residuals and Jacobians such that J^T r is the gradient of the losses and J^T J close to their Hessian.
@@ -79,23 +97,30 @@ def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> S
     Returns: None where the system is singular or its solution is not finite.
     Raises: ValueError: if a factor links states that are not neighbours.
     """
+    p, w = len(values.coefficients), values.width
+    system, start, diagonal = damped_rows(linearized, values, damping)
+    root = Root(np.empty((len(values.states), w, 2 * w + p + 1)), np.empty((p, 2 * w + p + 1)))
+    elimination.eliminate(system, start, w, root.states, root.coefficients)
+    states, coefficients = root.states[..., -1].copy(), root.coefficients[:, -1].copy()
+    elimination.substitute_back(root.states, root.coefficients, states, coefficients)
+    return Step.of(root, states, coefficients, damping, diagonal)
+
+
+def damped_rows(linearized: Sequence[Rows], values: Values, damping: float) -> tuple[Array, Index, Array]:
+    """All rows of the linear problem, ordered by their first states, with those of the damping.
+
+    Args: linearized, values, damping: as for `solve`.
+    Returns: rows (r, c) as `elimination` takes them; where the rows of each state begin (n + 2,), those of the
+        coefficients last; diagonal (n + 1, w + p) of J^T J, zeros without damping.
+    Raises: ValueError: if a factor links states that are not neighbours.
+    """
     n, p, w = len(values.states), len(values.coefficients), values.width
     pieces = [(rows.variables, *weighted(rows)) for rows in linearized]
     system, start, free = _system(pieces, n, p, w, further=damping > 0.0)
     diagonal = np.zeros((n + 1, w + p))
     if damping:
         elimination.damp(system, start, free, w, damping, diagonal)
-    root = Root(np.empty((n, w, 2 * w + p + 1)), np.empty((p, 2 * w + p + 1)))
-    elimination.eliminate(system, start, w, root.states, root.coefficients)
-    states, coefficients = root.states[..., -1].copy(), root.coefficients[:, -1].copy()
-    promised = float((states**2).sum() + (coefficients**2).sum())  # |J d|^2, and what the damping rows add to it
-    elimination.substitute_back(root.states, root.coefficients, states, coefficients)
-    if not (np.isfinite(states).all() and np.isfinite(coefficients).all()):
-        return None
-    if damping:
-        held = (diagonal[:n, :w] * states**2).sum() + (diagonal[n, :p] * coefficients**2).sum()
-        promised += damping * float(held)
-    return Step(states, coefficients, root, 0.5 * promised)
+    return system, start, diagonal
 
 
 def _system(pieces: Sequence[Piece], n: int, p: int, width: int, *, further: bool) -> tuple[Array, Index, Index]:

@@ -12,7 +12,7 @@ from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.factors.batch import Values
 from ballfg.factors.dynamics import FlightFactors
-from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Search, run
+from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Linearization, Search, run
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.lockstep import linearize_together, run_together
 from ballfg.factors.loss import Loss
@@ -51,22 +51,29 @@ def problems(request, model) -> list[tuple[BallGraph, Values]]:
     return [flight(own, length, seed) for seed, length in enumerate((8, 14, 3, 11))]
 
 
-def test_together_as_by_itself(problems) -> None:
+def questions(problems: list[tuple[BallGraph, Values]]) -> list[Linearization]:
+    return [Linearization(graph, values) for graph, values in problems]
+
+
+@pytest.mark.parametrize("device", [None, torch.device("cpu")])
+def test_together_as_by_itself(problems, device) -> None:
     """To rounding, in as many iterations; searches that end early do not disturb the others."""
     optimizer = LevenbergMarquardt(tolerance=1e-9)
     alone = [optimizer.minimize(graph, values) for graph, values in problems]
-    together = run_together([optimizer.search(graph, values) for graph, values in problems])
+    together = run_together([optimizer.search(graph, values) for graph, values in problems], device)
     assert len({minimum.iterations for minimum in alone}) > 1
     for one, other in zip(alone, together, strict=True):
         assert one.convergence is other.convergence is Convergence.CONVERGED
-        assert one.iterations == other.iterations
+        # the last steps are rounding: another order of the same sums may ask for one more
+        assert one.iterations == other.iterations or device is not None
         assert one.error == pytest.approx(other.error, rel=1e-10)
-        np.testing.assert_allclose(other.values.states, one.values.states, rtol=1e-9, atol=1e-9)
+        near = 1e-9 if device is None else 1e-7  # rad/s; the spin is known to 1
+        np.testing.assert_allclose(other.values.states, one.values.states, rtol=1e-9, atol=near)
         np.testing.assert_allclose(other.values.coefficients, one.values.coefficients, rtol=1e-9)
 
 
 def test_linearised_together_as_by_itself(problems) -> None:
-    for answer, (graph, values) in zip(linearize_together(problems), problems, strict=True):
+    for answer, (graph, values) in zip(linearize_together(questions(problems)), problems, strict=True):
         for rows, expected in zip(answer, graph.linearize(values), strict=True):
             np.testing.assert_array_equal(rows.variables, expected.variables)
             assert rows.loss == expected.loss
@@ -79,7 +86,7 @@ def test_one_call_a_sort(problems, monkeypatch) -> None:
     sizes = []
     propagate = FlightFactors.propagate
     monkeypatch.setattr(FlightFactors, "propagate", lambda kind, *a: sizes.append(len(kind)) or propagate(kind, *a))
-    linearize_together(problems)
+    linearize_together(questions(problems))
     assert sizes == [7 + 13 + 2 + 10]
 
 
@@ -91,7 +98,7 @@ def test_models_are_not_mixed(model, augmented) -> None:
         BallGraph((LauncherSpinFactors(np.array([0]), np.ones((1, 1)), embedding, np.ones((1, 3))),))
         for embedding in (light, heavy)
     ]
-    answers = linearize_together([(graph, values) for graph in graphs])
+    answers = linearize_together([Linearization(graph, values) for graph in graphs])
     for (rows,), graph in zip(answers, graphs, strict=True):
         np.testing.assert_array_equal(rows.residual, graph.linearize(values)[0].residual)
     assert not np.allclose(answers[0][0].residual, answers[1][0].residual)
@@ -104,7 +111,7 @@ def test_models_are_not_mixed(model, augmented) -> None:
 def test_results_come_in_order_whoever_ends_first() -> None:
     def counting(questions: int, name: str) -> Search[str]:
         for _ in range(questions):
-            rows = yield graph, values
+            rows = yield Linearization(graph, values)
             assert len(rows) == 1
         return name
 
@@ -118,7 +125,7 @@ def test_results_come_in_order_whoever_ends_first() -> None:
 
 def test_an_error_inside_a_search_is_heard() -> None:
     def failing() -> Search[None]:
-        yield graph, values
+        yield Linearization(graph, values)
         raise FloatingPointError("lost")
 
     graph, values = BallGraph((state_prior(0, np.zeros(9), np.ones(9)),)), Values(np.ones((1, 9)), np.zeros(0))

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import batch_jacobian, derivative, fly, fly_jacobian, followed, rk4_step
+from ballfg.dynamics.motion.integrate import batch_jacobian, fly, fly_jacobian, followed, is_plain, rk4_step
 from ballfg.dynamics.motion.limits import (
     BEYOND,
     GAP_TOLERANCE,
@@ -167,13 +167,14 @@ def fly_through_jacobian(
     Args: as for `fly_through`.
     Returns: state after dt (n, 9), contact times (n, k) s, Jacobian (n, 9, 9); detached from any graph.
     """
-    from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
+    if is_plain(state):
+        from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
 
-    functions = motion.functions_of(model)
-    if functions is not None:
-        return motion.fly_through_jacobian(model, functions, state, dt, heights)
+        functions = motion.functions_of(model)
+        if functions is not None:
+            return motion.fly_through_jacobian(model, functions, state, dt, heights)
     state = state.detach()
-    jacobian = torch.eye(state.shape[-1], dtype=state.dtype).expand(*state.shape, -1)
+    jacobian = torch.eye(state.shape[-1], dtype=state.dtype, device=state.device).expand(*state.shape, -1)
     elapsed = torch.zeros_like(dt)
     elapsed_by_state = torch.zeros_like(state).unsqueeze(-2)  # (n, 1, 9)
     times = []
@@ -182,11 +183,10 @@ def fly_through_jacobian(
             tau = contact_time(model, state, height, dt.abs() + BEYOND)
         before, flight = fly_jacobian(model, state, tau)
         jacobian = flight @ jacobian
-        with torch.no_grad():
-            rate, speed = derivative(model.rates, before), model.gap_rate(before).clamp_max(-MIN_SPEED)
-        # at the contact the gap is zero: d gap + gap_rate d tau = 0
-        tau_by_state = -(_gap_gradient(model, before, height).unsqueeze(-2) @ jacobian)
-        tau_by_state = tau_by_state / speed[..., None, None]
+        rate, upward = _flow_rate(model, state, tau), _gap_gradient(model, before, height)
+        speed = (upward * rate).sum(-1).clamp_max(-MIN_SPEED)
+        # at the contact the gap is zero: d gap + speed d tau = 0
+        tau_by_state = -(upward.unsqueeze(-2) @ jacobian) / speed[..., None, None]
         jacobian = jacobian + rate.unsqueeze(-1) * tau_by_state
         state, impact = batch_jacobian(model.after_bounce, before, outputs=state.shape[-1])
         jacobian = impact @ jacobian
@@ -196,10 +196,14 @@ def fly_through_jacobian(
     after, flight = fly_jacobian(model, state, dt - elapsed)
     if not times:
         return after, dt.new_zeros((*dt.shape, 0)), flight
-    with torch.no_grad():
-        rate = derivative(model.rates, after)
-    jacobian = flight @ jacobian - rate.unsqueeze(-1) * elapsed_by_state
+    jacobian = flight @ jacobian - _flow_rate(model, state, dt - elapsed).unsqueeze(-1) * elapsed_by_state
     return after, torch.stack(times, dim=-1), jacobian
+
+
+def _flow_rate(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
+    """(n, 9) derivative of `fly` by dt: that of the steps as they are taken, the motion's rate up to their error."""
+    flown = batch_jacobian(lambda t: fly(model, state, t[..., 0]), dt.unsqueeze(-1), outputs=state.shape[-1])
+    return flown[1][..., 0]
 
 
 def _gap_gradient(model: BallModel, state: Tensor, height: Tensor | float) -> Tensor:

@@ -105,10 +105,11 @@ def followed(*tensors: Tensor | float) -> bool:
     """
     if torch.is_grad_enabled() or forward_ad._current_level >= 0:
         return True
-    return any(isinstance(t, Tensor) and not _is_plain(t) for t in tensors)
+    return any(isinstance(t, Tensor) and not is_plain(t) for t in tensors)
 
 
-def _is_plain(tensor: Tensor) -> bool:
+def is_plain(tensor: Tensor) -> bool:
+    """Whether machine code can read it: float64 in the memory of the processor."""
     return type(tensor) is Tensor and tensor.dtype is torch.float64 and tensor.is_cpu
 
 
@@ -118,11 +119,12 @@ def fly_jacobian(model: BallModel, state: Tensor, dt: Tensor) -> tuple[Tensor, T
     Args: model: the ball.  state: (n, 9).  dt: (n,) s.
     Returns: state after dt (n, 9) and Jacobian (n, 9, 9); both detached from any graph.
     """
-    from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
+    if is_plain(state):
+        from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
 
-    functions = motion.functions_of(model)
-    if functions is not None:
-        return motion.fly_jacobian(model, functions, state, dt)
+        functions = motion.functions_of(model)
+        if functions is not None:
+            return motion.fly_jacobian(model, functions, state, dt)
     state = state.detach()
     steps = step_count(dt)
     h = (dt.detach() / steps).unsqueeze(-1)
@@ -140,16 +142,15 @@ def fly_jacobian(model: BallModel, state: Tensor, dt: Tensor) -> tuple[Tensor, T
 def _step_jacobian(model: BallModel, stages: tuple[Tensor, ...], h: Tensor) -> Tensor:
     """(n, 9, 9) derivative of one Runge-Kutta step, from the rates' Jacobians A_i at its stages."""
     heavy = model.parameter_count * len(stages) * len(h) > HEAVY
-    a1, a2, a3, a4 = rate_jacobian(model.rates, torch.stack(stages), heavy=heavy).numpy()  # small products: quicker
-    whole = h.numpy()[..., None]
+    a1, a2, a3, a4 = rate_jacobian(model.rates, torch.stack(stages), heavy=heavy)
+    whole = h[..., None]
     half = whole / 2
     k2 = a2 + half * (a2 @ a1)
     k3 = a3 + half * (a3 @ k2)
     k4 = a4 + whole * (a4 @ k3)
     jacobian = (whole / 6) * (a1 + 2 * (k2 + k3) + k4)
-    diagonal = np.arange(a1.shape[-1])
-    jacobian[..., diagonal, diagonal] += 1.0
-    return torch.from_numpy(jacobian)
+    jacobian.diagonal(dim1=-2, dim2=-1).add_(1.0)
+    return jacobian
 
 
 def rate_jacobian(rates: RateFunction, state: Tensor, *, heavy: bool = False) -> Tensor:
@@ -161,14 +162,15 @@ def rate_jacobian(rates: RateFunction, state: Tensor, *, heavy: bool = False) ->
     """
     width = state.shape[-1]
     jacobian = state.new_zeros((*state.shape, width))
-    jacobian[..., POSITION, VELOCITY] = _EYE3
+    eye = _EYE3.to(state.device)
+    jacobian[..., POSITION, VELOCITY] = eye
     leaf = (state.detach() if heavy else state.detach().expand(3, *state.shape)).requires_grad_(True)
     with torch.enable_grad():
         acceleration, spin_rate = rates(leaf)
     for value, rows in ((acceleration, VELOCITY), (spin_rate, SPIN)):
         if value is None or not value.requires_grad:  # gravity alone does not depend on the state
             continue
-        cotangent = _EYE3.view(3, *(1,) * (state.dim() - 1), 3).expand(3, *state.shape[:-1], 3)
+        cotangent = eye.view(3, *(1,) * (state.dim() - 1), 3).expand(3, *state.shape[:-1], 3)
         (by_state,) = torch.autograd.grad(
             value, leaf, cotangent, retain_graph=True, allow_unused=True, is_grads_batched=heavy
         )
@@ -194,6 +196,6 @@ def batch_jacobian(
     leaf = state.detach().expand(outputs, *state.shape).clone().requires_grad_(True)
     with torch.enable_grad():
         value = function(leaf)
-    cotangent = torch.eye(outputs, dtype=state.dtype).unsqueeze(1).expand_as(value)
+    cotangent = torch.eye(outputs, dtype=state.dtype, device=state.device).unsqueeze(1).expand_as(value)
     (rows,) = torch.autograd.grad(value, leaf, cotangent)
     return value[0].detach(), rows.transpose(0, 1)

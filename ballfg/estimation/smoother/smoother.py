@@ -105,12 +105,21 @@ class Smoother(Estimator):
 
         Args: track, factors: as for every estimator.  move_stamps: False leaves stamps where they are.
         """
+        return run(self.estimating(track, factors, move_stamps=move_stamps))
+
+    def estimating(
+        self, track: Track, factors: Sequence[FactorBatch] = (), *, move_stamps: bool = True
+    ) -> Search[Estimate]:
+        """`estimate`, asking for linearisations and solutions, so that several tracks are estimated together.
+
+        Args: track, factors, move_stamps: as for `estimate`.
+        """
         track = self.prepared(track, factors)
         moving = move_stamps and bool(self.settings.time_offsets)
         smoother = self.first_look() if moving else self
         for _ in range(OFFSET_ROUNDS):
             problem = smoother.problem(track)
-            estimate = smoother.result(problem, run(smoother.search(problem)))
+            estimate = smoother.result(problem, (yield from smoother.search(problem)))
             if not moving or estimate.status is Status.FAILED:
                 return estimate
             retimed = [later for one in problem.observations if (later := one.retimed(track, estimate)) is not None]
