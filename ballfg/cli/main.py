@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 
 from ballfg.cli.calibrate_cameras import calibrate_cameras
+from ballfg.cli.compile import compile_ahead
 from ballfg.cli.diagnose import diagnose
 from ballfg.cli.errors import guarded
 from ballfg.cli.estimate import estimate
@@ -43,6 +44,7 @@ app.command()(simulate)
 app.command()(render)
 app.command()(track)
 app.command(name="calibrate-cameras")(calibrate_cameras)
+app.command(name="compile")(compile_ahead)
 app.command()(info)
 
 

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ballfg.arrays import Array
 from ballfg.estimation.online.state import OnlineState
 from ballfg.prediction import Crossing
 
@@ -32,14 +33,8 @@ def warmed_up(online: Online) -> list[OnlineState]:
     """
     trial, states = online.copy(), []
     trial.reset()
-    gravity, rise = online.physics.gravity, online.surfaces.table_height + online.physics.radius
-    t = PERIOD * np.arange(SAMPLES)
-    after = np.maximum(t - np.sqrt(2.0 * DROP / gravity), 0.0)
-    falling = DROP - 0.5 * gravity * t**2
-    rising = 0.9 * np.sqrt(2.0 * DROP * gravity) * after - 0.5 * gravity * after**2
-    height = np.where(after > 0.0, rising, falling)
-    for k in range(SAMPLES):
-        state = trial.push(t[k], [3.0 * t[k], 0.0, rise + height[k]])
+    for k, (time, position) in enumerate(zip(*falling_ball(online), strict=True)):
+        state = trial.push(time, position)
         if k in LOOKED_AHEAD:
             bounce = _looked_ahead(state)
             states.append(state)
@@ -51,6 +46,17 @@ def warmed_up(online: Online) -> list[OnlineState]:
                 states.append(moved)
     trial.copy()
     return states
+
+
+def falling_ball(online: Online) -> tuple[Array, Array]:
+    """Stamps (40,) s and positions (40, 3) m of a ball that falls onto the table of an estimator, and bounces."""
+    gravity, rise = online.physics.gravity, online.surfaces.table_height + online.physics.radius
+    t = PERIOD * np.arange(SAMPLES)
+    after = np.maximum(t - np.sqrt(2.0 * DROP / gravity), 0.0)
+    falling = DROP - 0.5 * gravity * t**2
+    rising = 0.9 * np.sqrt(2.0 * DROP * gravity) * after - 0.5 * gravity * after**2
+    height = np.where(after > 0.0, rising, falling)
+    return t, np.stack((3.0 * t, np.zeros(SAMPLES), rise + height), axis=1)
 
 
 def _looked_ahead(state: OnlineState) -> Crossing | None:

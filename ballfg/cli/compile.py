@@ -1,0 +1,63 @@
+"""`ballfg compile`: machine code ahead of its first use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ballfg.cli import inputs
+from ballfg.progress import progress
+
+if TYPE_CHECKING:
+    from ballfg.dynamics import BallModel
+
+
+def compile_ahead(
+    model: Annotated[
+        list[Path] | None,
+        typer.Option("--model", help="Model file to compile as well; may be repeated."),
+    ] = None,
+    effects_file: inputs.EffectsFiles = None,
+) -> None:
+    """Compile the machine code of estimates, predictions and streams, for the balls that ship and for model files.
+
+    What is compiled is kept on disk. The first estimate on a machine then takes 3 s; without, it compiles for half a
+    minute. A change of coefficients or weights needs no new code, another set of effects does.
+
+    Example: ballfg compile --model model.yaml
+    """
+    from ballfg.dynamics import load_model, nominal_model
+    from ballfg.dynamics.compiled.build import cache_folder
+    from ballfg.dynamics.nominal import KNOWN_BALLS
+
+    inputs.know_effects(effects_file)
+    models: dict[str, BallModel] = {name: nominal_model(ball) for name, ball in KNOWN_BALLS.items()}
+    models |= {str(path): load_model(path) for path in model or ()}
+    parts = [part for one in models.values() for part in _parts(one)]
+    for _ in progress(_done(parts), len(parts), "parts compiled"):
+        pass
+    print(f"{', '.join(models)}: compiled, and kept in {cache_folder()}")
+
+
+def _done(parts: list[Callable[[], object]]) -> Iterator[None]:
+    for part in parts:
+        yield part()
+
+
+def _parts(model: BallModel) -> list[Callable[[], object]]:
+    """Whatever an estimate, a stream and their predictions call, with the settings that commands use."""
+    from ballfg.dynamics import Surfaces
+    from ballfg.estimation import Online, Settings, Smoother
+    from ballfg.estimation.online.warm_up import falling_ball
+    from ballfg.tracks import Track
+
+    table = Surfaces.table_tennis(0.0)
+    settings = Settings.for_measured(model, position_noise=(0.003,) * 3)
+    smoother = Smoother(model, table, settings)
+    streams = [Online(model, table, settings, solver=solver) for solver in ("chain", "isam2")]
+    track = Track(*falling_ball(streams[0]), name="falling")
+    return [partial(smoother.estimate, track), *(online.warm_up for online in streams)]
