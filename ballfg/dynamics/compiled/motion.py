@@ -181,9 +181,11 @@ def _numbers(given: Tensor | float, shape: torch.Size) -> Array:
 
 def fly_jacobian(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
     """As `integrate.fly_jacobian`."""
-    moving = Moving(model, functions, state.detach(), state.shape[-1])
-    moving.fly(dt.detach().numpy())
-    return moving.results()
+    width = state.shape[-1]
+    moving = Moving(model, functions, state.detach().reshape(-1, width), width)
+    moving.fly(dt.detach().reshape(-1).numpy())
+    after, jacobian = moving.results()
+    return after.reshape(state.shape), jacobian.reshape(*state.shape, width)
 
 
 def fly_through(

@@ -116,8 +116,8 @@ def is_plain(tensor: Tensor) -> bool:
 def fly_jacobian(model: BallModel, state: Tensor, dt: Tensor) -> tuple[Tensor, Tensor]:
     """`fly` and its derivative by the state.
 
-    Args: model: the ball.  state: (n, 9).  dt: (n,) s.
-    Returns: state after dt (n, 9) and Jacobian (n, 9, 9); both detached from any graph.
+    Args: model: the ball.  state: (..., 9).  dt: (...) s.
+    Returns: state after dt (..., 9) and Jacobian (..., 9, 9); both detached from any graph.
     """
     if is_plain(state):
         from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
@@ -140,8 +140,8 @@ def fly_jacobian(model: BallModel, state: Tensor, dt: Tensor) -> tuple[Tensor, T
 
 
 def _step_jacobian(model: BallModel, stages: tuple[Tensor, ...], h: Tensor) -> Tensor:
-    """(n, 9, 9) derivative of one Runge-Kutta step, from the rates' Jacobians A_i at its stages."""
-    heavy = model.parameter_count * len(stages) * len(h) > HEAVY
+    """(..., 9, 9) derivative of one Runge-Kutta step, from the rates' Jacobians A_i at its stages."""
+    heavy = model.parameter_count * len(stages) * h.numel() > HEAVY
     a1, a2, a3, a4 = rate_jacobian(model.rates, torch.stack(stages), heavy=heavy)
     whole = h[..., None]
     half = whole / 2

@@ -8,13 +8,15 @@ below a surface) is handed to `rollout`.
 """
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from ballfg.dynamics.model import BallModel, take_rows
 from ballfg.dynamics.motion.contact import contact_time
-from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, fly, rk4_step
+from ballfg.dynamics.motion.integrate import MAX_STEP, derivative, fly, fly_jacobian, rk4_step
 from ballfg.dynamics.motion.limits import LONGEST_MOTION, REST_SPEED
 from ballfg.dynamics.motion.rollout import next_surface, rollout, stays
 from ballfg.dynamics.surfaces import Surfaces
@@ -32,7 +34,7 @@ def paths(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) ->
         state: (n, 9) at time 0.
         times: (k,) or (n, k) s since then, not decreasing, not negative.
         surfaces: table and floor.
-    Returns: (n, k, 9), differentiable in the states and the parameters, through the contact times too.
+    Returns: (n, k, 9), differentiable once in the states and the parameters, through the contact times too.
     Raises: ValueError: if the times are negative or decrease.
     """
     times = times.expand(state.shape[0], -1) if times.dim() == 1 else times
@@ -124,21 +126,57 @@ def _fly_arc(model: BallModel, state: Tensor, left: Tensor, surfaces: Surfaces) 
     resting = stays(model, state.detach(), surfaces.level_below(state.detach()), surfaces)
     done = resting.clone()
     landed, step, level = torch.zeros_like(done), torch.zeros_like(done, dtype=torch.long), torch.zeros_like(left)
-    nodes, h = [state], torch.full_like(state[:, :1], MAX_STEP)
-    slopes: list[Tensor] = []
-    while not slopes or not bool(done.all()):
-        slope = derivative(model.rates, state)
-        after = rk4_step(model.rates, state, h, slope)
-        height = surfaces.level_below(state.detach())
-        height, landing = next_surface(model, state.detach(), after.detach(), height, ~done, surfaces)
-        step = torch.where(landing, len(slopes), step)
-        level, landed = torch.where(landing, height, level), landed | landing
-        state = torch.where(done.unsqueeze(-1), state, after)
-        slopes.append(slope)
-        nodes.append(state)
-        done = done | landing | (len(slopes) * MAX_STEP >= left)
-    slopes.append(derivative(model.rates, state))
-    return _Arc(torch.stack(nodes), torch.stack(slopes), landed, step, level, resting)
+    start, nodes, steps = state, [state.detach()], [done]
+    with torch.no_grad():
+        while len(nodes) == 1 or not bool(done.all()):
+            state = nodes[-1]
+            after = fly(model, state, torch.full_like(left, MAX_STEP))
+            height = surfaces.level_below(state)
+            height, landing = next_surface(model, state, after, height, ~done, surfaces)
+            step = torch.where(landing, len(nodes) - 1, step)
+            level, landed = torch.where(landing, height, level), landed | landing
+            nodes.append(torch.where(done.unsqueeze(-1), state, after))
+            steps.append(done)
+            done = done | landing | ((len(nodes) - 1) * MAX_STEP >= left)
+    joined = torch.stack(nodes)
+    if torch.is_grad_enabled():
+        joined = _followed(model, start, joined, torch.stack(steps[1:]))
+    return _Arc(joined, derivative(model.rates, joined), landed, step, level, resting)
+
+
+def _followed(model: BallModel, start: Tensor, nodes: Tensor, stays_put: Tensor) -> Tensor:
+    """Nodes (j + 1, m, 9) that are known, differentiable once in the first of them, `start`, and in the parameters.
+
+    Args: stays_put: (j, m) bool, the ball is done and does not take the step.
+    """
+    before, dt = nodes[:-1], nodes.new_full(nodes[:-1].shape[:-1], MAX_STEP)
+    after = torch.where(stays_put.unsqueeze(-1), before, rk4_step(model.rates, before, dt.unsqueeze(-1)))
+    _, jacobians = fly_jacobian(model, before, dt)
+    still = torch.eye(nodes.shape[-1], dtype=nodes.dtype, device=nodes.device)
+    followed: Tensor = _Chain.apply(start, after, torch.where(stays_put[..., None, None], still, jacobians))
+    return followed
+
+
+class _Chain(torch.autograd.Function):
+    """States x_k = F_k(x_{k-1}), known with the Jacobians A_k of all steps.
+
+    Autograd through a loop evaluates the model step by step, forward and back. Here what the parameters do in each step
+    is one batch, `after`, and a gradient by the states goes back through the Jacobians: u_{k-1} += A_k^T u_k.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, start: Tensor, after: Tensor, jacobians: Tensor) -> Tensor:
+        ctx.save_for_backward(jacobians)
+        return torch.cat((start.unsqueeze(0), after))
+
+    @staticmethod
+    @once_differentiable  # type: ignore[untyped-decorator]
+    def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, Tensor, None]:
+        (jacobians,) = ctx.saved_tensors
+        pulled = list(upstream[0].unbind())
+        for k in range(len(jacobians), 0, -1):
+            pulled[k - 1] = pulled[k - 1] + (pulled[k].unsqueeze(-2) @ jacobians[k - 1]).squeeze(-2)
+        return pulled[0], torch.stack(pulled[1:]), None
 
 
 def _land(model: BallModel, arc: _Arc, start: Tensor) -> tuple[Tensor, Tensor, Tensor]:
