@@ -43,7 +43,7 @@ def compile_ahead(
     print(f"{', '.join(models)}: compiled, and kept in {cache_folder()}")
 
 
-def _done(parts: list[Callable[[], object]]) -> Iterator[None]:
+def _done(parts: list[Callable[[], object]]) -> Iterator[object]:
     for part in parts:
         yield part()
 

@@ -74,8 +74,8 @@ def _time_estimates(watch: Stopwatch, row: str, count: int, device: torch.device
     smoother = Smoother(nominal, config.ball.surfaces, Settings.for_measured(nominal, position_noise=(0.003,) * 3))
     ours, theirs = estimate_together(smoother, tracks, None), estimate_together(smoother, tracks, str(device))
     off = max(float(np.abs((a.states - b.states) / a.sigmas).max()) for a, b in zip(ours, theirs, strict=True))
-    both = (partial(estimate_together, smoother, tracks, where) for where in (None, str(device)))
-    _record(watch, row, "estimates_time", device, *both, off, ESTIMATES_AGREE)
+    here, there = (partial(estimate_together, smoother, tracks, where) for where in (None, str(device)))
+    _record(watch, row, "estimates_time", device, here, there, off, ESTIMATES_AGREE)
 
 
 def _record(

@@ -170,7 +170,7 @@ class _Chain(torch.autograd.Function):
         return torch.cat((start.unsqueeze(0), after))
 
     @staticmethod
-    @once_differentiable  # type: ignore[untyped-decorator]
+    @once_differentiable
     def backward(ctx: Any, *upstream: Tensor) -> tuple[Tensor, Tensor, None]:
         (jacobians,) = ctx.saved_tensors
         pulled = list(upstream[0].unbind())

@@ -51,7 +51,7 @@ def warmed_up(online: Online) -> list[OnlineState]:
 def falling_ball(online: Online) -> tuple[Array, Array]:
     """Stamps (40,) s and positions (40, 3) m of a ball that falls onto the table of an estimator, and bounces."""
     gravity, rise = online.physics.gravity, online.surfaces.table_height + online.physics.radius
-    t = PERIOD * np.arange(SAMPLES)
+    t: Array = PERIOD * np.arange(SAMPLES, dtype=np.float64)
     after = np.maximum(t - np.sqrt(2.0 * DROP / gravity), 0.0)
     falling = DROP - 0.5 * gravity * t**2
     rising = 0.9 * np.sqrt(2.0 * DROP * gravity) * after - 0.5 * gravity * after**2
