@@ -1,16 +1,48 @@
-"""Progress of long work: a bar on a terminal, plain lines now and then elsewhere; nothing for less than two seconds."""
+"""Signs of life of long work: a bar on a terminal, plain lines elsewhere; nothing for less than two seconds.
 
+`progress` counts items. `doing` names a stage that cannot be counted. While a command runs, `alive` says every few
+seconds what is being done and for how long, wherever neither of them has just said something.
+"""
+
+import os
 import sys
+import threading
 import time
 from collections.abc import Iterable, Iterator
-from typing import Protocol, TypeVar
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Final, Protocol, TypeVar
 
 T = TypeVar("T")
 
-QUIET = 2.0
+QUIET: Final = 2.0
 """s. Work that is over before that shows nothing."""
-LINE_EVERY = 10.0
-"""s between plain lines."""
+LINE_EVERY: Final = 2.5
+"""s between plain lines, at most."""
+BEAT: Final = 0.2
+"""s between two looks at how long nothing was said."""
+VARIABLE: Final = "BALLFG_QUIET"
+"""Environment variable that silences progress, as the option --quiet does; processes that are started inherit it."""
+
+
+@dataclass
+class _Stage:
+    """What is being done."""
+
+    text: str
+    since: float
+
+
+@dataclass
+class _Signs:
+    """The stages within one another, when something was last said, and whether a bar shows it."""
+
+    stages: list[_Stage] = field(default_factory=list)
+    said: float = 0.0
+    covered: int = 0
+
+
+_SIGNS: Final = _Signs()
 
 
 class Watch(Protocol):
@@ -26,39 +58,137 @@ def unwatched(items: Iterable[T], total: int, what: str, /) -> Iterator[T]:
     return iter(items)
 
 
+def is_quiet() -> bool:
+    """Whether nobody wants to see progress."""
+    return bool(os.environ.get(VARIABLE))
+
+
+def be_quiet() -> None:
+    """Shows no progress from now on, in this process and in those that it starts."""
+    os.environ[VARIABLE] = "1"
+
+
+def say(line: str) -> None:
+    """Prints a line about the course of the work on stderr, unless progress is not wanted."""
+    _SIGNS.said = time.monotonic()
+    if not is_quiet():
+        print(line, file=sys.stderr, flush=True)
+
+
+def announce(line: str) -> None:
+    """Prints a line about what begins now; `alive` repeats it until the next."""
+    if _SIGNS.stages:
+        _SIGNS.stages[-1].text, _SIGNS.stages[-1].since = line, time.monotonic()
+    say(line)
+
+
+@contextmanager
+def doing(what: str) -> Iterator[None]:
+    """Names a stage of the work, for `alive`.
+
+    Args: what: for instance `compiling machine code`.
+    """
+    stage = _Stage(what, time.monotonic())
+    _SIGNS.stages.append(stage)
+    try:
+        yield
+    finally:
+        _SIGNS.stages.remove(stage)
+
+
+@contextmanager
+def alive(what: str) -> Iterator[None]:
+    """Says on stderr what is being done whenever nothing was said for `LINE_EVERY` seconds.
+
+    Args: what: the whole work, as its user calls it.
+    """
+    ended = threading.Event()
+    beating = threading.Thread(target=_beat, args=(ended,), daemon=True)
+    _SIGNS.said = time.monotonic()
+    if os.environ.get("RANK", "0") == "0":  # of processes that train together the first speaks
+        beating.start()
+    with doing(what):
+        try:
+            yield
+        finally:
+            ended.set()
+            if beating.ident is not None:
+                beating.join()
+
+
+@contextmanager
+def idle() -> Iterator[None]:
+    """Work that waits for others, or speaks for itself: `alive` says nothing."""
+    _SIGNS.covered += 1
+    try:
+        yield
+    finally:
+        _SIGNS.covered -= 1
+        _SIGNS.said = time.monotonic()
+
+
+def _beat(ended: threading.Event) -> None:
+    while not ended.wait(BEAT):
+        now = time.monotonic()
+        stages = tuple(_SIGNS.stages)
+        if stages and not _SIGNS.covered and now - _SIGNS.said >= LINE_EVERY - BEAT:
+            say(f"{stages[-1].text}: {now - stages[-1].since:.0f} s so far")
+
+
 def progress(items: Iterable[T], total: int, what: str, /) -> Iterator[T]:
     """Hands items through and shows on stderr how far it is.
 
     Args: items: a stream.  total: how many there will be.  what: for instance `tracks estimated`.
     """
+    if is_quiet():
+        return iter(items)
     return _bar(items, total, what) if sys.stderr.isatty() else _lines(items, total, what)
 
 
 def _bar(items: Iterable[T], total: int, what: str) -> Iterator[T]:
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
     start = time.monotonic()
-    with Progress(*columns, console=Console(stderr=True), transient=True, disable=False) as bar:
+    with idle(), Progress(*columns, TimeElapsedColumn(), console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task(what, total=total, visible=False)
-        for item in items:
-            yield item
-            bar.update(task, advance=1, visible=time.monotonic() - start > QUIET)
+        showing = threading.Timer(QUIET, lambda: bar.update(task, visible=True))
+        showing.daemon = True
+        showing.start()
+        try:
+            for item in items:
+                yield item
+                bar.update(task, advance=1, visible=time.monotonic() - start > QUIET)
+        finally:
+            showing.cancel()
 
 
 def _lines(items: Iterable[T], total: int, what: str) -> Iterator[T]:
     due = time.monotonic() + QUIET
     since: tuple[float, int] | None = None
-    for done, item in enumerate(items, start=1):
-        yield item
-        now = time.monotonic()
-        if now < due or done == total:
-            continue
-        left = ""
-        if since is None:  # the time up to here went into the start of processes too: count from here on
-            since = now, done
-        else:
-            left = f", {(now - since[0]) / (done - since[1]) * (total - done):.0f} s left"
-        print(f"{done} of {total} {what}{left}", file=sys.stderr, flush=True)
-        due = now + LINE_EVERY
+    stage = _Stage(what, time.monotonic())
+    _SIGNS.stages.append(stage)
+    try:
+        for done, item in enumerate(items, start=1):
+            yield item
+            stage.text = f"{done} of {total} {what}"
+            now = time.monotonic()
+            if now < due or done == total:
+                continue
+            left = ""
+            if since is None:  # the time up to here went into the start of processes too: count from here on
+                since = now, done
+            else:
+                left = f", {(now - since[0]) / (done - since[1]) * (total - done):.0f} s left"
+            say(f"{stage.text}{left}")
+            due = now + LINE_EVERY
+    finally:
+        _SIGNS.stages.remove(stage)

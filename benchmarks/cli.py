@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ballfg.cli.errors import guarded
 from ballfg.cli.inputs import CORES, Address, Cluster, workers
+from ballfg.cli.start import start
 from ballfg.machine import usable_device
 
 if TYPE_CHECKING:
@@ -344,6 +344,4 @@ def run(arguments: Sequence[str] | None = None) -> None:
 
     Raises: SystemExit: always; status 0, 2 on bad input, 130 after Ctrl-C.
     """
-    command = typer.main.get_command(app)
-    given = sys.argv[1:] if arguments is None else list(arguments)
-    sys.exit(guarded(lambda: command.main(given, prog_name="ballfg-bench", standalone_mode=False)))
+    start(app, "ballfg-bench", arguments)

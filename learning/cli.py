@@ -5,7 +5,6 @@ Heavy libraries are imported inside functions: `ballfg-train --help` must not wa
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,8 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ballfg.cli.errors import guarded
+from ballfg.cli.start import start
 from ballfg.machine import usable_cores
-from ballfg.progress import progress
+from ballfg.progress import alive, idle, progress
 
 if TYPE_CHECKING:
     from ballfg.learning.config.training import TrainConfig
@@ -72,7 +72,8 @@ def _train(config: TrainConfig, folder: Path, resume: bool) -> None:
         _train_here(config, folder, resume)
         return
     check(folder, config, resume=resume)  # refuse a bad folder before the processes start
-    status = launch(jobs, _train_guarded, config, folder, resume)
+    with idle():  # the first of the processes speaks
+        status = launch(jobs, _train_guarded, config, folder, resume)
     if status:
         raise SystemExit(status)  # the first process has printed the reason
 
@@ -85,7 +86,12 @@ def _train_here(config: TrainConfig, folder: Path, resume: bool) -> None:
 
 def _train_guarded(config: TrainConfig, folder: Path, resume: bool) -> int:
     """The work of each process that this command starts. Returns: its exit status."""
-    return guarded(lambda: _train_here(config, folder, resume))
+
+    def work() -> None:
+        with alive("ballfg-train"):
+            _train_here(config, folder, resume)
+
+    return guarded(work)
 
 
 def run(arguments: Sequence[str] | None = None) -> None:
@@ -93,6 +99,4 @@ def run(arguments: Sequence[str] | None = None) -> None:
 
     Raises: SystemExit: always; status 0, 2 on bad input, 130 after Ctrl-C.
     """
-    command = typer.main.get_command(app)
-    given = sys.argv[1:] if arguments is None else list(arguments)
-    sys.exit(guarded(lambda: command.main(given, prog_name="ballfg-train", standalone_mode=False)))
+    start(app, "ballfg-train", arguments)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import time
+
 import pytest
 
 from ballfg import progress as progress_module
-from ballfg.progress import progress, unwatched
+from ballfg.progress import alive, announce, be_quiet, doing, idle, progress, unwatched
 
 
 class Clock:
@@ -16,6 +18,11 @@ class Clock:
 
     def monotonic(self) -> float:
         return self.now
+
+
+@pytest.fixture(autouse=True)
+def loud(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(progress_module.VARIABLE)
 
 
 @pytest.fixture
@@ -44,10 +51,57 @@ def test_the_start_does_not_count_as_work(clock: Clock, capsys: pytest.CaptureFi
     """10 s until processes run, then 0.5 s a track: the first line tells no time, the second the right one."""
     work(clock, 10.0, 0.5, 88)
     lines = capsys.readouterr().err.splitlines()
-    assert lines[:2] == ["1 of 88 tracks estimated", "21 of 88 tracks estimated, 34 s left"]
-    assert len(lines) == 5
+    assert lines[:2] == ["1 of 88 tracks estimated", "6 of 88 tracks estimated, 41 s left"]
+    assert len(lines) == 18  # one in 2.5 s
 
 
 def test_unwatched_work_is_quiet(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(unwatched(range(3), 3, "tracks estimated")) == [0, 1, 2]
     assert capsys.readouterr().err == ""
+
+
+def test_quiet_work_is_quiet(clock: Clock, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(progress_module.VARIABLE, "")
+    be_quiet()
+    assert work(clock, 10.0, 0.5, 88) == list(range(88))
+    announce("fitting")
+    assert capsys.readouterr().err == ""
+
+
+@pytest.fixture
+def hurried(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Seconds become hundredths."""
+    monkeypatch.setattr(progress_module, "LINE_EVERY", 0.05)
+    monkeypatch.setattr(progress_module, "BEAT", 0.01)
+
+
+def test_a_stage_that_lasts_is_named_again_and_again(hurried: None, capsys: pytest.CaptureFixture[str]) -> None:
+    """The innermost stage, and what was announced last; nothing while somebody else speaks, or once it is over."""
+    with alive("ballfg test"):
+        time.sleep(0.2)
+        with doing("compiling"):
+            time.sleep(0.2)
+        announce("describing what is left")
+        time.sleep(0.2)
+        with idle():
+            before = capsys.readouterr().err.splitlines()
+            time.sleep(0.2)
+            assert capsys.readouterr().err == ""
+    time.sleep(0.1)
+    assert capsys.readouterr().err == ""
+    assert list(dict.fromkeys(before)) == [
+        "ballfg test: 0 s so far",
+        "compiling: 0 s so far",
+        "describing what is left",
+        "describing what is left: 0 s so far",
+    ]
+    assert all(before.count(line) >= 2 for line in before if "so far" in line)
+
+
+def test_items_that_take_long_are_alive_too(hurried: None, capsys: pytest.CaptureFixture[str]) -> None:
+    with alive("ballfg test"):
+        for _ in progress([1, 2], 2, "tracks estimated"):
+            time.sleep(0.2)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines.count("tracks estimated: 0 s so far") >= 2
+    assert lines.count("1 of 2 tracks estimated: 0 s so far") >= 2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ballfg.cli.inputs import CORES, Address, Cluster, DatasetFolders, EffectsFiles, Jobs, open_inputs, workers
+from ballfg.progress import announce
 
 if TYPE_CHECKING:
     from ballfg.diagnosis.result import Diagnosis
@@ -57,20 +57,16 @@ def diagnose(
     with workers(cluster, address, jobs) as processes:
         if others:
             together = [inputs.dataset, *(other.dataset for other in others)]
-            joint = diagnose_jointly(together, inputs.model, jobs=processes, watch=_say)
+            joint = diagnose_jointly(together, inputs.model, jobs=processes, watch=announce)
             diagnosis, rooms = joint.whole, joint.rooms
         else:
-            diagnosis = find(inputs.dataset, inputs.model, jobs=processes, watch=_say)
+            diagnosis = find(inputs.dataset, inputs.model, jobs=processes, watch=announce)
     write_report(diagnosis, out, rooms)
     print(*_summary(diagnosis), sep="\n")
     if rooms:
         print("", *diagnosis.remarks[: len(rooms) + 2], sep="\n")
     files = (PAGE, REPORT, MODEL, *map(room_file, rooms))
     print(f"\nwrote {', '.join(name for name in files if (out / name).is_file())} to {out}")
-
-
-def _say(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)
 
 
 def _summary(diagnosis: Diagnosis) -> Iterator[str]:

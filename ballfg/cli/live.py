@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ballfg.cli import inputs
+from ballfg.progress import idle
 
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel, Surfaces
@@ -85,7 +86,8 @@ def live(
         print(f"ballfg live: reading {source.name}", file=sys.stderr, flush=True)
         inbox = Inbox(source)
         session = Session(tracker, inbox, write, wanted, watchers)
-        _run(session, inbox)
+        with idle():  # it waits for lines, and answers them
+            _run(session, inbox)
     for line in session.summary():
         print(f"ballfg live: {line}", file=sys.stderr)
 

@@ -3,7 +3,6 @@
 Command files import what they need inside the command: `ballfg --help` must not wait for torch or GTSAM.
 """
 
-import sys
 from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Annotated
@@ -13,7 +12,6 @@ import typer
 from ballfg.cli.calibrate_cameras import calibrate_cameras
 from ballfg.cli.compile import compile_ahead
 from ballfg.cli.diagnose import diagnose
-from ballfg.cli.errors import guarded
 from ballfg.cli.estimate import estimate
 from ballfg.cli.info import info
 from ballfg.cli.live import live
@@ -21,6 +19,7 @@ from ballfg.cli.noise import noise
 from ballfg.cli.predict import predict
 from ballfg.cli.render import render
 from ballfg.cli.simulate import simulate
+from ballfg.cli.start import start
 from ballfg.cli.track import track
 
 EARLIER_OPTIONS = {"effects": "effects-file"}
@@ -66,6 +65,4 @@ def run(arguments: Sequence[str] | None = None) -> None:
 
     Raises: SystemExit: always; status 0, 2 on bad input, 130 after Ctrl-C.
     """
-    command = typer.main.get_command(app)
-    given = sys.argv[1:] if arguments is None else list(arguments)
-    sys.exit(guarded(lambda: command.main(given, prog_name="ballfg", standalone_mode=False)))
+    start(app, "ballfg", arguments)

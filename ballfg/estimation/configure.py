@@ -22,7 +22,7 @@ from ballfg.estimation.settings import MEASURED, Settings
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.estimation.table_extent import TableExtent, find_table_extent
 from ballfg.factors.noise import PROCESS_NOISE, ProcessNoise
-from ballfg.progress import Watch, unwatched
+from ballfg.progress import Watch, doing, unwatched
 from ballfg.tracks import Dataset, DatasetInfo, Track
 
 TRACKS_FOR_NOISE = 50
@@ -100,7 +100,8 @@ def fitted_settings(
     if key not in _FITTED:
         while len(_FITTED) >= KEPT:
             del _FITTED[next(iter(_FITTED))]
-        _FITTED[key] = _fitted(dataset, model, observed, watch)
+        with doing("looking for the noise that the tracks show"):
+            _FITTED[key] = _fitted(dataset, model, observed, watch)
     return _FITTED[key] or settings
 
 

@@ -12,6 +12,7 @@ from ballfg.benchmarks.gaussian_settings import StepNoise
 from ballfg.benchmarks.results import Results
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Settings, dataset_settings
+from ballfg.progress import doing
 from ballfg.tracks import Dataset
 
 
@@ -51,9 +52,11 @@ def run_synthetic(results: Results, out: Path, size: Size, jobs: int) -> list[Pa
     for protocol in protocols:
         print(f"{protocol.name}: {len(protocol.tracks)} tracks; {describe_settings(protocol.settings)}")
     for protocol in protocols:
-        run_protocol(results, protocol, jobs, size.counts)
+        with doing(f"{protocol.name}: {len(protocol.tracks)} tracks by all estimators"):
+            run_protocol(results, protocol, jobs, size.counts)
     many = fair_protocol(size.consistency, results.seed + CONSISTENCY_SEED, name="consistency")
-    run_consistency(results, many, jobs)
+    with doing(f"consistency: {len(many.tracks)} tracks"):
+        run_consistency(results, many, jobs)
     return [
         observations_picture(results.rows, name, title, out / f"estimators_{name}.png")
         for name, title in titles.items()

@@ -14,6 +14,7 @@ from ballfg.learning.gradient.implicit import GaussNewtonGradient, GradientMetho
 from ballfg.learning.registry import NETWORKS
 from ballfg.learning.trainee import Prepared
 from ballfg.learning.training_data import read_training_data
+from ballfg.progress import doing
 
 GRADIENTS: Mapping[str, type[GradientMethod]] = {
     "implicit": ImplicitGradient,
@@ -57,6 +58,7 @@ def _model(config: TrainConfig, analytic: AnalyticModel) -> BallModel:
     base = analytic if architecture.residual else None
     model = build_model(architecture, radius=analytic.radius, base=base, seed=config.seed)
     if base is None and config.architecture.pretrain:
-        left = pretrain(model, analytic, config.seed, config.architecture.pretrain)
+        with doing("fitting the networks to the analytic model"):
+            left = pretrain(model, analytic, config.seed, config.architecture.pretrain)
         print(f"networks fitted to the analytic model: {left:.2g} m/s^2, 0.1 m/s, 10 rad/s left", flush=True)
     return model

@@ -19,6 +19,7 @@ from numba.core.types import WrapperAddressProtocol
 from numba.extending import typeof_impl
 
 from ballfg.dynamics.compiled.signatures import FUNCTION
+from ballfg.progress import doing
 
 HEADER: Final = '''"""Generated from a model of a ball; safe to delete."""
 import math
@@ -53,7 +54,8 @@ def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
         def for_call(*_: Any, **__: Any) -> Any:
             """The machine code, which numba asks for at the first call from Python."""
             del dispatcher._compile_for_args, dispatcher.get_call_template
-            entry = dispatcher.compile(signature)
+            with doing("compiling, once on this machine; `ballfg compile` does it ahead"):
+                entry = dispatcher.compile(signature)
             dispatcher.disable_compile()  # as of a function whose signature numba is given at once
             return entry
 

@@ -22,6 +22,7 @@ from ballfg.dynamics.compiled.translation.recipe import Recipe
 from ballfg.dynamics.model import BallModel, is_substituted, substitute
 from ballfg.dynamics.networks.architecture import Architecture
 from ballfg.dynamics.networks.layers import MNN
+from ballfg.progress import doing
 from ballfg.state import STATE_DIM
 
 VALUES_AGREE: Final = 1e-12
@@ -170,7 +171,8 @@ def _plain(value: object) -> Hashable:
 
 def _compiled(model: BallModel, key: Hashable | None) -> CompiledModel | None:
     try:
-        rates, impact, surface = (_function(model, part, key) for part in PARTS)
+        with doing("machine code for this model"):
+            rates, impact, surface = (_function(model, part, key) for part in PARTS)
         return CompiledModel(rates, impact, surface, model.radius)
     except ImportError:
         raise

@@ -1,0 +1,53 @@
+"""The start of each program: its words, an option --quiet for all commands, signs of life, an exit status."""
+
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Annotated, Any, NoReturn
+
+import typer
+
+from ballfg.cli.errors import guarded
+from ballfg.progress import alive, be_quiet
+
+
+def start(app: typer.Typer, name: str, arguments: Sequence[str] | None) -> NoReturn:
+    """Runs a program with the given arguments, by default the command line's, and exits.
+
+    Args: app: the program.  name: its name, as users type it.  arguments: its words.
+    Raises: SystemExit: always; status 0, 2 on bad input, 130 after Ctrl-C, or what the command returns.
+    """
+    command = typer.main.get_command(app)
+    for one in _commands(command):
+        one.params.append(_quiet())
+    given = sys.argv[1:] if arguments is None else list(arguments)
+
+    def work() -> object:
+        with alive(" ".join([name, *given[:1]])):
+            return command.main(given, prog_name=name, standalone_mode=False)
+
+    sys.exit(guarded(work))
+
+
+def _commands(command: Any) -> Iterator[Any]:
+    """Those that do something: a group's own, or the command itself."""
+    own = getattr(command, "commands", None)
+    yield from own.values() if own else (command,)
+
+
+def _asked(quiet: bool) -> None:
+    if quiet:
+        be_quiet()
+
+
+def _template(
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", callback=_asked, help="Show no progress.")] = False,
+) -> None:
+    """A command whose option all others get: typer makes options of functions alone."""
+
+
+def _quiet() -> Any:
+    template = typer.Typer(add_completion=False)
+    template.command()(_template)
+    option = next(p for p in typer.main.get_command(template).params if p.name == "quiet")
+    option.expose_value = False
+    return option
