@@ -13,6 +13,7 @@ from ballfg.cli.calibrate_cameras import calibrate_cameras
 from ballfg.cli.compile import compile_ahead
 from ballfg.cli.diagnose import diagnose
 from ballfg.cli.estimate import estimate
+from ballfg.cli.example import example
 from ballfg.cli.info import info
 from ballfg.cli.live import live
 from ballfg.cli.noise import noise
@@ -39,6 +40,7 @@ app.command()(predict)
 app.command()(live)
 app.command()(diagnose)
 app.command()(noise)
+app.command()(example)
 app.command()(simulate)
 app.command()(render)
 app.command()(track)

@@ -1,0 +1,42 @@
+"""`ballfg example`: two datasets that the other commands read, the second with what the first has not."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+
+from ballfg.tracks import read_dataset
+from tests.commands import status
+
+
+def test_two_datasets_and_what_to_do_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert status("example", "--tracks", 6) == 0
+    said = capsys.readouterr().out
+    names = {"shots": set(), "windy": {"wind"}}
+    for name, undeclared in names.items():
+        folder = Path("example") / name
+        assert len(read_dataset(folder)) == 6
+        assert set(yaml.safe_load((folder / "truth.yaml").read_text())["undeclared"]) == undeclared
+        assert "wind" not in (folder / "model.yaml").read_text()
+    (command,) = (line.split()[1:] for line in said.splitlines() if line.strip().startswith("ballfg estimate"))
+    assert status(*command) == 0
+    assert Path("states.csv").is_file()
+    assert "BSD-3-Clause" in said
+
+
+def test_earlier_examples_stay_unless_forced(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert status("example", "--tracks", 6) == 0
+    before = (Path("example") / "shots" / "tracks.csv").read_bytes()
+    assert status("example", "--tracks", 6, "--seed", 1) == 2
+    assert "--force" in capsys.readouterr().err
+    assert (Path("example") / "shots" / "tracks.csv").read_bytes() == before
+    assert status("example", "--tracks", 6, "--seed", 1, "--force") == 0
+    assert (Path("example") / "shots" / "tracks.csv").read_bytes() != before
