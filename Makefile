@@ -8,7 +8,7 @@ SOURCES := ballfg factors learning benchmarks tests
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: bench test check check-speed format clean
+.PHONY: bench test check check-speed docs package format clean
 
 bench: $(READY)  ## the estimator comparison: table, results/results.json, pictures; measured tracks too where they are
 	$(BIN)/ballfg-bench estimators --out results
@@ -24,9 +24,20 @@ check: $(READY)  ## format, lint, types (of the installed package: its folders l
 	$(BIN)/ruff check $(SOURCES)
 	rm -rf build/typed && $(BIN)/pip install --quiet --no-deps --no-build-isolation --target build/typed .
 	$(BIN)/mypy --config-file pyproject.toml --cache-dir .mypy_cache build/typed/ballfg
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+docs: check  ## the documentation as a site: build/site/index.html
+	@echo "build/site/index.html"
 
 check-speed: $(READY)  ## times as multiples of a control, against those of the baseline; two minutes, nothing else running
 	$(BIN)/ballfg-bench speed --gate benchmarks/speed/baseline.json --out results/speed
+
+package: $(READY)  ## wheel and sdist in dist/, tried in a bare environment away from the sources
+	rm -rf dist build/bare build/lib && $(BIN)/python -m build --no-isolation --outdir dist .
+	$(PYTHON) -m venv build/bare
+	build/bare/bin/python -m pip install --quiet -c constraints.txt dist/*.whl
+	cd build/bare && rm -rf tried && mkdir tried && cd tried && ../bin/ballfg example --tracks 6 \
+	&& ../bin/ballfg estimate example/shots --out states.csv && ../bin/ballfg info
 
 format: $(READY)
 	$(BIN)/ruff format $(SOURCES)

@@ -58,7 +58,12 @@ class Step:
     def of(cls, root: Root, states: Array, coefficients: Array, damping: float, diagonal: Array) -> Step | None:
         """The step R d = y with what it promises; None where it is not finite.
 
-        Args: root: R and y.  states, coefficients: d.  damping, diagonal: of `damped_rows`.
+        Args:
+            root: R and y.
+            states: (n, 9 + b) m, m/s, rad/s, m, and
+            coefficients: (p,) in their own units: d.
+            damping: Marquardt's lambda.
+            diagonal: (n + 1, w + p) of `damped_rows`, each in the inverse square of its unit.
         """
         if not (np.isfinite(states).all() and np.isfinite(coefficients).all()):
             return None
