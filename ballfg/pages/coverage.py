@@ -9,7 +9,7 @@ from statistics import NormalDist
 import numpy as np
 
 from ballfg.arrays import Array, Index
-from ballfg.pages.shot import Shot
+from ballfg.pages.shot import SAME_STAMP, Shot
 
 LEVEL = 0.9
 """What an interval should hold."""
@@ -50,7 +50,7 @@ def coverage(shots: Iterable[Shot]) -> Coverage:
         if not known.any() or not len(before):
             continue
         inside = errors[known] <= HALF_WIDTH * shot.predicted_sigmas[known]
-        bins = np.floor((shot.predicted_times[known] - before[-1]) / BIN).astype(int)
+        bins = np.floor((shot.predicted_times[known] - before[-1] + SAME_STAMP) / BIN).astype(int)
         for b in np.unique(bins).tolist():
             held[b] = held.get(b, np.zeros(3)) + inside[bins == b].sum(axis=0)
             samples[b] = samples.get(b, 0) + int((bins == b).sum())

@@ -99,7 +99,9 @@ def _paths(panel: Axes, shot: Shot, across: int, up: int) -> None:
     ):
         if len(places):
             panel.plot(*places[:, view].T, color=colour, linewidth=1.2, label=label)
-            panel.add_collection(PolyCollection(_bands(places[:, view], sigmas[:, view]), facecolor=colour, alpha=0.25))
+            panel.add_collection(
+                PolyCollection(list(_bands(places[:, view], sigmas[:, view])), facecolor=colour, alpha=0.25)
+            )
     for kind, (symbol, colour) in MARKERS.items():
         found = np.array([mark.place for mark in shot.marks if mark.kind == kind]).reshape(-1, 3)
         if len(found):

@@ -66,6 +66,6 @@ def _shot(rerun: Any, recording: Any, shot: Shot) -> None:
         if np.isfinite(state[6:]).all():
             recording.log(f"{name}/spin", rerun.Arrows3D(origins=[state[:3]], vectors=[SPIN_LENGTH * state[6:]]))
     for kind in ("contact", "hit"):
-        places = [mark.place for mark in shot.marks if mark.kind == kind]
-        if places:
-            recording.log(f"{name}/{kind}s", rerun.Points3D(places, radii=0.01), static=True)
+        marked = [mark.place for mark in shot.marks if mark.kind == kind]
+        if marked:
+            recording.log(f"{name}/{kind}s", rerun.Points3D(marked, radii=0.01), static=True)

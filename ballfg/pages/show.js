@@ -29,7 +29,7 @@ function layout(extra) {
   const base = {
     margin: {l: 58, r: 12, t: 12, b: 44}, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     font: {color: colour("--ink"), family: "system-ui, sans-serif", size: 12},
-    legend: {orientation: "h", y: -0.2, yanchor: "top", x: 0}, hovermode: "closest",
+    legend: {orientation: "h", y: -0.24, yanchor: "top", x: 0}, hovermode: "closest",
     hoverlabel: {align: "left"},
   };
   const merged = {...base, ...extra};
@@ -131,7 +131,7 @@ function spinArrows() {
   if (!heads.x.length) return traces;
   traces.push({type: "scatter3d", mode: "lines", x, y, z, name: "spin axis, 0.1 m for 100 rad/s", legendgroup: "spin",
                line: {color: SPIN, width: 4}, hoverinfo: "skip"});
-  traces.push({type: "cone", ...heads, sizemode: "absolute", sizeref: 0.045, anchor: "tip", showscale: false,
+  traces.push({type: "cone", ...heads, sizemode: "absolute", sizeref: 0.35, anchor: "tip", showscale: false,
                legendgroup: "spin", colorscale: [[0, SPIN], [1, SPIN]], hovertemplate: "%{text}<extra></extra>"});
   return traces;
 }
@@ -174,7 +174,8 @@ function drawSpace() {
   const axis = name => ({title: {text: `${name}, m`}, gridcolor: colour("--line"), color: colour("--ink"), showspikes: false});
   const narrow = element("space").clientWidth < 520;
   const scene = {aspectmode: "data", xaxis: axis("x"), yaxis: axis("y"), zaxis: axis("z"),
-                 camera: {eye: narrow ? {x: 1.0, y: -2.1, z: 0.75} : {x: 0.55, y: -1.45, z: 0.6}}, uirevision: "kept"};
+                 camera: {center: {x: 0, y: 0, z: -0.12},
+                          eye: narrow ? {x: 0.75, y: -2.3, z: 0.8} : {x: 0.5, y: -1.6, z: 0.55}}, uirevision: "kept"};
   const drawn = {margin: {l: 0, r: 0, t: 0, b: 0}, scene, legend: {orientation: "h", x: 0, y: 0, yanchor: "top"}};
   Plotly.react("space", traces, layout(drawn), CONFIG);
 }
@@ -245,7 +246,7 @@ function drawResiduals() {
   if (element("whitened") === null) return;
   const lines = [-BAND, BAND].map(y => ({type: "line", xref: "paper", x0: 0, x1: 1, y0: y, y1: y,
                                          line: {dash: "dash", width: 1, color: colour("--quiet")}}));
-  const drawn = layout({xaxis: time, yaxis: {title: {text: "residual / standard deviation"}}, shapes: lines});
+  const drawn = layout({xaxis: time, yaxis: {title: {text: "standard deviations"}}, shapes: lines});
   Plotly.react("whitened", dots(whitened, "standard deviations"), drawn, CONFIG);
 }
 

@@ -245,5 +245,7 @@ def _candidates(found: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 def _plain(array: Array, decimals: int) -> list[Any]:
     """Nested lists of rounded numbers, None for those that are not finite."""
-    rounded = np.round(array, decimals)
-    return np.where(np.isfinite(rounded), rounded.astype(object), None).tolist()
+    rounded = np.round(array, decimals).astype(object)
+    rounded[~np.isfinite(array)] = None
+    plain: list[Any] = rounded.tolist()
+    return plain
