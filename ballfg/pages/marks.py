@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -16,6 +17,8 @@ LARGEST_ACCELERATION = 150.0
 """m/s^2. Air and gravity change a velocity less than this: drag of a table-tennis ball at 25 m/s is 80 m/s^2."""
 SUDDEN = 1.5
 """m/s. A jump that is smaller is not taken for a hit: velocities err, and bounces change them at the edge of a step."""
+GAP = 0.1
+"""s. Over a longer step nobody saw what the ball did: it may have bounced several times."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ def marks(times: Array, states: Array, surfaces: Sequence[float], radius: float)
     """Contacts and hits between the states of a track.
 
     A contact is where the vertical velocity turns from down to up near a surface, a hit where the velocity jumps by
-    more than air, gravity or a contact can explain.
+    more than air, gravity or a contact can explain. Steps of more than `GAP` have none.
 
     Args:
         times: (m,) s.  states: (m, 9).
@@ -39,6 +42,8 @@ def marks(times: Array, states: Array, surfaces: Sequence[float], radius: float)
         radius: m, of the ball.
     """
     for i, step in enumerate(np.diff(times)):
+        if step > GAP:
+            continue
         before, after = states[i], states[i + 1]
         contact = _contact(before, after, float(step), surfaces, radius)
         if contact is not None:
@@ -58,10 +63,11 @@ def _contact(before: Array, after: Array, step: float, surfaces: Sequence[float]
         fall = float(before[Z]) - level
         reached = fall + float(before[VZ]) * step - 0.5 * STANDARD_GRAVITY * step**2
         if abs(fall) < NEAR or (fall > 0.0 and reached < NEAR):
-            return float(np.clip(fall / -float(before[VZ]), 0.0, step))
+            falling = math.sqrt(float(before[VZ]) ** 2 + 2.0 * STANDARD_GRAVITY * max(fall, 0.0))
+            return min((falling + float(before[VZ])) / STANDARD_GRAVITY, step)
     return None
 
 
 def _mark(kind: str, time: float, before: Array, later: float) -> Mark:
     x, y, z = (before[POSITION] + later * before[VELOCITY]).tolist()
-    return Mark(kind, time + later, (x, y, z))
+    return Mark(kind, time + later, (x, y, z - 0.5 * STANDARD_GRAVITY * later**2))

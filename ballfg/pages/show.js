@@ -11,6 +11,7 @@ const BAND = page.half_width;
 const RING = 12;            // corners of a tube's cross-section
 const ARROWS = 14;          // spin axes that are drawn along a shot
 const SPIN_LENGTH = 0.001;  // m of an arrow for each rad/s
+const MARGIN = 0.4;         // m about the samples, the estimate and the table
 const CONFIG = {responsive: true, displaylogo: false, displayModeBar: false};
 
 let shot = null;
@@ -25,7 +26,7 @@ const mm = value => value === null || value === undefined ? "unknown" : (1000 * 
 const subtract = (a, b) => a.map((value, i) => value === null || b[i] === null ? null : value - b[i]);
 
 function layout(extra) {
-  const line = {gridcolor: colour("--line"), zerolinecolor: colour("--line"), automargin: true};
+  const line = {gridcolor: colour("--line"), zerolinecolor: colour("--line")};
   const base = {
     margin: {l: 58, r: 12, t: 12, b: 44}, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)",
     font: {color: colour("--ink"), family: "system-ui, sans-serif", size: 12},
@@ -62,7 +63,7 @@ function surroundings() {
     traces.push(polyline([...net, net[0]], "net", {line: {color: "#888888", width: 2}}));
   }
   if (table.floor !== null) {
-    const m = 0.6;
+    const m = MARGIN;
     const corners = [[x0 - m, y0 - m], [x1 + m, y0 - m], [x1 + m, y1 + m], [x0 - m, y1 + m]].map(c => [...c, table.floor]);
     traces.push(rectangle(corners, {color: "#999999", opacity: 0.12}));
     traces.push(polyline([...corners, corners[0]], "floor", {line: {color: "#999999", width: 1}}));
@@ -71,7 +72,7 @@ function surroundings() {
 }
 
 // A tube about a path: rings across the flight, as wide as the standard deviations in these directions.
-function tube(places, sigmas, scale, style) {
+function tube(times, places, sigmas, scale, style) {
   const rows = places[0].map((_, i) => i).filter(i => sigmas.every(s => s[i] !== null));
   if (rows.length < 2) return [];
   const x = [], y = [], z = [], faces = [[], [], []];
@@ -84,7 +85,7 @@ function tube(places, sigmas, scale, style) {
       const c = Math.cos(2 * Math.PI * k / RING), s = Math.sin(2 * Math.PI * k / RING);
       const at = [0, 1, 2].map(a => places[a][row] + scale * BAND * sigmas[a][row] * (c * side[a] + s * up[a]));
       x.push(at[0]); y.push(at[1]); z.push(at[2]);
-      if (number === 0) continue;
+      if (number === 0 || times[row] - times[rows[number - 1]] > page.gap) continue;
       const a = RING * number + k, b = RING * number + (k + 1) % RING;
       faces[0].push(a, b); faces[1].push(b, b - RING); faces[2].push(a - RING, a - RING);
     }
@@ -105,6 +106,17 @@ function cross(a, b) {
 function cloud(places, times, words, style) {
   return {type: "scatter3d", x: places[0], y: places[1], z: places[2],
           text: times.map((t, i) => words(t, i)), hovertemplate: "%{text}<extra></extra>", ...style};
+}
+
+// A line that is not drawn where samples are missing: between its ends there nothing is known.
+function broken(trace, times) {
+  const gaps = times.map((t, i) => i > 0 && t - times[i - 1] > page.gap);
+  const cut = (values, filler) => values.flatMap((value, i) => gaps[i] ? [filler, value] : [value]);
+  const result = {...trace, connectgaps: false};
+  for (const key of ["x", "y", "z", "text"]) {
+    if (Array.isArray(trace[key])) result[key] = cut(trace[key], key === "text" ? "" : null);
+  }
+  return result;
 }
 
 const placeWords = (places, i) => AXES.map((a, k) => `${a} ${places[k][i].toFixed(4)} m`).join("<br>");
@@ -148,6 +160,17 @@ function marks() {
   return traces;
 }
 
+// From where to where each axis goes: about the samples, the estimate and the table. A prediction past a hit goes anywhere.
+function room() {
+  const table = page.table === null ? [[], [], []] : [page.table.extent.slice(0, 2), page.table.extent.slice(2),
+                                                      [page.table.height, page.table.floor ?? page.table.height]];
+  const known = shot.t.length || hasStates() ? [shot.positions, shot.states] : [shot.predicted];
+  return [0, 1, 2].map(a => {
+    const values = [...table[a], ...known.flatMap(rows => rows[a] ?? [])];
+    return [Math.min(...values) - MARGIN, Math.max(...values) + MARGIN];
+  });
+}
+
 function drawSpace() {
   const scale = Number(element("scale").value), traces = surroundings();
   if (shot.t.length) {
@@ -156,26 +179,31 @@ function drawSpace() {
   }
   if (hasStates()) {
     const places = shot.states.slice(0, 3), velocity = shot.states.slice(3, 6);
-    traces.push(cloud(places, shot.state_t, (t, i) => `estimate at ${t.toFixed(4)} s<br>${placeWords(places, i)}<br>speed ` +
-                      `${Math.hypot(...velocity.map(v => v[i])).toFixed(2)} m/s${spread(shot.state_sigmas, i)}`,
-                      {mode: "lines", name: "estimate", line: {color: ESTIMATE, width: 5}}));
-    traces.push(...tube(places, shot.state_sigmas, scale, {color: ESTIMATE, name: "its 90 % tube"}));
+    const words = (t, i) => `estimate at ${t.toFixed(4)} s<br>${placeWords(places, i)}<br>speed ` +
+      `${Math.hypot(...velocity.map(v => v[i])).toFixed(2)} m/s${spread(shot.state_sigmas, i)}`;
+    const style = {mode: "lines", name: "estimate", line: {color: ESTIMATE, width: 5}};
+    traces.push(broken(cloud(places, shot.state_t, words, style), shot.state_t));
+    traces.push(...tube(shot.state_t, places, shot.state_sigmas, scale, {color: ESTIMATE, name: "its 90 % tube"}));
   }
   if (hasPredictions()) {
-    traces.push(cloud(shot.predicted, shot.predicted_t, (t, i) => `predicted for ${t.toFixed(4)} s<br>` +
-                      placeWords(shot.predicted, i) + spread(shot.predicted_sigmas, i),
-                      {mode: "lines", name: "prediction", line: {color: PREDICTION, width: 5}}));
-    traces.push(...tube(shot.predicted, shot.predicted_sigmas, scale, {color: PREDICTION, name: "90 % tube of a measurement"}));
+    const words = (t, i) => `predicted for ${t.toFixed(4)} s<br>${placeWords(shot.predicted, i)}${spread(shot.predicted_sigmas, i)}`;
+    const style = {mode: "lines", name: "prediction", line: {color: PREDICTION, width: 5}};
+    traces.push(broken(cloud(shot.predicted, shot.predicted_t, words, style), shot.predicted_t));
+    traces.push(...tube(shot.predicted_t, shot.predicted, shot.predicted_sigmas, scale, {color: PREDICTION, name: "90 % tube of a measurement"}));
   }
   traces.push(...marks(), ...spinArrows());
   ballTrace = traces.length;
   traces.push({type: "scatter3d", mode: "markers", name: "ball at the chosen time", x: [0], y: [0], z: [0], hoverinfo: "skip",
                marker: {size: 8, color: "#f5a623", line: {color: "#333333", width: 1}}});
-  const axis = name => ({title: {text: `${name}, m`}, gridcolor: colour("--line"), color: colour("--ink"), showspikes: false});
-  const narrow = element("space").clientWidth < 520;
-  const scene = {aspectmode: "data", xaxis: axis("x"), yaxis: axis("y"), zaxis: axis("z"),
-                 camera: {center: {x: 0, y: 0, z: -0.12},
-                          eye: narrow ? {x: 0.75, y: -2.3, z: 0.8} : {x: 0.5, y: -1.6, z: 0.55}}, uirevision: "kept"};
+  const range = room();
+  const axis = (name, a) => ({title: {text: `${name}, m`}, range: range[a], gridcolor: colour("--line"),
+                              color: colour("--ink"), showspikes: false});
+  const size = pathPlaces().slice(0, 2).map(row => Math.max(...row) - Math.min(...row));
+  const alongY = size[1] > size[0], narrow = element("space").clientWidth < 520;
+  const [ahead, aside, above] = narrow ? [0.8, 2.5, 0.85] : [0.5, 1.6, 0.55];
+  const eye = alongY ? {x: aside, y: ahead, z: above} : {x: ahead, y: -aside, z: above};  // from the side of the flight
+  const scene = {aspectmode: "data", xaxis: axis("x", 0), yaxis: axis("y", 1), zaxis: axis("z", 2),
+                 camera: {center: {x: 0, y: 0, z: -0.12}, eye}, uirevision: alongY ? "y" : "x"};
   const drawn = {margin: {l: 0, r: 0, t: 0, b: 0}, scene, legend: {orientation: "h", x: 0, y: 0, yanchor: "top"}};
   Plotly.react("space", traces, layout(drawn), CONFIG);
 }
@@ -207,11 +235,13 @@ function drawByAxis() {
     const first = name => ({name, legendgroup: name, showlegend: a === 0, hovertemplate, ...on});
     if (hasPredictions()) {
       traces.push(band(shot.predicted_t, shot.predicted[a], shot.predicted_sigmas[a], PREDICTION, on));
-      traces.push(line(shot.predicted_t, shot.predicted[a], {mode: "lines", line: {color: PREDICTION}, ...first("prediction")}));
+      const style = {mode: "lines", line: {color: PREDICTION}, ...first("prediction")};
+      traces.push(broken(line(shot.predicted_t, shot.predicted[a], style), shot.predicted_t));
     }
     if (hasStates()) {
       traces.push(band(shot.state_t, shot.states[a], shot.state_sigmas[a], ESTIMATE, on));
-      traces.push(line(shot.state_t, shot.states[a], {mode: "lines", line: {color: ESTIMATE, width: 1.5}, ...first("estimate")}));
+      const style = {mode: "lines", line: {color: ESTIMATE, width: 1.5}, ...first("estimate")};
+      traces.push(broken(line(shot.state_t, shot.states[a], style), shot.state_t));
     }
     if (shot.t.length) {
       traces.push(line(shot.t, shot.positions[a], {mode: "markers", marker: {size: 4, color: colour("--quiet")}, ...first("measured")}));
@@ -226,8 +256,9 @@ function drawErrors() {
     const on = {yaxis: a ? `y${a + 1}` : "y"}, error = shot.prediction_errors[a].map(e => e === null ? null : 1000 * e);
     const zero = error.map(() => 0), sigma = shot.predicted_sigmas[a].map(s => s === null ? null : 1000 * s);
     traces.push(band(shot.predicted_t, zero, sigma, PREDICTION, {...on, name: "90 % interval", showlegend: a === 0}));
-    traces.push(line(shot.predicted_t, error, {mode: "markers+lines", marker: {size: 4}, line: {width: 1, color: AXIS_COLOURS[a]},
-                name: AXES[a], hovertemplate: `%{x:.4f} s: %{y:.1f} mm in ${AXES[a]}<extra></extra>`, ...on}));
+    const style = {mode: "markers+lines", marker: {size: 4}, line: {width: 1, color: AXIS_COLOURS[a]}, name: AXES[a],
+                   hovertemplate: `%{x:.4f} s: %{y:.1f} mm in ${AXES[a]}<extra></extra>`, ...on};
+    traces.push(broken(line(shot.predicted_t, error, style), shot.predicted_t));
   }
   Plotly.react("errors", traces, stacked(AXES, "mm"), CONFIG);
 }
@@ -235,19 +266,24 @@ function drawErrors() {
 function drawResiduals() {
   const inMm = shot.residuals.map(row => row.map(r => r === null ? null : 1000 * r));
   const whitened = shot.residuals.map((row, a) => row.map((r, i) => {
-    const sigma = shot.noise[a][i];
-    return r === null || sigma === null || sigma === undefined ? null : r / sigma;
+    const sigma = Array.isArray(shot.noise[a]) ? shot.noise[a][i] : shot.noise[a];
+    return r === null || sigma === null ? null : r / sigma;
   }));
-  const dots = (rows, unit) => rows.map((row, a) => line(shot.t, row, {
-    mode: "markers", name: AXES[a], marker: {size: 5, color: AXIS_COLOURS[a], symbol: ["circle", "diamond", "square"][a]},
-    hovertemplate: `%{x:.4f} s: %{y:.2f} ${unit}<extra>${AXES[a]}</extra>`}));
+  const dots = (rows, unit, most) => rows.map((row, a) => {
+    const symbol = ["circle", "diamond", "square"][a];
+    const drawn = row.map(r => r === null ? null : Math.max(-most, Math.min(most, r)));
+    return line(shot.t, drawn, {
+      mode: "markers", name: AXES[a], customdata: row,
+      marker: {size: 5, color: AXIS_COLOURS[a], symbol: row.map(r => Math.abs(r) > most ? symbol + "-open" : symbol)},
+      hovertemplate: `%{x:.4f} s: %{customdata:.2f} ${unit}<extra>${AXES[a]}</extra>`});
+  });
   const time = {title: {text: "time, s"}};
-  Plotly.react("residuals", dots(inMm, "mm"), layout({xaxis: time, yaxis: {title: {text: "residual, mm"}}}), CONFIG);
+  Plotly.react("residuals", dots(inMm, "mm", Infinity), layout({xaxis: time, yaxis: {title: {text: "residual, mm"}}}), CONFIG);
   if (element("whitened") === null) return;
   const lines = [-BAND, BAND].map(y => ({type: "line", xref: "paper", x0: 0, x1: 1, y0: y, y1: y,
                                          line: {dash: "dash", width: 1, color: colour("--quiet")}}));
   const drawn = layout({xaxis: time, yaxis: {title: {text: "standard deviations"}}, shapes: lines});
-  Plotly.react("whitened", dots(whitened, "standard deviations"), drawn, CONFIG);
+  Plotly.react("whitened", dots(whitened, "standard deviations", page.largest), drawn, CONFIG);
 }
 
 function drawCoverage() {
@@ -277,7 +313,7 @@ function drawDiagnosis() {
   Plotly.react("candidates", [{type: "bar", orientation: "h", x: sizes, y: names, marker: {color: ESTIMATE},
                text: found.candidates.map(c => c.outcome).reverse(), textposition: "none",
                hovertemplate: "%{y}: %{x:.3g}<br>%{text}<extra></extra>"}],
-               layout({xaxis: {title: {text: "squared residual explained"}, type: "log"}, yaxis: {type: "category"}}), CONFIG);
+               layout({xaxis: {title: {text: "squared residual explained"}, type: "log"}, yaxis: {type: "category", automargin: true}}), CONFIG);
 }
 
 function showMoment() {

@@ -10,14 +10,19 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.pages.coverage import HALF_WIDTH, LEVEL
 from ballfg.pages.html import Html, items, section, table, tag, term
+from ballfg.pages.marks import GAP
 from ballfg.pages.outline import NET_HEIGHT, Outline
 from ballfg.pages.page import script, whole_page
 from ballfg.pages.shot import Shot
 from ballfg.pages.shown import Shown
+from ballfg.state import POSITION, SPIN, VELOCITY
 
-LENGTH_DECIMALS, TIME_DECIMALS, RATE_DECIMALS = 5, 6, 3
-"""Digits after the point of m, s, and m/s and rad/s in the page: 10 um is far below what trackers resolve."""
+LENGTH_DECIMALS, TIME_DECIMALS, VELOCITY_DECIMALS, SPIN_DECIMALS = 5, 5, 3, 1
+"""Digits after the point of m, s, m/s and rad/s in the page: 10 um is far below what trackers resolve."""
 SIGMA_DECIMALS = 6
+"""The same of standard deviations in m: those of a state may be a tenth of a mm."""
+LARGEST = 8.0
+"""Standard deviations beyond which a residual is drawn at the edge, so that one outlier does not hide the others."""
 CANDIDATES = 10
 """Effects of a diagnosis that are drawn, those first that explain most."""
 
@@ -56,9 +61,10 @@ def _sentence(shown: Shown) -> str:
     ]
     words = [word for word in what if word]
     listed = words[0] if len(words) == 1 else f"{', '.join(words[:-1])} and {words[-1]}"
-    shots = "One shot" if count == 1 else f"{count} shots"
-    rest = "" if count == shown.count else f" ({count} of {shown.count}; --track chooses others)"
-    return f"{shots}{rest}: {listed}."
+    shots = "One shot" if count == shown.count == 1 else f"{count} shots"
+    if count < shown.count:
+        shots = f"{count} of {shown.count} shots (--track chooses others)"
+    return f"{shots}: {listed}."
 
 
 def _flight(shown: Shown) -> Html:
@@ -81,7 +87,7 @@ def _flight(shown: Shown) -> Html:
     running = tag("div", tag("button", "Play", type="button", id="play"), time, kind="controls")
     words = (
         "Turn the picture with the mouse or a finger. Times count from the shot's first stamp. A tube holds "
-        "the central 90 % of each coordinate."
+        "the central 90 % of each coordinate. What lies far from samples, estimate and table is cut off."
     )
     if shown.given.states is not None and shown.given.dataset is not None:
         words += " Contacts and hits are read off the states: where the ball turns up at a surface, and where it jumps."
@@ -106,7 +112,10 @@ def _residuals(shown: Shown) -> Html:
     explained = "The measured position less the estimated one. A pattern in time is something that the model lacks."
     figures = [_figure("residuals", "In mm", "Along x, y and z.", "plot")]
     if shown.noise:
-        words = "Divided by the standard deviation of a sample. About nine of ten belong between the dashed lines."
+        words = (
+            "Divided by the standard deviation of a sample. About nine of ten belong between the dashed lines. Those "
+            f"beyond {LARGEST:g} are drawn there, with open signs."
+        )
         figures.append(_figure("whitened", "In standard deviations", words, "plot"))
     words_ = tag("p", "The ", term("residuals", explained), " of the estimate at each sample. ", shown.noise)
     return section("Residuals: measured less estimated", words_, tag("div", *figures, kind="plots"))
@@ -181,6 +190,8 @@ def _data(shown: Shown) -> dict[str, Any]:
     return {
         "half_width": HALF_WIDTH,
         "level": 100.0 * LEVEL,
+        "largest": LARGEST,
+        "gap": GAP,
         "table": None if shown.table is None else _table(shown.table),
         "shots": [_shot(shot) for shot in shown.shots],
         "coverage": None
@@ -211,23 +222,33 @@ def _table(outline: Outline) -> dict[str, Any]:
 
 def _shot(shot: Shot) -> dict[str, Any]:
     start = shot.start
-    states = [*_plain(shot.states[:, :3].T, LENGTH_DECIMALS), *_plain(shot.states[:, 3:].T, RATE_DECIMALS)]
+    states = [
+        *_plain(shot.states[:, POSITION].T, LENGTH_DECIMALS),
+        *_plain(shot.states[:, VELOCITY].T, VELOCITY_DECIMALS),
+        *_plain(shot.states[:, SPIN].T, SPIN_DECIMALS),
+    ]
     known = len(shot.state_times) > 0
     return {
         "name": shot.name,
         "t": _plain(shot.times - start, TIME_DECIMALS),
         "positions": _plain(shot.positions.T, LENGTH_DECIMALS),
-        "noise": _plain(shot.noise.T, SIGMA_DECIMALS) if known else [],
-        "residuals": _plain(shot.residuals().T, SIGMA_DECIMALS) if known else [],
+        "noise": _noise(shot) if known else [],
+        "residuals": _plain(shot.residuals().T, LENGTH_DECIMALS) if known else [],
         "state_t": _plain(shot.state_times - start, TIME_DECIMALS),
         "states": states,
         "state_sigmas": _plain(shot.state_sigmas[:, :3].T, SIGMA_DECIMALS),
         "predicted_t": _plain(shot.predicted_times - start, TIME_DECIMALS),
         "predicted": _plain(shot.predicted.T, LENGTH_DECIMALS),
         "predicted_sigmas": _plain(shot.predicted_sigmas.T, SIGMA_DECIMALS),
-        "prediction_errors": _plain(shot.prediction_errors().T, SIGMA_DECIMALS),
+        "prediction_errors": _plain(shot.prediction_errors().T, LENGTH_DECIMALS),
         "marks": [{"kind": mark.kind, "t": mark.time - start, "place": list(mark.place)} for mark in shot.marks],
     }
+
+
+def _noise(shot: Shot) -> list[Any]:
+    """The standard deviations of each axis: one number where they are all the same, which most datasets state."""
+    rows = _plain(shot.noise.T, SIGMA_DECIMALS)
+    return [row[0] if len(set(row)) == 1 else row for row in rows]
 
 
 def _tracks(found: Mapping[str, Any]) -> dict[str, Any]:

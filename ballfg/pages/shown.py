@@ -19,8 +19,8 @@ from ballfg.tracks import Track
 
 MOST_SHOTS = 40
 """Shots of one page where none are named: a list to choose from that one can still read."""
-MOST_ROWS = 60_000
-"""Samples, states and predictions of one page together: about 5 MB."""
+MOST_ROWS = 36_000
+"""Samples, states and predictions of one page together: about 3 MB beside the 5 MB of the drawing library."""
 ROBUST = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 
@@ -54,7 +54,7 @@ def collect(given: Given, names: Sequence[str] = (), limited: bool = True) -> Sh
     Args:
         given: what there is.
         names: of the shots; where empty, the first ones.
-        limited: whether at most 40 shots and 60,000 rows are taken, as a page holds.
+        limited: whether at most 40 shots and 36,000 rows are taken, as a page holds.
     Raises: ValueError: a name that is not there, results that belong to other tracks, or a shot too long for a page.
     """
     known = _names(given)

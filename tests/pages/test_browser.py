@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 import re
 import shutil
 import subprocess
@@ -21,10 +22,15 @@ const frame = document.querySelector("iframe");
 frame.addEventListener("load", () => setTimeout(() => {
   const inside = frame.contentDocument, root = inside.documentElement;
   const count = query => inside.querySelectorAll(query).length;
-  const found = {too_wide: root.scrollWidth - root.clientWidth, traces: count(".scatterlayer .trace"), spaces: count(".gl-container canvas"),
-    svgs: count(".main-svg"), bars: count(".bars .point"), options: count("#shot option"),
+  const found = {
+    too_wide: root.scrollWidth - root.clientWidth,
+    traces: count(".scatterlayer .trace"),
+    spaces: count(".gl-container canvas"),
+    bars: count(".bars .point"),
+    options: count("#shot option"),
     readout: (inside.getElementById("readout") || {}).textContent || "",
-    legend: Array.from(inside.querySelectorAll("#space .legendtext")).map(e => e.textContent).join("|")};
+    legend: Array.from(inside.querySelectorAll("#space .legendtext")).map(e => e.textContent).join("|"),
+  };
   document.body.dataset.found = JSON.stringify(found);
 }, 3000));
 """
@@ -32,8 +38,6 @@ frame.addEventListener("load", () => setTimeout(() => {
 
 def browsed(page: str, width: int, folder: Path) -> tuple[dict[str, object], str]:
     """What is drawn in a window of a width in px, and the messages of the console."""
-    import json
-
     # a window cannot be made narrower than 500 px, but a frame can; its text comes with it, so that it can be measured
     frame = f'<iframe srcdoc="{html.escape(page)}" style="width:{width}px;height:900px;border:0"></iframe>'
     (folder / "frame.html").write_text(
