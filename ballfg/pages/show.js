@@ -200,7 +200,10 @@ function drawSpace() {
                               color: colour("--ink"), showspikes: false});
   const size = pathPlaces().slice(0, 2).map(row => Math.max(...row) - Math.min(...row));
   const alongY = size[1] > size[0], narrow = element("space").clientWidth < 520;
-  const [ahead, aside, above] = narrow ? [0.8, 2.5, 0.85] : [0.5, 1.6, 0.55];
+  // the longest axis, in units of the cube that plotly draws, fits into the picture
+  const lengths = range.map(([low, high]) => high - low);
+  const longest = Math.max(...lengths) / Math.cbrt(lengths.reduce((product, length) => product * length));
+  const [ahead, aside, above] = (narrow ? [0.6, 1.85, 0.62] : [0.38, 1.22, 0.42]).map(part => part * longest);
   const eye = alongY ? {x: aside, y: ahead, z: above} : {x: ahead, y: -aside, z: above};  // from the side of the flight
   const scene = {aspectmode: "data", xaxis: axis("x", 0), yaxis: axis("y", 1), zaxis: axis("z", 2),
                  camera: {center: {x: 0, y: 0, z: -0.12}, eye}, uirevision: alongY ? "y" : "x"};

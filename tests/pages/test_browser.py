@@ -31,6 +31,15 @@ frame.addEventListener("load", () => setTimeout(() => {
     readout: (inside.getElementById("readout") || {}).textContent || "",
     legend: Array.from(inside.querySelectorAll("#space .legendtext")).map(e => e.textContent).join("|"),
   };
+  const list = inside.getElementById("shot"), slider = inside.getElementById("moment");
+  if (list !== null && list.length > 1) {
+    list.selectedIndex = 1;
+    list.dispatchEvent(new Event("change"));
+    slider.value = 20;
+    slider.dispatchEvent(new Event("input"));
+    found.moved = inside.getElementById("readout").textContent;
+    found.ball = inside.getElementById("space").data.at(-1).x[0];
+  }
   document.body.dataset.found = JSON.stringify(found);
 }, 3000));
 """
@@ -63,6 +72,8 @@ def test_everything_is_drawn(made: Made, report: Path, tmp_path: Path, width: in
     assert found["bars"]
     assert found["options"] == 3
     assert str(found["readout"]).startswith("t = 0.000 s · x 0.000 m, y 0.000 m, z 1.080 m (± 1.00 mm")
+    assert str(found["moved"]).startswith("t = 0.200 s · x -0.800 m, y 0.100 m, z 1.084 m")  # of the second shot
+    assert found["ball"] == -0.8
     for name in ("measured", "estimate", "prediction", "contact", "spin axis, 0.1 m for 100 rad/s"):
         assert name in str(found["legend"]).split("|")
 
