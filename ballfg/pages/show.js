@@ -236,6 +236,9 @@ function drawByAxis() {
   for (let a = 0; a < 3; a++) {
     const on = {yaxis: a ? `y${a + 1}` : "y"}, hovertemplate = `%{x:.4f} s: ${AXES[a]} = %{y:.4f} m`;
     const first = name => ({name, legendgroup: name, showlegend: a === 0, hovertemplate, ...on});
+    if (shot.t.length) {
+      traces.push(line(shot.t, shot.positions[a], {mode: "markers", marker: {size: 4, color: colour("--quiet")}, ...first("measured")}));
+    }
     if (hasPredictions()) {
       traces.push(band(shot.predicted_t, shot.predicted[a], shot.predicted_sigmas[a], PREDICTION, on));
       const style = {mode: "lines", line: {color: PREDICTION}, ...first("prediction")};
@@ -245,9 +248,6 @@ function drawByAxis() {
       traces.push(band(shot.state_t, shot.states[a], shot.state_sigmas[a], ESTIMATE, on));
       const style = {mode: "lines", line: {color: ESTIMATE, width: 1.5}, ...first("estimate")};
       traces.push(broken(line(shot.state_t, shot.states[a], style), shot.state_t));
-    }
-    if (shot.t.length) {
-      traces.push(line(shot.t, shot.positions[a], {mode: "markers", marker: {size: 4, color: colour("--quiet")}, ...first("measured")}));
     }
   }
   Plotly.react("axes", traces, stacked(AXES, "m"), CONFIG);

@@ -113,8 +113,8 @@ def _residuals(shown: Shown) -> Html:
     figures = [_figure("residuals", "In mm", "Along x, y and z.", "plot")]
     if shown.noise:
         words = (
-            "Divided by the standard deviation of a sample. About nine of ten belong between the dashed lines. Those "
-            f"beyond {LARGEST:g} are drawn there, with open signs."
+            "Divided by the standard deviation of a sample. Nine of ten, or a few more since the estimate follows the "
+            f"samples, belong between the dashed lines. Those beyond {LARGEST:g} are drawn there, with open signs."
         )
         figures.append(_figure("whitened", "In standard deviations", words, "plot"))
     words_ = tag("p", "The ", term("residuals", explained), " of the estimate at each sample. ", shown.noise)
