@@ -15,6 +15,7 @@ LEVELS = (
     ("tracks",),
     ("vision",),
     ("dynamics",),
+    ("pages",),
     ("simulation", "factors"),
     ("prediction",),
     ("estimation",),

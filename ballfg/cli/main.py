@@ -19,6 +19,7 @@ from ballfg.cli.live import live
 from ballfg.cli.noise import noise
 from ballfg.cli.predict import predict
 from ballfg.cli.render import render
+from ballfg.cli.show import show
 from ballfg.cli.simulate import simulate
 from ballfg.cli.start import start
 from ballfg.cli.track import track
@@ -39,6 +40,7 @@ app.command()(estimate)
 app.command()(predict)
 app.command()(live)
 app.command()(diagnose)
+app.command()(show)
 app.command()(noise)
 app.command()(example)
 app.command()(simulate)

@@ -1,11 +1,17 @@
 """The result of a diagnosis: the verdict, effects added with their evidence, errors before and after, the rest."""
 
+from __future__ import annotations
+
 import enum
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics import BallModel
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class Verdict(enum.Enum):
@@ -305,3 +311,14 @@ class Diagnosis:
     def __repr__(self) -> str:
         effects = ", ".join(finding.name for finding in self.findings) or "none"
         return f"Diagnosis({self.dataset!r}, effects added: {effects};\n    {self.sentence})"
+
+    def plot(self) -> Figure:
+        """A picture of the prediction error of each held-out track, before and after the model was corrected.
+
+        Where nothing was added to the model, it shows the residuals of the fitted model over their normal distribution.
+        """
+        from ballfg.diagnosis.report import pictures
+
+        if self.findings:
+            return pictures.errors_by_track(self.before, self.after)
+        return pictures.histogram({"the fitted model": self.residuals_before})

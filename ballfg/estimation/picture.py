@@ -1,10 +1,15 @@
-"""The picture of an estimate: each component of the state over time, with its uncertainty."""
+"""Pictures of an estimate and of a prediction: each component over time, with its uncertainty."""
 
 from typing import Final
 
+import numpy as np
 from matplotlib.figure import Figure
 
 from ballfg.estimation.result import Estimate
+from ballfg.estimation.track_prediction import TrackPrediction
+from ballfg.pages.marks import Mark
+from ballfg.pages.pictures import by_axis
+from ballfg.pages.shot import Shot
 
 PARTS: Final = (("position", "m"), ("velocity", "m/s"), ("spin", "rad/s"))
 AXES: Final = ("x", "y", "z")
@@ -35,3 +40,36 @@ def picture(estimate: Estimate) -> Figure:
     panels[0].set_title(f"track {estimate.name}: states with two standard deviations; dashed: contacts")
     panels[2].set_xlabel("time, s")
     return figure
+
+
+def predicted(prediction: TrackPrediction) -> Figure:
+    """Three panels, one for each axis; contacts of the observed part are dashed lines, hits are dotted ones.
+
+    Args: prediction: of one track.
+    """
+    return by_axis(
+        Shot(
+            prediction.name,
+            prediction.times,
+            prediction.measured,
+            np.full(prediction.measured.shape, np.nan),
+            prediction.estimate.times,
+            prediction.estimate.states,
+            prediction.estimate.sigmas,
+            prediction.times,
+            prediction.positions,
+            prediction.sigmas,
+            _marks(prediction.estimate),
+        )
+    )
+
+
+def _marks(estimate: Estimate) -> tuple[Mark, ...]:
+    times = estimate.times
+    events = [("contact", contact.time) for contact in estimate.contacts]
+    events += [("hit", float(0.5 * (times[interval] + times[interval + 1]))) for interval in estimate.hits]
+    found = []
+    for kind, time in events:
+        x, y, z = (float(np.interp(time, times, path)) for path in estimate.states[:, :3].T)
+        found.append(Mark(kind, time, (x, y, z)))
+    return tuple(found)

@@ -24,6 +24,8 @@ from ballfg.state import POSITION, VELOCITY
 from ballfg.tracks import Track
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
     from ballfg.estimation.conformal import ConformalScales
 
 BLOCK = 64
@@ -64,6 +66,12 @@ class TrackPrediction:
     def status(self) -> Status:
         """How the estimation of the observed part ended."""
         return self.estimate.status
+
+    def plot(self) -> Figure:
+        """A picture of x, y and z over time: the estimate, the prediction and what was measured, with 90 % bands."""
+        from ballfg.estimation.picture import predicted
+
+        return predicted(self)
 
 
 def predict_tracks(

@@ -16,6 +16,7 @@ from ballfg.prediction.state import BallState
 from ballfg.state import POSITION
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from pandas import DataFrame
 
 
@@ -96,6 +97,14 @@ class Ahead:
 
         columns = {"t": self.times, **dict(zip(AXES, self.positions.T, strict=True))}
         return pandas.DataFrame(columns | {f"sigma_{a}": s for a, s in zip(AXES, self.sigmas.T, strict=True)})
+
+    def plot(self) -> Figure:
+        """A picture of x, y and z over time, each with the band that holds 90 %; without measurement noise."""
+        from ballfg.pages.pictures import by_axis
+        from ballfg.pages.shot import Shot
+
+        name, places = self.start.name, self.positions
+        return by_axis(Shot(name, predicted_times=self.times, predicted=places, predicted_sigmas=self.sigmas))
 
 
 def look_ahead(start: BallState, horizon: float, step: float = 0.01) -> Ahead:

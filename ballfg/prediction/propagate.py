@@ -5,9 +5,12 @@ Near a contact of uncertain time the reported mean and covariance are those of t
 (docs/derivations/prediction.md).
 """
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -25,7 +28,10 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.edges import edge_doubt
-from ballfg.state import STATE_DIM
+from ballfg.state import POSITION, STATE_DIM
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 AT_ONCE = 64
 """Steps of free flight that machine code does before anyone looks: more would keep covariances that nobody needs."""
@@ -44,6 +50,18 @@ class Prediction:
     times: Array
     states: Array
     covariances: Array
+
+    def plot(self, ball: int = 0) -> Figure:
+        """A picture of x, y and z of one ball over time, each with the band that holds 90 %.
+
+        Args: ball: index of the ball.
+        """
+        from ballfg.pages.pictures import by_axis
+        from ballfg.pages.shot import Shot
+
+        sigmas = np.sqrt(np.diagonal(self.covariances[ball], axis1=1, axis2=2)[:, POSITION])
+        places = self.states[ball][:, POSITION]
+        return by_axis(Shot(str(ball), predicted_times=self.times[ball], predicted=places, predicted_sigmas=sigmas))
 
 
 @dataclass(frozen=True)

@@ -27,6 +27,7 @@ ROOMS = (
     "ballfg.tracks",
     "ballfg.vision",
     "ballfg.dynamics",
+    "ballfg.pages",
     "ballfg.simulation",
     "ballfg.factors",
     "ballfg.estimation",

@@ -1,0 +1,96 @@
+"""`ballfg show`: measured shots, estimates, predictions and a diagnosis as a page to look at."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ballfg.files.whole_file import check_file, whole_file, write_text
+
+if TYPE_CHECKING:
+    from ballfg.pages import Shown
+
+
+def show(
+    given: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="WHAT...",
+            help="Dataset, states of estimate, predictions of predict, folder or report.json of diagnose; "
+            "one or more, in any order.",
+        ),
+    ],
+    out: Annotated[Path | None, typer.Option(help="Page to write, .html; everything is inside.")] = None,
+    png: Annotated[Path | None, typer.Option(help="Picture for papers, .png, .pdf or .svg, of the first shot.")] = None,
+    rerun: Annotated[
+        Path | None, typer.Option(help="Recording .rrd for the viewer rerun, of all shots however long.")
+    ] = None,
+    track: Annotated[
+        list[str] | None, typer.Option(help="Name of a shot to show; may be repeated. Default: the first 40.")
+    ] = None,
+) -> None:
+    """A page with each shot over the table, its residuals, its predictions against what was measured.
+
+    Example: ballfg show data/ballgun states.csv predictions.csv --out page.html
+
+    The page is one file without links: it opens without a network, on a computer or a phone.
+    """
+    from ballfg.pages import collect, recognise, show_page
+
+    _check_outputs(out, png, rerun)
+    what, names = recognise(given), track or []
+    for note in what.dataset.notes if what.dataset is not None else ():
+        print(f"note: {note}", file=sys.stderr)
+    if rerun is not None:
+        _write_recording(collect(what, names, limited=False), rerun)
+    if out is None and png is None:
+        return
+    shown = collect(what, names)
+    for note in shown.notes:
+        print(f"note: {note}", file=sys.stderr)
+    if png is not None:
+        _write_picture(shown, png)
+    if out is not None:
+        write_text(out, show_page(shown))
+        print(f"{out}: {len(shown.shots)} of {shown.count} shots")
+
+
+def _check_outputs(out: Path | None, png: Path | None, rerun: Path | None) -> None:
+    """Refuses outputs that cannot be written, before anything is read. Raises: ValueError."""
+    if out is None and png is None and rerun is None:
+        raise ValueError("out must name the page to write; got nothing. Add --out page.html, --png or --rerun.")
+    for name, path, endings in (
+        ("out", out, (".html", ".htm")),
+        ("png", png, (".png", ".pdf", ".svg")),
+        ("rerun", rerun, (".rrd",)),
+    ):
+        if path is not None:
+            if path.suffix.lower() not in endings:
+                raise ValueError(f"{name} must end in {' or '.join(endings)}; got {path}. Choose another name.")
+            check_file(path, name)
+    if rerun is not None:
+        from ballfg.pages.recording import check_rerun
+
+        check_rerun()
+
+
+def _write_picture(shown: Shown, png: Path) -> None:
+    """The first shot that is shown, for papers."""
+    from ballfg.pages.pictures import views
+
+    if not shown.shots:
+        raise ValueError("png must have a shot to draw; only a diagnosis was given. Add a dataset or a table.")
+    with whole_file(png, "png") as temporary:
+        views(shown.shots[0], shown.table).savefig(temporary, dpi=200)
+    print(f"{png}: shot {shown.shots[0].name}")
+
+
+def _write_recording(shown: Shown, rerun: Path) -> None:
+    from ballfg.pages import record
+
+    with whole_file(rerun, "rerun") as temporary:
+        record(shown, temporary)
+    print(f"{rerun}: {len(shown.shots)} shots")

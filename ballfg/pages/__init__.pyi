@@ -1,0 +1,15 @@
+from .given import Given as Given
+from .given import recognise as recognise
+from .html import Html as Html
+from .html import items as items
+from .html import section as section
+from .html import table as table
+from .html import tag as tag
+from .html import term as term
+from .html import text as text
+from .page import whole_page as whole_page
+from .recording import record as record
+from .shot import Shot as Shot
+from .show_page import show_page as show_page
+from .shown import Shown as Shown
+from .shown import collect as collect

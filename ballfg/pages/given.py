@@ -1,0 +1,88 @@
+"""What the words of `ballfg show` are: a dataset, states, predictions, a diagnosis, in any order."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ballfg.pages.tables import Kind, ResultTable, columns_of, kind_of, read_table
+from ballfg.tracks import Dataset, read_dataset
+
+REPORT = "report.json"
+"""The file of a diagnosis folder that programs read."""
+COULD_BE = (
+    "a dataset (a folder with dataset.yaml), states of `ballfg estimate`, predictions of `ballfg predict` "
+    "(.csv or .parquet), or a diagnosis of `ballfg diagnose` (its folder or report.json)"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """What there is to show; None for what was not given.
+
+    Attributes:
+        dataset: the measured tracks.
+        states, predictions: tables of results, in the units of their columns.
+        diagnosis: content of `report.json`.
+    """
+
+    dataset: Dataset | None = None
+    states: ResultTable | None = None
+    predictions: ResultTable | None = None
+    diagnosis: Mapping[str, Any] | None = None
+
+
+def recognise(paths: Iterable[Path]) -> Given:
+    """Reads each path as what it is.
+
+    Args: paths: one of each kind at most, in any order.
+    Raises:
+        FileNotFoundError: a path that is not there.
+        ValueError: a path that is nothing of the kind, two of one kind, or a file that breaks its format.
+    """
+    found: dict[str, Any] = {}
+    places: dict[str, Path] = {}
+    for path in paths:
+        kind, content = _read(path)
+        if kind in found:
+            raise ValueError(f"one {kind} can be shown at a time; got {places[kind]} and {path}. Leave one out.")
+        found[kind], places[kind] = content, path
+    if not found:
+        raise ValueError(f"something must be given to show: {COULD_BE}. Name its path.")
+    return Given(**found)
+
+
+def _read(path: Path) -> tuple[str, Any]:
+    if not path.exists():
+        raise FileNotFoundError(f"{path} does not exist; it could be {COULD_BE}. Check the path.")
+    if path.is_dir():
+        if (path / "dataset.yaml").is_file():
+            return "dataset", read_dataset(path)
+        if (path / REPORT).is_file():
+            return "diagnosis", _diagnosis(path / REPORT)
+        raise ValueError(f"{path} must be {COULD_BE}; it holds neither dataset.yaml nor {REPORT}. Check the path.")
+    if path.suffix.lower() == ".json":
+        return "diagnosis", _diagnosis(path)
+    if path.suffix.lower() not in (".csv", ".parquet"):
+        raise ValueError(f"{path} must be {COULD_BE}; its ending is {path.suffix or 'none'!r}. Check the path.")
+    columns = columns_of(path)
+    own = path.absolute().parent / "dataset.yaml"
+    kind = None if own.is_file() and path.stem == "tracks" else kind_of(columns)
+    if kind is None:
+        shown = ", ".join(columns[:8]) + (", ..." if len(columns) > 8 else "")
+        hint = f"Give its folder, {path.parent}." if own.is_file() else "Check the path."
+        raise ValueError(f"{path} must be {COULD_BE}; its columns are {shown}. {hint}")
+    return ("states" if kind is Kind.STATES else "predictions"), read_table(path, kind)
+
+
+def _diagnosis(path: Path) -> Mapping[str, Any]:
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except ValueError:
+        raise ValueError(f"{path} must be the {REPORT} of a diagnosis; it is no JSON. Diagnose again.") from None
+    if not isinstance(content, dict) or not {"verdict", "sentence", "error", "calibrated", "rounds"} <= content.keys():
+        raise ValueError(f"{path} must be the {REPORT} of a diagnosis; its fields are others. Give {COULD_BE}.")
+    return content

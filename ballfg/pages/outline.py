@@ -1,0 +1,80 @@
+"""Where the table, its net and the floor are drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH
+from ballfg.tracks import TABLE_TENNIS, TENNIS, DatasetInfo
+
+NET_HEIGHT = 0.1525
+"""m above the table, and how far the net reaches over its sides (ITTF Laws 2.2)."""
+SMALL_BALL = 0.5 * (TABLE_TENNIS.radius + TENNIS.radius)
+"""m. Balls below this radius are table-tennis balls: their table has the size of the rules, and a net."""
+MARGIN = 0.2
+"""m by which a surface without known ends reaches beyond the samples."""
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Heights and ends of what the ball bounces on.
+
+    Attributes:
+        height: m, of the surface.
+        extent: (x_low, x_high, y_low, y_high) m.
+        net: whether a net stands across its longer side.
+        floor: m, height of the floor; None where it is not known.
+        words: a sentence on where the ends are from.
+    """
+
+    height: float
+    extent: tuple[float, float, float, float]
+    net: bool
+    floor: float | None
+    words: str
+
+    @property
+    def surfaces(self) -> tuple[float, ...]:
+        """m, heights that a ball can bounce on."""
+        return (self.height,) if self.floor is None else (self.height, self.floor)
+
+
+def outline(info: DatasetInfo, positions: Array) -> Outline:
+    """The table of a dataset.
+
+    Args: info: what the dataset states.  positions: (n, 3) m, samples that the table lies under, n >= 1.
+    """
+    small = info.ball.radius < SMALL_BALL
+    floor = info.table_height - TABLE_ABOVE_FLOOR if small else None
+    if info.table_extent is not None:
+        words = "The ends of the table are those of dataset.yaml."
+        return Outline(info.table_height, _finite(info.table_extent, positions), small, floor, words)
+    low, high = positions[:, :2].min(axis=0), positions[:, :2].max(axis=0)
+    if not small:
+        ends = (low[0] - MARGIN, high[0] + MARGIN, low[1] - MARGIN, high[1] + MARGIN)
+        words = "dataset.yaml does not state where the surface ends: it is drawn under all samples."
+        return Outline(info.table_height, _numbers(ends), False, floor, words)
+    middle = 0.5 * (low + high)
+    along_x = high[0] - low[0] >= high[1] - low[1]
+    half = 0.5 * np.array((TABLE_LENGTH, TABLE_WIDTH) if along_x else (TABLE_WIDTH, TABLE_LENGTH))
+    ends = (middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1])
+    words = (
+        "dataset.yaml does not state where the table's ends are: a table of the rules' size is drawn under the middle "
+        "of the samples. Only its height is known."
+    )
+    return Outline(info.table_height, _numbers(ends), False, floor, words)
+
+
+def _finite(extent: tuple[float, float, float, float], positions: Array) -> tuple[float, float, float, float]:
+    """The extent, with the samples' own ends where one is infinite."""
+    low, high = positions[:, :2].min(axis=0) - MARGIN, positions[:, :2].max(axis=0) + MARGIN
+    seen = (low[0], high[0], low[1], high[1])
+    return _numbers(tuple(end if np.isfinite(end) else other for end, other in zip(extent, seen, strict=True)))
+
+
+def _numbers(ends: tuple[float, ...]) -> tuple[float, float, float, float]:
+    a, b, c, d = (float(end) for end in ends)
+    return a, b, c, d

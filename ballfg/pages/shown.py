@@ -1,0 +1,185 @@
+"""What a page shows: the shots that were chosen, from all that was given, checked against each other."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.checks import did_you_mean
+from ballfg.pages.coverage import Coverage, coverage
+from ballfg.pages.given import Given
+from ballfg.pages.marks import marks
+from ballfg.pages.outline import Outline, outline
+from ballfg.pages.shot import SAME_STAMP, Shot
+from ballfg.pages.tables import ResultTable
+from ballfg.tracks import Track
+
+MOST_SHOTS = 40
+"""Shots of one page where none are named: a list to choose from that one can still read."""
+MOST_ROWS = 36_000
+"""Samples, states and predictions of one page together: about 3 MB beside the 5 MB of the drawing library."""
+ROBUST = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What is drawn.
+
+    Attributes:
+        given: all that there is.
+        shots: those chosen, in the dataset's order.
+        count: how many shots there are in all.
+        table: where the table is; None without a dataset.
+        coverage: of all predicted shots, not of those chosen alone; None without measured tracks or predictions.
+        noise: a sentence on the standard deviation of the measured coordinates; empty where it is not known.
+        notes: sentences on what the reader should know.
+    """
+
+    given: Given
+    shots: tuple[Shot, ...]
+    count: int
+    table: Outline | None
+    coverage: Coverage | None
+    noise: str
+    notes: tuple[str, ...]
+
+
+def collect(given: Given, names: Sequence[str] = (), limited: bool = True) -> Shown:
+    """Chooses shots and puts together what is known of each.
+
+    Args:
+        given: what there is.
+        names: of the shots; where empty, the first ones.
+        limited: whether at most 40 shots and 36,000 rows are taken, as a page holds.
+    Raises: ValueError: a name that is not there, results that belong to other tracks, or a shot too long for a page.
+    """
+    known = _names(given)
+    _check_names(names, known)
+    notes = list(_check_results(given))
+    wanted = set(names) if names else set(known[:MOST_SHOTS] if limited else known)
+    shots: list[Shot] = []
+    for shot in _all_shots(given, wanted):
+        if limited and sum(other.rows for other in shots) + shot.rows > MOST_ROWS:
+            if not shots or names:
+                raise ValueError(
+                    f"a page holds {MOST_ROWS} samples, states and predictions; shot {shot.name!r} brings more. "
+                    "Name fewer shots with --track, or write a recording with --rerun."
+                )
+            break
+        shots.append(shot)
+    held = coverage(_all_shots(given)) if given.dataset is not None and given.predictions is not None else None
+    noise = ""
+    if given.dataset is not None and given.states is not None:
+        shots, noise = _with_noise(given, shots)
+    table = None
+    if given.dataset is not None and shots:
+        table = outline(given.dataset.info, np.concatenate([shot.positions for shot in shots]))
+        radius = given.dataset.ball.radius
+        shots = [replace(s, marks=tuple(marks(s.state_times, s.states, table.surfaces, radius))) for s in shots]
+        notes.append(table.words)
+    return Shown(given, tuple(shots), len(known), table, held, noise, tuple(notes))
+
+
+def _names(given: Given) -> list[str]:
+    """The shots there are: those of the dataset, else those of the tables."""
+    if given.dataset is not None:
+        return given.dataset.names
+    tables = [one for one in (given.states, given.predictions) if one is not None]
+    return list(dict.fromkeys(name for one in tables for name in one.rows))
+
+
+def _check_names(names: Sequence[str], known: Sequence[str]) -> None:
+    for name in names:
+        if name not in known:
+            hint = did_you_mean(name, known)
+            raise ValueError(f"--track must name one of the {len(known)} shots; got {name!r}.{hint} Correct the name.")
+
+
+def _check_results(given: Given) -> Iterator[str]:
+    """Notes on results of a part of the shots.
+
+    Raises: ValueError: results of tracks that the dataset does not have.
+    """
+    dataset = given.dataset
+    for table in (given.states, given.predictions):
+        if table is None or dataset is None:
+            continue
+        there = set(dataset.names)
+        for name in table.rows:
+            if name not in there:
+                raise ValueError(
+                    f"{table.path} must belong to {dataset.path}; it has a trajectory {name!r}, which the dataset does "
+                    "not have. Give the dataset that it was made from."
+                )
+        if len(table.rows) < len(there):
+            yield f"{table.path.name} has rows for {len(table.rows)} of the {len(there)} shots."
+    named = None if given.diagnosis is None else given.diagnosis.get("dataset")
+    if dataset is not None and named is not None and named != dataset.info.name:
+        yield f"The diagnosis is of {named!r}, the tracks are of {dataset.info.name!r}."
+
+
+def _all_shots(given: Given, wanted: set[str] | None = None) -> Iterator[Shot]:
+    """Shots in the dataset's order, without marks and noise; those wanted, or all."""
+    if given.dataset is not None:
+        for track in given.dataset:
+            if wanted is None or track.name in wanted:
+                yield _shot(given, track.name, track)
+        return
+    for name in _names(given):
+        if wanted is None or name in wanted:
+            yield _shot(given, name, None)
+
+
+def _shot(given: Given, name: str, track: Track | None) -> Shot:
+    shot = Shot(name)
+    if track is not None:
+        unknown = np.full(track.positions.shape, np.nan)
+        noise = unknown if track.sigmas is None else track.sigmas
+        shot = replace(shot, times=track.times, positions=track.positions, noise=noise)
+    if given.states is not None:
+        rows = _rows(given.states, name, track)
+        shot = replace(shot, state_times=rows[:, 0], states=rows[:, 1:10], state_sigmas=rows[:, 10:])
+    if given.predictions is not None:
+        rows = _rows(given.predictions, name, track)
+        shot = replace(shot, predicted_times=rows[:, 0], predicted=rows[:, 1:4], predicted_sigmas=rows[:, 4:])
+    return shot
+
+
+def _rows(table: ResultTable, name: str, track: Track | None) -> Array:
+    """Rows of a table. Raises: ValueError: stamps that the measured track does not have."""
+    rows = table.of(name)
+    if track is not None and len(rows):
+        i = np.clip(np.searchsorted(track.times, rows[:, 0] - SAME_STAMP), 0, len(track) - 1)
+        wrong = np.flatnonzero(np.abs(track.times[i] - rows[:, 0]) > SAME_STAMP)
+        if len(wrong):
+            raise ValueError(
+                f"{table.path} must belong to the dataset: it has t = {rows[wrong[0], 0]:.9g} s of trajectory "
+                f"{name!r}, where the dataset has no sample. Give the dataset that it was made from."
+            )
+    return rows
+
+
+def _with_noise(given: Given, shots: list[Shot]) -> tuple[list[Shot], str]:
+    """The shots with the standard deviations of their samples, and a sentence on where they are from."""
+    assert given.dataset is not None
+    info = given.dataset.info
+    if given.dataset.has_sigmas:
+        return shots, "The standard deviations of the samples are those of the dataset's table."
+    words = "The standard deviations of the samples are those of dataset.yaml"
+    if info.noise is not None and info.noise.position is not None:
+        sigma = np.array(info.noise.position)
+    elif info.position_noise is not None:
+        sigma = np.full(3, info.position_noise)
+    else:
+        residuals = np.concatenate([shot.residuals() for shot in shots])
+        residuals = residuals[np.isfinite(residuals).all(axis=1)]
+        if not len(residuals) or not (sigma := ROBUST * np.median(np.abs(residuals), axis=0)).all():
+            return shots, ""
+        words = "The dataset states no noise: the standard deviations are those of the residuals of the shots shown"
+    x, y, z = (1e3 * sigma).tolist()
+    found = [replace(shot, noise=np.broadcast_to(sigma, shot.positions.shape)) for shot in shots]
+    return found, f"{words}: {x:.2g} mm in x, {y:.2g} mm in y, {z:.2g} mm in z."

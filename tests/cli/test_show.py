@@ -1,0 +1,66 @@
+"""`ballfg show` as a user types it: what it writes, and one clear line for what it cannot show."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.commands import status
+from tests.pages.made import Fall, Made, make
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Made:
+    return make(tmp_path / "made", {"a": Fall(), "b": Fall(0.5)})
+
+
+def test_page_and_picture(made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    page, picture = tmp_path / "page.html", tmp_path / "picture.png"
+    given = (made.predictions, made.dataset, made.states)
+    assert status("show", *given, "--out", page, "--png", picture, "--track", "b") == 0
+    said = capsys.readouterr()
+    assert said.out.splitlines() == [f"{picture}: shot b", f"{page}: 1 of 2 shots"]
+    assert page.read_text(encoding="utf-8").startswith("<!DOCTYPE html>")
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--out", "page.txt"], "out must end in .html or .htm"),
+        (["--out", "no/page.html"], "out must be in an existing folder"),
+        ([], "out must name the page to write"),
+        (["--out", "page.html", "--track", "c"], "--track must name one of the 2 shots; got 'c'"),
+    ],
+)
+def test_bad_input_is_one_line_and_nothing_is_written(
+    made: Made,
+    tmp_path: Path,
+    words: list[str],
+    message: str,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert status("show", made.dataset, *words) == 2
+    lines = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("note: ")]
+    assert len(lines) == 1
+    assert message in lines[0]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["made"]
+
+
+def test_a_missing_viewer_is_said_before_anything_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    assert status("show", tmp_path / "nothing", "--rerun", tmp_path / "log.rrd") == 2
+    assert "pip install 'ballfg[viewer]'" in capsys.readouterr().err
+
+
+def test_a_recording_holds_every_shot(made: Made, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("rerun", reason="rerun-sdk is not installed")
+    assert status("show", made.dataset, made.states, "--rerun", tmp_path / "log.rrd") == 0
+    assert f"{tmp_path / 'log.rrd'}: 2 shots" in capsys.readouterr().out
+    assert (tmp_path / "log.rrd").stat().st_size > 1000

@@ -1,0 +1,100 @@
+"""The page in a browser: everything is drawn, nothing fails, and it fits narrow and wide windows."""
+
+from __future__ import annotations
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from ballfg.pages import collect, recognise, show_page
+from tests.pages.made import Fall, Made, make
+
+BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
+pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
+FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+MEASURE = """
+const frame = document.querySelector("iframe");
+frame.addEventListener("load", () => setTimeout(() => {
+  const inside = frame.contentDocument, root = inside.documentElement;
+  const count = query => inside.querySelectorAll(query).length;
+  const found = {
+    too_wide: root.scrollWidth - root.clientWidth,
+    traces: count(".scatterlayer .trace"),
+    spaces: count(".gl-container canvas"),
+    bars: count(".bars .point"),
+    options: count("#shot option"),
+    readout: (inside.getElementById("readout") || {}).textContent || "",
+    legend: Array.from(inside.querySelectorAll("#space .legendtext")).map(e => e.textContent).join("|"),
+  };
+  const list = inside.getElementById("shot"), slider = inside.getElementById("moment");
+  if (list !== null && list.length > 1) {
+    list.selectedIndex = 1;
+    list.dispatchEvent(new Event("change"));
+    slider.value = 20;
+    slider.dispatchEvent(new Event("input"));
+    found.moved = inside.getElementById("readout").textContent;
+    found.ball = inside.getElementById("space").data.at(-1).x[0];
+  }
+  document.body.dataset.found = JSON.stringify(found);
+}, 3000));
+"""
+
+
+def browsed(page: str, width: int, folder: Path) -> tuple[dict[str, object], str]:
+    """What is drawn in a window of a width in px, and the messages of the console."""
+    # a window cannot be made narrower than 500 px, but a frame can; its text comes with it, so that it can be measured
+    frame = f'<iframe srcdoc="{html.escape(page)}" style="width:{width}px;height:900px;border:0"></iframe>'
+    (folder / "frame.html").write_text(
+        f"<!DOCTYPE html><body>{frame}<script>{MEASURE}</script></body>", encoding="utf-8"
+    )
+    command = [str(BROWSER), *FLAGS, "--enable-logging=stderr", "--v=0", "--virtual-time-budget=12000"]
+    command += [f"--user-data-dir={folder / 'profile'}", "--window-size=1400,1000", "--dump-dom"]
+    done = subprocess.run([*command, (folder / "frame.html").as_uri()], capture_output=True, text=True, timeout=120)
+    (found,) = re.findall(r'<body data-found="([^"]*)"', done.stdout)
+    console = [line for line in done.stderr.splitlines() if "CONSOLE" in line and "GL Driver Message" not in line]
+    return json.loads(html.unescape(found)), "\n".join(console)
+
+
+@pytest.mark.parametrize("width", [400, 1200])
+def test_everything_is_drawn(made: Made, report: Path, tmp_path: Path, width: int) -> None:
+    page = show_page(collect(recognise([made.dataset, made.states, made.predictions, report])))
+    found, console = browsed(page, width, tmp_path)
+    assert not re.search(r"error|uncaught|exception|warn", console, flags=re.IGNORECASE), console
+    assert found["too_wide"] == 0, "the page scrolls sideways"
+    # axes 3 x (measured, estimate, prediction and 2 bands), errors 3 x 2, residuals 3 + 3, coverage 3, diagnosis 2
+    assert found["traces"] == 15 + 6 + 6 + 3 + 2
+    assert found["spaces"]
+    assert found["bars"]
+    assert found["options"] == 3
+    assert str(found["readout"]).startswith("t = 0.000 s · x 0.000 m, y 0.000 m, z 1.080 m (± 1.00 mm")
+    assert str(found["moved"]).startswith("t = 0.200 s · x -0.800 m, y 0.100 m, z 1.084 m")  # of the second shot
+    assert found["ball"] == -0.8
+    for name in ("measured", "estimate", "prediction", "contact", "spin axis, 0.1 m for 100 rad/s"):
+        assert name in str(found["legend"]).split("|")
+
+
+def test_a_hostile_name_runs_nothing_and_two_samples_are_drawn(tmp_path: Path) -> None:
+    falls = {"<img src=x onerror=document.title='run'>": Fall(samples=2), "</script><b>": Fall()}
+    made = make(tmp_path, falls, extent=False)
+    found, console = browsed(show_page(collect(recognise([made.dataset, made.states]))), 400, tmp_path)
+    assert not re.search(r"error|uncaught|exception|warn", console, flags=re.IGNORECASE), console
+    assert (found["too_wide"], found["options"]) == (0, 2)
+    assert "measured" in str(found["legend"])
+
+
+def test_one_row_of_a_table_is_drawn(tmp_path: Path) -> None:
+    made = make(tmp_path, {"one": Fall(samples=1)})
+    found, console = browsed(show_page(collect(recognise([made.states]))), 400, tmp_path)
+    assert not re.search(r"error|uncaught|exception|warn", console, flags=re.IGNORECASE), console
+    assert (found["too_wide"], found["options"]) == (0, 1)
+
+
+def test_a_diagnosis_alone_is_drawn(report: Path, tmp_path: Path) -> None:
+    found, console = browsed(show_page(collect(recognise([report]))), 400, tmp_path)
+    assert not re.search(r"error|uncaught|exception|warn", console, flags=re.IGNORECASE), console
+    assert (found["traces"], found["spaces"]) == (2, 0)

@@ -1,0 +1,67 @@
+"""Results draw themselves: predictions with their bands, a diagnosis with its errors."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from matplotlib.figure import Figure
+
+import ballfg as bf
+from ballfg.diagnosis import Diagnosis
+from tests.diagnosis.made_diagnosis import found, silent
+from tests.pages.made import Fall, Made, make
+
+LEVEL_90 = 1.6448536
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    return make(tmp_path_factory.mktemp("small"), {"a": Fall()})
+
+
+@pytest.fixture(scope="module")
+def estimate(small: Made) -> bf.Estimate:
+    return bf.estimate(str(small.dataset))["a"]
+
+
+def check(figure: Figure, label: str, times: np.ndarray, places: np.ndarray, sigmas: np.ndarray) -> None:
+    """The line of a label and the last band of each axis are these numbers."""
+    assert [axes.get_ylabel() for axes in figure.axes] == ["x, m", "y, m", "z, m"]
+    for axis, panel in enumerate(figure.axes):
+        (line,) = [one for one in panel.lines if one.get_label() == label]
+        np.testing.assert_array_equal(np.column_stack(line.get_data()), np.column_stack((times, places[:, axis])))
+        edges = panel.collections[-1].get_datalim(panel.transData).intervaly
+        width = LEVEL_90 * sigmas[:, axis]
+        assert edges == pytest.approx([(places[:, axis] - width).min(), (places[:, axis] + width).max()])
+
+
+def test_a_path_ahead(estimate: bf.Estimate) -> None:
+    ahead = estimate.predict(0.3)
+    check(ahead.plot(), "prediction", ahead.times, ahead.positions, ahead.sigmas)
+
+
+def test_one_of_several_balls(estimate: bf.Estimate) -> None:
+    from ballfg.prediction import Propagator
+    from ballfg.prediction.ahead import carried_by
+
+    propagator, belief = carried_by(estimate.last)
+    assert isinstance(propagator, Propagator)
+    several = propagator.rollout(belief, estimate.last.time + np.array([[0.1, 0.2, 0.3]]))
+    sigmas = np.sqrt(np.diagonal(several.covariances[0], axis1=1, axis2=2))
+    check(several.plot(0), "prediction", several.times[0], several.states[0, :, :3], sigmas)
+
+
+def test_a_prediction_against_what_was_measured(small: Made) -> None:
+    predicted = bf.predict(str(small.dataset), observe=0.3)["a"]
+    figure = predicted.plot()
+    check(figure, "prediction", predicted.times, predicted.positions, predicted.sigmas)
+    (measured,) = [line for line in figure.axes[2].lines if line.get_label() == "measured"]
+    np.testing.assert_array_equal(measured.get_ydata(), predicted.measured[:, 2])
+    dashed = [line for line in figure.axes[0].lines if line.get_linestyle() == "--"]
+    assert [line.get_xdata()[0] for line in dashed] == [contact.time for contact in predicted.estimate.contacts]
+    assert len(dashed) == 1
+
+
+@pytest.mark.parametrize(("diagnosis", "label"), [(found(), "prediction error, mm"), (silent(), "density")])
+def test_a_diagnosis(diagnosis: Diagnosis, label: str) -> None:
+    assert diagnosis.plot().axes[0].get_ylabel() == label

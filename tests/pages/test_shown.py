@@ -1,0 +1,69 @@
+"""What a page shows of which shots, and results that belong to other data."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ballfg.pages import collect, recognise
+from ballfg.pages import shown as room
+from tests.pages.made import NOISE, Fall, Made, make
+
+
+def test_residuals_are_measured_less_estimated(made: Made) -> None:
+    shown = collect(recognise([made.dataset, made.states, made.predictions]))
+    assert [shot.name for shot in shown.shots] == list(made.falls)
+    for shot, fall in zip(shown.shots, made.falls.values(), strict=True):
+        np.testing.assert_allclose(shot.residuals(), shot.positions - fall.states()[:, :3], atol=1e-12)
+        assert shot.noise == pytest.approx(NOISE)
+        later = fall.times > 0.25
+        np.testing.assert_allclose(shot.prediction_errors(), shot.positions[later] - shot.predicted, atol=1e-12)
+        (contact,) = shot.marks
+        assert contact.time == pytest.approx(fall.contact, abs=5e-4)
+
+
+def test_noise_of_the_residuals_where_none_is_stated(tmp_path: Path) -> None:
+    made = make(tmp_path, {str(i): Fall() for i in range(30)}, noise=False)
+    shown = collect(recognise([made.dataset, made.states]))
+    assert shown.shots[0].noise == pytest.approx(NOISE, rel=0.1)  # 1800 samples: 3 % of chance
+    assert "states no noise" in shown.noise
+
+
+def test_results_without_a_dataset(made: Made) -> None:
+    shown = collect(recognise([made.predictions]))
+    assert (shown.table, shown.coverage, shown.count) == (None, None, 3)
+    assert not len(shown.shots[0].times)
+    assert len(shown.shots[0].predicted) == 34
+
+
+def test_shots_are_chosen_and_limited(made: Made, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = recognise([made.dataset])
+    assert [shot.name for shot in collect(given, ["b"]).shots] == ["b"]
+    with pytest.raises(ValueError, match=r"--track must name one of the 3 shots; got 'bb'. Did you mean 'b'\?"):
+        collect(given, ["bb"])
+    many = make(tmp_path, {f"{i:03}": Fall(samples=5) for i in range(50)})
+    shown = collect(recognise([many.dataset]))
+    assert (len(shown.shots), shown.count) == (40, 50)
+    assert len(collect(recognise([many.dataset]), limited=False).shots) == 50
+    monkeypatch.setattr(room, "MOST_ROWS", 12)
+    assert len(collect(recognise([many.dataset])).shots) == 2
+    with pytest.raises(ValueError, match=r"a page holds 12 samples.*--rerun"):
+        collect(given, ["a"])
+
+
+def test_results_of_other_data_are_refused(made: Made, tmp_path: Path) -> None:
+    other = make(tmp_path / "named", {"z": Fall()})
+    with pytest.raises(ValueError, match="has a trajectory 'z', which the dataset does not have"):
+        collect(recognise([made.dataset, other.predictions]))
+    longer = make(tmp_path / "longer", {"a": Fall(samples=80)})
+    with pytest.raises(ValueError, match=r"t = 0.6 s of trajectory 'a', where the dataset has no sample"):
+        collect(recognise([made.dataset, longer.states]))
+
+
+def test_notes_on_results_of_some_shots_and_another_diagnosis(made: Made, report: Path, tmp_path: Path) -> None:
+    part = make(tmp_path, {"a": Fall()})
+    shown = collect(recognise([made.dataset, part.states, report]))
+    assert any("states.csv has rows for 1 of the 3 shots" in note for note in shown.notes)
+    assert any("The diagnosis is of 'shots <in a draught>'" in note for note in shown.notes)
