@@ -19,7 +19,7 @@ LEVELS = (
     ("prediction",),
     ("estimation",),
     ("live", "learning"),
-    ("diagnosis",),
+    ("diagnosis", "importing"),
     ("front",),
     ("benchmarks", "cli"),
 )

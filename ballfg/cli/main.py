@@ -15,6 +15,7 @@ from ballfg.cli.compile import compile_ahead
 from ballfg.cli.diagnose import diagnose
 from ballfg.cli.errors import guarded
 from ballfg.cli.estimate import estimate
+from ballfg.cli.import_ import import_
 from ballfg.cli.info import info
 from ballfg.cli.live import live
 from ballfg.cli.noise import noise
@@ -35,6 +36,7 @@ app = typer.Typer(
     context_settings={"token_normalize_func": lambda name: EARLIER_OPTIONS.get(name, name)},
 )
 
+app.command(name="import")(import_)
 app.command()(estimate)
 app.command()(predict)
 app.command()(live)
