@@ -48,14 +48,17 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
     given = {role: _existing(table, name) for role, name in choices.columns.items()}
     read = {name: meanings(name) for name in table.columns} if table.named else {}
     places, units = _places(table, read, given)
+    counters: list[str] = []
     by_name = places is not None
     time = _named_time(table, read, given, places or ())
     trajectory = _trajectory(table, read, given, {*(places or ()), *time})
     if places is None:
         if table.named and not _numeric_rest(table, {*time, *([trajectory] if trajectory else [])}):
             return None
-        time = time or _time_by_numbers(table, {trajectory} if trajectory else set())
         frames = [name for name, found in read.items() if any(one.role == "frame" for one in found)]
+        if not time:
+            time, counter = _time_by_numbers(table, {trajectory} if trajectory else set())
+            frames += [counter] if counter else []
         trajectory = trajectory or _pieces(table, {*time, *frames})
         found = _numeric_rest(table, {*time, *frames, *([trajectory] if trajectory else [])})
         if len(found) < 3:
@@ -68,9 +71,11 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
                 "x={},y={},z={}".format(*found[:3]),
             )
         places = (found[0], found[1], found[2])
+        counters = frames
     frame = given.get("frame") or next((n for n, ms in read.items() for m in ms if m.role == "frame"), None)
+    frame = frame or (counters[0] if counters else None)
     if not time and frame is None:
-        time = _time_by_numbers(table, {*places, *([trajectory] if trajectory else [])})
+        time, frame = _time_by_numbers(table, {*places, *([trajectory] if trajectory else [])})
     sigmas = _sigmas(read, given)
     used = {*places, *time, *(sigmas or ())} | {one for one in (frame, trajectory) if one}
     return Roles(
@@ -219,8 +224,8 @@ def _numeric_rest(table: RawTable, used: set[str]) -> list[str]:
     return found
 
 
-def _time_by_numbers(table: RawTable, used: set[str]) -> tuple[str, ...]:
-    """The column that runs forward most regularly; a counter of rows only where nothing else does."""
+def _time_by_numbers(table: RawTable, used: set[str]) -> tuple[tuple[str, ...], str | None]:
+    """The column of times that runs forward most regularly, or else a counter of frames."""
     found: list[tuple[bool, float, str]] = []
     for name, column in table.columns.items():
         stamps = as_stamps(column)
@@ -234,7 +239,10 @@ def _time_by_numbers(table: RawTable, used: set[str]) -> tuple[str, ...]:
         spread = float(np.median(np.abs(forward - typical))) / typical
         if spread <= _REGULAR:
             found.append((column.dtype.kind == "i" and typical == 1.0, spread, name))
-    return (min(found)[2],) if found else ()
+    if not found:
+        return (), None
+    counter, _, name = min(found)
+    return ((), name) if counter else ((name,), None)
 
 
 def _pieces(table: RawTable, used: set[str]) -> str | None:

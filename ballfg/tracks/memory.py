@@ -31,6 +31,10 @@ class MemoryRows(RowSource):
             codes = np.zeros(len(track), dtype=np.int32)
             yield Block(int(start), [track.name], codes, np.concatenate(parts, axis=1))
 
+    def stamp(self) -> tuple[int, int]:
+        """Number of rows, and no time: tracks in memory do not change."""
+        return int(self._starts[-1]), 0
+
     def where(self, *rows: int) -> str:
         """The tracks that hold these rows."""
         places = np.searchsorted(self._starts, rows, side="right") - 1
