@@ -1,6 +1,6 @@
 """Units and up axis, from what is stated and from the fall; and the turn to a frame with z up."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -19,6 +19,8 @@ _LEAST_SCORE: Final = 0.12
 """Score below which nothing seems to fall."""
 RATES: Final = (24, 25, 30, 50, 60, 90, 100, 120, 125, 150, 180, 200, 240, 250, 300, 360, 400, 480, 500, 600, 960, 1000)
 """Hz, of usual cameras."""
+
+_DECIMAL: Final = ("m", "cm", "mm")
 
 TURNS: Final = {
     "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
@@ -92,13 +94,13 @@ def find_frame(
     ups = (choices.up,) if choices.up else AXES
     found = scales(shots, lengths, times, ups)
     decided = len(lengths) == len(times) == len(ups) == 1
+    _contradiction(shots, found, choices, {"length": known_length, "time": known_time}, ups)
     if not found and not decided:
         _no_flight(shots, known_length, known_time)
     best = found[0] if found else Scale(lengths[0], times[0], ups[0], 0.0, 0, 0.0)
     if not decided:
         for option, values in (("length", lengths), ("time", times), ("up", ups)):
             _decide(option, best, found, len(values) > 1)
-    _contradiction(shots, best, choices, known_length, known_time)
     why = f"balls fall at 9.81 m/s^2 in it: {best.score:.0%} of {best.windows} short stretches agree"
     lines = [
         _line("unit of length", "length", best, found, choices.length, stated_length, why, "named in the source"),
@@ -119,9 +121,10 @@ def find_frame(
 def likely_rate(shots: Sequence[tuple[Array, Array]], length: str | None) -> int | None:
     """The usual camera rate at which balls fall as they should; stamps are numbers of frames.
 
-    Args: shots: frames (n,) and positions (n, 3).  length: their unit, if it is known.
+    Args: shots: frames (n,) and positions (n, 3).  length: their unit if it is known; else m, cm or mm, which
+        no usual rates confuse.
     """
-    lengths = (length,) if length in LENGTHS else tuple(LENGTHS)
+    lengths = (length,) if length in LENGTHS else _DECIMAL
     scored = [
         (found[0].score, rate)
         for rate in RATES
@@ -177,29 +180,38 @@ def _no_flight(shots: Sequence[tuple[Array, Array]], length: str | None, time: s
     step = float(np.median(steps))
     what = f"no stretch of flight is long enough to show the units: the median step of the times is {step:g}"
     option, example = ("time", "ms") if time is None else ("length", "mm") if length is None else ("up", "z")
+    if not step > 0.0 and (steps > 0.0).any():
+        raise UndecidedError("most stamps have several positions, as of two balls", "columns", (), "trajectory=NAME")
     if not step > 0.0:
-        raise UndecidedError(f"the times do not increase: the median step is {step:g}", "columns", (), "t=NAME")
+        raise UndecidedError("the times do not increase", "columns", (), "t=NAME")
     raise UndecidedError(what, option, (), example)
 
 
 def _contradiction(
-    shots: Sequence[tuple[Array, Array]], best: Scale, choices: Choices, length: str | None, time: str | None
+    shots: Sequence[tuple[Array, Array]],
+    found: Sequence[Scale],
+    choices: Choices,
+    stated: Mapping[str, str | None],
+    ups: Sequence[str],
 ) -> None:
     """Refuses units in names that make nothing fall, where others do."""
-    named = [("length", length, choices.length), ("time", time, choices.time)]
-    doubted = [(option, value) for option, value, given in named if value and not given]
+    given = {"length": choices.length, "time": choices.time}
+    doubted = {option: value for option, value in stated.items() if value and not given[option]}
     if not doubted:
         return
-    free = scales(
-        shots,
-        *((choices.length,) if choices.length else tuple(LENGTHS), (choices.time,) if choices.time else tuple(TIMES)),
-        (choices.up,) if choices.up else AXES,
-    )
-    if not free or free[0].score < _LEAST_SCORE or odds(free[0].score, best.score) < _AGAINST:
+    lengths = (choices.length,) if choices.length else tuple(LENGTHS)
+    times = (choices.time,) if choices.time else tuple(TIMES)
+    free = scales(shots, lengths, times, ups)
+    score = found[0].score if found else 0.0
+    if not free or free[0].score < _LEAST_SCORE or odds(free[0].score, score) < _AGAINST:
         return
-    for option, value in doubted:
-        other = getattr(free[0], option)
-        if other != value:
+    # of two stated units, the one that has to change is wrong; where either would do, both are shown in turn
+    for option, value in doubted.items():
+        others = [one for one in free if getattr(one, option) != value]
+        kept = {name: unit for name, unit in doubted.items() if name != option}
+        alone = [one for one in others if all(getattr(one, name) == unit for name, unit in kept.items())]
+        if alone and odds(alone[0].score, score) >= _AGAINST:
+            other = getattr(alone[0], option)
             raise UndecidedError(
                 f"the names say {value}, but balls fall at 9.81 m/s^2 if it is {other}", option, (other, value)
             )

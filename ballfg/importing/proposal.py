@@ -28,6 +28,8 @@ _MOST_SHOTS: Final = 60
 _TENNIS_DRAG: Final = 0.045
 """1/m; halfway, in ratio, between the drags of the two balls."""
 _SURE_WINDOWS: Final = 30
+_INTERRUPTED: Final = 0.5
+"""Share of the files or recordings with gaps, from which on a gap ends a shot and is not a ball out of sight."""
 
 
 @dataclass(frozen=True)
@@ -168,19 +170,23 @@ def _split(shots: list[Shot], roles: Roles, frame: Frame, choices: Choices) -> t
     if roles.trajectory is not None:
         why = f"one for each value of {roles.trajectory!r}"
         return shots, Guess("shots", str(count), why, "sure", f"--columns trajectory={roles.trajectory}")
-    steps = np.concatenate([np.diff(shot.stamps).astype(np.float64) * unit for shot in shots])
-    forward = steps[steps > 0]
-    gap = max(GAP, GAP_STEPS * float(np.median(forward))) if len(forward) else GAP
+    steps = [np.diff(shot.stamps).astype(np.float64) * unit for shot in shots]
+    typical = float(np.median(np.concatenate(steps)))
+    gap = max(GAP, GAP_STEPS * typical)
+    interrupted = sum(bool((one > gap).any()) for one in steps)
+    typed = f"--split-gap {gap:g}"
+    if interrupted < _INTERRUPTED * count:
+        why = "a shot ends where time starts again or the file ends"
+        if interrupted:
+            why += f"; gaps over {gap:g} s in {interrupted} of them are taken for a ball out of sight"
+        return shots, Guess("shots", str(count), why, "likely" if interrupted else "sure", typed)
     done = split_at_gaps(shots, unit, gap)
-    if len(done) > count == 1:
+    if count == 1:
         done = [replace(shot, name=f"{i:03d}") for i, shot in enumerate(done)]
-    longest = float(forward[forward <= gap].max()) if (forward <= gap).any() else 0.0
-    why = (
-        f"a shot ends where time starts again, at the end of a file, and at gaps over {gap:g} s; longest gap within a "
-        f"shot {longest:.2g} s"
-    )
-    sure = "sure" if longest < gap / 2 else "likely"
-    return _unique(done), Guess("shots", str(len(done)), why, sure, f"--split-gap {gap:g}")
+    held = np.concatenate(steps)
+    longest = float(held[held <= gap].max())
+    why = f"a shot ends at a gap over {gap:.3g} s; the longest gap within one is {longest:.2g} s"
+    return _unique(done), Guess("shots", str(len(done)), why, "sure" if longest < gap / 2 else "likely", typed)
 
 
 def _with_labels(shots: list[Shot], beside: Sequence[RawTable]) -> list[Shot]:

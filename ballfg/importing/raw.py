@@ -29,7 +29,8 @@ MISSING: Final = (
     "-inf",
 )
 """What files write, in lower case, where a number is missing."""
-_WITH_UNIT: Final = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\W\d_]{1,3})\s*$")
+WITH_UNIT: Final = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\W\d_]{1,3})\s*$")
+"""A number with its unit, such as 12.5 mm."""
 _MOSTLY: Final = 0.5
 """Share of a column's cells that must be numbers, where it is taken for one of numbers."""
 
@@ -130,7 +131,7 @@ def _from_text(label: str, cells: list[str]) -> tuple[Column, str, list[str]]:
 
 def _with_units(label: str, cells: list[str], present: list[int]) -> tuple[Column, str, list[str]]:
     """Cells such as "12.5 mm", with one unit in all of them; else the text as it is."""
-    found = [_WITH_UNIT.match(cells[i]) for i in present]
+    found = [WITH_UNIT.match(cells[i]) for i in present]
     units = {match[2] if match else "" for match in found}
     if present and len(units) == 1 and all(found):
         values = [float(match[1]) for match in found if match]

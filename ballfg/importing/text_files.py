@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final
 
 from ballfg.importing.names import unit_of_text
-from ballfg.importing.raw import MISSING, RawTable, table_of
+from ballfg.importing.raw import MISSING, WITH_UNIT, RawTable, table_of
 
 SEPARATORS: Final = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 _COMMENTS: Final = ("#", "%", "//")
@@ -109,7 +109,7 @@ def _cells(lines: Sequence[str], separator: str) -> list[list[str]]:
 def _first_data_row(rows: Sequence[Sequence[str]]) -> int | None:
     """The first row with three numbers or more."""
     for i, row in enumerate(rows):
-        if sum(bool(_NUMBER.match(cell)) for cell in row) >= min(3, max(2, len(row) - 1)):
+        if sum(bool(_NUMBER.match(cell) or WITH_UNIT.match(cell)) for cell in row) >= min(3, max(2, len(row) - 1)):
             return i
         spread = sum(cell.lower() in MISSING or bool(_NUMBER.match(cell)) for cell in row)
         if i and len(row) > 2 and spread == len(row) and any(_NUMBER.match(cell) for cell in row):

@@ -58,8 +58,8 @@ def page(proposal: Proposal) -> str:
         f'<meta name="viewport" content="width=device-width,initial-scale=1"><style>{_STYLE}</style></head><body>'
         f"<h1>{_safe(info.name)}</h1><p>{len(proposal.tracks)} shots, {samples} samples, {info.rate:g} Hz, from "
         f"{_safe(info.source)}. Balls fly in arcs that open downwards and bounce on the grey line if the import is "
-        f"right.</p>{_picture(proposal.tracks, info.table_height)}<h2>Guesses</h2><table><tr><th>what</th><th>guess</th>"
-        f"<th>why</th><th>how sure</th><th>change it with</th></tr>{rows}</table>{left}</body></html>\n"
+        f"right.</p>{_picture(proposal.tracks, info.table_height)}<h2>Guesses</h2><table><tr><th>what</th>"
+        f"<th>guess</th><th>why</th><th>how sure</th><th>change it with</th></tr>{rows}</table>{left}</body></html>\n"
     )
 
 

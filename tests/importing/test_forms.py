@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from datetime import datetime, timedelta, timezone
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import h5py
@@ -121,7 +121,7 @@ def json_lines_of_nanoseconds(folder: Path, shots: list[Track]) -> Path:
 
 def parquet_of_dates_and_feet(folder: Path, shots: list[Track]) -> Path:
     path = folder / "shots.parquet"
-    origin = datetime(2026, 3, 1, 12, tzinfo=timezone.utc)
+    origin = datetime(2026, 3, 1, 12, tzinfo=UTC)
     feet = np.concatenate([shot.positions for shot in shots]) / 0.3048
     stamps = [origin + timedelta(seconds=float(t)) for times in one_after_the_other(shots) for t in times]
     table = {"when (datetime)": stamps, "X": feet[:, 0], "Y": feet[:, 1], "Z": feet[:, 2]}
