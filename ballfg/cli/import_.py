@@ -6,7 +6,7 @@ import sys
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, cast
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
@@ -86,9 +86,8 @@ def _answered(question: UndecidedError, choices: Choices) -> Choices:
     field = question.option.replace("-", "_")
     if field == "columns":
         return replace(choices, columns={**choices.columns, **parse_columns(answer)})
-    if field in ("table_height", "rate", "split_gap"):
-        return replace(choices, **{field: float(answer)})
-    return replace(choices, **{field: answer})
+    decided: dict[str, Any] = {field: float(answer) if field in ("table_height", "rate", "split_gap") else answer}
+    return replace(choices, **decided)
 
 
 def _show(proposal: Proposal) -> None:

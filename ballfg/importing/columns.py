@@ -1,15 +1,15 @@
 """Which column is what: by its name, and where names say nothing, by its numbers."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 
 from ballfg.checks import did_you_mean
 from ballfg.importing.choices import Choices, UndecidedError
+from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
 from ballfg.importing.names import Meaning, meanings
-from ballfg.importing.raw import Column, RawTable, is_number, numbers
 from ballfg.importing.stamps import as_stamps
 
 RATES: Final = ("rate", "fps", "frame_rate", "framerate", "hz", "sampling_rate", "frequency")
@@ -37,7 +37,6 @@ class Roles:
     rate: float | None = None
     by_name: bool = True
     others: tuple[str, ...] = ()
-    why: dict[str, str] = field(default_factory=dict)
 
 
 def roles_of(table: RawTable, choices: Choices) -> Roles | None:
@@ -61,6 +60,9 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
             frames += [counter] if counter else []
         trajectory = trajectory or _pieces(table, {*time, *frames})
         found = _numeric_rest(table, {*time, *frames, *([trajectory] if trajectory else [])})
+        left = [n for n, c in table.columns.items() if is_number(c) and n not in (*time, *frames, trajectory)]
+        if len(found) < 3 and len(left) == 3:  # a coordinate may be constant
+            found = left
         if len(found) < 3:
             return None
         if len(found) > 3:

@@ -12,10 +12,10 @@ from ballfg.importing.bounces import surface
 from ballfg.importing.choices import Choices, Guess, UndecidedError
 from ballfg.importing.columns import Roles, roles_of
 from ballfg.importing.fall import TIMES
+from ballfg.importing.formats.raw import RawTable
+from ballfg.importing.formats.sources import tables_of
 from ballfg.importing.frame import Frame, find_frame, likely_rate
-from ballfg.importing.raw import RawTable
 from ballfg.importing.shots import GAP, GAP_STEPS, Counts, Shot, cut, split_at_gaps
-from ballfg.importing.sources import tables_of
 from ballfg.importing.stamps import in_seconds, origin_of
 from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball, DatasetInfo, Track
 from ballfg.tracks.checks import Findings, tidy

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.importing.choices import Choices, UndecidedError
 from ballfg.importing.columns import Roles
-from ballfg.importing.raw import Column, RawTable, is_number, numbers
+from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
 from ballfg.importing.stamps import Stamps, as_stamps, is_date, joined, missing
 from ballfg.tracks.track import Label
 
@@ -102,7 +102,7 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
             counts.short += 1
             continue
         own = None if sigmas is None else sigmas[part]
-        known = {key: values[i] for key, values in labels.items() if values[i] is not None}
+        known = {key: value for key, values in labels.items() if (value := values[i]) is not None}
         found.append(Shot(name, stamps[part], positions[part], own, known, part, table))
     return found
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.importing.raw import MISSING, Column
+from ballfg.importing.formats.raw import MISSING, Column
 
 Stamps = NDArray[Any]
 """(n,) int64 or float64, in a unit that is not known yet."""

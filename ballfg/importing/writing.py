@@ -75,7 +75,7 @@ def _picture(tracks: Sequence[Track], height: float) -> str:
     across = _across(tracks)
     with mpl.rc_context({"svg.hashsalt": "ballfg", "svg.fonttype": "none", "font.size": 9}):
         figure = Figure(figsize=(9.0, 6.5), layout="constrained")
-        side, above = figure.subplots(2, 1, sharex=True)
+        side, above = figure.subplots(2, 1)
         for track in tracks[:: max(1, -(-len(tracks) // _MOST_SHOTS))]:
             p = track.positions[:: max(1, -(-len(track) // _MOST_POINTS))]
             for axes, other in ((side, 2), (above, 1 - across)):

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ballfg.importing.nested import nested_tables
-from ballfg.importing.raw import RawTable, table_of
-from ballfg.importing.text_files import text_table
+from ballfg.importing.formats.nested import nested_tables
+from ballfg.importing.formats.raw import RawTable, table_of
+from ballfg.importing.formats.text_files import text_table
 
 
 def read_parquet(path: Path) -> list[RawTable]:

@@ -6,10 +6,10 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
-from ballfg.importing.containers import read_bag, read_excel, read_hdf5, read_matlab, read_npz, read_parquet
-from ballfg.importing.nested import nested_tables
-from ballfg.importing.raw import RawTable
-from ballfg.importing.text_files import decoded, read_text_table
+from ballfg.importing.formats.containers import read_bag, read_excel, read_hdf5, read_matlab, read_npz, read_parquet
+from ballfg.importing.formats.nested import nested_tables
+from ballfg.importing.formats.raw import RawTable
+from ballfg.importing.formats.text_files import decoded, read_text_table
 
 TEXT: Final = (".csv", ".tsv", ".txt", ".dat", ".tab", ".asc", "")
 JSON: Final = (".json", ".jsonl", ".ndjson")

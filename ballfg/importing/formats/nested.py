@@ -5,7 +5,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ballfg.importing.raw import RawTable, table_of
+from ballfg.importing.formats.raw import RawTable, table_of
 
 _LEAST: Final = 3
 """Rows from which on a list is taken for a table; shorter lists are points or settings."""

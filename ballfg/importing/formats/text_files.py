@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from ballfg.importing.formats.raw import MISSING, WITH_UNIT, RawTable, table_of
 from ballfg.importing.names import unit_of_text
-from ballfg.importing.raw import MISSING, WITH_UNIT, RawTable, table_of
 
 SEPARATORS: Final = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
 _COMMENTS: Final = ("#", "%", "//")

@@ -1,7 +1,7 @@
 """A table as it was found in a file: named columns of numbers or text, nothing interpreted yet."""
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -167,6 +167,3 @@ def _real(cell: str) -> float | None:
         return float(cell) if "_" not in cell and not _padded(cell.partition(".")[0]) else None
     except ValueError:
         return None
-
-
-Reader = Callable[..., list[RawTable]]
