@@ -58,6 +58,8 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
         if not time:
             time, counter = _time_by_numbers(table, {trajectory} if trajectory else set())
             frames += [counter] if counter else []
+        if table.named and not time and not frames:
+            return None
         trajectory = trajectory or _pieces(table, {*time, *frames})
         found = _numeric_rest(table, {*time, *frames, *([trajectory] if trajectory else [])})
         left = [n for n, c in table.columns.items() if is_number(c) and n not in (*time, *frames, trajectory)]
@@ -207,7 +209,7 @@ def _trajectory(
         (m.rank, name) for name, found in read.items() for m in found if m.role == "trajectory" and name not in used
     )
     for _, name in candidates:
-        column = table.columns[name]
+        column = table.texts.get(name, table.columns[name])
         distinct = len(set(column.tolist()))
         if distinct <= max(1, len(column) // 3):
             return name

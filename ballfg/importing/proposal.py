@@ -73,7 +73,9 @@ def propose(data: Any, choices: Choices) -> Proposal:
         source=source[:200],
         imported={guess.what: f"{guess.value} ({guess.sure}: {guess.why})" for guess in guesses},
     )
-    table_notes = list(dict.fromkeys(note for table in chosen for note in table.notes))
+    used = (*roles.time, *roles.places, roles.frame)
+    doubts = [[*table.notes, *(said for name, said in table.doubts.items() if name in used)] for table in chosen]
+    table_notes = list(dict.fromkeys(note for notes_of_one in doubts for note in notes_of_one))
     return Proposal(info, tracks, guesses, [*table_notes[:5], *counts.notes(), *notes])
 
 
@@ -84,12 +86,19 @@ def _understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawT
         kinds.setdefault((table.named, *table.columns), []).append(table)
     read: list[tuple[list[RawTable], Roles]] = []
     beside: list[RawTable] = []
+    questions: list[UndecidedError] = []
     for same in kinds.values():
-        roles = roles_of(max(same, key=len), choices)
+        try:
+            roles = roles_of(max(same, key=len), choices)
+        except UndecidedError as question:
+            questions.append(question)
+            roles = None
         if roles is None:
             beside += same
         else:
             read.append((same, roles))
+    if questions and not any(roles.by_name for _, roles in read):
+        raise questions[0]
     if not read:
         largest = max(tables, key=len)
         columns = ", ".join(list(largest.columns)[:12])

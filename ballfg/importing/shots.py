@@ -93,7 +93,9 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
         parts = _at_restarts(stamps, rows, counts)
         names = [f"{i:03d}" for i in range(len(parts))]
     else:
-        parts, names = _by_name(table.columns[roles.trajectory], stamps, rows, counts)
+        parts, names = _by_name(
+            table.texts.get(roles.trajectory, table.columns[roles.trajectory]), stamps, rows, counts
+        )
     found = []
     labels = _labels(table, roles.others, parts, counts)
     for i, (name, part) in enumerate(zip(names, parts, strict=True)):

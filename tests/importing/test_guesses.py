@@ -142,3 +142,23 @@ def test_measured_tracks(name: str, up: str, size: float, rate: float) -> None:
         np.testing.assert_allclose(one.times, track.times, rtol=0.0, atol=1e-9)
         np.testing.assert_allclose(one.positions, track.positions, rtol=0.0, atol=1e-9)
     assert found.table == pytest.approx(data.table, abs=0.01)
+
+
+def test_names_of_shots_stay_text() -> None:
+    t, p = thrown()
+    names = ["007", "8", "warm up", "1e3"]
+    rows = [{"shot": name, "t": float(a), "pos": b} for name in names for a, b in zip(t, p.tolist(), strict=True)]
+    assert bf.import_tracks(rows).names == names
+    mostly_numbers = [row | {"shot": {"007": "7", "1e3": "9"}.get(row["shot"], row["shot"])} for row in rows]
+    assert bf.import_tracks(mostly_numbers).names == ["7", "8", "warm up", "9"]
+
+
+def test_a_dataset_is_imported_with_its_labels(tmp_path: Path) -> None:
+    t, p = thrown()
+    rows = [{"shot": name, "t": float(a), "pos": b} for name in "abc" for a, b in zip(t, p.tolist(), strict=True)]
+    bf.import_tracks(rows, out=tmp_path / "one")
+    labels = "trajectory,spin_x,spin_y,spin_z,group\na,1,2,3,slow\nb,4,5,6,fast\nc,7,8,9,fast\n"
+    (tmp_path / "one" / "labels.csv").write_text(labels, encoding="utf-8")
+    data = bf.import_tracks(tmp_path / "one", out=tmp_path / "two")
+    assert data["b"].labels == {"spin_x": 4.0, "spin_y": 5.0, "spin_z": 6.0, "group": "fast"}
+    np.testing.assert_allclose(data["a"].positions, p, atol=1e-12)

@@ -49,6 +49,17 @@ class RawTable:
     """Whether the columns have names of their own."""
     notes: list[str] = field(default_factory=list)
     """What was left out while it was read."""
+    texts: dict[str, Column] = field(default_factory=dict)
+    """Columns of numbers with some cells that are none, as they were written."""
+
+    @property
+    def doubts(self) -> dict[str, str]:
+        """A sentence for each column of numbers in which cells that are none count as missing."""
+        found = {}
+        for name, text in self.texts.items():
+            wrong = [cell for cell in text.tolist() if cell.lower() not in MISSING and _real(cell) is None]
+            found[name] = f"column {name!r}: {len(wrong)} cells such as {wrong[0]!r} count as missing"
+        return found
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()))) if self.columns else 0
@@ -61,13 +72,14 @@ class RawTable:
 
 def table_of(name: str, columns: Mapping[str, Any], source: str = "", named: bool = True) -> RawTable:
     """A table whose columns are arrays or lists (n,) of anything; text that is numbers becomes numbers."""
-    notes: list[str] = []
     ready: dict[str, Column] = {}
+    texts: dict[str, Column] = {}
     for label, values in columns.items():
-        column, new_label, problems = _column(label, values)
+        column, new_label, text = _column(label, values)
         ready[new_label] = column
-        notes += problems
-    return RawTable(name, ready, source, named, notes)
+        if text is not None:
+            texts[new_label] = text
+    return RawTable(name, ready, source, named, texts=texts)
 
 
 def numbers(column: Column) -> NDArray[np.float64]:
@@ -82,17 +94,17 @@ def is_number(column: Column) -> bool:
     return column.dtype.kind in "iuf"
 
 
-def _column(label: str, values: Any) -> tuple[Column, str, list[str]]:
+def _column(label: str, values: Any) -> tuple[Column, str, Column | None]:
     array = values if isinstance(values, np.ndarray) else _array(values)
     if array.dtype.kind == "M":
         stamps = array.astype("datetime64[ns]").astype(np.int64)
-        return stamps, f"{label} [ns]", []
+        return stamps, f"{label} [ns]", None
     if array.dtype.kind == "m":
-        return array.astype("timedelta64[ns]").astype(np.int64), f"{label} [ns]", []
+        return array.astype("timedelta64[ns]").astype(np.int64), f"{label} [ns]", None
     if array.dtype.kind in "bui":
-        return array.astype(np.int64), label, []
+        return array.astype(np.int64), label, None
     if array.dtype.kind == "f":
-        return array.astype(np.float64), label, []
+        return array.astype(np.float64), label, None
     return _from_text(label, [_cell(value) for value in array.tolist()])
 
 
@@ -115,30 +127,35 @@ def _cell(value: Any) -> str:
     return value.isoformat() if hasattr(value, "isoformat") else str(value).strip()
 
 
-def _from_text(label: str, cells: list[str]) -> tuple[Column, str, list[str]]:
+def _from_text(label: str, cells: list[str]) -> tuple[Column, str, Column | None]:
     """Numbers where most cells are numbers; whole numbers keep all their digits."""
+    if any(len(cell) > 1 and cell[0] == "0" and cell.isdigit() for cell in cells):  # 007 names something
+        return _text(cells), label, None
     present = [i for i, cell in enumerate(cells) if cell.lower() not in MISSING]
     for convert in (_whole, _real):
         parsed = [convert(cells[i]) for i in present]
         wrong = [cells[i] for i, value in zip(present, parsed, strict=True) if value is None]
         if present and not wrong:
-            return _filled(len(cells), present, parsed), label, []
+            return _filled(len(cells), present, parsed), label, None
     if not present or len(wrong) > (1.0 - _MOSTLY) * len(present):
         return _with_units(label, cells, present)
-    note = f"column {label!r}: {len(wrong)} cells that are not numbers, such as {wrong[0]!r}, count as missing"
-    return _filled(len(cells), present, parsed), label, [note]
+    return _filled(len(cells), present, parsed), label, _text(cells)
 
 
-def _with_units(label: str, cells: list[str], present: list[int]) -> tuple[Column, str, list[str]]:
+def _with_units(label: str, cells: list[str], present: list[int]) -> tuple[Column, str, Column | None]:
     """Cells such as "12.5 mm", with one unit in all of them; else the text as it is."""
     found = [WITH_UNIT.match(cells[i]) for i in present]
     units = {match[2] if match else "" for match in found}
     if present and len(units) == 1 and all(found):
         values = [float(match[1]) for match in found if match]
-        return _filled(len(cells), present, values), f"{label} [{units.pop()}]", []
+        return _filled(len(cells), present, values), f"{label} [{units.pop()}]", None
+    return _text(cells), label, None
+
+
+def _text(cells: list[str]) -> Column:
     text = np.empty(len(cells), dtype=object)
     text[:] = cells
-    return text, label, []
+    return text
 
 
 def _filled(count: int, places: list[int], values: Sequence[float | int | None]) -> Column:
@@ -154,16 +171,11 @@ def _whole(cell: str) -> int | None:
         value = int(cell)
     except ValueError:
         return None
-    return value if "_" not in cell and abs(value) < 1 << 62 and not _padded(cell) else None
-
-
-def _padded(cell: str) -> bool:
-    """A number such as 007 names something; it stays text if all of its column does."""
-    return len(cell) > 1 and cell[0] == "0"
+    return value if "_" not in cell and abs(value) < 1 << 62 else None
 
 
 def _real(cell: str) -> float | None:
     try:
-        return float(cell) if "_" not in cell and not _padded(cell.partition(".")[0]) else None
+        return float(cell) if "_" not in cell else None
     except ValueError:
         return None
