@@ -55,7 +55,7 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
         if table.named and not _numeric_rest(table, {*time, *([trajectory] if trajectory else [])}):
             return None
         frames = [name for name, found in read.items() if any(one.role == "frame" for one in found)]
-        if not time:
+        if not time and (table.named or len(table.columns) > 3):  # three columns alone are x, y and z
             time, counter = _time_by_numbers(table, {trajectory} if trajectory else set())
             frames += [counter] if counter else []
         if table.named and not time and not frames:

@@ -97,6 +97,13 @@ def test_a_mirror_is_only_stated() -> None:
     np.testing.assert_allclose(flipped, p, atol=1e-12)
 
 
+def test_positions_alone_need_a_rate() -> None:
+    t, p = thrown()
+    with pytest.raises(UndecidedError, match="fits about 100 Hz. Decide it with --rate 100"):
+        bf.import_tracks(p)
+    np.testing.assert_allclose(bf.import_tracks(p, rate=100.0)["000"].times, t, atol=1e-12)
+
+
 def test_nothing_falls() -> None:
     t = np.arange(0.0, 1.0, 0.01)
     rolling = np.column_stack([t, t, 0.1 * t, 0.0 * t])
