@@ -42,8 +42,9 @@ def import_(
 ) -> None:
     """Import tracks from your own files: any columns, units and axes.
 
-    It looks, shows what it understood and why, and writes the dataset with a page to check it, import.html. A guess
-    that is not safe is asked for on a terminal, and refused elsewhere with the option that decides it.
+    It shows what it understood and why, and writes the dataset with a page to check it, import.html.
+
+    A guess that is not safe is asked for on a terminal, and refused elsewhere with the option that decides it.
 
     Example: ballfg import shots.csv --out my_shots
     """

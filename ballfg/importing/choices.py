@@ -83,7 +83,12 @@ class Guess:
 
 
 def parse_columns(text: str) -> dict[str, str]:
-    """Roles and columns from "t=stamp,x=X". Raises: ValueError: not of this form."""
+    """Roles and columns from text such as "t=stamp,x=X".
+
+    Args: text: as typed after --columns.
+    Returns: role -> name of the column.
+    Raises: ValueError: not of this form.
+    """
     found: dict[str, str] = {}
     for part in text.split(","):
         role, sign, column = part.partition("=")

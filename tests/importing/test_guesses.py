@@ -99,7 +99,7 @@ def test_a_mirror_is_only_stated() -> None:
 
 def test_positions_alone_need_a_rate() -> None:
     t, p = thrown()
-    with pytest.raises(UndecidedError, match="fits about 100 Hz. Decide it with --rate 100"):
+    with pytest.raises(UndecidedError, match=r"fits about 100 Hz\. Decide it with --rate 100"):
         bf.import_tracks(p)
     np.testing.assert_allclose(bf.import_tracks(p, rate=100.0)["000"].times, t, atol=1e-12)
 
@@ -169,3 +169,13 @@ def test_a_dataset_is_imported_with_its_labels(tmp_path: Path) -> None:
     data = bf.import_tracks(tmp_path / "one", out=tmp_path / "two")
     assert data["b"].labels == {"spin_x": 4.0, "spin_y": 5.0, "spin_z": 6.0, "group": "fast"}
     np.testing.assert_allclose(data["a"].positions, p, atol=1e-12)
+
+
+def test_files_under_other_names(tmp_path: Path) -> None:
+    t, p = thrown()
+    table = np.column_stack([t, p])
+    np.save(tmp_path / "a.npy", table)
+    np.savez(tmp_path / "b.npz", shot=table)
+    (tmp_path / "b.npz").rename(tmp_path / "b.data")
+    for name in ("a.npy", "b.data"):
+        np.testing.assert_allclose(bf.import_tracks(tmp_path / name)["000"].positions, p, atol=1e-12)

@@ -53,7 +53,7 @@ def read_excel(path: Path) -> list[RawTable]:
 
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path} must be an Excel file (.xlsx); it is none. Save it again as .xlsx or CSV.")
-    book = openpyxl.load_workbook(path, read_only=True, data_only=True)
+    book = openpyxl.load_workbook(io.BytesIO(path.read_bytes()), read_only=True, data_only=True)
     found: list[RawTable] = []
     for sheet in book.worksheets:
         rows = [
@@ -87,12 +87,13 @@ def read_excel(path: Path) -> list[RawTable]:
 def read_npz(path: Path) -> list[RawTable]:
     """The tables of an npz or npy file. Raises: ValueError: not one, or it holds Python objects."""
     try:
-        with np.load(path, allow_pickle=False) as file:
-            content: Any = {key: file[key] for key in file.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise _unreadable(path, "npz", error) from None
-    except AttributeError:  # an .npy file is an array and no archive
-        content = np.load(path, allow_pickle=False)
+        loaded = np.load(path, allow_pickle=False)
+        content: Any = loaded if isinstance(loaded, np.ndarray) else {key: loaded[key] for key in loaded.files}
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile):
+        raise ValueError(
+            f"{path} must be a whole npz or npy file of plain arrays; it is another file, cut off, or holds Python "
+            "objects. Save arrays of numbers with numpy.savez."
+        ) from None
     return nested_tables(content, path.stem, str(path))
 
 

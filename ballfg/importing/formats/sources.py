@@ -1,6 +1,7 @@
 """From what a user names - files, folders, data in memory - to tables."""
 
 import json
+import zipfile
 from collections.abc import Iterable, Sequence
 from os import PathLike
 from pathlib import Path
@@ -95,6 +96,10 @@ def _of_file(path: Path, topic: str | None) -> list[RawTable]:
     for magic, reader in _MAGIC:
         if head.startswith(magic):
             return reader(path)
+    if zipfile.is_zipfile(path):  # numpy's archive or Excel's, under another name
+        with zipfile.ZipFile(path) as archive:
+            arrays = any(name.endswith(".npy") for name in archive.namelist())
+        return read_npz(path) if arrays else read_excel(path)
     text = decoded(path) if ending in JSON or head.lstrip(b"\xef\xbb\xbf \r\n\t")[:1] in (b"{", b"[") else None
     return read_text_table(path) if text is None else _json(path, text)
 
