@@ -3,6 +3,7 @@ from . import diagnosis as diagnosis
 from . import dynamics as dynamics
 from . import estimation as estimation
 from . import factors as factors
+from . import importing as importing
 from . import learning as learning
 from . import live as live
 from . import prediction as prediction
@@ -30,6 +31,7 @@ from .estimation import register_observation as register_observation
 from .front import diagnose as diagnose
 from .front import estimate as estimate
 from .front import predict as predict
+from .importing import import_tracks as import_tracks
 from .live import Tracker as Tracker
 from .prediction import BallState as BallState
 from .simulation import simulate as simulate

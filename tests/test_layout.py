@@ -20,7 +20,7 @@ LEVELS = (
     ("prediction",),
     ("estimation",),
     ("live", "learning"),
-    ("diagnosis",),
+    ("diagnosis", "importing"),
     ("front",),
     ("benchmarks", "cli"),
 )

@@ -14,6 +14,7 @@ from ballfg.cli.compile import compile_ahead
 from ballfg.cli.diagnose import diagnose
 from ballfg.cli.estimate import estimate
 from ballfg.cli.example import example
+from ballfg.cli.import_ import import_
 from ballfg.cli.info import info
 from ballfg.cli.live import live
 from ballfg.cli.noise import noise
@@ -36,6 +37,7 @@ app = typer.Typer(
     context_settings={"token_normalize_func": lambda name: EARLIER_OPTIONS.get(name, name)},
 )
 
+app.command(name="import")(import_)
 app.command()(estimate)
 app.command()(predict)
 app.command()(live)

@@ -6,6 +6,7 @@ from .info import TABLE_TENNIS as TABLE_TENNIS
 from .info import TENNIS as TENNIS
 from .info import Ball as Ball
 from .info import DatasetInfo as DatasetInfo
+from .memory import dataset_in_memory as dataset_in_memory
 from .noise import TrackNoise as TrackNoise
 from .sightings import Sightings as Sightings
 from .table import TableWriter as TableWriter

@@ -142,7 +142,7 @@ def read_dataset(folder: str | PathLike[str]) -> Dataset:
             )
     findings = Findings()
     for group in groups(source, index):
-        _check_group(source, group, info, findings)
+        check_group(source, group, info, findings)
     if not index.contiguous:
         notes.append(f"{source.path.name}: the rows of different trajectories interleave: regrouped at each pass")
     return Dataset(path, info, source, index, labels, notes + findings.notes())
@@ -175,7 +175,8 @@ def _listing(folder: Path) -> str:
     return shown or "an empty folder"
 
 
-def _check_group(source: RowSource, group: RowGroup, info: DatasetInfo, findings: Findings) -> None:
+def check_group(source: RowSource, group: RowGroup, info: DatasetInfo, findings: Findings) -> None:
+    """Refuses a trajectory whose numbers cannot be metres and seconds; repairs are added to the findings."""
     values = tidy(group, source.where, findings)
     sigmas = values[:, 4:] if values.shape[1] > 4 else None
     try:

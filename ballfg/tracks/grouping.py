@@ -61,7 +61,7 @@ def scan(source: RowSource) -> Index:
 
     Raises: ValueError: no rows, a nameless trajectory, a value that is not finite, a sigma that is none.
     """
-    stamp = file_stamp(source)
+    stamp = source.stamp()
     codes_of: dict[str, int] = {}
     counts: list[int] = []
     contiguous = True
@@ -87,15 +87,9 @@ def groups(source: RowSource, index: Index) -> Iterator[RowGroup]:
 
     Raises: ValueError: if the file is no longer the one that was scanned.
     """
-    if file_stamp(source) != index.stamp:
+    if source.stamp() != index.stamp:
         raise ValueError(f"{source.path}: must not change while it is in use; it did. Call read_dataset again.")
     return _stream(source) if index.contiguous else _regroup(source, index)
-
-
-def file_stamp(source: RowSource) -> tuple[int, int]:
-    """Size (bytes) and time of the last change (ns) of the file."""
-    status = source.path.stat()
-    return status.st_size, status.st_mtime_ns
 
 
 def check_cells(source: RowSource, block: Block) -> None:

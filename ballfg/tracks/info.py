@@ -15,7 +15,7 @@ from ballfg.tracks.noise import TrackNoise
 INFO_FILE = "dataset.yaml"
 _REQUIRED = ("name", "frame", "ball")
 _OPTIONAL = ("rate", "position_noise", "spin_noise", "source", "licence")
-_KNOWN = (*_REQUIRED, *_OPTIONAL, "noise", "labels")
+_KNOWN = (*_REQUIRED, *_OPTIONAL, "noise", "labels", "import")
 
 # The largest values that can be meant in SI units; above them the unit is almost surely another one.
 _MAX_RADIUS = 0.5  # m
@@ -90,11 +90,16 @@ class DatasetInfo:
     noise: TrackNoise | None = None
     """All noise that is known of the tracks, as `ballfg noise` finds it; it comes before the two numbers above."""
 
+    imported: Mapping[str, Any] | None = None
+    """How the tracks were read from their source, as `ballfg import` states it in the section `import`; for people."""
+
     def __post_init__(self) -> None:
         for key in ("name", "source", "licence"):
             check_text(key, getattr(self, key), optional=key != "name")
         if not isinstance(self.noise, TrackNoise | None):
             raise TypeError(f"noise must be a TrackNoise or None; got {type(self.noise).__name__}.")
+        if not isinstance(self.imported, Mapping | None):
+            raise TypeError(f"import must be a mapping; got {type_name(self.imported)}. Delete the section.")
         if not isinstance(self.ball, Ball):
             raise TypeError(f"ball must be a Ball; got {type(self.ball).__name__}. Pass Ball(radius, mass).")
         height = check_number("frame.table_height", self.table_height, "m", limit=MAX_HEIGHT, instead="mm")
@@ -133,6 +138,7 @@ class DatasetInfo:
             ball=Ball(radius=ball["radius"], mass=ball["mass"]),
             table_extent=_stated_extent(frame),
             noise=None if content.get("noise") is None else TrackNoise.from_mapping(content["noise"]),
+            imported=content.get("import"),
             **{key: content.get(key) for key in _OPTIONAL},
         )
 
@@ -148,7 +154,9 @@ class DatasetInfo:
         }
         optional = {key: getattr(self, key) for key in _OPTIONAL}
         content |= {key: value for key, value in optional.items() if value is not None}
-        return content if self.noise is None else content | {"noise": self.noise.to_mapping()}
+        if self.noise is not None:
+            content["noise"] = self.noise.to_mapping()
+        return content if self.imported is None else content | {"import": dict(self.imported)}
 
 
 def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:

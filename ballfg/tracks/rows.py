@@ -68,6 +68,11 @@ class RowSource(ABC):
         Raises: ValueError: a cell or a row that cannot be read; the message names line and column.
         """
 
+    def stamp(self) -> tuple[int, int]:
+        """Size (bytes) and time of the last change (ns) of the file."""
+        status = self.path.stat()
+        return status.st_size, status.st_mtime_ns
+
     @abstractmethod
     def where(self, *rows: int) -> str:
         """The file and the place of these rows (counted from 0) as a reader of the file counts them."""

@@ -1,0 +1,106 @@
+"""`ballfg import`: a user's own files to a dataset."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
+
+import typer
+
+if TYPE_CHECKING:
+    from ballfg.importing import Choices, Proposal, UndecidedError
+
+_guess, _file = (partial(typer.Option, rich_help_panel=panel) for panel in ("Instead of a guess", "Files"))
+MOST_QUESTIONS = 8
+"""Questions on a terminal, after which something else is wrong."""
+WIDTH = 160
+"""Characters of a line of the proposal, where no terminal tells."""
+
+
+def import_(
+    sources: Annotated[list[Path], typer.Argument(metavar="SOURCE...", help="Files and folders to import.")],
+    out: Annotated[Path, _file("--out", help="Folder of the new dataset.")],
+    columns: Annotated[str, _guess(help="Roles of columns, as t=stamp,x=X,y=Y,z=Z,trajectory=shot.")] = "",
+    length: Annotated[str | None, _guess(help="Unit of positions: m, cm, mm, in or ft.")] = None,
+    time: Annotated[str | None, _guess(help="Unit of times: s, ms, us or ns.")] = None,
+    up: Annotated[str | None, _guess(help="Axis that points up: x, y, z, -x, -y or -z.")] = None,
+    flip: Annotated[str | None, _guess(help="Axis to mirror, for a left-handed frame: x, y or z.")] = None,
+    table_height: Annotated[float | None, _guess(help="z of the table's surface in the new frame, m.")] = None,
+    split_gap: Annotated[float | None, _guess(help="Gap after which a new shot begins, s.")] = None,
+    ball: Annotated[str | None, _guess(help="Ball: table-tennis, tennis or a ball file (YAML).")] = None,
+    rate: Annotated[float | None, _guess(help="Frames per second, where there are frames and no times.")] = None,
+    key: Annotated[
+        str | None, _guess("--key", "--sheet", help="Table, sheet or group, where a source holds several.")
+    ] = None,
+    topic: Annotated[str | None, _guess(help="Topic of a ROS bag.")] = None,
+    name: Annotated[str | None, _file(help="Name of the dataset; that of the folder by default.")] = None,
+    format: Annotated[str, _file(help="Format of the tracks: csv or parquet.")] = "csv",
+    force: Annotated[bool, _file("--force", help="Replace a dataset.")] = False,
+) -> None:
+    """Import tracks from your own files: any columns, units and axes.
+
+    It shows what it understood and why, and writes the dataset with a page to check it, import.html.
+
+    A guess that is not safe is asked for on a terminal, and refused elsewhere with the option that decides it.
+
+    Example: ballfg import shots.csv --out my_shots
+    """
+    from ballfg.files.whole_folder import check_replaceable
+    from ballfg.importing import Choices, parse_columns, write_import
+
+    if format not in ("csv", "parquet"):
+        raise ValueError(f"--format must be csv or parquet; got {format!r}. Choose one of them.")
+    check_replaceable(out, mark="dataset.yaml", what="a dataset", force=force)
+    choices = Choices(
+        parse_columns(columns) if columns else {}, length, time, up, flip, table_height, split_gap, ball, rate, key,
+        topic, name or out.resolve().name,
+    )  # fmt: skip
+    proposal = _proposed(sources, choices)
+    _show(proposal)
+    write_import(out, proposal, cast(Literal["csv", "parquet"], format), force)
+    samples = sum(len(track) for track in proposal.tracks)
+    typer.echo(f"wrote {len(proposal.tracks)} shots, {samples} samples to {out}; look at {out / 'import.html'}")
+
+
+def _proposed(sources: list[Path], choices: Choices) -> Proposal:
+    """The proposal; on a terminal the user answers what is not safe to guess."""
+    from ballfg.importing import UndecidedError, propose
+
+    for _ in range(MOST_QUESTIONS):
+        try:
+            return propose(sources, choices)
+        except UndecidedError as question:
+            if not (sys.stdin.isatty() and sys.stderr.isatty()):
+                raise
+            choices = _answered(question, choices)
+    return propose(sources, choices)
+
+
+def _answered(question: UndecidedError, choices: Choices) -> Choices:
+    from ballfg.importing import parse_columns
+
+    default = question.choices[0] if question.choices else None
+    answer = typer.prompt(f"{question}\n--{question.option}", default=default, err=True)
+    field = question.option.replace("-", "_")
+    if field == "columns":
+        return replace(choices, columns={**choices.columns, **parse_columns(answer)})
+    decided: dict[str, Any] = {field: float(answer) if field in ("table_height", "rate", "split_gap") else answer}
+    return replace(choices, **decided)
+
+
+def _show(proposal: Proposal) -> None:
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False)
+    for head in ("what", "guess", "why", "how sure", "change it with"):
+        table.add_column(head, overflow="fold", no_wrap=head in ("what", "how sure"))
+    for guess in proposal.guesses:
+        table.add_row(*(Text(part) for part in (guess.what, guess.value, guess.why, guess.sure, guess.option)))
+    Console(width=None if sys.stdout.isatty() else WIDTH).print(table)
+    for note in proposal.notes:
+        typer.echo(f"note: {note}")

@@ -1,0 +1,114 @@
+"""The height of the table, from where the balls bounce."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ballfg.arrays import Array
+
+_ARM: Final = 0.06
+"""s of flight that is fitted on each side of a bounce."""
+_LEAST_SAMPLES: Final = 3
+_LEAST_SPEED: Final = 0.7
+"""m/s, of the fall before and of the rise after a bounce; slower ones are rolling balls and noise."""
+_MOST_RESIDUAL: Final = 0.02
+"""m, root mean square about the two flights; more is a hit, an outlier, or two balls."""
+_SAME: Final = 0.04
+"""m: bounces within this distance of each other are on one surface."""
+_SHARE: Final = 0.3
+"""A higher surface with this share of the bounces of the most frequent one is the table: balls bounce on below it."""
+_GRAVITY: Final = 10.0
+"""m/s^2, of the fitted arcs: gravity and a little topspin. An error of 5 moves a bounce by 2 mm."""
+
+
+@dataclass(frozen=True)
+class Surface:
+    """A height at which balls bounce."""
+
+    centre: float
+    """m, of the ball's centre at contact, the median of the bounces."""
+    spread: float
+    """m, standard deviation of one bounce."""
+    bounces: int
+    others: tuple[float, ...] = ()
+    """m, centres at further surfaces."""
+
+
+def surface(shots: Iterable[tuple[Array, Array]]) -> Surface | None:
+    """The surface that most balls bounce on, or a higher one that nearly as many do.
+
+    Args: shots: times (n,) s and positions (n, 3) m, z up.
+    Returns: None where no bounce is seen.
+    """
+    heights = np.sort([height for t, p in shots for height in bounce_heights(t, p[:, 2])])
+    groups: list[Array] = []
+    while len(heights):
+        near = np.searchsorted(heights, heights + _SAME, side="right") - np.searchsorted(heights, heights - _SAME)
+        middle = heights[int(np.argmax(near))]
+        inside = np.abs(heights - middle) <= _SAME
+        groups.append(heights[inside])
+        heights = heights[np.abs(heights - middle) > 2.0 * _SAME]
+    if not groups:
+        return None
+    often = [group for group in groups if len(group) >= max(_SHARE * len(groups[0]), 1.0)]
+    table = max(often, key=lambda group: float(np.median(group)))
+    spread = 1.4826 * float(np.median(np.abs(table - np.median(table))))
+    others = tuple(float(np.median(group)) for group in often if group is not table)
+    return Surface(float(np.median(table)), spread, len(table), others)
+
+
+def bounce_heights(times: Array, heights: Array) -> list[float]:
+    """The heights (m) at which one ball bounced: where the arc before meets the arc after.
+
+    Args: times: (n,) s.  heights: (n,) m.
+    """
+    found: list[tuple[float, float, float]] = []
+    n = len(times)
+    for i in range(1, n - 2):
+        # the bounce lies between samples i and i + 1, or one of them is the lowest of its neighbours
+        if min(heights[i], heights[i + 1]) > min(heights[i - 1], heights[i + 2]):
+            continue
+        arms = _arms(times, i)
+        if arms is None:
+            continue
+        before, after = (_arc(times[part], heights[part], times[i]) for part in arms)
+        if before[1] > -_LEAST_SPEED or after[1] < _LEAST_SPEED or max(before[2], after[2]) > _MOST_RESIDUAL:
+            continue
+        when = (before[0] - after[0]) / (after[1] - before[1])
+        step = times[i + 1] - times[i]
+        if -0.1 * step <= when <= 1.1 * step:
+            found.append(
+                (before[2] + after[2], times[i] + when, before[0] + before[1] * when - 0.5 * _GRAVITY * when**2)
+            )
+    return [height for _, _, height in _distinct(found)]
+
+
+def _arms(times: Array, i: int) -> Sequence[slice] | None:
+    """The samples of the flight before, up to i, and after, from i + 1."""
+    first = max(int(np.searchsorted(times, times[i] - _ARM)), 0)
+    last = int(np.searchsorted(times, times[i + 1] + _ARM, side="right"))
+    first, last = min(first, max(i - _LEAST_SAMPLES + 1, 0)), max(last, min(i + 1 + _LEAST_SAMPLES, len(times)))
+    if i + 1 - first < _LEAST_SAMPLES or last - i - 1 < _LEAST_SAMPLES:
+        return None
+    return slice(first, i + 1), slice(i + 1, last)
+
+
+def _arc(times: Array, heights: Array, origin: float) -> tuple[float, float, float]:
+    """Height and vertical speed at the origin of a free fall through the samples, and its residual (m)."""
+    s = times - origin
+    lifted = heights + 0.5 * _GRAVITY * s**2
+    design = np.stack([np.ones_like(s), s], axis=1)
+    (height, speed), *_ = np.linalg.lstsq(design, lifted, rcond=None)
+    residual = lifted - design @ (height, speed)
+    return float(height), float(speed), float(np.sqrt(np.mean(residual**2)))
+
+
+def _distinct(found: list[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
+    """Of bounces less than the length of an arm apart, the one that fits best."""
+    kept: list[tuple[float, float, float]] = []
+    for bounce in sorted(found):
+        if all(abs(bounce[1] - other[1]) > _ARM for other in kept):
+            kept.append(bounce)
+    return kept

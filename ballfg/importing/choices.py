@@ -1,0 +1,98 @@
+"""What a user may decide about an import, what was guessed in its place, and the question where no guess is safe."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from typing import Any, Final
+
+from ballfg.importing.fall import AXES, LENGTHS, TIMES
+
+ROLES: Final = ("t", "frame", "trajectory", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
+"""What a column can be."""
+
+
+class UndecidedError(ValueError):
+    """A guess that is not safe: the option that decides it, and what it may be."""
+
+    def __init__(self, what: str, option: str, choices: Sequence[str], example: str | None = None) -> None:
+        self.option, self.choices = option, tuple(choices)
+        remedy = example or (choices[0] if choices else "...")
+        many = f" (or {', '.join(choices[1:4])})" if len(choices) > 1 else ""
+        super().__init__(f"{what}. Decide it with --{option} {remedy}{many}.")
+
+
+@dataclass(frozen=True)
+class Choices:
+    """What is decided; None where it is to be guessed.
+
+    Raises: ValueError: an option that is not one of its kind.
+    """
+
+    columns: Mapping[str, str] = field(default_factory=dict)
+    """Role -> name of the column."""
+    length: str | None = None
+    time: str | None = None
+    up: str | None = None
+    flip: str | None = None
+    """Axis of the source whose sign is changed, for a left-handed frame."""
+    table_height: float | None = None
+    """m, in the new frame."""
+    split_gap: float | None = None
+    """s."""
+    ball: str | None = None
+    rate: float | None = None
+    """Hz."""
+    key: str | None = None
+    topic: str | None = None
+    name: str | None = None
+
+    def __post_init__(self) -> None:
+        for option, value, known in (
+            ("length", self.length, tuple(LENGTHS)),
+            ("time", self.time, tuple(TIMES)),
+            ("up", self.up, AXES),
+            ("flip", self.flip, ("x", "y", "z")),
+        ):
+            if value is not None and value not in known:
+                raise ValueError(f"--{option} must be one of {', '.join(known)}; got {value!r}. Choose one of them.")
+        for role in self.columns:
+            if role not in ROLES:
+                raise ValueError(
+                    f"--columns must name roles among {', '.join(ROLES)}; got {role!r}. Write --columns t=stamp,x=X."
+                )
+        for option, number in (("rate", self.rate), ("split-gap", self.split_gap)):
+            if number is not None and not number > 0.0:
+                raise ValueError(f"--{option} must be positive; got {number:g}. Correct it.")
+
+    def decided(self) -> dict[str, Any]:
+        """The options that were given."""
+        values = {one.name: getattr(self, one.name) for one in fields(self)}
+        return {key: value for key, value in values.items() if value not in (None, {})}
+
+
+@dataclass(frozen=True)
+class Guess:
+    """One line of the proposal."""
+
+    what: str
+    value: str
+    why: str
+    sure: str
+    """stated, sure, likely or unsure."""
+    option: str
+    """As typed to change it; empty where nothing can be changed."""
+
+
+def parse_columns(text: str) -> dict[str, str]:
+    """Roles and columns from text such as "t=stamp,x=X".
+
+    Args: text: as typed after --columns.
+    Returns: role -> name of the column.
+    Raises: ValueError: not of this form.
+    """
+    found: dict[str, str] = {}
+    for part in text.split(","):
+        role, sign, column = part.partition("=")
+        if not sign or not column.strip():
+            raise ValueError(f"--columns must be written role=name, with commas between; got {part!r}: t=stamp,x=X.")
+        found[role.strip()] = column.strip()
+    return found

@@ -1,0 +1,289 @@
+"""Which column is what: by its name, and where names say nothing, by its numbers."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ballfg.checks import did_you_mean
+from ballfg.importing.choices import Choices, UndecidedError
+from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
+from ballfg.importing.names import Meaning, meanings
+from ballfg.importing.stamps import as_stamps
+
+RATES: Final = ("rate", "fps", "frame_rate", "framerate", "hz", "sampling_rate", "frequency")
+"""Names of a constant that is the number of frames per second."""
+UNITS: Final = ("unit", "units", "length_unit", "position_unit")
+_REGULAR: Final = 0.3
+"""Median deviation of the steps of a time column, in median steps; coordinates vary more."""
+_FORWARD: Final = 0.9
+_PIECES: Final = 0.2
+"""Most changes, per row, of a column that names trajectories."""
+
+
+@dataclass(frozen=True)
+class Roles:
+    """The columns of one table by what they are."""
+
+    places: tuple[str, str, str]
+    time: tuple[str, ...]
+    """One column of stamps, two of s and ns, or none."""
+    frame: str | None = None
+    trajectory: str | None = None
+    sigmas: tuple[str, str, str] | None = None
+    length_unit: str | None = None
+    time_unit: str | None = None
+    rate: float | None = None
+    by_name: bool = True
+    others: tuple[str, ...] = ()
+
+
+def roles_of(table: RawTable, choices: Choices) -> Roles | None:
+    """The roles of a table's columns; None if it holds no positions.
+
+    Raises: UndecidedError: several readings. ValueError: positions in an image alone, or a column that does not exist.
+    """
+    given = {role: _existing(table, name) for role, name in choices.columns.items()}
+    read = {name: meanings(name) for name in table.columns} if table.named else {}
+    places, units = _places(table, read, given)
+    counters: list[str] = []
+    by_name = places is not None
+    time = _named_time(table, read, given, places or ())
+    trajectory = _trajectory(table, read, given, {*(places or ()), *time})
+    if places is None:
+        if table.named and not _numeric_rest(table, {*time, *([trajectory] if trajectory else [])}):
+            return None
+        frames = [name for name, found in read.items() if any(one.role == "frame" for one in found)]
+        if not time and (table.named or len(table.columns) > 3):  # three columns alone are x, y and z
+            time, counter = _time_by_numbers(table, {trajectory} if trajectory else set())
+            frames += [counter] if counter else []
+        if table.named and not time and not frames:
+            return None
+        trajectory = trajectory or _pieces(table, {*time, *frames})
+        found = _numeric_rest(table, {*time, *frames, *([trajectory] if trajectory else [])})
+        left = [n for n, c in table.columns.items() if is_number(c) and n not in (*time, *frames, trajectory)]
+        if len(found) < 3 and len(left) == 3:  # a coordinate may be constant
+            found = left
+        if len(found) < 3:
+            return None
+        if len(found) > 3:
+            raise UndecidedError(
+                f"{table.where}: x, y and z must be three columns; {', '.join(found[:8])} may be meant",
+                "columns",
+                (),
+                "x={},y={},z={}".format(*found[:3]),
+            )
+        places = (found[0], found[1], found[2])
+        counters = frames
+    frame = given.get("frame") or next((n for n, ms in read.items() for m in ms if m.role == "frame"), None)
+    frame = frame or (counters[0] if counters else None)
+    if not time and frame is None:
+        time, frame = _time_by_numbers(table, {*places, *([trajectory] if trajectory else [])})
+    sigmas = _sigmas(read, given)
+    used = {*places, *time, *(sigmas or ())} | {one for one in (frame, trajectory) if one}
+    return Roles(
+        places,
+        time,
+        None if time else frame,
+        trajectory,
+        sigmas,
+        units or _stated_unit(table),
+        _time_unit(read, time),
+        _stated_rate(table),
+        by_name,
+        tuple(name for name in table.columns if name not in used and name.lower() not in (*RATES, *UNITS)),
+    )
+
+
+def _existing(table: RawTable, name: str) -> str:
+    if name in table.columns:
+        return name
+    alike = [one for one in table.columns if one.lower() == name.lower() or one.split(" [")[0] == name]
+    if len(alike) == 1:
+        return alike[0]
+    raise ValueError(
+        f"--columns must name columns of {table.where}; it has no {name!r} but {', '.join(list(table.columns)[:12])}."
+        f"{did_you_mean(name, table.columns)}"
+    )
+
+
+def _places(
+    table: RawTable, read: Mapping[str, list[Meaning]], given: Mapping[str, str]
+) -> tuple[tuple[str, str, str] | None, str | None]:
+    """The columns of x, y and z and the unit in their names."""
+    groups: dict[str, dict[str, tuple[str, Meaning]]] = {}
+    for name, found in read.items():
+        for meaning in found:
+            if meaning.role in "xyz" and is_number(table.columns[name]):
+                groups.setdefault(meaning.group, {}).setdefault(meaning.role, (name, meaning))
+    if {"x", "y", "z"} <= set(given):
+        units = [one.unit for axis in "xyz" for one in read.get(given[axis], []) if one.role in "xyz" and one.unit]
+        return (given["x"], given["y"], given["z"]), units[0] if units else None
+    _refuse_images(table, groups)
+    whole = [group for group in groups.values() if len(group) == 3]
+    if not whole:
+        return None, None
+    ranks = [sum(meaning.rank for _, meaning in group.values()) for group in whole]
+    best = [group for group, rank in zip(whole, ranks, strict=True) if rank == min(ranks)]
+    if len(best) > 1 and not given:
+        sets = [",".join(f"{axis}={group[axis][0]}" for axis in "xyz") for group in best]
+        raise UndecidedError(f"{table.where}: {len(best)} sets of columns may be the ball's x, y, z", "columns", sets)
+    chosen = {axis: given.get(axis, best[0][axis][0]) for axis in "xyz"}
+    found_units = {meaning.unit for _, meaning in best[0].values()}
+    if len(found_units) > 1:
+        raise UndecidedError(
+            f"{table.where}: x, y and z must have one unit; their names state {', '.join(map(str, found_units))}",
+            "length",
+            tuple(str(unit) for unit in found_units if unit),
+        )
+    return (chosen["x"], chosen["y"], chosen["z"]), found_units.pop()
+
+
+def _refuse_images(table: RawTable, groups: Mapping[str, Mapping[str, tuple[str, Meaning]]]) -> None:
+    """Refuses pixels: places in an image need cameras to become places in a room."""
+    whole = any(len(group) == 3 for group in groups.values())
+    pixels = any(meaning.unit == "px" for group in groups.values() for _, meaning in group.values())
+    flat = [group for group in groups.values() if set(group) == {"x", "y"}]
+    if pixels or (flat and not whole):
+        names = ", ".join(table.columns)
+        raise ValueError(
+            f"{table.where} must have x, y and z; its columns are {names[:120]}: places in an image, or z is missing. "
+            "Name z with --columns z=NAME, or make tracks from detections of several cameras: ballfg track DETECTIONS "
+            "--cameras cameras.yaml --out DATASET."
+        )
+
+
+def _named_time(
+    table: RawTable, read: Mapping[str, list[Meaning]], given: Mapping[str, str], places: tuple[str, ...]
+) -> tuple[str, ...]:
+    if "t" in given:
+        return (given["t"],)
+    if "frame" in given:
+        return ()
+    parts = {m.role: name for name, found in read.items() for m in found if m.role in ("seconds", "nanoseconds")}
+    if len(parts) == 2:
+        return parts["seconds"], parts["nanoseconds"]
+    candidates = [
+        (m.rank, name)
+        for name, found in read.items()
+        for m in found
+        if m.role in ("t", "seconds") and name not in places and as_stamps(table.columns[name]) is not None
+    ]
+    if not candidates:
+        return ()
+    least = min(rank for rank, _ in candidates)
+    best = [name for rank, name in candidates if rank == least]
+    moving = [name for name in best if _varies(table.columns[name])] or best
+    if len(moving) > 1 and not _one_clock(table, moving):
+        raise UndecidedError(
+            f"{table.where}: {' and '.join(moving)} may both be the time", "columns", [f"t={name}" for name in moving]
+        )
+    return (moving[0],)
+
+
+def _varies(column: Column) -> bool:
+    return len(set(column[:1000].tolist())) > 1
+
+
+def _one_clock(table: RawTable, names: list[str]) -> bool:
+    """Whether columns tell the same time but for its origin and unit."""
+    first, *others = (as_stamps(table.columns[name]) for name in names)
+    for other in others:
+        if first is None or other is None:
+            return False
+        a, b = (np.asarray(one - one[0], dtype=np.float64) for one in (first, other))
+        slope = float(a @ b) / max(float(a @ a), 1e-300)
+        power = np.log10(abs(slope)) if slope else np.inf
+        if abs(power - round(power)) > 1e-3 or np.abs(b - slope * a).max() > 1e-3 * max(np.abs(b).max(), 1e-300):
+            return False
+    return True
+
+
+def _trajectory(
+    table: RawTable, read: Mapping[str, list[Meaning]], given: Mapping[str, str], used: set[str]
+) -> str | None:
+    if "trajectory" in given:
+        return given["trajectory"]
+    candidates = sorted(
+        (m.rank, name) for name, found in read.items() for m in found if m.role == "trajectory" and name not in used
+    )
+    for _, name in candidates:
+        column = table.texts.get(name, table.columns[name])
+        distinct = len(set(column.tolist()))
+        if distinct <= max(1, len(column) // 3):
+            return name
+    return None
+
+
+def _numeric_rest(table: RawTable, used: set[str]) -> list[str]:
+    """Columns that may be coordinates: numbers that vary, and no counters."""
+    found = []
+    for name, column in table.columns.items():
+        values = numbers(column)
+        held = values[np.isfinite(values)]
+        counts = column.dtype.kind == "i" and len(held) > 2 and bool((np.abs(np.diff(held)) <= 1).mean() > _FORWARD)
+        if name not in used and len(held) > 2 and np.ptp(held) > 0 and not counts:
+            found.append(name)
+    return found
+
+
+def _time_by_numbers(table: RawTable, used: set[str]) -> tuple[tuple[str, ...], str | None]:
+    """The column of times that runs forward most regularly, or else a counter of frames."""
+    found: list[tuple[bool, float, str]] = []
+    for name, column in table.columns.items():
+        stamps = as_stamps(column)
+        if name in used or stamps is None or len(stamps) < 3:
+            continue
+        steps = np.diff(stamps).astype(np.float64)
+        forward = steps[steps > 0]
+        if len(forward) < _FORWARD * len(steps):
+            continue
+        typical = float(np.median(forward))
+        spread = float(np.median(np.abs(forward - typical))) / typical
+        if spread <= _REGULAR:
+            found.append((column.dtype.kind == "i" and typical == 1.0, spread, name))
+    if not found:
+        return (), None
+    counter, _, name = min(found)
+    return ((), name) if counter else ((name,), None)
+
+
+def _pieces(table: RawTable, used: set[str]) -> str | None:
+    for name, column in table.columns.items():
+        if name in used or column.dtype.kind == "f":
+            continue
+        changes = int((column[1:] != column[:-1]).sum())
+        if 0 < changes <= _PIECES * len(column):
+            return name
+    return None
+
+
+def _sigmas(read: Mapping[str, list[Meaning]], given: Mapping[str, str]) -> tuple[str, str, str] | None:
+    found = {m.role: name for name, ms in read.items() for m in ms if m.role.startswith("sigma")} | dict(given)
+    if all(f"sigma_{axis}" in found for axis in "xyz"):
+        return found["sigma_x"], found["sigma_y"], found["sigma_z"]
+    return None
+
+
+def _time_unit(read: Mapping[str, list[Meaning]], time: tuple[str, ...]) -> str | None:
+    if len(time) != 1:
+        return "ns" if time else None
+    return next((m.unit for m in read.get(time[0], []) if m.role in ("t", "seconds") and m.unit), None)
+
+
+def _constant(table: RawTable, names: tuple[str, ...]) -> object:
+    for name, column in table.columns.items():
+        if name.lower() in names and len(column) and len(set(column.tolist())) == 1:
+            return column.tolist()[0]
+    return None
+
+
+def _stated_rate(table: RawTable) -> float | None:
+    value = _constant(table, RATES)
+    return float(value) if isinstance(value, int | float) and value > 0 else None
+
+
+def _stated_unit(table: RawTable) -> str | None:
+    value = _constant(table, UNITS)
+    return value.strip().lower() if isinstance(value, str) else None

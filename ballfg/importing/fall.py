@@ -1,0 +1,109 @@
+"""Units and the up axis, read off the fall of the ball: gravity is known, and nothing else falls so steadily."""
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.state import STANDARD_GRAVITY
+
+LENGTHS: Final = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+"""m in a unit of length."""
+TIMES: Final = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""s in a unit of time."""
+AXES: Final = ("x", "-x", "y", "-y", "z", "-z")
+"""Where up may be."""
+
+_WINDOW: Final = 0.12
+"""s over which an acceleration is fitted: 3 mm of noise at 100 Hz make 2 m/s^2, and most flights are longer."""
+_STEPS: Final = (1e-4, 0.34)
+"""s between two samples, least and most: nothing faster films a ball, and nothing slower shows its fall."""
+_LEAST_SAMPLES: Final = 5
+_WIDTH: Final = 0.3
+"""Standard deviation, in gravities, of an acceleration about its model: noise, spin and bounces in the window."""
+_DRAGS: Final = np.linspace(0.0, 0.2, 11)
+"""1/m; a table-tennis ball has 0.13, a tennis ball 0.02."""
+_MOST_WINDOWS: Final = 4000
+_MOST_SPEED: Final = 120.0
+"""m/s; the fastest smash of any ball game is slower."""
+_COINCIDENCE: Final = 0.02
+"""Share of windows that fit a wrong axis or unit by chance; it keeps the ratio of two small scores near one."""
+
+
+@dataclass(frozen=True)
+class Scale:
+    """One reading of the numbers: their units and the axis that points up."""
+
+    length: str
+    time: str
+    up: str
+    score: float
+    """Weighted share of the windows whose acceleration is that of a falling ball, 0 to 1."""
+    windows: int
+    drag: float
+    """1/m, the quadratic drag with which the windows agree best."""
+
+
+def scales(
+    shots: Sequence[tuple[Array, Array]],
+    lengths: Collection[str] = tuple(LENGTHS),
+    times: Collection[str] = tuple(TIMES),
+    ups: Collection[str] = AXES,
+) -> list[Scale]:
+    """Every combination of units and up axis, the likeliest first.
+
+    The acceleration of short windows is compared with gravity along the axis and drag against the velocity. The score
+    of a combination is the mean of exp(-r^2 / 2), with r the difference in units of 0.3 g.
+
+    Args: shots: times (n,) and positions (n, 3) of each, in their own units.  lengths, times, ups: to choose from.
+    Returns: the combinations; empty where no window is long enough.
+    """
+    found: list[Scale] = []
+    for time in times:
+        velocities, accelerations = _windows(shots, TIMES[time])
+        if not len(velocities):
+            continue
+        for length in lengths:
+            v, a = velocities * LENGTHS[length], accelerations * LENGTHS[length]
+            speeds = np.linalg.norm(v, axis=1, keepdims=True)
+            flying = np.median(speeds) <= _MOST_SPEED
+            drag = -speeds * v
+            for up in ups:
+                gravity = np.zeros(3)
+                gravity["xyz".index(up[-1])] = STANDARD_GRAVITY * (1.0 if up[0] == "-" else -1.0)
+                misses = [np.sum((a - gravity - k * drag) ** 2, axis=1) for k in _DRAGS]
+                fits = [float(np.exp(-0.5 * miss / (_WIDTH * STANDARD_GRAVITY) ** 2).mean()) for miss in misses]
+                best = int(np.argmax(fits))
+                score = fits[best] if flying else 0.0
+                found.append(Scale(length, time, up, score, len(v), float(_DRAGS[best])))
+    return sorted(found, key=lambda scale: -scale.score)
+
+
+def odds(best: float, other: float) -> float:
+    """How much better one score is than another; at least about 2 decides."""
+    return (best + _COINCIDENCE) / (other + _COINCIDENCE)
+
+
+def _windows(shots: Sequence[tuple[Array, Array]], unit: float) -> tuple[Array, Array]:
+    """Velocities and accelerations (k, 3) in lengths per s and s^2, of windows that overlap by half."""
+    steps = [float(np.median(np.diff(t))) * unit for t, _ in shots if len(t) >= _LEAST_SAMPLES]
+    if not steps or not _STEPS[0] <= np.median(steps) <= _STEPS[1]:
+        return np.empty((0, 3)), np.empty((0, 3))
+    count = max(_LEAST_SAMPLES, round(_WINDOW / float(np.median(steps))) + 1)
+    hop = max(1, count // 2)
+    places = [(i, start) for i, (t, _) in enumerate(shots) for start in range(0, len(t) - count + 1, hop)]
+    places = places[:: max(1, len(places) // _MOST_WINDOWS)]
+    velocities, accelerations = [], []
+    for i, start in places:
+        t, p = (values[start : start + count] for values in shots[i])
+        s = (t - t.mean()) * unit
+        if s[-1] - s[0] > 2.5 * count * np.median(steps):  # frames are missing: a bounce may hide in the gap
+            continue
+        width = max(float(s[-1] - s[0]), 1e-12)
+        design = np.stack([np.ones_like(s), s / width, (s / width) ** 2], axis=1)
+        _, slope, bend = np.linalg.lstsq(design, p - p.mean(axis=0), rcond=None)[0]
+        velocities.append(slope / width)
+        accelerations.append(2.0 * bend / width**2)
+    return np.array(velocities).reshape(-1, 3), np.array(accelerations).reshape(-1, 3)

@@ -1,0 +1,1 @@
+"""Files, folders and data in memory to tables, nothing interpreted yet."""

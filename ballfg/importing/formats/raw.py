@@ -1,0 +1,181 @@
+"""A table as it was found in a file: named columns of numbers or text, nothing interpreted yet."""
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+Column = NDArray[Any]
+"""(n,) int64, float64 or object (text)."""
+
+MISSING: Final = (
+    "",
+    "-",
+    "--",
+    "?",
+    "nan",
+    "na",
+    "n/a",
+    "#n/a",
+    "null",
+    "none",
+    "nil",
+    "missing",
+    "lost",
+    "inf",
+    "-inf",
+)
+"""What files write, in lower case, where a number is missing."""
+WITH_UNIT: Final = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\W\d_]{1,3})\s*$")
+"""A number with its unit, such as 12.5 mm."""
+_MOSTLY: Final = 0.5
+"""Share of a column's cells that must be numbers, where it is taken for one of numbers."""
+
+
+@dataclass
+class RawTable:
+    """One table of a source."""
+
+    name: str
+    """Of the table in its file; the file's own name where that holds one table."""
+    columns: dict[str, Column]
+    """By name, in the order of the file."""
+    source: str = ""
+    """The file, for messages."""
+    named: bool = True
+    """Whether the columns have names of their own."""
+    notes: list[str] = field(default_factory=list)
+    """What was left out while it was read."""
+    texts: dict[str, Column] = field(default_factory=dict)
+    """Columns of numbers with some cells that are none, as they were written."""
+
+    @property
+    def doubts(self) -> dict[str, str]:
+        """A sentence for each column of numbers in which cells that are none count as missing."""
+        found = {}
+        for name, text in self.texts.items():
+            wrong = [cell for cell in text.tolist() if cell.lower() not in MISSING and _real(cell) is None]
+            found[name] = f"column {name!r}: {len(wrong)} cells such as {wrong[0]!r} count as missing"
+        return found
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()))) if self.columns else 0
+
+    @property
+    def where(self) -> str:
+        """File and table, for messages."""
+        return self.source if self.name in ("", self.source) else f"{self.source} ({self.name})"
+
+
+def table_of(name: str, columns: Mapping[str, Any], source: str = "", named: bool = True) -> RawTable:
+    """A table whose columns are arrays or lists (n,) of anything; text that is numbers becomes numbers."""
+    ready: dict[str, Column] = {}
+    texts: dict[str, Column] = {}
+    for label, values in columns.items():
+        column, new_label, text = _column(label, values)
+        ready[new_label] = column
+        if text is not None:
+            texts[new_label] = text
+    return RawTable(name, ready, source, named, texts=texts)
+
+
+def numbers(column: Column) -> NDArray[np.float64]:
+    """The column as float64 (n,); NaN where it holds text."""
+    if column.dtype.kind in "iuf":
+        return column.astype(np.float64)
+    return np.full(len(column), np.nan)
+
+
+def is_number(column: Column) -> bool:
+    """Whether the column holds numbers."""
+    return column.dtype.kind in "iuf"
+
+
+def _column(label: str, values: Any) -> tuple[Column, str, Column | None]:
+    array = values if isinstance(values, np.ndarray) else _array(values)
+    if array.dtype.kind == "M":
+        stamps = array.astype("datetime64[ns]").astype(np.int64)
+        return stamps, f"{label} [ns]", None
+    if array.dtype.kind == "m":
+        return array.astype("timedelta64[ns]").astype(np.int64), f"{label} [ns]", None
+    if array.dtype.kind in "bui":
+        return array.astype(np.int64), label, None
+    if array.dtype.kind == "f":
+        return array.astype(np.float64), label, None
+    return _from_text(label, [_cell(value) for value in array.tolist()])
+
+
+def _array(values: Sequence[Any]) -> Column:
+    held = list(values)
+    if held and all(isinstance(value, bool | int | np.integer) for value in held):
+        return np.array(held, dtype=np.int64)
+    if held and all(isinstance(value, int | float | np.number) for value in held):
+        return np.array(held, dtype=np.float64)
+    made = np.empty(len(held), dtype=object)
+    made[:] = held
+    return made
+
+
+def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace").strip()
+    return value.isoformat() if hasattr(value, "isoformat") else str(value).strip()
+
+
+def _from_text(label: str, cells: list[str]) -> tuple[Column, str, Column | None]:
+    """Numbers where most cells are numbers; whole numbers keep all their digits."""
+    if any(len(cell) > 1 and cell[0] == "0" and cell.isdigit() for cell in cells):  # 007 names something
+        return _text(cells), label, None
+    present = [i for i, cell in enumerate(cells) if cell.lower() not in MISSING]
+    for convert in (_whole, _real):
+        parsed = [convert(cells[i]) for i in present]
+        wrong = [cells[i] for i, value in zip(present, parsed, strict=True) if value is None]
+        if present and not wrong:
+            return _filled(len(cells), present, parsed), label, None
+    if not present or len(wrong) > (1.0 - _MOSTLY) * len(present):
+        return _with_units(label, cells, present)
+    return _filled(len(cells), present, parsed), label, _text(cells)
+
+
+def _with_units(label: str, cells: list[str], present: list[int]) -> tuple[Column, str, Column | None]:
+    """Cells such as "12.5 mm", with one unit in all of them; else the text as it is."""
+    found = [WITH_UNIT.match(cells[i]) for i in present]
+    units = {match[2] if match else "" for match in found}
+    if present and len(units) == 1 and all(found):
+        values = [float(match[1]) for match in found if match]
+        return _filled(len(cells), present, values), f"{label} [{units.pop()}]", None
+    return _text(cells), label, None
+
+
+def _text(cells: list[str]) -> Column:
+    text = np.empty(len(cells), dtype=object)
+    text[:] = cells
+    return text
+
+
+def _filled(count: int, places: list[int], values: Sequence[float | int | None]) -> Column:
+    if len(places) == count and all(isinstance(value, int) for value in values):
+        return np.array(values, dtype=np.int64)
+    column = np.full(count, np.nan)
+    column[places] = [np.nan if value is None else float(value) for value in values]
+    return column
+
+
+def _whole(cell: str) -> int | None:
+    try:
+        value = int(cell)
+    except ValueError:
+        return None
+    return value if "_" not in cell and abs(value) < 1 << 62 else None
+
+
+def _real(cell: str) -> float | None:
+    try:
+        return float(cell) if "_" not in cell else None
+    except ValueError:
+        return None

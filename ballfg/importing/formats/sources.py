@@ -1,0 +1,142 @@
+"""From what a user names - files, folders, data in memory - to tables."""
+
+import json
+import zipfile
+from collections.abc import Iterable, Sequence
+from os import PathLike
+from pathlib import Path
+from typing import Any, Final
+
+from ballfg.importing.formats.containers import read_bag, read_excel, read_hdf5, read_matlab, read_npz, read_parquet
+from ballfg.importing.formats.nested import nested_tables
+from ballfg.importing.formats.raw import RawTable
+from ballfg.importing.formats.text_files import decoded, read_text_table
+
+TEXT: Final = (".csv", ".tsv", ".txt", ".dat", ".tab", ".asc", "")
+JSON: Final = (".json", ".jsonl", ".ndjson")
+BAGS: Final = (".mcap", ".db3")
+READERS: Final = {
+    ".parquet": read_parquet, ".pq": read_parquet, ".xlsx": read_excel, ".xlsm": read_excel, ".npz": read_npz,
+    ".npy": read_npz, ".h5": read_hdf5, ".hdf5": read_hdf5, ".hdf": read_hdf5, ".mat": read_matlab,
+}  # fmt: skip
+_MAGIC: Final = (
+    (b"PAR1", read_parquet), (b"\x89HDF", read_hdf5), (b"\x93NUMPY", read_npz), (b"MATLAB 5.0", read_matlab),
+)  # fmt: skip
+_OWN: Final = ("import.html", "truth.csv", "truth.parquet")
+"""Files in a dataset's folder that are no measurements."""
+
+
+def tables_of(data: Any, topic: str | None = None, key: str | None = None) -> list[RawTable]:
+    """All tables of a source.
+
+    Args:
+        data: a path or several, of files and folders; a DataFrame, a dict of arrays, an array, or a list of these.
+        topic: of a ROS bag.  key: part of the name of the tables to take.
+    Raises: FileNotFoundError: no such path. ValueError: unreadable, or no table of that key.
+    """
+    if isinstance(data, str | PathLike):
+        data = [data]
+    if isinstance(data, list | tuple) and data and all(isinstance(one, str | PathLike) for one in data):
+        found = [table for path in data for table in _of_path(Path(path), topic)]
+        name = ", ".join(str(path) for path in data)
+    else:
+        found, name = nested_tables(data, "", "data"), "data"
+    if not found:
+        raise ValueError(
+            f"{name} must hold a table with a time and x, y, z; none was found. Give (n, 4) numbers t, x, y, z, or "
+            "columns of these names."
+        )
+    if key is None:
+        return found
+    chosen = [table for table in found if table.name == key or Path(table.source).name == key] or [
+        table for table in found if key in f"{table.source}/{table.name}"
+    ]
+    if not chosen:
+        raise ValueError(f"--key must name a table of the source; got {key!r}, there are {_listed(found)}.")
+    return chosen
+
+
+def _listed(tables: Iterable[RawTable]) -> str:
+    names = list(dict.fromkeys(table.name or table.source for table in tables))
+    return ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+
+
+def _of_path(path: Path, topic: str | None) -> list[RawTable]:
+    if not path.exists():
+        raise FileNotFoundError(f"source must exist; {path} does not. Give a file or a folder.")
+    if path.is_file():
+        return _of_file(path, topic)
+    if (path / "metadata.yaml").is_file() or any(path.glob("*.db3")):
+        return read_bag(path, topic)
+    files = sorted(file for file in path.rglob("*") if file.is_file() and _is_table(file))
+    if not files:
+        listing = ", ".join(sorted(entry.name for entry in path.iterdir())[:8]) or "nothing"
+        raise ValueError(f"{path} must hold files of measurements, such as .csv or .json; got {listing}.")
+    found: list[RawTable] = []
+    for file in files:
+        found += _of_file(file, topic)
+    return found
+
+
+def _is_table(file: Path) -> bool:
+    known = file.suffix.lower() in (*TEXT[:-1], *JSON, *BAGS, *READERS)
+    return known and not file.name.startswith(".") and file.name not in _OWN and "readme" not in file.name.lower()
+
+
+def _of_file(path: Path, topic: str | None) -> list[RawTable]:
+    ending = path.suffix.lower()
+    if path.stat().st_size == 0:
+        raise ValueError(f"{path} must hold rows of numbers; the file is empty. Export it again.")
+    if ending in BAGS:
+        return read_bag(path, topic)
+    if ending in READERS:
+        return READERS[ending](path)
+    with path.open("rb") as file:
+        head = file.read(16)
+    for magic, reader in _MAGIC:
+        if head.startswith(magic):
+            return reader(path)
+    if zipfile.is_zipfile(path):  # numpy's archive or Excel's, under another name
+        with zipfile.ZipFile(path) as archive:
+            arrays = any(name.endswith(".npy") for name in archive.namelist())
+        return read_npz(path) if arrays else read_excel(path)
+    text = decoded(path) if ending in JSON or head.lstrip(b"\xef\xbb\xbf \r\n\t")[:1] in (b"{", b"[") else None
+    return read_text_table(path) if text is None else _json(path, text)
+
+
+def _json(path: Path, text: str) -> list[RawTable]:
+    """The tables of a JSON file, or of one with a JSON value on each line."""
+    try:
+        content = json.loads(text)
+    except json.JSONDecodeError as error:
+        lines = [line for line in text.splitlines() if line.strip()]
+        if not _whole_line(lines[0]):
+            raise ValueError(
+                f"{path}, line {error.lineno}: must be valid JSON; {error.msg} at column {error.colno}, as in a file "
+                "that was cut off. Write it again, whole."
+            ) from None
+        content = _json_lines(path, lines)
+    if isinstance(content, dict) and not any(isinstance(value, list | dict) for value in content.values()):
+        content = [content]
+    return nested_tables(content, path.stem, str(path))
+
+
+def _whole_line(line: str) -> bool:
+    try:
+        json.loads(line)
+    except json.JSONDecodeError:
+        return False
+    return True
+
+
+def _json_lines(path: Path, lines: Sequence[str]) -> list[Any]:
+    values: list[Any] = []
+    for number, line in enumerate(lines, 1):
+        try:
+            values.append(json.loads(line))
+        except json.JSONDecodeError as error:
+            raise ValueError(
+                f"{path}, line {number}: must be valid JSON; {error.msg} at column {error.colno}. Correct or delete "
+                "the line."
+            ) from None
+    return values

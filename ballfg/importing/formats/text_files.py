@@ -1,0 +1,151 @@
+"""Tables of text: CSV, TSV and their kin, with any separator, decimal sign, header and comments."""
+
+import csv
+import re
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Final
+
+from ballfg.importing.formats.raw import MISSING, WITH_UNIT, RawTable, table_of
+from ballfg.importing.names import unit_of_text
+
+SEPARATORS: Final = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", " ": "spaces"}
+_COMMENTS: Final = ("#", "%", "//")
+_NUMBER: Final = re.compile(r"^[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?$")
+_DECIMAL_COMMA: Final = re.compile(r"^[-+]?\d*,\d+([eE][-+]?\d+)?$")
+_LOOK: Final = 200
+"""Lines that are looked at to find the separator."""
+_CONTROL: Final = 0.02
+"""Share of control characters from which on a file is not text."""
+
+
+def read_text_table(path: Path) -> list[RawTable]:
+    """The one table of a text file.
+
+    Raises: ValueError: not text, empty, or without rows of numbers; the message says what was seen.
+    """
+    return [text_table(decoded(path), path.stem, str(path))]
+
+
+def decoded(path: Path) -> str:
+    """The text of a file, whatever its encoding. Raises: ValueError: empty, or not text."""
+    content = path.read_bytes()
+    if not content.strip():
+        raise ValueError(f"{path} must hold rows of numbers; the file is empty. Export it again.")
+    if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return content.decode("utf-16", "replace")
+    head = content[:4096]
+    if b"\0" in head or sum(byte < 32 and byte not in b"\t\r\n\f" for byte in head) > _CONTROL * len(head):
+        raise ValueError(
+            f"{path} must be text, JSON, Parquet, Excel, HDF5, npz, MATLAB or a ROS bag; it is binary and begins with "
+            f"{content[:8]!r}. Export it as CSV."
+        )
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def text_table(text: str, name: str, source: str) -> RawTable:
+    """The table that a text holds. Raises: ValueError: it has no rows of numbers."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    comments = [line for line in lines if line.lstrip().startswith(_COMMENTS)]
+    rows_of_text = [line for line in lines if not line.lstrip().startswith(_COMMENTS)]
+    separator = _separator(rows_of_text)
+    rows = _cells(rows_of_text, separator)
+    comma = separator != "," or any(_DECIMAL_COMMA.match(cell) for row in rows[-5:] for cell in row)
+    if comma and any(_DECIMAL_COMMA.match(cell) for row in rows for cell in row):
+        rows = [[cell.replace(",", ".") if _DECIMAL_COMMA.match(cell) else cell for cell in row] for row in rows]
+    start = _first_data_row(rows)
+    if start is None:
+        shown = rows_of_text[0][:60] if rows_of_text else comments[0][:60]
+        raise ValueError(
+            f"{source} must hold rows of numbers: a time and x, y, z; its text begins with {shown!r} and has no such "
+            "rows. Export the table as CSV with a header t,x,y,z."
+        )
+    width = Counter(len(row) for row in rows[start : start + _LOOK]).most_common(1)[0][0]
+    header = [row for row in rows[:start] if len(row) == width]
+    if not header and comments:
+        header = _header_in_comment(comments[-1], separator, width)
+    data = [row for row in rows[start:] if len(row) == width]
+    names = _joined(header, width) if header else [str(i) for i in range(width)]
+    table = table_of(name, dict(zip(names, zip(*data, strict=True), strict=True)), source, bool(header))
+    if len(rows) - start > len(data):
+        table.notes.append(f"{len(rows) - start - len(data)} lines without {width} cells left out")
+    return table
+
+
+def _separator(lines: Sequence[str]) -> str:
+    """The separator that gives most lines the same number of cells."""
+    best, most = ",", (0.0, 0)
+    for separator in SEPARATORS:
+        widths = Counter(len(row) for row in _cells(lines[-_LOOK:], separator))
+        if not widths:
+            continue
+        width, count = widths.most_common(1)[0]
+        score = (count / sum(widths.values()) if width > 1 else 0.0, _numbers(lines[-_LOOK:], separator))
+        if score[1] > most[1] or (score[1] == most[1] and score[0] > most[0]):
+            best, most = separator, score
+    return best
+
+
+def _numbers(lines: Sequence[str], separator: str) -> int:
+    """How many cells are numbers; a comma that separates makes two of 1,5, so whole columns of zeros do not count."""
+    rows = _cells(lines, separator)
+    found = sum(1 for row in rows for cell in row if _NUMBER.match(cell) or _DECIMAL_COMMA.match(cell))
+    other = sum(1 for row in rows for cell in row if not (_NUMBER.match(cell) or _DECIMAL_COMMA.match(cell)))
+    return found - 4 * other if len(rows[0]) > 1 else 0
+
+
+def _cells(lines: Sequence[str], separator: str) -> list[list[str]]:
+    if separator == " ":
+        return [line.split() for line in lines]
+    found = [[cell.strip() for cell in row] for row in csv.reader(lines, delimiter=separator)]
+    trailing = bool(found) and all(row and row[-1] == "" for row in found)
+    return [row[:-1] for row in found] if trailing else found
+
+
+def _first_data_row(rows: Sequence[Sequence[str]]) -> int | None:
+    """The first row with three numbers or more."""
+    for i, row in enumerate(rows):
+        if sum(bool(_NUMBER.match(cell) or WITH_UNIT.match(cell)) for cell in row) >= min(3, max(2, len(row) - 1)):
+            return i
+        spread = sum(cell.lower() in MISSING or bool(_NUMBER.match(cell)) for cell in row)
+        if i and len(row) > 2 and spread == len(row) and any(_NUMBER.match(cell) for cell in row):
+            return i
+    return None
+
+
+def _header_in_comment(comment: str, separator: str, width: int) -> list[list[str]]:
+    words = comment.lstrip("#%/ ")
+    for candidate in (separator, " ", ",", "\t", ";"):
+        cells = _cells([words], candidate)[0]
+        if len(cells) == width and not any(_NUMBER.match(cell) for cell in cells):
+            return [cells]
+    return []
+
+
+def _joined(header: Sequence[Sequence[str]], width: int) -> list[str]:
+    """One name for each column from headers of several lines; a line of units goes into brackets."""
+    names: list[list[str]] = [[] for _ in range(width)]
+    units = [""] * width
+    for row in header:
+        if (
+            sum(unit_of_text(cell) is not None for cell in row) >= 2
+            and all(unit_of_text(cell) is not None or cell in ("", "-", "1") for cell in row)
+            and any(names)
+        ):
+            units = list(row)
+            continue
+        for i, cell in enumerate(row):
+            if cell and cell not in names[i]:
+                names[i].append(cell)
+    joined = [".".join(parts) or str(i) for i, parts in enumerate(names)]
+    full = [f"{name} [{unit.strip('[]()')}]" if unit else name for name, unit in zip(joined, units, strict=True)]
+    counts: Counter[str] = Counter()
+    unique = []
+    for name in full:
+        counts[name] += 1
+        unique.append(name if counts[name] == 1 else f"{name}#{counts[name]}")
+    return unique

@@ -1,0 +1,217 @@
+"""Units and up axis, from what is stated and from the fall; and the turn to a frame with z up."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.importing.choices import Choices, Guess, UndecidedError
+from ballfg.importing.fall import AXES, LENGTHS, TIMES, Scale, odds, scales
+
+_LIKELY: Final = 2.0
+"""Odds of the best reading against the next, below which it is not taken."""
+_SURE: Final = 4.0
+_AGAINST: Final = 4.0
+"""Odds against a stated unit, from which on it is doubted."""
+_LEAST_SCORE: Final = 0.12
+"""Score below which nothing seems to fall."""
+RATES: Final = (24, 25, 30, 50, 60, 90, 100, 120, 125, 150, 180, 200, 240, 250, 300, 360, 400, 480, 500, 600, 960, 1000)
+"""Hz, of usual cameras."""
+
+_DECIMAL: Final = ("m", "cm", "mm")
+
+TURNS: Final = {
+    "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+    "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+    "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+    "-y": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+    "x": ((0, 1, 0), (0, 0, 1), (1, 0, 0)),
+    "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+}
+"""For each axis that points up the rotation to a frame with z up; its determinant is one."""
+
+
+@dataclass(frozen=True)
+class Frame:
+    """How numbers become metres and seconds in a frame with z up."""
+
+    length: str
+    time: str
+    up: str
+    flip: str | None
+    drag: float | None
+    """1/m, that the falls show."""
+    windows: int = 0
+
+    def metres(self, positions: Array) -> Array:
+        """(n, 3) m, in the units of the source, not turned."""
+        size = LENGTHS[self.length]
+        inverse = round(1.0 / size)
+        return positions / inverse if abs(inverse * size - 1.0) < 1e-12 else positions * size
+
+    def turned(self, positions: Array) -> Array:
+        """(n, 3) in the frame with z up."""
+        signs = np.array([-1.0 if axis == self.flip else 1.0 for axis in "xyz"])
+        return (positions * signs) @ np.array(TURNS[self.up], dtype=np.float64).T + 0.0
+
+    def turned_sizes(self, sigmas: Array) -> Array:
+        """(n, 3) standard deviations, along the axes of the frame with z up."""
+        return sigmas @ np.abs(np.array(TURNS[self.up], dtype=np.float64)).T
+
+    @property
+    def rotation(self) -> str:
+        """The turn in words."""
+        axes = []
+        for row in TURNS[self.up]:
+            i = int(np.flatnonzero(row)[0])
+            minus = (row[i] < 0) != ("xyz"[i] == self.flip)
+            axes.append(f"{'-' if minus else ''}{'xyz'[i]}")
+        return f"new x, y, z = old {', '.join(axes)}"
+
+
+def find_frame(
+    shots: Sequence[tuple[Array, Array]],
+    choices: Choices,
+    stated_length: str | None,
+    stated_time: str | None,
+    time_why: str,
+) -> tuple[Frame, list[Guess]]:
+    """The units and the up axis, with a line of the proposal for each.
+
+    Args: shots: stamps (n,) and positions (n, 3).  stated_length, stated_time: as the source's names say.
+        time_why: why the unit of time is known, if it is.
+    Raises: UndecidedError: nothing falls, two readings are alike, or names contradict the fall.
+    """
+    if choices.flip:
+        signs = np.array([-1.0 if axis == choices.flip else 1.0 for axis in "xyz"])
+        shots = [(t, p * signs) for t, p in shots]
+    known_length = choices.length or (stated_length if stated_length in LENGTHS else None)
+    known_time = choices.time or (stated_time if stated_time in TIMES else None)
+    lengths = (known_length,) if known_length else tuple(LENGTHS)
+    times = (known_time,) if known_time else tuple(TIMES)
+    ups = (choices.up,) if choices.up else AXES
+    found = scales(shots, lengths, times, ups)
+    decided = len(lengths) == len(times) == len(ups) == 1
+    _contradiction(shots, found, choices, {"length": known_length, "time": known_time}, ups)
+    if not found and not decided:
+        _no_flight(shots, known_length, known_time)
+    best = found[0] if found else Scale(lengths[0], times[0], ups[0], 0.0, 0, 0.0)
+    if not decided:
+        for option, values in (("length", lengths), ("time", times), ("up", ups)):
+            _decide(option, best, found, len(values) > 1)
+    why = f"balls fall at 9.81 m/s^2 in it: {best.score:.0%} of {best.windows} short stretches agree"
+    lines = [
+        _line("unit of length", "length", best, found, choices.length, stated_length, why, "named in the source"),
+        _line("unit of time", "time", best, found, choices.time, stated_time, why, time_why),
+        _line("up axis", "up", best, found, choices.up, None, why, ""),
+    ]
+    drag = best.drag if best.score >= _LEAST_SCORE else None
+    frame = Frame(best.length, best.time, best.up, choices.flip, drag, best.windows)
+    hand = (
+        f"mirrored along {choices.flip} as stated"
+        if choices.flip
+        else "taken for right-handed: positions cannot show it"
+    )
+    lines.append(Guess("turn", frame.rotation, hand, "stated" if choices.flip else "likely", "--flip y"))
+    return frame, lines
+
+
+def likely_rate(shots: Sequence[tuple[Array, Array]], length: str | None) -> int | None:
+    """The usual camera rate at which balls fall as they should; stamps are numbers of frames.
+
+    Args: shots: frames (n,) and positions (n, 3).  length: their unit if it is known; else m, cm or mm, which
+        no usual rates confuse.
+    """
+    lengths = (length,) if length in LENGTHS else _DECIMAL
+    scored = [
+        (found[0].score, rate)
+        for rate in RATES
+        if (found := scales([(t / rate, p) for t, p in shots], lengths, ("s",)))
+    ]
+    best = max(scored, default=(0.0, 0))
+    return best[1] if best[0] >= _LEAST_SCORE else None
+
+
+def _line(
+    what: str,
+    option: str,
+    best: Scale,
+    found: Sequence[Scale],
+    chosen: str | None,
+    stated: str | None,
+    why: str,
+    named: str,
+) -> Guess:
+    value = getattr(best, option)
+    typed = f"--{option} {value}"
+    if chosen:
+        return Guess(what, value, "as given", "stated", typed)
+    ratio = _ratio(option, best, found)
+    if stated == value:
+        return Guess(
+            what, value, f"{named}, and the fall agrees" if best.score > _LEAST_SCORE else named, "sure", typed
+        )
+    return Guess(what, value, why, "sure" if ratio >= _SURE else "likely", typed)
+
+
+def _ratio(option: str, best: Scale, found: Sequence[Scale]) -> float:
+    other = next((one for one in found if getattr(one, option) != getattr(best, option)), None)
+    return np.inf if other is None else odds(best.score, other.score)
+
+
+def _decide(option: str, best: Scale, found: Sequence[Scale], open_: bool) -> None:
+    """Refuses a reading that is hardly better than another one."""
+    ratio = _ratio(option, best, found)
+    if not open_ or (ratio >= _LIKELY and best.score >= _LEAST_SCORE):
+        return
+    values = list(dict.fromkeys(getattr(one, option) for one in found))[:3]
+    if ratio == np.inf:
+        values = [getattr(best, option)]
+    what = {"length": "unit of length", "time": "unit of time", "up": "up axis"}[option]
+    raise UndecidedError(
+        f"the {what} does not show in the fall of the ball, which fits {best.score:.0%} of the flight", option, values
+    )
+
+
+def _no_flight(shots: Sequence[tuple[Array, Array]], length: str | None, time: str | None) -> None:
+    steps = np.concatenate([np.diff(t) for t, _ in shots]) if shots else np.zeros(1)
+    step = float(np.median(steps))
+    what = f"no stretch of flight is long enough to show the units: the median step of the times is {step:g}"
+    option, example = ("time", "ms") if time is None else ("length", "mm") if length is None else ("up", "z")
+    if not step > 0.0 and (steps > 0.0).any():
+        raise UndecidedError("most stamps have several positions, as of two balls", "columns", (), "trajectory=NAME")
+    if not step > 0.0:
+        raise UndecidedError("the times do not increase", "columns", (), "t=NAME")
+    raise UndecidedError(what, option, (), example)
+
+
+def _contradiction(
+    shots: Sequence[tuple[Array, Array]],
+    found: Sequence[Scale],
+    choices: Choices,
+    stated: Mapping[str, str | None],
+    ups: Sequence[str],
+) -> None:
+    """Refuses units in names that make nothing fall, where others do."""
+    given = {"length": choices.length, "time": choices.time}
+    doubted = {option: value for option, value in stated.items() if value and not given[option]}
+    if not doubted:
+        return
+    lengths = (choices.length,) if choices.length else tuple(LENGTHS)
+    times = (choices.time,) if choices.time else tuple(TIMES)
+    free = scales(shots, lengths, times, ups)
+    score = found[0].score if found else 0.0
+    if not free or free[0].score < _LEAST_SCORE or odds(free[0].score, score) < _AGAINST:
+        return
+    # of two stated units, the one that has to change is wrong; where either would do, both are shown in turn
+    for option, value in doubted.items():
+        others = [one for one in free if getattr(one, option) != value]
+        kept = {name: unit for name, unit in doubted.items() if name != option}
+        alone = [one for one in others if all(getattr(one, name) == unit for name, unit in kept.items())]
+        if alone and odds(alone[0].score, score) >= _AGAINST:
+            other = getattr(alone[0], option)
+            raise UndecidedError(
+                f"the names say {value}, but balls fall at 9.81 m/s^2 if it is {other}", option, (other, value)
+            )

@@ -1,0 +1,70 @@
+"""`bf.import_tracks`: tracks of any units, axes and columns as a dataset."""
+
+from collections.abc import Mapping
+from os import PathLike
+from pathlib import Path
+from typing import Any, Literal
+
+from ballfg.importing.choices import Choices
+from ballfg.importing.proposal import propose
+from ballfg.importing.writing import write_import
+from ballfg.tracks import Dataset, dataset_in_memory, read_dataset
+
+
+def import_tracks(
+    data: Any,
+    *,
+    out: str | PathLike[str] | None = None,
+    columns: Mapping[str, str] | None = None,
+    length: str | None = None,
+    time: str | None = None,
+    up: str | None = None,
+    flip: str | None = None,
+    table_height: float | None = None,
+    split_gap: float | None = None,
+    ball: str | None = None,
+    rate: float | None = None,
+    key: str | None = None,
+    topic: str | None = None,
+    name: str | None = None,
+    file_format: Literal["csv", "parquet"] = "csv",
+    force: bool = False,
+) -> Dataset:
+    """Tracks from a user's own files or data, in SI units with z up; what is not given is guessed.
+
+    Columns are found by their names or numbers, units and the up axis by the fall of the ball, the table by bounces,
+    shots by a column, restarts of time and gaps. `dataset.info.imported` has each guess with its reason.
+
+    Args:
+        data: a file or folder or several (CSV, JSON, Parquet, Excel, HDF5, npz, MATLAB, ROS bags), a DataFrame, a dict
+            of arrays (n,) or (n, 3), an array (n, 4) of t, x, y, z, or a list of these, one a shot.
+        out: folder to write the dataset to; None keeps it in memory.
+        columns: role -> name of the column; roles are t, frame, trajectory, x, y, z, sigma_x, sigma_y, sigma_z.
+        length: unit of positions and sigmas: m, cm, mm, in or ft.
+        time: unit of stamps: s, ms, us or ns.
+        up: axis of the source that points up: x, y, z, -x, -y or -z.
+        flip: axis of the source whose sign is changed first, for a left-handed frame.
+        table_height: z of the table's surface in the new frame, m.
+        split_gap: s without samples after which a new shot begins.
+        ball: table-tennis, tennis or a ball file; table-tennis where None.
+        rate: Hz, for sources with numbers of frames in place of times.
+        key: name of a table, sheet or group in a source that holds several.
+        topic: of a ROS bag.
+        name: of the dataset.
+        file_format: "csv" or "parquet".
+        force: replace a dataset in `out`.
+    Returns: the dataset; it goes into `bf.estimate` as it is.
+    Raises:
+        UndecidedError: a guess that is not safe, a ValueError that names the argument (as a command's option).
+        ValueError: unreadable data, or an argument that breaks its rule.
+        FileNotFoundError: a file that is not there.
+    """
+    choices = Choices(
+        columns or {}, length, time, up, flip, table_height, split_gap, ball, rate, key, topic,
+        name or (Path(out).name if out is not None else None),
+    )  # fmt: skip
+    proposal = propose(data, choices)
+    if out is None:
+        return dataset_in_memory(proposal.info, proposal.tracks, proposal.notes)
+    write_import(Path(out), proposal, file_format, force)
+    return read_dataset(out)

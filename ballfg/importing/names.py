@@ -1,0 +1,161 @@
+"""What a column's name says: its role and its unit."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+LENGTH_UNITS: Final = {
+    "m": "m", "meter": "m", "meters": "m", "metre": "m", "metres": "m",
+    "cm": "cm", "centimeter": "cm", "centimeters": "cm", "centimetre": "cm", "centimetres": "cm",
+    "mm": "mm", "millimeter": "mm", "millimeters": "mm", "millimetre": "mm", "millimetres": "mm",
+    "in": "in", "inch": "in", "inches": "in",
+    "ft": "ft", "foot": "ft", "feet": "ft",
+}  # fmt: skip
+TIME_UNITS: Final = {
+    "s": "s", "sec": "s", "secs": "s", "second": "s", "seconds": "s", "sek": "s",
+    "ms": "ms", "msec": "ms", "millis": "ms", "millisecond": "ms", "milliseconds": "ms",
+    "us": "us", "µs": "us", "μs": "us", "usec": "us", "micros": "us", "microsecond": "us", "microseconds": "us",
+    "ns": "ns", "nsec": "ns", "nanos": "ns", "nanosec": "ns", "nanosecond": "ns", "nanoseconds": "ns",
+}  # fmt: skip
+PIXELS: Final = ("px", "pix", "pixel", "pixels")
+
+_TIME: Final = (
+    "t", "time", "times", "timestamp", "timestamps", "stamp", "stamps", "ts", "seconds", "second", "secs", "sec",
+    "datetime", "clock", "elapsed", "date", "zeit",
+    "temps", "tiempo", "tempo", "tid", "czas", "waktu", "millis", "时间",
+)  # fmt: skip
+_FRAME: Final = ("frame", "frames", "framenumber", "frameid", "frameidx", "frameno", "bild", "imagen", "fr")
+_TRAJECTORY: Final = (
+    "trajectory", "trajectories", "traj", "shot", "track", "throw", "rally", "run", "trial", "serve", "stroke",
+    "ball", "wurf", "schuss", "versuch", "tir", "essai", "tiro", "sequence", "segment", "recording", "episode", "file",
+    "object", "id",
+)  # fmt: skip
+_NOT_A_POSITION: Final = frozenset((
+    "v", "vx", "vy", "vz", "vel", "velocity", "speed", "a", "acc", "accel", "acceleration", "w", "omega", "spin", "ang",
+    "angular", "rot", "rotation", "q", "quat", "quaternion", "orientation", "dx", "dy", "dz", "racket", "paddle", "bat",
+    "robot", "target", "camera", "cam", "player", "euler", "force", "gyro", "hand", "truth",
+))  # fmt: skip
+_SIGMA: Final = frozenset(("sigma", "std", "stddev", "stdev", "sd", "err", "error", "uncertainty", "unc"))
+_FILLER: Final = frozenset((
+    "pos", "position", "positions", "ball", "center", "centre", "coord", "coords", "coordinate", "p", "point", "loc",
+    "location", "translation", "axis", "world", "xyz", "pose", "koordinate", "header", "data", "col", "column", "achse",
+    "measured", "measurement", "tracked", "value", "ballpos",
+))  # fmt: skip
+_AXIS: Final = {"x": "x", "y": "y", "z": "z", "0": "x", "1": "y", "2": "z", "east": "x", "north": "y", "up": "z"}
+_WORDS: Final = re.compile(r"[^\W\d_]+|\d+")
+_CAMEL: Final = re.compile(r"(?<=[a-zµ])(?=[A-Z])")
+_BRACKET: Final = re.compile(r"[\[(/{]\s*([^\W\d]+)\s*[\])}]?\s*$")
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """One reading of a column's name."""
+
+    role: str
+    """t, frame, trajectory, x, y, z, sigma_x, sigma_y, sigma_z, seconds or nanoseconds (of a stamp in two parts)."""
+    rank: int
+    """0 for a name that can mean nothing else; more for vaguer ones."""
+    unit: str | None = None
+    """As in the name, normalised; text in brackets that is not known stays as it is."""
+    group: str = ""
+    """The other words of the name: x, y and z belong together where theirs are the same."""
+
+
+def unit_of_text(text: str) -> str | None:
+    """The unit that a text is, normalised; None if it is none."""
+    word = text.strip().strip("[](){}").strip().lower()
+    return LENGTH_UNITS.get(word) or TIME_UNITS.get(word) or ("px" if word in PIXELS else None)
+
+
+def meanings(name: str) -> list[Meaning]:
+    """What a column of this name may be."""
+    name, _, copy = name.partition("#")
+    bracket = _BRACKET.search(name)
+    unit_text = bracket[1] if bracket else None
+    bare = name[: bracket.start()] if bracket else name
+    words = [word.lower() for part in _WORDS.findall(bare) for word in _CAMEL.split(part)]
+    found = [_as_time(words, unit_text), _as_place(words, unit_text), _as_trajectory(words, bare)]
+    known = [meaning for meaning in found if meaning is not None]
+    return [
+        replace(meaning, rank=meaning.rank + 1, group=f"{meaning.group}#{copy}") if copy else meaning
+        for meaning in known
+    ]
+
+
+def _as_time(words: list[str], bracket: str | None) -> Meaning | None:
+    unit = _unit(bracket, TIME_UNITS)
+    if not words:
+        return None
+    rest = [word for word in words if word not in ("header", "frame", "capture", "ros", "unix", "epoch", "data")]
+    if words[-1] in ("nanosec", "nsec", "nsecs", "nanosecs") and {"stamp", "sec"} & set(words):
+        return Meaning("nanoseconds", 0)
+    if words[-1] in ("sec", "secs") and "stamp" in words:
+        return Meaning("seconds", 0)
+    if len(rest) > 1 and unit is None and rest[-1] in TIME_UNITS:
+        unit, rest = TIME_UNITS[rest[-1]], rest[:-1]
+    if rest == ["time", "stamp"]:
+        rest = ["timestamp"]
+    if len(rest) == 1 and rest[0] in _TIME:
+        own = TIME_UNITS.get(rest[0]) if rest[0] not in ("t", "s") else None
+        exact = rest[0] in ("t", "time", "timestamp", "stamp") and rest == words
+        return Meaning("t", 0 if exact else 1, unit or own)
+    joined = "".join(words)
+    if joined in _FRAME or (
+        words[0] in _FRAME and len(words) <= 2 and words[-1] in ("frame", "id", "no", "index", "number", "idx", "nr")
+    ):
+        return Meaning("frame", 0)
+    if set(rest) & set(_TIME[:7]):
+        return Meaning("t", 2, unit)
+    return None
+
+
+def _as_place(words: list[str], bracket: str | None) -> Meaning | None:
+    unit = _unit(bracket, LENGTH_UNITS)
+    if bracket is not None and bracket.lower() in PIXELS:
+        unit = "px"
+    if unit is None and len(words) > 1 and words[-1] in (*LENGTH_UNITS, "px"):
+        unit, words = LENGTH_UNITS.get(words[-1], words[-1]), words[:-1]
+    words = [part for word in words for part in (word if word in ("xyz",) else _split(word))]
+    axes = [word for word in words if word in _AXIS]
+    axes = [word for word in axes if not word.isdigit()] or axes  # "marker1_x" and "x_1" are both along x
+    if not axes:
+        return None
+    axes = axes[-1:]
+    others = [word for i, word in enumerate(words) if word != axes[0]]
+    if set(others) & _NOT_A_POSITION:
+        return None
+    axis = _AXIS[axes[0]]
+    if set(others) & _SIGMA:
+        return Meaning(f"sigma_{axis}", 0, unit, ".".join(others))
+    if axes[0].isdigit() and not set(others) & _FILLER:
+        return None
+    strange = [word for word in others if word not in _FILLER]
+    rank = 0 if not others else 1 if not strange else 2
+    if "ball" in others:
+        rank = min(rank, 1)
+    return Meaning(axis, rank, unit, ".".join(others))
+
+
+def _split(word: str) -> list[str]:
+    """Names written in one word, such as posx or ballz."""
+    for start in ("position", "ballpos", "coord", "ball", "pos", "sigma", "std", "p", "s"):
+        if word.startswith(start) and word.removeprefix(start) in ("x", "y", "z"):
+            return [{"s": "sigma"}.get(start, start), word[-1]]
+    return [word]
+
+
+def _as_trajectory(words: list[str], name: str) -> Meaning | None:
+    kept = [word for word in words if word not in ("id", "nr", "no", "number", "index", "name", "num", "idx")]
+    if not kept and words:
+        kept = ["id"]
+    if len(kept) == 1 and (kept[0] in _TRAJECTORY or kept[0].removesuffix("id") in _TRAJECTORY):
+        word = kept[0] if kept[0] in _TRAJECTORY else kept[0].removesuffix("id")
+        return Meaning("trajectory", _TRAJECTORY.index(word))
+    return None
+
+
+def _unit(text: str | None, units: Mapping[str, str]) -> str | None:
+    if text is None:
+        return None
+    return units.get(text.lower(), text)

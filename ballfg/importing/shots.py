@@ -1,0 +1,238 @@
+"""Rows to shots: by a column, by file, where time starts again, and at gaps."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.arrays import Array
+from ballfg.importing.choices import Choices, UndecidedError
+from ballfg.importing.columns import Roles
+from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
+from ballfg.importing.stamps import Stamps, as_stamps, is_date, joined, missing
+from ballfg.tracks.track import Label
+
+_DISORDER: Final = 3.0
+"""Median steps: a stamp that is earlier by less came late; by more, a new shot begins."""
+_ALONE: Final = 5.0
+"""A row of zeros is a missing sample if it lies this many median distances from its neighbours."""
+GAP: Final = 0.5
+"""s without samples, after which a new shot is taken to begin."""
+GAP_STEPS: Final = 20.0
+"""Median steps that such a gap has at least."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """The samples of one shot in the units of their source."""
+
+    name: str
+    stamps: Stamps
+    """(n,) non-decreasing."""
+    positions: Array
+    """(n, 3)"""
+    sigmas: Array | None
+    """(n, 3)"""
+    labels: Mapping[str, Label]
+    rows: NDArray[np.intp]
+    """(n,) index into the source's table."""
+    table: RawTable
+
+
+@dataclass
+class Counts:
+    """What was left out or put in order."""
+
+    missing: int = 0
+    zeros: int = 0
+    late: int = 0
+    short: int = 0
+    ignored: set[str] = field(default_factory=set)
+    dates: bool = False
+
+    def notes(self) -> list[str]:
+        """One sentence for each kind."""
+        said = [
+            (self.missing, "rows without a time or a position left out"),
+            (self.zeros, "rows with x = y = z = 0 far from their neighbours left out as missing samples"),
+            (self.late, "rows put in the order of their times"),
+            (self.short, "shots of fewer than two samples left out"),
+        ]
+        found = [f"{count} {words}" for count, words in said if count]
+        if self.ignored:
+            found.append(f"columns left out: {', '.join(sorted(self.ignored))}")
+        return found
+
+
+def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list[Shot]:
+    """The shots of a table, cut at its trajectory column or else where time starts again.
+
+    Raises: UndecidedError: no time and no rate. ValueError: a time that is text, or no row with a position.
+    """
+    stamps = _stamps(table, roles, choices, counts)
+    positions = np.stack([numbers(table.columns[name]) for name in roles.places], axis=1)
+    sigmas = None
+    held = ~missing(stamps) & np.isfinite(positions).all(axis=1)
+    if roles.sigmas is not None:
+        sigmas = np.stack([numbers(table.columns[name]) for name in roles.sigmas], axis=1)
+        held &= np.isfinite(sigmas).all(axis=1) & (sigmas > 0).all(axis=1)
+    counts.missing += int((~held).sum())
+    rows = np.flatnonzero(held)
+    if not len(rows):
+        columns = ", ".join((*roles.time, *roles.places))
+        raise UndecidedError(
+            f"{table.where}: no row has a time and a position in {columns}",
+            "columns",
+            (),
+            "t=NAME,x=NAME,y=NAME,z=NAME",
+        )
+    if roles.trajectory is None:
+        parts = _at_restarts(stamps, rows, counts)
+        names = [f"{i:03d}" for i in range(len(parts))]
+    else:
+        parts, names = _by_name(
+            table.texts.get(roles.trajectory, table.columns[roles.trajectory]), stamps, rows, counts
+        )
+    found = []
+    labels = _labels(table, roles.others, parts, counts)
+    for i, (name, part) in enumerate(zip(names, parts, strict=True)):
+        part = part[~_lone_zeros(positions[part], counts)]
+        if len(part) < 2:
+            counts.short += 1
+            continue
+        own = None if sigmas is None else sigmas[part]
+        known = {key: value for key, values in labels.items() if (value := values[i]) is not None}
+        found.append(Shot(name, stamps[part], positions[part], own, known, part, table))
+    return found
+
+
+def split_at_gaps(shots: Iterable[Shot], unit: float, gap: float) -> list[Shot]:
+    """The shots, cut where no sample came for `gap` s.
+
+    Args: unit: s in the unit of the stamps.  gap: s.
+    """
+    found: list[Shot] = []
+    for shot in shots:
+        steps = np.diff(shot.stamps).astype(np.float64) * unit
+        places = np.flatnonzero(steps > gap) + 1
+        if not len(places):
+            found.append(shot)
+            continue
+        cuts = [0, *places.tolist(), len(shot.stamps)]
+        pieces = [slice(a, b) for a, b in pairwise(cuts) if b - a >= 2]
+        for i, part in enumerate(pieces):
+            found.append(
+                replace(
+                    shot,
+                    name=f"{shot.name}-{i:03d}",
+                    stamps=shot.stamps[part],
+                    positions=shot.positions[part],
+                    sigmas=None if shot.sigmas is None else shot.sigmas[part],
+                    rows=shot.rows[part],
+                )
+            )
+    return found
+
+
+def _stamps(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> Stamps:
+    if len(roles.time) == 2:
+        return joined(*(table.columns[name] for name in roles.time))
+    rate = choices.rate or roles.rate
+    if not roles.time:
+        frames = None if roles.frame is None else numbers(table.columns[roles.frame])
+        if rate is None:
+            seen = (
+                "has frames but no time"
+                if frames is not None
+                else f"has no column of times, but {', '.join(table.columns)}"
+            )
+            raise UndecidedError(f"{table.where} {seen}: the number of frames per second is needed", "rate", (), "120")
+        return (np.arange(len(table), dtype=np.float64) if frames is None else frames) / rate
+    column = table.columns[roles.time[0]]
+    stamps = as_stamps(column)
+    if stamps is None:
+        raise UndecidedError(
+            f"{table.where}: the column of times, {roles.time[0]!r}, must hold numbers or dates; it holds "
+            f"{str(column[0])[:30]!r}",
+            "columns",
+            (),
+            "t=NAME",
+        )
+    counts.dates |= is_date(column)
+    return stamps
+
+
+def _at_restarts(stamps: Stamps, rows: NDArray[np.intp], counts: Counts) -> list[NDArray[np.intp]]:
+    """Cuts where the time jumps back; a few late stamps are sorted, and a table from last to first is turned."""
+    steps = np.diff(stamps[rows]).astype(np.float64)
+    if len(steps) and (steps < 0).mean() > 0.5:
+        counts.late += len(rows)
+        rows = rows[::-1]
+        steps = -steps[::-1]
+    typical = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
+    parts = np.split(rows, np.flatnonzero(steps < -_DISORDER * typical) + 1)
+    return [_ordered(part, stamps, counts) for part in parts]
+
+
+def _ordered(part: NDArray[np.intp], stamps: Stamps, counts: Counts) -> NDArray[np.intp]:
+    late = int((np.diff(stamps[part]) < 0).sum())
+    if not late:
+        return part
+    counts.late += late
+    return part[np.argsort(stamps[part], kind="stable")]
+
+
+def _by_name(
+    column: Column, stamps: Stamps, rows: NDArray[np.intp], counts: Counts
+) -> tuple[list[NDArray[np.intp]], list[str]]:
+    _, first, codes = np.unique(column[rows].astype(str), return_index=True, return_inverse=True)
+    order = np.argsort(codes, kind="stable")
+    parts = np.split(rows[order], np.flatnonzero(np.diff(codes[order])) + 1)
+    sequence = np.argsort(first)
+    names = [_text(column[parts[i][0]]) for i in sequence]
+    return [_ordered(parts[i], stamps, counts) for i in sequence], names
+
+
+def _text(value: object) -> str:
+    number = float(value) if isinstance(value, float | np.floating) else None
+    return f"{number:.0f}" if number is not None and number.is_integer() else str(value) or "unnamed"
+
+
+def _lone_zeros(positions: Array, counts: Counts) -> NDArray[np.bool_]:
+    """Rows of zeros that trackers write where they saw no ball."""
+    zero = (positions == 0.0).all(axis=1)
+    if not zero.any() or zero.all():
+        return np.zeros(len(zero), dtype=bool)
+    held = positions[~zero]
+    typical = float(np.median(np.linalg.norm(np.diff(held, axis=0), axis=1))) if len(held) > 2 else 0.0
+    lone = zero & (np.linalg.norm(held, axis=1).min() > _ALONE * typical)
+    counts.zeros += int(lone.sum())
+    return np.asarray(lone)
+
+
+def _labels(
+    table: RawTable, names: Iterable[str], parts: list[NDArray[np.intp]], counts: Counts
+) -> dict[str, list[Label | None]]:
+    """Columns that are constant in every shot."""
+    found: dict[str, list[Label | None]] = {}
+    for name in names:
+        column = table.columns[name]
+        if all((column[part] == column[part[0]]).all() for part in parts) and name.isprintable():
+            found[name] = [_label(column, int(part[0])) for part in parts]
+        elif not _empty(column):
+            counts.ignored.add(name)
+    return found
+
+
+def _label(column: Column, row: int) -> Label | None:
+    if is_number(column):
+        value = float(column[row])
+        return value if np.isfinite(value) else None
+    return " ".join(str(column[row]).split()) or None
+
+
+def _empty(column: Column) -> bool:
+    return is_number(column) and not np.isfinite(numbers(column)).any()
