@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from ballfg.diagnosis.report import report
 from ballfg.diagnosis.report.page import page
-from ballfg.diagnosis.report.parts import Html, picture
+from ballfg.files.page_parts import Html, picture
 from ballfg.diagnosis.report.report import content, write_report
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback
 from ballfg.dynamics import Architecture, build, load_model, model_to_dict, nominal_model

@@ -1,10 +1,11 @@
-"""The elements of the page: escaped text, tables, pictures inside the page, bars."""
+"""Pages for people, each one self-contained file, and their elements: escaped text, tables, pictures, bars, terms."""
 
 import base64
 import html
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.resources import files
 
 from matplotlib.figure import Figure
 
@@ -31,6 +32,28 @@ def _power(match: re.Match[str]) -> str:
     exponent = f"{int(match[2])}".replace("-", "−")
     base = "" if match[1] == "1" else f"{match[1]}·"
     return f"{base}10<sup>{exponent}</sup>"
+
+
+def whole_page(title: str, *content: str) -> str:
+    """A self-contained page with the style of all pages; title: of the browser's window."""
+    style = files(__package__).joinpath("page.css").read_text(encoding="utf-8")
+    head = (
+        '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{text(title)}</title><style>\n{style}</style>"
+    )
+    body = tag("main", *content)
+    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>{body}</body></html>\n'
+
+
+def explained(word: str, meaning: str, kind: str = "") -> Html:
+    """A word whose meaning shows on hover; kind: a class of the page."""
+    css = f' class="{kind}"' if kind else ""
+    return Html(f'<abbr{css} title="{html.escape(meaning)}">{text(word)}</abbr>')
+
+
+def meanings(words: Mapping[str, str]) -> Html:
+    """A list of words with their meanings."""
+    return tag("dl", *(part for name, meaning in words.items() for part in (tag("dt", name), tag("dd", meaning))))
 
 
 def tag(name: str, *content: str, kind: str = "") -> Html:
