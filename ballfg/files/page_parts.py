@@ -12,6 +12,9 @@ from matplotlib.figure import Figure
 DPI = 110
 """Dots per inch of pictures, which are then about as wide as a page on a common screen."""
 
+WIDE = 8.0
+"""Inches. Wider pictures keep their size on a phone and scroll sideways, so that their words can be read."""
+
 
 class Html(str):
     """Text that is HTML already. All other text is escaped where it enters a page."""
@@ -20,10 +23,13 @@ class Html(str):
 
 
 def text(words: str) -> Html:
-    """Escaped words; `Html` stays. Minus signs and powers of ten are typeset: 3e-12 as 3·10 with −12 raised."""
+    """Escaped words; `Html` stays.
+
+    Minus signs, squares of units and powers of ten are typeset: 3e-12 as 3·10 with −12 raised.
+    """
     if isinstance(words, Html):
         return words
-    escaped = html.escape(words)
+    escaped = html.escape(words).replace("/s^2", "/s²").replace("m^2", "m²")
     raised = re.sub(r"\b(\d[\d.]*)e([+-]\d+)\b", _power, escaped)
     return Html(re.sub(r"(?<![\w>.)-])-(?=\d)", "−", raised))
 
@@ -94,4 +100,5 @@ def picture(figure: Figure, caption: str) -> Html:
     figure.savefig(memory, dpi=DPI, format="png")
     data = base64.b64encode(memory.getvalue()).decode("ascii")
     image = Html(f'<img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">')
-    return tag("figure", image, tag("figcaption", caption))
+    wide = "wide" if figure.get_figwidth() > WIDE else ""
+    return tag("figure", tag("div", image, kind="scroll"), tag("figcaption", caption), kind=wide)

@@ -8,7 +8,7 @@ from typing import Final
 
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.plain_effects import in_plain_words, plain_name
-from ballfg.diagnosis.report.wording import NONE, fixed, joined, probability
+from ballfg.diagnosis.report.wording import NONE, fixed, probability
 from ballfg.diagnosis.result import Diagnosis, Finding, Outcome, Verdict
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.noise.tracker import NUMBERS
@@ -22,37 +22,39 @@ PLACES: Final = {
     "time": "from sample to sample",
 }
 """Begin of a test's words, and the same in a sentence."""
-MANY: Final = 2
-"""From so many effects on the first sentence counts them, and a list says what they are."""
+SURE: Final = ((1e-6, "practically certain"), (1e-3, "very likely"), (0.05, "likely"))
+"""Words for the probability that a finding is none; the larger one of both halves of the tracks counts."""
 COUNTS: Final = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine")
 
 
 def headline(diagnosis: Diagnosis) -> str:
-    """The answer for a reader who knows neither the model nor the statistics."""
+    """The answer for a reader who knows neither the model nor the statistics, and what predictions gain."""
     effects = [f for f in diagnosis.findings if f.name not in NUMBERS]
-    tracker = [in_plain_words(f) for f in diagnosis.findings if f.name in NUMBERS]
-    left = diagnosis.verdict is Verdict.UNEXPLAINED
-    if not effects and not left:
+    if not effects and diagnosis.verdict is not Verdict.UNEXPLAINED:
         nothing = f"Nothing that the model lacks was found: its predictions are off by {_error(diagnosis)}"
-        return " ".join((f"{nothing}, and what is left looks like noise.", *tracker))
+        return f"{nothing}, and what is left looks like noise."
     if not effects:
         said = (
             f"Something is missing from the model that no known effect explains: {where(diagnosis.unexplained.where)}."
         )
-    elif len(effects) < MANY:
+    elif len(effects) == 1:
         others = effects[0].indistinguishable_from
         doubt = f" It may also be {_or(others)}: these tracks cannot tell." if others else ""
         said = in_plain_words(effects[0]) + doubt
     else:
-        listed = joined(tuple(plain_name(f.name) for f in effects))
         count = COUNTS[len(effects)] if len(effects) < len(COUNTS) else f"{len(effects)}"
-        said = f"{count} effects are missing from the model: {listed}."
-    parts = [said, gain(diagnosis, _what(diagnosis, len(effects))), *tracker]
-    if effects and left:
-        parts.append(
-            f"Something else is missing too, which no known effect explains: {where(diagnosis.unexplained.where)}."
-        )
-    return " ".join(part for part in parts if part)
+        said = f"{count} effects are missing from the model."
+    return " ".join(part for part in (said, gain(diagnosis, _what(diagnosis, len(effects)))) if part)
+
+
+def further(diagnosis: Diagnosis) -> Iterator[str]:
+    """Sentences on what else was found: several effects one by one, the tracker, and what no effect explains."""
+    effects = [f for f in diagnosis.findings if f.name not in NUMBERS]
+    if len(effects) > 1:
+        yield from (in_plain_words(f) for f in effects)
+    yield from (in_plain_words(f) for f in diagnosis.findings if f.name in NUMBERS)
+    if effects and diagnosis.verdict is Verdict.UNEXPLAINED:
+        yield f"Something else is missing too, which no known effect explains: {where(diagnosis.unexplained.where)}."
 
 
 def gain(diagnosis: Diagnosis, what: str) -> str:
@@ -80,7 +82,8 @@ def certainty(diagnosis: Diagnosis) -> Iterator[str]:
         yield f"These tracks say nothing about {unseen} more effects, which may be there or not."
     if diagnosis.verdict is Verdict.UNEXPLAINED and diagnosis.unexplained.tests:
         least = min(test.p_value for test in diagnosis.unexplained.tests)
-        yield f"That a pattern is left is sure as far as {probability(least)}, the probability that chance makes it."
+        word = next((word for limit, word in SURE if least < limit), "possible")
+        yield f"That something is left: {word}. Chance makes such a pattern with probability {probability(least)}."
 
 
 def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
@@ -88,8 +91,14 @@ def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
     dataset, model = shlex.quote(origin.datasets[0]), shlex.quote(f"{origin.out.rstrip('/')}/model.yaml")
     changed = bool(diagnosis.findings) or diagnosis.unexplained.fallback is not None
     if changed:
-        yield "Estimate with the corrected model:", f"ballfg estimate {dataset} --model {model} --out states.csv"
-        yield "Predict with it:", f"ballfg predict {dataset} --model {model} --observe 0.3 --out predictions.csv"
+        yield (
+            "Estimate the states with the corrected model:",
+            f"ballfg estimate {dataset} --model {model} --out states.csv",
+        )
+        yield (
+            "Predict with the corrected model:",
+            f"ballfg predict {dataset} --model {model} --observe 0.3 --out predictions.csv",
+        )
     else:
         given = f" --model {shlex.quote(origin.model)}" if origin.model else ""
         yield (
@@ -121,7 +130,9 @@ def where(words: str) -> str:
 
 
 def _sure(finding: Finding) -> str:
-    sure = f"a trace so strong comes about by chance with probability {probability(finding.p_value)}"
+    worst = max(p for p in (finding.p_value, finding.held_out_p, 0.0) if math.isfinite(p))
+    word = next((word for limit, word in SURE if worst < limit), "possible")
+    sure = f"{word}. Chance makes a trace so strong with probability {probability(finding.p_value)}"
     if math.isfinite(finding.held_out_p):
         sure += f"; tracks that had no part in finding it agree (by chance {probability(finding.held_out_p)})"
     if finding.indistinguishable_from:

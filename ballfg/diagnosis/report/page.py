@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from ballfg.diagnosis.remains.generic import ALARM
 from ballfg.diagnosis.report import pictures, shots
 from ballfg.diagnosis.report.glossary import glossary, outcome_badge, term
-from ballfg.diagnosis.report.headline import advice, certainty, headline, where
+from ballfg.diagnosis.report.headline import advice, certainty, further, headline, where
 from ballfg.diagnosis.report.origin import Origin, date, packages
 from ballfg.diagnosis.report.plain_effects import in_plain_words, plain_name
 from ballfg.diagnosis.report.wording import NONE, change, fixed, joined, listed, number, plus_minus, probability
@@ -69,9 +69,9 @@ def page(diagnosis: Diagnosis, origin: Origin | None = None) -> str:
 
 
 def _in_short(diagnosis: Diagnosis) -> Html:
-    """What each finding says, and how sure it is."""
-    each = items(in_plain_words(f) for f in diagnosis.findings) if len(diagnosis.findings) > 1 else Html()
-    parts = [tag("h3", "The effects one by one"), each] if each else []
+    """What was found beside the first sentence, and how sure it is."""
+    more = items(further(diagnosis))
+    parts = [tag("h3", "In detail"), more] if more else []
     sure = items(certainty(diagnosis))
     return tag("div", *parts, *((tag("h3", "How sure is that?"), sure) if sure else ()), kind="short")
 
@@ -162,8 +162,12 @@ def _shots(diagnosis: Diagnosis) -> Html:
     words = "Root mean square errors of all judged tracks. Cells without a number hold too few samples."
     return section(
         "One shot, and where the errors are",
-        picture(shots.shot_picture(shot, changed), caption),
-        picture(shots.error_map(before, after, changed), words),
+        tag(
+            "div",
+            picture(shots.shot_picture(shot, changed), caption),
+            picture(shots.error_map(before, after, changed), words),
+            kind="beside",
+        ),
     )
 
 

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from ballfg.diagnosis.report.wording import listed
+from ballfg.diagnosis.report.wording import listed, plus_minus
 from ballfg.diagnosis.result import Finding, Value
 
 Values = Mapping[str, Value]
@@ -44,8 +44,19 @@ def in_plain_words(finding: Finding) -> str:
     """A sentence on an effect and its size. Of an unknown effect: its own first sentence and its coefficients."""
     if finding.name in PLAIN:
         return PLAIN[finding.name].says(finding.parameters)
+    for ending, words in ((BY_GROUP, "differs between groups of tracks"), (DRIFT, "changes along the recording")):
+        if finding.name.endswith(ending):
+            whole = plain_name(finding.name.removesuffix(ending))
+            levels = (f"{_level(name)} {plus_minus(value)}" for name, value in finding.parameters.items())
+            return f"{whole[:1].upper()}{whole[1:]} {words}: {', '.join(levels)}."
     said = finding.sentence.partition(". ")[0].rstrip(".")
     return f"{said} ({listed(finding.parameters)})." if finding.parameters else f"{said}."
+
+
+def _level(name: str) -> str:
+    """`topspin` of `k[topspin]`; with the axis of a coefficient that has several: `topspin x`."""
+    coefficient, _, level = name.partition("[")
+    return f"{level.removesuffix(']')} {coefficient}" if coefficient in ("x", "y", "z") else level.removesuffix("]")
 
 
 def size(values: Values) -> float:
