@@ -97,7 +97,7 @@ def _next(better: bool | None, command: str) -> list[Html]:
         )
         parts += [items(lines)]
     if command:
-        parts += [tag("p", "Use the model:"), tag("pre", tag("code", command))]
+        parts += [tag("p", "Use the model that was written:"), tag("pre", tag("code", command))]
     return parts
 
 

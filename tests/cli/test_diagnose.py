@@ -44,7 +44,7 @@ def answer(monkeypatch: pytest.MonkeyPatch) -> Answer:
             return diagnosis
 
         monkeypatch.setattr(ballfg.diagnosis, "diagnose", diagnose)
-        monkeypatch.setattr("ballfg.diagnosis.report.report.page", lambda diagnosis: "<html></html>")
+        monkeypatch.setattr("ballfg.diagnosis.report.report.page", lambda diagnosis, origin: "<html></html>")
         return asked
 
     return answer

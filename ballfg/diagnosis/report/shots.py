@@ -126,8 +126,11 @@ def _cells(paths: Sequence[PredictedPath], edges: Sequence[Array]) -> Array:
     """(a, b) mm, root mean square error of the samples in each cell; NaN with few of them."""
     where = np.concatenate([path.measured[:, :2] for path in paths])
     squares = np.concatenate([distances(path) ** 2 for path in paths])
-    count = np.histogram2d(*where.T, bins=list(edges))[0]
-    total = np.histogram2d(*where.T, bins=list(edges), weights=squares)[0]
+    places = [np.searchsorted(own, where[:, i], side="right") - 1 for i, own in enumerate(edges)]
+    count, total = np.zeros([len(own) - 1 for own in edges]), np.zeros([len(own) - 1 for own in edges])
+    inside = np.all([(place >= 0) & (place < size) for place, size in zip(places, count.shape, strict=True)], axis=0)
+    np.add.at(count, (places[0][inside], places[1][inside]), 1.0)
+    np.add.at(total, (places[0][inside], places[1][inside]), squares[inside])
     return np.where(count >= LEAST_SAMPLES, 1e3 * np.sqrt(total / np.maximum(count, 1)), np.nan)
 
 

@@ -16,7 +16,7 @@ from ballfg.diagnosis.report.headline import advice, certainty, further, headlin
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.page import page
 from ballfg.diagnosis.report.plain_effects import PLAIN, in_plain_words, plain_name
-from ballfg.diagnosis.report.shots import distances, median_shot
+from ballfg.diagnosis.report.shots import distances, error_map, median_shot
 from ballfg.diagnosis.result import Diagnosis, GenericTest, Outcome, Unexplained, Value, Verdict
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.noise.tracker import NUMBERS
@@ -204,6 +204,21 @@ def test_the_shot_shown_is_the_one_with_the_median_gain() -> None:
     assert alone is not None
     assert 1e3 * distances(alone.after).max() == pytest.approx(np.median(before.by_track))
     assert median_shot(replace(before, paths=()), after, True) is None
+
+
+def test_the_map_holds_the_mean_square_of_each_cell() -> None:
+    after = found().after
+    axes = error_map(after, after, False).axes[0]
+    shown = {text.get_text() for text in axes.texts}
+    places = np.concatenate([path.measured[:, :2] for path in after.paths])
+    squares = np.concatenate([distances(path) ** 2 for path in after.paths])
+    low, high = np.quantile(places, 0.01, axis=0) - 1e-6, np.quantile(places, 0.99, axis=0) + 1e-6
+    edges = [np.linspace(low[0], high[0], 7), np.linspace(low[1], high[1], 5)]
+    count = np.histogram2d(*places.T, bins=edges)[0]
+    total = np.histogram2d(*places.T, bins=edges, weights=squares)[0]
+    seen = count >= 5
+    assert seen.sum() == len(axes.texts)
+    assert shown == {f"{1e3 * np.sqrt(value):.0f}" for value in total[seen] / count[seen]}
 
 
 def test_the_date_of_a_page_can_be_set(monkeypatch: pytest.MonkeyPatch) -> None:
