@@ -135,7 +135,7 @@ def _stop(training: Training, record: Record, folder: Path) -> None:
 def _write_page(training: Training, record: Record, folder: Path, model: Path, shot: PredictedShot | None) -> None:
     best = 0 if training.progress is None else training.progress.best_epoch
     data = training.task.config.data
-    dataset = data if isinstance(data, str) else data[0] if data else "DATASET"
+    dataset = data[0] if data else "DATASET"
     command = f"ballfg predict {dataset} --model {model} --observe 0.3 --out predictions.csv" if model.is_file() else ""
     packages = ", ".join(f"{name} {version}" for name, version in versions(files.PACKAGES).items())
     drawn, learned = curves(record.epochs, record.title), training.task.trainee.learned()
