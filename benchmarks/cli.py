@@ -330,7 +330,7 @@ def _shared(folder: Path, cluster: str | None) -> Path:
 
 def _finish(results: Results, out: Path, pictures: Sequence[Path]) -> None:
     """Print the table, write `results.json`, say where everything is."""
-    from ballfg.benchmarks.results import print_table
+    from ballfg.benchmarks.tables import print_table
 
     print_table(results.rows)
     path = results.write(out)

@@ -41,6 +41,9 @@ def train(
     The key `kind` of the config selects the model. kind: calibrate estimates the drag of the ball and the restitution
     of the table, with error bars.
 
+    The exit status is 1 if no epoch predicts the validation tracks better than the
+    model before the first step. After Ctrl-C the best model so far is written.
+
     Example: ballfg-train train.yaml --data data/ballgun --out ballgun-model kind=mnn+gs optimizer.epochs=30
     """
     from ballfg.learning.config.calibration import CalibrationConfig
@@ -58,38 +61,40 @@ def train(
 
         run_calibration(settings, folder, resume=resume is not None, jobs=usable_cores(), watch=progress)
     else:
-        _train(settings, folder, resume is not None)
+        status = _train(settings, folder, resume is not None)
+        if status:
+            raise SystemExit(status)
 
 
-def _train(config: TrainConfig, folder: Path, resume: bool) -> None:
-    """Train in this process if a launcher has started it or one is enough, else in new processes."""
+def _train(config: TrainConfig, folder: Path, resume: bool) -> int:
+    """Train in this process if a launcher has started it or one is enough, else in new processes.
+
+    Returns: the exit status.
+    """
     from ballfg.learning.run.launch import launch
     from ballfg.learning.run.ranks import started_by_launcher
     from ballfg.learning.run.run_folder import check
 
     jobs = config.jobs or usable_cores()
     if jobs == 1 or started_by_launcher():
-        _train_here(config, folder, resume)
-        return
+        return _train_here(config, folder, resume)
     check(folder, config, resume=resume)  # refuse a bad folder before the processes start
-    with idle():  # the first of the processes speaks
-        status = launch(jobs, _train_guarded, config, folder, resume)
-    if status:
-        raise SystemExit(status)  # the first process has printed the reason
+    with idle():  # the first of the processes speaks, and prints the reason of its status
+        return launch(jobs, _train_guarded, config, folder, resume)
 
 
-def _train_here(config: TrainConfig, folder: Path, resume: bool) -> None:
+def _train_here(config: TrainConfig, folder: Path, resume: bool) -> int:
     from ballfg.learning.run.training import run_training
 
-    run_training(config, folder, resume=resume, watch=progress)
+    return run_training(config, folder, resume=resume, watch=progress)
 
 
 def _train_guarded(config: TrainConfig, folder: Path, resume: bool) -> int:
     """The work of each process that this command starts. Returns: its exit status."""
 
-    def work() -> None:
+    def work() -> int:
         with alive("ballfg-train"):
-            _train_here(config, folder, resume)
+            return _train_here(config, folder, resume)
 
     return guarded(work)
 
@@ -97,6 +102,7 @@ def _train_guarded(config: TrainConfig, folder: Path, resume: bool) -> int:
 def run(arguments: Sequence[str] | None = None) -> None:
     """Run `ballfg-train` with the given arguments, by default those of the command line, and exit.
 
-    Raises: SystemExit: always; status 0, 2 on bad input, 130 after Ctrl-C.
+    Raises: SystemExit: always; status 0, 1 if the trained model is not better than before, 2 on bad input, 130 after
+        Ctrl-C.
     """
     start(app, "ballfg-train", arguments)

@@ -9,6 +9,8 @@ from typing import Any, NamedTuple, Self
 import torch
 from torch import Tensor, nn
 
+from ballfg.arrays import Array
+
 
 @dataclass(frozen=True)
 class BatchLoss:
@@ -34,6 +36,33 @@ class BatchLoss:
         return cls(torch.zeros((), dtype=torch.float64), 0, 0.0, 0, tuple(failed))
 
 
+@dataclass(frozen=True)
+class PredictedShot:
+    """A track as a model predicts it.
+
+    Attributes:
+        name: of the track.
+        times: (k,) s since the last observed sample; those of observed samples are not positive.
+        measured, predicted: (k, 3) m.
+    """
+
+    name: str
+    times: Array
+    measured: Array
+    predicted: Array
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A number that was learned, in its `unit`, before and after; `meaning` says what it is."""
+
+    name: str
+    before: float
+    after: float
+    unit: str
+    meaning: str
+
+
 class Trainee(ABC):
     """A model with its data.
 
@@ -57,6 +86,17 @@ class Trainee(ABC):
     @abstractmethod
     def export(self, folder: Path) -> Path:
         """Write the model into a folder. Returns: the path that other commands and classes load it from."""
+
+    def shown(self, track: int) -> PredictedShot | None:
+        """A track as the model predicts it, for a picture; None where it cannot be predicted, or by default.
+
+        Args: track: its number.
+        """
+        return None
+
+    def learned(self) -> Sequence[Learned]:
+        """Numbers with a meaning that were learned, such as noise and coefficients; none by default."""
+        return ()
 
     def groups(self) -> list[dict[str, Any]]:
         """Parameter groups for a torch optimizer, each with `name` and a `scale` on the learning rate."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -39,6 +40,7 @@ def diagnose(
     """
     from ballfg.diagnosis import diagnose as find
     from ballfg.diagnosis import diagnose_jointly
+    from ballfg.diagnosis.report.origin import Origin
     from ballfg.diagnosis.report.report import MODEL, PAGE, REPORT, check_report_folder, room_file, write_report
     from ballfg.dynamics import AnalyticModel
 
@@ -61,7 +63,9 @@ def diagnose(
             diagnosis, rooms = joint.whole, joint.rooms
         else:
             diagnosis = find(inputs.dataset, inputs.model, jobs=processes, watch=announce)
-    write_report(diagnosis, out, rooms)
+    typed = _typed(datasets, model, effects_file, out)
+    origin = Origin(typed, tuple(map(str, datasets)), "" if model is None else str(model), str(out))
+    write_report(diagnosis, out, rooms, origin)
     print(*_summary(diagnosis), sep="\n")
     if rooms:
         print("", *diagnosis.remarks[: len(rooms) + 2], sep="\n")
@@ -69,10 +73,20 @@ def diagnose(
     print(f"\nwrote {', '.join(name for name in files if (out / name).is_file())} to {out}")
 
 
+def _typed(datasets: Sequence[Path], model: Path | None, effects: Sequence[Path] | None, out: Path) -> str:
+    """The command line, without options that do not change the result."""
+    words = ["ballfg", "diagnose", *map(str, datasets)]
+    words += [] if model is None else ["--model", str(model)]
+    words += [word for path in effects or () for word in ("--effects-file", str(path))]
+    return shlex.join([*words, "--out", str(out)])
+
+
 def _summary(diagnosis: Diagnosis) -> Iterator[str]:
     """The diagnosis in lines: the sentence, effects, errors on the held-out half, the rest."""
+    from ballfg.diagnosis.report.headline import headline
     from ballfg.diagnosis.report.wording import fixed, listed, probability
 
+    yield headline(diagnosis)
     yield f"{diagnosis.verdict.value}: {diagnosis.sentence}"
     rows = [("effect", "kind", "by chance", "BIC", "cannot be told from", "coefficients")]
     for f in diagnosis.findings:

@@ -282,6 +282,7 @@ def _pooled(by_room: dict[str, Errors]) -> Errors:
         np.concatenate([one.by_track for one in every]),
         middle("intervals_held"),
         middle("nis_median"),
+        tuple(path for one in every for path in one.paths),
     )
 
 

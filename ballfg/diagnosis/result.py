@@ -119,6 +119,24 @@ class Refusal:
 
 
 @dataclass(frozen=True)
+class PredictedPath:
+    """The prediction of one held-out track, to show it.
+
+    Attributes:
+        name: of the track.
+        seen: (m, 3) m, measured positions of the observed part.
+        times: (k,) s since the end of the observed part, of the samples predicted.
+        predicted, measured: (k, 3) m at these times.
+    """
+
+    name: str
+    seen: Array
+    times: Array
+    predicted: Array
+    measured: Array
+
+
+@dataclass(frozen=True)
 class Errors:
     """Prediction errors on the held-out half: the first 40 % of each track observed, the rest predicted.
 
@@ -130,6 +148,7 @@ class Errors:
         by_track: (t,) mm, root mean square distance of each track.
         intervals_held: share of measured coordinates inside their central 90 % intervals, 0 to 1.
         nis_median: median over samples of the squared whitened errors of x, y and z added; 2.37 is right.
+        paths: the predictions themselves, in the order of `by_track`.
     """
 
     prediction_rmse_mm: float
@@ -139,6 +158,7 @@ class Errors:
     by_track: Array
     intervals_held: float = float("nan")
     nis_median: float = float("nan")
+    paths: tuple[PredictedPath, ...] = ()
 
 
 @dataclass(frozen=True)

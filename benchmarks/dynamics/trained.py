@@ -34,7 +34,7 @@ def trained_contender(job: Job, task: Task) -> Contender:
     folder = job.folder / "training"
     config = config_of(job, _written(job))
     begun = (folder / METRICS).is_file()
-    if not (folder / MODEL).exists() and not (folder / "model").exists():
+    if not _finished(folder, config):
         with (job.folder / "log.txt").open("a") as log, redirect_stdout(log), redirect_stderr(log):
             run_training(config, folder, resume=begun, watch=unwatched)
     seconds = sum(epoch.seconds for epoch in read_metrics(folder / METRICS))
@@ -51,6 +51,13 @@ def trained_contender(job: Job, task: Task) -> Contender:
         parameter_count=_learned_numbers(model),
         training_seconds=seconds,
     )
+
+
+def _finished(folder: Path, config: TrainConfig) -> bool:
+    """Whether a training was run to its end: one that was stopped leaves its best model so far, too."""
+    if not ((folder / MODEL).exists() or (folder / FOLDER).exists()) or not (folder / METRICS).is_file():
+        return False
+    return read_metrics(folder / METRICS)[-1].epoch >= config.optimizer.epochs
 
 
 def recipe(job: Job) -> str:

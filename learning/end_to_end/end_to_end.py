@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -33,7 +34,7 @@ from ballfg.learning.gradient.likelihood import negative_log_likelihood
 from ballfg.learning.gradient.objective import BatchObjective
 from ballfg.learning.run.run_folder import MODEL
 from ballfg.learning.shots import Shot
-from ballfg.learning.trainee import BatchLoss, Trainee
+from ballfg.learning.trainee import BatchLoss, Learned, PredictedShot, Trainee
 from ballfg.state import POSITION, STATE_DIM
 from ballfg.tracks import TrackNoise
 
@@ -41,6 +42,14 @@ LOSS_UNIT: Final = 0.01
 """m. Squared errors are divided by its square, so that losses are of order one."""
 SOLUTION_TOLERANCE: Final = 1e-5
 """Relative error of the linear solution of each track: far below the scatter between batches."""
+NOISE_WORDS: Final = {
+    "acceleration": ("m/s²/√Hz", "acceleration that the model lacks"),
+    "spin": ("rad/s/√s", "random change of the spin in flight"),
+    "contact_velocity": ("m/s", "scatter of the velocity after a bounce"),
+    "contact_tangential": ("m/s", "scatter along the surface in addition"),
+    "contact_spin": ("rad/s", "scatter of the spin after a bounce"),
+}
+"""Unit and meaning of each learned number of the process noise."""
 MakeSolver = Callable[[GaussNewtonFactors, Tensor], LinearSolver]
 """From the factorisations of a batch and the owners of its numbers (`ConjugateGradients`) to a solver."""
 TRAINING_SOLVER: Final[MakeSolver] = partial(ConjugateGradients, tolerance=SOLUTION_TOLERANCE)
@@ -111,6 +120,7 @@ class EndToEnd(Trainee):
         self.fades = tuple(fades)
         self.held_out = tuple(held_out)
         scale = None if loss.position_scale is None else loss.position_scale / LOSS_UNIT
+        self.before = self._numbers()
         self.point_loss = Loss() if scale is None else Loss("huber", scale)
 
     def groups(self) -> list[dict[str, Any]]:
@@ -186,6 +196,44 @@ class EndToEnd(Trainee):
             failed += [(name, "the predicted track is not finite") for name in names]
             prediction = Prediction(prediction.error[good], prediction.counts[good])
             return _batch_loss(self._outer(prediction).sum(), prediction, failed)
+
+    def shown(self, track: int) -> PredictedShot | None:
+        """A track as it is judged: the rollout from its estimated first state, beside the usable samples."""
+        solved, _ = self.solver([track], {})
+        if not solved:
+            return None
+        shot, one = self.shots[track], solved[0]
+        with torch.no_grad():
+            prediction = self.predict(solved, torch.from_numpy(one.solution.minimum.values.states[0])[None], None)
+        counted = prediction.counts[0, : len(one.positions)].numpy()
+        measured = np.asarray(one.positions)[counted]
+        times = (shot.track.times - shot.track.times[shot.observed - 1])[: len(counted)][counted]
+        error = prediction.error[0, : len(counted)].numpy()[counted]
+        return PredictedShot(shot.name, times, measured, measured + error)
+
+    def learned(self) -> Sequence[Learned]:
+        """Declared coefficients and, where it is learned, the noise."""
+        now = self._numbers()
+        return [Learned(name, value, now[name][0], unit, words) for name, (value, unit, words) in self.before.items()]
+
+    def _numbers(self) -> dict[str, tuple[float, str, str]]:
+        """Value, unit and meaning of each number that is learned, by name."""
+        parameters, noise = dict(self.learnables.model.named_parameters()), self.learnables.noise
+        found = {
+            name: (float(parameters[name].detach()), "" if c.unit == "1" else c.unit, "coefficient of the model")
+            for name, c in self.learnables.model.declared_coefficients().items()
+            if parameters[name].requires_grad
+        }
+        if not noise.learned:
+            return found
+        found |= {name: (value, *NOISE_WORDS[name]) for name, value in noise.values().items()}
+        found["position noise"] = (noise.position_scale(), "", "as a multiple of what the dataset states")
+        settings = self.shots[0].settings
+        launched = settings.launcher
+        spin = settings.spin_label_noise if launched is None else launched.sigma
+        words = "uncertainty of spin labels" if launched is None else "scatter of the spin about the launcher's setting"
+        found["spin noise"] = (spin * noise.spin_scale(), "rad/s", words)
+        return found
 
     def predict(self, solved: Sequence[Solved], first: Tensor, epoch: int | None) -> Prediction:
         """Rollouts over the whole tracks from their first states.

@@ -5,9 +5,8 @@ from operator import itemgetter
 from pathlib import Path
 from statistics import fmean
 
-import matplotlib
-import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from torch.utils.tensorboard import SummaryWriter
 
@@ -16,8 +15,6 @@ from ballfg.learning.run import run_folder as files
 from ballfg.learning.run.checkpoint import Checkpoint, write_checkpoint
 from ballfg.learning.run.loop import Task
 from ballfg.learning.run.metrics import Epoch, epoch_line, read_metrics, write_metrics
-
-matplotlib.use("Agg")
 
 SCALARS = {
     "loss/train": ("loss", 1.0),
@@ -85,7 +82,14 @@ class Record:
 
 def draw_curves(epochs: Sequence[Epoch], title: str, path: Path) -> None:
     """Write loss and RMSE of the predicted positions over the epochs as a PNG file."""
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9.6, 3.9), layout="constrained")
+    with whole_file(path) as temporary:
+        curves(epochs, title).savefig(temporary, dpi=DPI, format="png")
+
+
+def curves(epochs: Sequence[Epoch], title: str) -> Figure:
+    """Loss and RMSE of the predicted positions over the epochs."""
+    figure = Figure(figsize=(9.6, 3.9), layout="constrained")
+    left, right = figure.subplots(1, 2)
     losses = [(e.epoch, e.loss) for e in epochs if e.loss is not None]
     trained = [(e.epoch, 1e3 * e.train_rmse) for e in epochs if e.train_rmse is not None]
     judged = [(e.epoch, 1e3 * e.validation_rmse) for e in epochs if e.validation_rmse is not None]
@@ -98,9 +102,7 @@ def draw_curves(epochs: Sequence[Epoch], title: str, path: Path) -> None:
     _finish(left, "loss per track", losses)
     _finish(right, "RMSE of predicted positions, mm", trained + judged)
     figure.suptitle(title, size=11)
-    with whole_file(path) as temporary:
-        figure.savefig(temporary, dpi=DPI, format="png")
-    plt.close(figure)
+    return figure
 
 
 def _curve(axes: Axes, points: Points, colour: str, label: str) -> None:

@@ -1,11 +1,15 @@
 """A training from config to model: the work of `ballfg-train` in each of its processes."""
 
 import io
+import math
 import sys
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from functools import partial
 from pathlib import Path
+from typing import Final
 
+from ballfg.estimation import spread_over
+from ballfg.files.whole_file import write_text
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.registry import TRAINEES
 from ballfg.learning.run import run_folder as files
@@ -13,9 +17,16 @@ from ballfg.learning.run.checkpoint import Checkpoint, read_checkpoint
 from ballfg.learning.run.loop import Task, Training, TrainingStoppedError
 from ballfg.learning.run.metrics import Epoch
 from ballfg.learning.run.ranks import TOLD_BY_FIRST, Ranks, join_ranks
-from ballfg.learning.run.record import Record
-from ballfg.learning.trainee import Prepared
+from ballfg.learning.run.record import Record, curves
+from ballfg.learning.run.training_page import improved, page, verdict
+from ballfg.learning.trainee import PredictedShot, Prepared
+from ballfg.machine import versions
 from ballfg.progress import Watch, unwatched
+
+NOT_BETTER: Final = 1
+"""Exit status of a training that ended and whose model is not better than before."""
+MOST_JUDGED: Final = 25
+"""Validation tracks that are judged one by one, to show the median one."""
 
 
 def build(config: TrainConfig) -> Prepared:
@@ -27,10 +38,13 @@ def build(config: TrainConfig) -> Prepared:
     return TRAINEES[config.kind].build(config)
 
 
-def run_training(config: TrainConfig, folder: Path, *, resume: bool = False, watch: Watch = unwatched) -> None:
+def run_training(config: TrainConfig, folder: Path, *, resume: bool = False, watch: Watch = unwatched) -> int:
     """Train a model and write the folder of the run.
 
     Every process of a group calls this; the first one writes and prints.
+
+    Returns: the exit status of `ballfg-train`: 0, or `NOT_BETTER` if no epoch predicts the validation tracks better
+        than the model before the first step.
 
     Args:
         config: of the training.
@@ -39,7 +53,8 @@ def run_training(config: TrainConfig, folder: Path, *, resume: bool = False, wat
         watch: sees the batches pass in the first process, for instance to show progress.
     Raises:
         ValueError, FileNotFoundError: bad input, or a training that cannot go on (`TrainingStoppedError`).
-        KeyboardInterrupt: after Ctrl-C; the epochs up to the last checkpoint are kept.
+        KeyboardInterrupt: after Ctrl-C; the epochs up to the last checkpoint are kept, and the best model so far is
+            written.
         SystemExit: in the other processes, where the first one raises.
     """
     with join_ranks() as ranks:
@@ -57,14 +72,14 @@ def run_training(config: TrainConfig, folder: Path, *, resume: bool = False, wat
                 kept = training.checkpoint() if due else None
                 ranks.from_first(partial(_write, record, epoch, kept))
             training.take_best()
-            ranks.from_first(lambda: _finish(training, folder))
+            return ranks.from_first(lambda: _finish(training, record, folder))
         except TrainingStoppedError:
             if not ranks.first:
                 raise SystemExit(TOLD_BY_FIRST) from None
             raise
         except KeyboardInterrupt:
             if record is not None:
-                print(f"{record.kept}; continue with --resume {folder}", file=sys.stderr)
+                _stop(training, record, folder)
             raise
         finally:
             if record is not None:
@@ -85,12 +100,54 @@ def _write(record: Record | None, epoch: Epoch, checkpoint: Checkpoint | None) -
         record.write(epoch, checkpoint)
 
 
-def _finish(training: Training, folder: Path) -> None:
-    """Write the model with the best weights, and print the paths of the results."""
+def _finish(training: Training, record: Record | None, folder: Path) -> int:
+    """Write the model with the best weights and the page, and print whether it helped. Returns: the exit status."""
     model = training.task.trainee.export(folder)
-    progress = training.progress
-    if progress is not None and progress.best_rmse is not None:
+    progress, epochs = training.progress, [] if record is None else record.epochs
+    if progress is None or record is None:
+        return 0
+    shot = median_shot(training.task)
+    _write_page(training, record, folder, model, shot)
+    better = improved(epochs, progress.best_epoch)
+    print(verdict(epochs, progress.best_epoch))
+    if progress.best_rmse is not None:
         print(f"best: epoch {progress.best_epoch}, validation RMSE {1e3 * progress.best_rmse:.2f} mm")
     else:
         print("no validation track could be judged: the weights are those of the last epoch")
-    print(f"{model}: the trained model\n{folder / files.METRICS}: all numbers\n{folder / files.CURVES}")
+    what = "the model before the first step, which no epoch improved" if better is False else "the trained model"
+    print(f"{folder / files.PAGE}: the training, to read")
+    print(f"{model}: {what}\n{folder / files.METRICS}: all numbers\n{folder / files.CURVES}")
+    return NOT_BETTER if better is False else 0
+
+
+def _stop(training: Training, record: Record, folder: Path) -> None:
+    """Write the best model so far after Ctrl-C, and say what is kept."""
+    print(f"{record.kept}; continue with --resume {folder}", file=sys.stderr, flush=True)
+    if training.progress is None:
+        print("no model is written: not even the first one had been judged", file=sys.stderr)
+        return
+    training.take_best()
+    model = training.task.trainee.export(folder)
+    _write_page(training, record, folder, model, None)
+    print(f"{model}: the best model so far, of epoch {training.progress.best_epoch}", file=sys.stderr)
+
+
+def _write_page(training: Training, record: Record, folder: Path, model: Path, shot: PredictedShot | None) -> None:
+    best = 0 if training.progress is None else training.progress.best_epoch
+    data = training.task.config.data
+    dataset = data[0] if data else "DATASET"
+    command = f"ballfg predict {dataset} --model {model} --observe 0.3 --out predictions.csv" if model.is_file() else ""
+    packages = ", ".join(f"{name} {version}" for name, version in versions(files.PACKAGES).items())
+    drawn, learned = curves(record.epochs, record.title), training.task.trainee.learned()
+    write_text(folder / files.PAGE, page(record.title, record.epochs, best, drawn, learned, shot, command, packages))
+
+
+def median_shot(task: Task) -> PredictedShot | None:
+    """The validation track with the median error, of at most `MOST_JUDGED`, as the model predicts it."""
+    tracks, errors = spread_over(task.validation, len(task.validation), MOST_JUDGED), {}
+    for track in tracks:
+        judged = task.trainee.judge([track])
+        if judged.points and math.isfinite(judged.squared_error):
+            errors[track] = judged.squared_error / judged.points
+    ordered = sorted(errors, key=errors.__getitem__)
+    return task.trainee.shown(ordered[(len(ordered) - 1) // 2]) if ordered else None

@@ -15,7 +15,7 @@ from ballfg.learning.sequence.data import Batch, Example, LauncherSettings, coll
 from ballfg.learning.sequence.model import SequenceModel
 from ballfg.learning.sequence.predictor import SequencePredictor
 from ballfg.learning.shots import Shot
-from ballfg.learning.trainee import BatchLoss, Prepared, Trainee
+from ballfg.learning.trainee import BatchLoss, PredictedShot, Prepared, Trainee
 from ballfg.learning.training_data import read_training_data
 from ballfg.tracks import Track
 
@@ -95,6 +95,15 @@ class SequenceTrainee(Trainee):
             positions = self.module.predict(batch)
         error = ((positions - batch.rest) / self.module.frame.units).square().sum(-1) * batch.asked
         return self._batch_loss(tracks, error.sum(1) / batch.asked.sum(1), positions, batch)
+
+    def shown(self, track: int) -> PredictedShot | None:
+        """The unobserved rest of a track."""
+        one = self._examples.get(track)
+        if one is None:
+            return None
+        with torch.no_grad():
+            positions = self.module.predict(collate([one]))[0]
+        return PredictedShot(self._names[track], one.times.numpy(), one.rest.numpy(), positions.double().numpy())
 
     def predictor(self) -> SequencePredictor:
         """The model as it is now, for use."""

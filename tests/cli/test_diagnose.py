@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import ballfg.diagnosis
+from ballfg.diagnosis.report.headline import headline
 from ballfg.diagnosis.result import Diagnosis
 from ballfg.dynamics import AnalyticModel, Architecture, build, load_model, nominal_model, save_model
 from ballfg.progress import VARIABLE
@@ -45,7 +46,7 @@ def answer(monkeypatch: pytest.MonkeyPatch) -> Answer:
             return diagnosis
 
         monkeypatch.setattr(ballfg.diagnosis, "diagnose", diagnose)
-        monkeypatch.setattr("ballfg.diagnosis.report.report.page", lambda diagnosis: "<html></html>")
+        monkeypatch.setattr("ballfg.diagnosis.report.report.page", lambda diagnosis, origin: "<html></html>")
         return asked
 
     return answer
@@ -66,7 +67,8 @@ def test_what_is_printed_and_written(
     assert (effects[:2], jobs) == (("gravity", "drag"), 2)
     said = capsys.readouterr()
     assert said.err.startswith("fitting the declared model to 25 tracks\n")
-    lines = said.out.splitlines()
+    first, *lines = said.out.splitlines()
+    assert first == headline(found())
     assert lines[0] == f"effect found: {found().sentence}"
     assert lines[2].split()[:4] == ["effect", "kind", "by", "chance"]
     assert lines[3].startswith("wind    flight  less than 1e-99  -598  gust_region          x 0.200 ± 0.012 m/s, ")
@@ -89,7 +91,7 @@ def test_other_verdicts(
     answer(silent())
     assert status("diagnose", dataset, "--out", tmp_path / "a") == 0
     said = capsys.readouterr().out
-    assert said.startswith("nothing lacking: Nothing is lacking")
+    assert said.startswith(f"{headline(silent())}\nnothing lacking: Nothing is lacking")
     assert "effect " not in said
     answer(unexplained())
     assert status("diagnose", dataset, "--out", tmp_path / "a") == 0
@@ -158,4 +160,4 @@ def test_a_whole_run(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert report["effects"] == []
     assert 3.0 < report["error"]["before"]["prediction_rmse_mm"] < 60.0
     assert isinstance(load_model(out / "model.yaml"), AnalyticModel)
-    assert capsys.readouterr().out.startswith("nothing lacking: ")
+    assert "\nnothing lacking: " in capsys.readouterr().out

@@ -19,6 +19,7 @@ from ballfg.diagnosis.result import (
     GenericTest,
     MeasurementResiduals,
     Outcome,
+    PredictedPath,
     Residuals,
     Unexplained,
     Value,
@@ -87,7 +88,16 @@ def errors(size: float, seed: int) -> Errors:
     """Errors of 25 tracks about a size in mm."""
     by_track = size * np.random.default_rng(seed).lognormal(-0.08, 0.4, 25)
     pooled = float(np.sqrt((by_track**2).mean()))
-    return Errors(pooled, 0.6 * pooled, (pooled / 8.0) ** 2, 3.9 - 0.02 * pooled, by_track, 0.87, 2.6)
+    paths = tuple(_path(f"shot {i}", 1e-3 * error) for i, error in enumerate(by_track))
+    return Errors(pooled, 0.6 * pooled, (pooled / 8.0) ** 2, 3.9 - 0.02 * pooled, by_track, 0.87, 2.6, paths)
+
+
+def _path(name: str, error: float) -> PredictedPath:
+    """A flight along x whose prediction is off by `error` m to the left."""
+    times = np.linspace(0.0, 0.6, 40)
+    places = np.stack((5.0 * times, 0.2 * times, 1.0 + 2.0 * times - 4.9 * times**2), axis=-1)
+    rest = places[16:]
+    return PredictedPath(name, places[:16], times[16:] - times[16], rest + np.array([0.0, error, 0.0]), rest)
 
 
 def _candidate(

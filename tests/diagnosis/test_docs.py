@@ -75,7 +75,7 @@ def test_the_whole_from_python(here: Path, monkeypatch: pytest.MonkeyPatch) -> N
         return found()
 
     monkeypatch.setattr("ballfg.diagnosis.diagnose", answer)
-    monkeypatch.setattr("ballfg.diagnosis.report.report.page", lambda diagnosis: "<html></html>")
+    monkeypatch.setattr("ballfg.diagnosis.report.report.page", lambda diagnosis, origin: "<html></html>")
     write_simulation("windy", SimulationConfig(tracks=6, rate=30.0))
     exec(compile(blocks("diagnose.md", "python")[0], "diagnose.md", "exec"), {})
     assert asked == [(6, ["gravity", "drag", "magnus"], 2)]

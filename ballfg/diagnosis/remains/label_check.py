@@ -49,6 +49,8 @@ class LabelCheck:
     @property
     def where(self) -> str:
         """In words, which labels contradict their flights."""
+        if not self.contradicted:
+            return f"label: none of {self.labels} spin labels contradicts its flight"
         shown = ", ".join(self.contradicted[:4]) + (", ..." if len(self.contradicted) > 4 else "")
         return (
             f"label: {len(self.contradicted)} of {self.labels} spin labels contradict their flights, "

@@ -2,35 +2,58 @@
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from importlib.resources import files
 
 from matplotlib.figure import Figure
 
-from ballfg.diagnosis.report import pictures
-from ballfg.diagnosis.report.parts import Html, bar, items, picture, section, table, tag, text
+from ballfg.diagnosis.remains.generic import ALARM
+from ballfg.diagnosis.report import pictures, shots
+from ballfg.diagnosis.report.glossary import glossary, outcome_badge, term
+from ballfg.diagnosis.report.headline import advice, certainty, further, headline, where
+from ballfg.diagnosis.report.origin import Origin, date, packages
+from ballfg.diagnosis.report.plain_effects import in_plain_words, plain_name
 from ballfg.diagnosis.report.wording import NONE, change, fixed, joined, listed, number, plus_minus, probability
-from ballfg.diagnosis.result import Candidate, Diagnosis, Finding, Outcome, Residuals, Value, Verdict
+from ballfg.diagnosis.result import (
+    Candidate,
+    Diagnosis,
+    Errors,
+    Finding,
+    GenericTest,
+    Outcome,
+    Residuals,
+    Value,
+    Verdict,
+)
 from ballfg.dynamics import EFFECTS
+from ballfg.files.page_parts import Html, bar, items, picture, section, table, tag, whole_page
 
 BADGES = {Verdict.FOUND: "found", Verdict.NOTHING: "nothing", Verdict.UNEXPLAINED: "unexplained"}
 COLOURS = {Outcome.ADDED: "added", Outcome.ALIKE: "alike"}
 """Classes of the style for the verdict and for the outcome of a candidate."""
 SHOWN = 8
 """Rows of a ranking that are seen at once; the others unfold."""
-INTERVALS = "90 % is right: share of measured coordinates inside their 90 % intervals"
-RANKING = ("candidate", "squared residual it would explain", "by chance", "BIC", "first estimate", "outcome")
+RANKING = (
+    "candidate",
+    term("squared residual", "squared residual it would explain"),
+    term("by chance"),
+    term("BIC"),
+    "first estimate",
+    "outcome",
+)
 
 
-def page(diagnosis: Diagnosis) -> str:
-    """The whole page."""
+def page(diagnosis: Diagnosis, origin: Origin | None = None) -> str:
+    """The whole page; origin: the command and the files that it comes from, where they are known."""
     badge = tag("span", diagnosis.verdict.value, kind=f"badge {BADGES[diagnosis.verdict]}")
     question = tag("p", f"{diagnosis.dataset} · what does the model lack? ", badge)
-    calibrated = table(("coefficient", "declared", "fitted with the added effects"), _values(diagnosis.calibrated))
+    values = (term("coefficient"), "declared", "fitted with the added effects")
+    calibrated = table(values, _values(diagnosis.calibrated))
     noise = table(("position noise along", "stated", "estimated"), _values(diagnosis.noise))
-    body = tag(
-        "main",
-        tag("header", question, tag("h1", diagnosis.sentence)),
+    return whole_page(
+        f"{diagnosis.dataset}: diagnosis",
+        tag("header", question, tag("h1", headline(diagnosis)), _in_short(diagnosis)),
+        section("What to do next", *_next(diagnosis, origin)),
         _errors(diagnosis),
+        _shots(diagnosis),
         section("What was added to the model", *(_finding(f) for f in diagnosis.findings)),
         _alike(diagnosis),
         section("What fits better and is no name", items(diagnosis.remarks) if diagnosis.remarks else ""),
@@ -40,57 +63,119 @@ def page(diagnosis: Diagnosis) -> str:
         _invisible(diagnosis),
         section("Coefficients and noise", calibrated, noise),
         _evaluation(diagnosis),
+        section("Where this report comes from", _made(diagnosis, origin)),
+        section("What the words mean", glossary()),
     )
-    style = files(__package__).joinpath("style.css").read_text(encoding="utf-8")
-    head = (
-        '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
-        f"<title>{text(diagnosis.dataset)}: diagnosis</title><style>\n{style}</style>"
-    )
-    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>{body}</body></html>\n'
+
+
+def _in_short(diagnosis: Diagnosis) -> Html:
+    """What was found beside the first sentence, and how sure it is."""
+    more = items(further(diagnosis))
+    parts = [tag("h3", "In detail"), more] if more else []
+    sure = items(certainty(diagnosis))
+    return tag("div", *parts, *((tag("h3", "How sure is that?"), sure) if sure else ()), kind="short")
+
+
+def _next(diagnosis: Diagnosis, origin: Origin | None) -> Iterator[Html]:
+    """Commands and experiments that follow."""
+    known = origin or Origin("", ("DATASET",), "", "OUT")
+    for words, command in advice(diagnosis, known):
+        yield tag("p", words)
+        if command:
+            yield tag("pre", tag("code", command))
+
+
+def _made(diagnosis: Diagnosis, origin: Origin | None) -> Html:
+    """Date, versions and inputs."""
+    rows = [("made on", date()), ("with", packages()), ("dataset", diagnosis.dataset)]
+    if origin is not None:
+        rows += [
+            ("from", ", ".join(origin.datasets)),
+            ("model", origin.model or "the nominal model of the dataset's ball"),
+            ("command", tag("code", origin.command)),
+        ]
+    used = f"{diagnosis.tracks_found_on} to find with, {diagnosis.tracks_judged_on} to judge by"
+    return table(("", ""), (*rows, ("tracks", used)))
 
 
 def _errors(diagnosis: Diagnosis) -> Html:
-    """Errors of predictions on the held-out half, before and after."""
-    before, after, changed = diagnosis.before, diagnosis.after, bool(diagnosis.findings)
-    likelihoods = before.log_likelihood, after.log_likelihood
-    cards = tag(
-        "div",
-        _card("prediction error", before.prediction_rmse_mm, after.prediction_rmse_mm, " mm", changed),
-        _card("error of the apex", before.apex_rmse_mm, after.apex_rmse_mm, " mm", changed),
-        _card("NIS", before.nis, after.nis, "", changed, "1: errors are as large as predicted"),
-        _card("intervals hold", 100 * before.intervals_held, 100 * after.intervals_held, " %", changed, INTERVALS),
-        _card("log likelihood", *likelihoods, "", changed, "per coordinate; more is better"),
-        kind="cards",
+    """Errors of predictions on the held-out half, before and after, and what they should be."""
+    before, after, changed = diagnosis.before, diagnosis.after, diagnosis.after is not diagnosis.before
+    changed = changed and (bool(diagnosis.findings) or diagnosis.unexplained.fallback is not None)
+    numbers = (
+        (term("prediction error"), before.prediction_rmse_mm, after.prediction_rmse_mm, " mm", "small"),
+        (term("apex", "error of the apex"), before.apex_rmse_mm, after.apex_rmse_mm, " mm", "small"),
+        (term("NIS"), before.nis, after.nis, "", "1"),
+        (term("90 % intervals", "90 % intervals hold"), *_percents(before, after), " %", "90 %"),
+        (term("log likelihood"), before.log_likelihood, after.log_likelihood, "", "large"),
     )
-    words = (
-        f"Both models were fitted to the other tracks. Of {diagnosis.tracks_judged_on} tracks the first 40 % was "
-        "observed. The rest was predicted and compared with the measured positions."
+    words = tag(
+        "p",
+        f"Of {diagnosis.tracks_judged_on} ",
+        term("held-out tracks"),
+        " the first 40 % was observed. The rest was predicted and compared with the measured positions. "
+        + ("Both models were" if changed else "The model was")
+        + " fitted to the other tracks.",
     )
     if not changed:
-        return section("How well the model predicts", tag("p", words), cards)
+        rows = [(name, _fixed(now, unit), goal) for name, _, now, unit, goal in numbers]
+        return section("How well the model predicts", words, table(("", "value", "should be"), rows))
+    head = ("", "declared model", "corrected model", "change", "should be")
+    lines = [
+        (name, _fixed(was, unit), _fixed(now, unit), _changed(was, now, unit), goal)
+        for name, was, now, unit, goal in numbers
+    ]
     caption = "Each line is one of these tracks; diamonds pool them all."
     paired = picture(pictures.errors_by_track(before, after), caption)
-    return section("How much predictions gain", tag("p", words), tag("div", cards, paired, kind="beside"))
+    shown = tag("div", tag("div", table(head, lines)), paired, kind="beside")
+    return section("How much predictions gain", words, shown)
 
 
-def _card(name: str, was: float, now: float, unit: str, changed: bool, note: str = "") -> Html:
-    """One number, with its old value where the model changed, and a note or the change in percent."""
-    decimals = 1 if unit else 2
-    old = tag("span", f"{fixed(was, decimals)} → ", kind="was") if changed and math.isfinite(was) else Html()
-    shown = f"{fixed(now, decimals)}{unit}" if math.isfinite(now) else NONE
-    if not math.isfinite(now):
-        note = "nothing to compare"
-    elif not note and changed:
-        note = change(was, now)
-    below = tag("span", note, kind="quiet") if note else Html()
-    return tag("div", tag("span", name, kind="quiet"), tag("span", old, shown, kind="big"), below, kind="card")
+def _percents(before: Errors, after: Errors) -> tuple[float, float]:
+    return 100 * before.intervals_held, 100 * after.intervals_held
+
+
+def _fixed(value: float, unit: str) -> str:
+    return f"{fixed(value, 1 if unit else 2)}{unit}" if math.isfinite(value) else NONE
+
+
+def _changed(was: float, now: float, unit: str) -> str:
+    """The change in percent of a length; nothing for numbers whose ratio means nothing."""
+    if not math.isfinite(was + now):
+        return "nothing to compare"
+    return change(was, now) if unit == " mm" else ""
+
+
+def _shots(diagnosis: Diagnosis) -> Html:
+    """One shot, and where the errors are."""
+    before, after = diagnosis.before, diagnosis.after
+    changed = after is not before and bool(diagnosis.findings or diagnosis.unexplained.fallback)
+    shot = shots.median_shot(before, after, changed)
+    if shot is None:
+        return Html()
+    was, now = shot.errors
+    off = f"off by {was:.1f} mm before and {now:.1f} mm after" if changed else f"off by {now:.1f} mm"
+    ranked = "gain is the median" if changed else "error is the median"
+    caption = (
+        f"Track {shot.after.name}, whose {ranked} of all {len(after.paths)} judged tracks: its prediction is {off}."
+    )
+    words = "Root mean square errors of all judged tracks. Cells without a number hold too few samples."
+    return section(
+        "One shot, and where the errors are",
+        tag(
+            "div",
+            picture(shots.shot_picture(shot, changed), caption),
+            picture(shots.error_map(before, after, changed), words),
+            kind="beside",
+        ),
+    )
 
 
 def _finding(finding: Finding) -> Html:
     """An effect that was added, its coefficients and its evidence."""
-    head = tag("h3", finding.name, " ", tag("span", finding.kind, kind="badge added"))
+    head = tag("h3", _upper(plain_name(finding.name)), " ", tag("code", finding.name, kind="quiet"))
     values = table(
-        ("coefficient", "value ± standard deviation"),
+        (term("coefficient"), "value ± standard deviation"),
         ((tag("code", name), plus_minus(value)) for name, value in finding.parameters.items()),
     )
     verb = "falls" if finding.delta_bic < 0 else "rises"
@@ -99,13 +184,21 @@ def _finding(finding: Finding) -> Html:
     evidence = items(
         (
             f"Probability of so strong a trace by chance, all candidates counted: {probability(finding.p_value)}.",
-            f"The model's BIC {verb} by {abs(finding.delta_bic):.0f} with it, refitted.",
-            f"On the held-out tracks it {gain} {number(abs(finding.held_out_gain))} of log likelihood per track; "
-            f"probability of that by chance: {probability(finding.held_out_p)}.",
+            tag("span", "The model's ", term("BIC"), f" {verb} by {abs(finding.delta_bic):.0f} with it, refitted."),
+            tag(
+                "span",
+                "On the ",
+                term("held-out tracks"),
+                f" it {gain} {number(abs(finding.held_out_gain))} of ",
+                term("log likelihood"),
+                f" per track; probability of that by chance: {probability(finding.held_out_p)}.",
+            ),
             f"Cannot be told from {joined(others)}." if others else "No other candidate explains as much.",
         )
     )
-    return tag("article", head, tag("p", finding.sentence), values, evidence, kind="card")
+    return tag(
+        "article", head, tag("p", in_plain_words(finding)), tag("p", finding.sentence), values, evidence, kind="card"
+    )
 
 
 def _alike(diagnosis: Diagnosis) -> Html:
@@ -115,8 +208,9 @@ def _alike(diagnosis: Diagnosis) -> Html:
         others = finding.indistinguishable_from
         if others:
             hints = {finding.name: finding.decide} | {n: EFFECTS[n].decide for n in others if n in EFFECTS}
-            words = f"These data cannot tell {joined((finding.name, *others))} apart. What would decide it:"
-            lines = items(tag("span", tag("b", name), f": {hint}") for name, hint in hints.items())
+            names = joined(tuple(map(plain_name, (finding.name, *others))))
+            words = f"These data cannot tell {names} apart. What would decide it:"
+            lines = items(tag("span", tag("b", plain_name(n)), f": {hint}") for n, hint in hints.items())
             cards.append(tag("article", tag("p", words), lines, kind="card"))
     return section("What could not be told apart", *cards)
 
@@ -124,14 +218,16 @@ def _alike(diagnosis: Diagnosis) -> Html:
 def _left_over(diagnosis: Diagnosis) -> Html:
     """The pattern that is left in the end, its tests, and a description without a name."""
     left, share = diagnosis.unexplained, ""
-    words = left.where or "No pattern is left that the tests can see: what remains is noise."
+    words = _upper(f"{where(left.where)}.") if left.where else ""
+    words = words or "No pattern is left that the tests can see: what remains is noise."
     if left.where and math.isfinite(left.share_of_residual):
         share = f"That is {100 * left.share_of_residual:.0f} % of the pattern that was there at the start."
-    shares = [f"{100 * t.share:.0f} %" if math.isfinite(t.share) else NONE for t in left.tests]
-    tests = table(
-        ("test", "by chance", "share of the first pattern", "pattern"),
-        ((t.name, probability(t.p_value), share, t.where) for t, share in zip(left.tests, shares, strict=True)),
-    )
+    alarms = [t for t in left.tests if t.p_value < ALARM]
+    quiet = tuple(dict.fromkeys(t.name for t in left.tests if t.p_value >= ALARM))
+    head = (term("generic test"), term("by chance"), "pattern", "share of it at the start that is left")
+    tests = table(head, ((t.name, probability(t.p_value), t.where, _share(t)) for t in alarms))
+    silent = f"Tests that find nothing beyond noise: {joined(quiet)}." if quiet else ""
+    quietly = tag("p", silent, kind="quiet") if silent else Html()
     rest = Html()
     if left.fallback is not None:
         without, within = (fixed(e.prediction_rmse_mm, 1) for e in (left.fallback.before, left.fallback.after))
@@ -143,7 +239,16 @@ def _left_over(diagnosis: Diagnosis) -> Html:
             tag("p", f"{purpose} {without} mm without, {within} mm with it."),
             kind="card",
         )
-    return section("What is left unexplained", tag("p", words), tag("p", share) if share else "", tests, rest)
+    return section("What is left unexplained", tag("p", words), tag("p", share) if share else "", tests, quietly, rest)
+
+
+def _share(test: GenericTest) -> str:
+    """The share of a pattern that is left."""
+    return f"{100 * test.share:.0f} %" if math.isfinite(test.share) else NONE
+
+
+def _upper(words: str) -> str:
+    return words[:1].upper() + words[1:]
 
 
 def _residuals(diagnosis: Diagnosis) -> Html:
@@ -193,12 +298,12 @@ def _lines(row: Sequence[Candidate], most: float) -> Iterator[tuple[str, ...]]:
         unseen = c.outcome is Outcome.INVISIBLE
         length = math.log1p(max(c.explained, 0.0)) / math.log1p(most) if most > 0.0 and not unseen else 0.0
         yield (
-            tag("span", tag("b", c.name), " ", tag("span", c.kind, kind="quiet")),
+            tag("span", tag("b", _upper(plain_name(c.name))), " ", tag("code", c.name, kind="quiet")),
             NONE if unseen else tag("span", bar(length, colour), number(c.explained)),
             NONE if unseen else probability(c.p_value),
             NONE if c.delta_bic is None else f"{c.delta_bic:+.0f}",
             NONE if unseen else listed(c.estimate),
-            tag("span", c.outcome.value, kind=f"badge {colour}"),
+            outcome_badge(c.outcome, colour),
         )
 
 
@@ -210,7 +315,10 @@ def _invisible(diagnosis: Diagnosis) -> Html:
         "These effects may be there or not: nothing in the tracks depends on them, or something unknown takes up all "
         "that they would change. They are not ruled out."
     )
-    rows = ((tag("b", n), *((EFFECTS[n].sentence, EFFECTS[n].decide) if n in EFFECTS else (NONE, NONE))) for n in names)
+    rows = (
+        (tag("b", plain_name(n)), *((EFFECTS[n].sentence, EFFECTS[n].decide) if n in EFFECTS else (NONE, NONE)))
+        for n in names
+    )
     parts = (tag("p", words), table(("candidate", "it is", "to see it"), rows)) if names else ()
     return section("What these data cannot show", *parts)
 

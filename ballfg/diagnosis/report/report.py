@@ -10,6 +10,8 @@ from typing import Any, Final
 
 import numpy as np
 
+from ballfg.diagnosis.report.headline import headline
+from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.page import page
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Value
 from ballfg.dynamics import BallModel, save_model
@@ -27,7 +29,10 @@ def room_file(name: str) -> str:
 
 
 def write_report(
-    diagnosis: Diagnosis, out: str | os.PathLike[str], rooms: Mapping[str, BallModel] | None = None
+    diagnosis: Diagnosis,
+    out: str | os.PathLike[str],
+    rooms: Mapping[str, BallModel] | None = None,
+    origin: Origin | None = None,
 ) -> None:
     """Write `report.json`, `report.html` and `model.yaml` into a folder.
 
@@ -38,6 +43,7 @@ def write_report(
         diagnosis: to report.
         out: folder, new, empty or with an earlier report; its parent must exist.
         rooms: models of single rooms, by name, written beside it.
+        origin: the command and the files that the diagnosis comes from, for the page.
     Raises:
         ValueError: if `out` is a file or holds other things than a report.
         FileNotFoundError: if its parent does not exist.
@@ -51,7 +57,7 @@ def write_report(
         save_model(diagnosis.model, made / MODEL)
         for name, model in (rooms or {}).items():
             save_model(model, made / room_file(name))
-        (made / PAGE).write_text(page(diagnosis), encoding="utf-8")
+        (made / PAGE).write_text(page(diagnosis, origin), encoding="utf-8")
         text = json.dumps(content(diagnosis), indent=2, allow_nan=False, ensure_ascii=False)
         (made / REPORT).write_text(text + "\n", encoding="utf-8")
 
@@ -79,6 +85,7 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
         {
             "verdict": diagnosis.verdict.value,
             "sentence": diagnosis.sentence,
+            "headline": headline(diagnosis),
             "dataset": diagnosis.dataset,
             "effects": [vars(f) | {"parameters": _values(f.parameters)} for f in diagnosis.findings],
             "error": {
@@ -117,7 +124,7 @@ def _candidate(candidate: Candidate) -> dict[str, Any]:
 
 def _errors(errors: Errors) -> dict[str, Any]:
     named = {"by_track": "by_track_mm"}
-    return {named.get(name, name): value for name, value in vars(errors).items()}
+    return {named.get(name, name): value for name, value in vars(errors).items() if name != "paths"}
 
 
 def _values(values: Mapping[str, Value]) -> dict[str, Any]:

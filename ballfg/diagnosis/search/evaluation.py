@@ -11,7 +11,7 @@ from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.problem import Fit, Noise
 from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.fit.system import by_track
-from ballfg.diagnosis.result import Errors
+from ballfg.diagnosis.result import Errors, PredictedPath
 from ballfg.diagnosis.search.plausible import SIGMAS
 from ballfg.diagnosis.search.score import score_tests
 from ballfg.diagnosis.search.signatures import Signatures
@@ -19,6 +19,7 @@ from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation import Settings, TrackPrediction, make_estimator, predict_tracks
 from ballfg.estimation.noise.forecasts import NINETY
 from ballfg.prediction.apexes import measured_apexes, path_apex
+from ballfg.tracks import Track
 
 OBSERVED = 0.4
 """Share of each track that is observed; the rest is predicted."""
@@ -46,7 +47,7 @@ def prediction_errors(
         surfaces: of the dataset with this model.
         settings: of the dataset with this model.
         jobs: processes.
-    Returns: errors over all tracks, in mm and without unit.
+    Returns: errors over all tracks, in mm and without unit, with the predictions.
     Raises: ValueError: if no track leaves enough to predict.
     """
     estimator = make_estimator("smoother", model, surfaces, settings)
@@ -70,7 +71,14 @@ def prediction_errors(
         1e3 * np.sqrt([s.mean() for s in squares]),
         float((np.abs(scores) < NINETY).mean()),
         float(np.median((scores**2).sum(axis=-1))),
+        tuple(_path(t.track, p) for t, p in pairs),
     )
+
+
+def _path(track: Track, prediction: TrackPrediction) -> PredictedPath:
+    first = prediction.times[0]
+    seen = track.positions[track.times < first]
+    return PredictedPath(track.name, seen, prediction.times - first, prediction.positions, prediction.measured)
 
 
 def _apex_distances(evaluated: EvaluationTrack, prediction: TrackPrediction) -> Array:

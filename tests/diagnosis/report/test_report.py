@@ -13,13 +13,15 @@ import pytest
 from matplotlib.figure import Figure
 
 from ballfg.diagnosis.report import report
+from ballfg.diagnosis.report.headline import headline
+from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.page import page
-from ballfg.diagnosis.report.parts import Html, picture
 from ballfg.diagnosis.report.report import content, write_report
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback
 from ballfg.dynamics import Architecture, build, load_model, model_to_dict, nominal_model
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.networks.learned import LearnedModel
+from ballfg.files.page_parts import Html, picture
 from tests.diagnosis.made_diagnosis import found, silent, unexplained
 
 VOID = {"meta", "img"}
@@ -77,7 +79,7 @@ def drawn(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 @pytest.fixture
 def no_page(monkeypatch: pytest.MonkeyPatch) -> None:
     """A page of one sentence, for tests that are about files."""
-    monkeypatch.setattr(report, "page", lambda diagnosis: f"<html>{diagnosis.sentence}</html>")
+    monkeypatch.setattr(report, "page", lambda diagnosis, origin: f"<html>{diagnosis.sentence}</html>")
 
 
 def refuse(word: str) -> None:
@@ -121,12 +123,12 @@ def test_json_of_a_fallback() -> None:
 
 def test_the_page_stands_alone_and_is_whole(found_page: Page) -> None:
     assert found_page.open == []
-    assert len(found_page.addresses) == 7
+    assert len(found_page.addresses) == 9
     assert all(address.startswith("data:image/png;base64,") for address in found_page.addresses)
 
 
 def test_the_page_says_what_was_found(found_page: Page) -> None:
-    assert found_page.headings[0] == found().sentence
+    assert found_page.headings[0] == headline(found())
     for words in (
         "shots <in a draught>",
         "0.200 ± 0.012 m/s",
@@ -134,25 +136,29 @@ def test_the_page_says_what_was_found(found_page: Page) -> None:
         "adds 5.8 of log likelihood per track; probability of that by chance: 2·10−7.",
         "all candidates counted: less than 10−99.",
         "Cannot be told from gust_region.",
-        "These data cannot tell wind and gust_region apart. What would decide it:",
-        "wind: Shoot in the opposite direction, or across",
+        "These data cannot tell a wind and a wind in one part of the room apart. What would decide it:",
+        "a wind: Shoot in the opposite direction, or across",
         "Effects were looked for in all tracks, fitted to 25 of them, and had to help on the other 25",
         "flight.drag.k 0.12 0.1213 ± 0.0011 1/m",
         "shot 7 has no free flight of 10 samples.",
-        "12.1 → – nothing to compare",
+        "error of the apex 12.1 mm – nothing to compare small",
     ):
         spaced = re.sub(r"\s+", "", words)
         assert spaced in found_page.text.replace(" ", ""), words
     shown = found_page.text[found_page.text.index("What these data cannot show") :]
-    assert shown.index("spin_label_scale") < shown.index("wind_shear") < shown.index("Coefficients and noise")
+    assert (
+        shown.index("spin labels wrong by a factor")
+        < shown.index("a wind that grows with height")
+        < shown.index("Coefficients and noise")
+    )
 
 
 def test_pages_without_a_finding(drawn: list[str]) -> None:
     quiet = Page(page(silent()))
-    assert quiet.headings[:2] == [silent().sentence, "How well the model predicts"]
+    assert quiet.headings[:3] == [headline(silent()), "What to do next", "How well the model predicts"]
     assert "→" not in quiet.text
     assert "No pattern is left" in quiet.text
-    assert len(drawn) == 4  # no errors side by side, no contacts, no second round
+    assert len(drawn) == 6  # no errors side by side, no contacts, no second round
     assert not any("contact" in caption for caption in drawn)
     left = Page(page(unexplained()))
     assert "What is left unexplained" in left.headings
@@ -170,7 +176,7 @@ def test_the_three_files_appear_and_the_model_can_be_read(tmp_path: Path) -> Non
     assert isinstance(model, AnalyticModel)
     assert model_to_dict(model) == model_to_dict(nominal_model())
     assert json.loads((out / "report.json").read_text(encoding="utf-8"))["verdict"] == "nothing lacking"
-    assert Page((out / "report.html").read_text(encoding="utf-8")).headings[0] == silent().sentence
+    assert Page((out / "report.html").read_text(encoding="utf-8")).headings[0] == headline(silent())
 
 
 @pytest.mark.usefixtures("no_page")
@@ -202,7 +208,7 @@ def with_learned_fallback() -> Diagnosis:
 def test_a_failure_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: bool) -> None:
     out = tmp_path / "diagnosis"
 
-    def fail(diagnosis: Diagnosis) -> str:
+    def fail(diagnosis: Diagnosis, origin: Origin | None) -> str:
         raise KeyboardInterrupt
 
     if there:

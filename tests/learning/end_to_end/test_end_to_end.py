@@ -140,6 +140,24 @@ def test_unusable_samples_and_the_horizon() -> None:
     assert counted[0] < counted[1] < counted[2] == counted[3] == growing.judge((0, 1, 2)).points
 
 
+def test_the_shot_shown_has_the_error_that_is_judged() -> None:
+    learner = trainee()
+    judged, shot = learner.judge((1,)), learner.shown(1)
+    assert shot is not None
+    assert shot.name == learner.shots[1].name
+    assert len(shot.times) == judged.points
+    assert ((shot.predicted - shot.measured) ** 2).sum() == pytest.approx(judged.squared_error, rel=1e-9)
+    observed = learner.shots[1].observed
+    assert (shot.times > 0.0).sum() == learner.shots[1].usable[observed:].sum()
+    before = {one.name: one for one in learner.learned()}
+    assert before["position noise"].before == before["position noise"].after
+    with torch.no_grad():
+        learner.learnables.noise.position += np.log(2.0)
+    after = {one.name: one for one in learner.learned()}
+    assert after["position noise"].after == pytest.approx(2.0 * after["position noise"].before)
+    assert set(before) >= {"position noise", "spin noise", "acceleration"}
+
+
 def test_a_far_point_pulls_linearly() -> None:
     """`position_scale`: the loss of each point is Huber's of its distance."""
     plain, robust = trainee(noise=False), trainee(LossConfig(position_scale=0.004), noise=False)

@@ -121,6 +121,7 @@ def test_ctrl_c_keeps_the_last_epoch(folder: Path, jobs: int) -> None:
     assert status == 130
     assert said.splitlines()[1:] == [
         f"epochs up to 2 are kept; continue with --resume {out}",
+        f"{out / 'ball.safetensors'}: the best model so far, of epoch 2",
         "ballfg: interrupted",
     ]
     kept = read_checkpoint(out)

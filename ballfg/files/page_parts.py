@@ -1,15 +1,19 @@
-"""The elements of the page: escaped text, tables, pictures inside the page, bars."""
+"""Pages for people, each one self-contained file, and their elements: escaped text, tables, pictures, bars, terms."""
 
 import base64
 import html
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from importlib.resources import files
 
 from matplotlib.figure import Figure
 
 DPI = 110
 """Dots per inch of pictures, which are then about as wide as a page on a common screen."""
+
+WIDE = 8.0
+"""Inches. Wider pictures keep their size on a phone and scroll sideways, so that their words can be read."""
 
 
 class Html(str):
@@ -19,10 +23,13 @@ class Html(str):
 
 
 def text(words: str) -> Html:
-    """Escaped words; `Html` stays. Minus signs and powers of ten are typeset: 3e-12 as 3·10 with −12 raised."""
+    """Escaped words; `Html` stays.
+
+    Minus signs, squares of units and powers of ten are typeset: 3e-12 as 3·10 with −12 raised.
+    """
     if isinstance(words, Html):
         return words
-    escaped = html.escape(words)
+    escaped = html.escape(words).replace("/s^2", "/s²").replace("m^2", "m²")
     raised = re.sub(r"\b(\d[\d.]*)e([+-]\d+)\b", _power, escaped)
     return Html(re.sub(r"(?<![\w>.)-])-(?=\d)", "−", raised))
 
@@ -31,6 +38,28 @@ def _power(match: re.Match[str]) -> str:
     exponent = f"{int(match[2])}".replace("-", "−")
     base = "" if match[1] == "1" else f"{match[1]}·"
     return f"{base}10<sup>{exponent}</sup>"
+
+
+def whole_page(title: str, *content: str) -> str:
+    """A self-contained page with the style of all pages; title: of the browser's window."""
+    style = files(__package__).joinpath("page.css").read_text(encoding="utf-8")
+    head = (
+        '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+        f"<title>{text(title)}</title><style>\n{style}</style>"
+    )
+    body = tag("main", *content)
+    return f'<!DOCTYPE html>\n<html lang="en"><head>{head}</head>\n<body>{body}</body></html>\n'
+
+
+def explained(word: str, meaning: str, kind: str = "") -> Html:
+    """A word whose meaning shows on hover; kind: a class of the page."""
+    css = f' class="{kind}"' if kind else ""
+    return Html(f'<abbr{css} title="{html.escape(meaning)}">{text(word)}</abbr>')
+
+
+def meanings(words: Mapping[str, str]) -> Html:
+    """A list of words with their meanings."""
+    return tag("dl", *(part for name, meaning in words.items() for part in (tag("dt", name), tag("dd", meaning))))
 
 
 def tag(name: str, *content: str, kind: str = "") -> Html:
@@ -71,4 +100,5 @@ def picture(figure: Figure, caption: str) -> Html:
     figure.savefig(memory, dpi=DPI, format="png")
     data = base64.b64encode(memory.getvalue()).decode("ascii")
     image = Html(f'<img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">')
-    return tag("figure", image, tag("figcaption", caption))
+    wide = "wide" if figure.get_figwidth() > WIDE else ""
+    return tag("figure", tag("div", image, kind="scroll"), tag("figcaption", caption), kind=wide)

@@ -1,0 +1,62 @@
+"""What the words of a report mean: on hover where they stand, and in a list at the end of the page."""
+
+from typing import Final
+
+from ballfg.diagnosis.result import Outcome
+from ballfg.files.page_parts import Html, explained, meanings
+
+TERMS: Final = {
+    "prediction error": "Distance between a predicted and a measured position, in mm: the root mean square (RMSE) over "
+    "all predicted samples, so that large errors weigh more.",
+    "held-out tracks": "Every second track. The corrected model is not fitted to them while it is judged: their "
+    "predictions show what the model does for new tracks.",
+    "apex": "The highest point of a flight.",
+    "NIS": "Normalised innovation squared: squared prediction error over the variance that the prediction states. 1 on "
+    "average is right; above 1 the stated uncertainty is too small, below 1 it is too large.",
+    "90 % intervals": "Ranges that should hold 90 of 100 measured coordinates. Fewer: predictions claim to be better "
+    "than they are. More: they are too cautious.",
+    "log likelihood": "How probable the measurements are under the predictions, as a logarithm per coordinate; larger "
+    "is better. It judges the error and the stated uncertainty together.",
+    "by chance": "Probability that noise alone gives a trace as strong as this one (p-value), corrected for the number "
+    "of effects tested. Below 0.005 it counts as found.",
+    "BIC": "Bayesian information criterion: badness of fit plus a penalty for each further coefficient. An effect pays "
+    "for itself where the BIC falls; by 10 is strong evidence.",
+    "coefficient": "A number of the model, such as the strength of the drag. After ± stands one standard deviation: "
+    "the true value lies within two of them in 95 of 100 cases.",
+    "residual": "Measured minus predicted.",
+    "squared residual": "Squared residuals in units of their noise, summed. Chance explains about 1 for each "
+    "coefficient.",
+    "stretch": "The part of a track between two hits by a player or launcher.",
+    "round": "One pass of the search: all effects are tested, and at most one is added to the model.",
+    "generic test": "A test for a pattern of any cause: by place, speed, spin, time or order in the recording.",
+}
+"""Words of the report that a newcomer may not know."""
+OUTCOMES: Final = {
+    Outcome.ADDED: "It was added to the model.",
+    Outcome.ALIKE: "It explains these tracks as well as the one added: they cannot tell the two apart.",
+    Outcome.WEAKER: "Another effect explains more of the same residuals and was added in its place.",
+    Outcome.NOT_HELPFUL: "It fits one half of the tracks and does not help on the other.",
+    Outcome.IMPLAUSIBLE: "Its fitted strength is larger than real balls, rooms and cameras have.",
+    Outcome.MISLEADING: "It fits whole tracks better, but predictions from their beginnings get worse with it.",
+    Outcome.INSIGNIFICANT: "Its fitted coefficients may as well be zero.",
+    Outcome.CONTRADICTORY: "The two halves of the tracks want values of it that exclude each other.",
+    Outcome.SAME_PATTERN: "It explains the pattern of another effect, which explains more.",
+    Outcome.NOT_NEEDED: "Nothing in the tracks asks for it: what it would explain, chance explains as well.",
+    Outcome.INVISIBLE: "Nothing in these tracks depends on it, so they neither show it nor rule it out.",
+}
+"""What each outcome of a candidate means."""
+
+
+def term(name: str, shown: str = "") -> Html:
+    """A word with its explanation on hover; shown: another form of it."""
+    return explained(shown or name, TERMS[name])
+
+
+def outcome_badge(outcome: Outcome, colour: str) -> Html:
+    """The outcome of a candidate, with its explanation on hover; colour: a class of the page."""
+    return explained(outcome.value, OUTCOMES[outcome], f"badge {colour}")
+
+
+def glossary() -> Html:
+    """All words with their explanations."""
+    return meanings(TERMS | {f"“{outcome.value}”": meaning for outcome, meaning in OUTCOMES.items()})

@@ -1,0 +1,161 @@
+"""The first lines of a report: what was found, how sure that is, and what to do next, for any reader."""
+
+import math
+import re
+import shlex
+from collections.abc import Iterator, Sequence
+from typing import Final
+
+from ballfg.diagnosis.report.origin import Origin
+from ballfg.diagnosis.report.plain_effects import in_plain_words, plain_name
+from ballfg.diagnosis.report.wording import NONE, fixed, probability
+from ballfg.diagnosis.result import Diagnosis, Finding, Outcome, Verdict
+from ballfg.dynamics import EFFECTS
+from ballfg.estimation.noise.tracker import NUMBERS
+
+PLACES: Final = {
+    "flight": "in flight",
+    "contact": "at bounces",
+    "measurement": "in the measured positions",
+    "recording": "along the recording",
+    "label": "in the spin labels",
+    "time": "from sample to sample",
+}
+"""Begin of a test's words, and the same in a sentence."""
+SURE: Final = ((1e-6, "practically certain"), (1e-3, "very likely"), (0.05, "likely"))
+"""Words for the probability that a finding is none; the larger one of both halves of the tracks counts."""
+COUNTS: Final = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine")
+
+
+def headline(diagnosis: Diagnosis) -> str:
+    """The answer for a reader who knows neither the model nor the statistics, and what predictions gain."""
+    effects = [f for f in diagnosis.findings if f.name not in NUMBERS]
+    if not effects and diagnosis.verdict is not Verdict.UNEXPLAINED:
+        nothing = f"Nothing that the model lacks was found: its predictions are off by {_error(diagnosis)}"
+        return f"{nothing}, and what is left looks like noise."
+    if not effects:
+        said = (
+            f"Something is missing from the model that no known effect explains: {where(diagnosis.unexplained.where)}."
+        )
+    elif len(effects) == 1:
+        others = effects[0].indistinguishable_from
+        doubt = f" It may also be {_or(others)}: these tracks cannot tell." if others else ""
+        said = in_plain_words(effects[0]) + doubt
+    else:
+        count = COUNTS[len(effects)] if len(effects) < len(COUNTS) else f"{len(effects)}"
+        said = f"{count} effects are missing from the model."
+    return " ".join(part for part in (said, gain(diagnosis, _what(diagnosis, len(effects)))) if part)
+
+
+def further(diagnosis: Diagnosis) -> Iterator[str]:
+    """Sentences on what else was found: several effects one by one, the tracker, and what no effect explains."""
+    effects = [f for f in diagnosis.findings if f.name not in NUMBERS]
+    if len(effects) > 1:
+        yield from (in_plain_words(f) for f in effects)
+    yield from (in_plain_words(f) for f in diagnosis.findings if f.name in NUMBERS)
+    if effects and diagnosis.verdict is Verdict.UNEXPLAINED:
+        yield f"Something else is missing too, which no known effect explains: {where(diagnosis.unexplained.where)}."
+
+
+def gain(diagnosis: Diagnosis, what: str) -> str:
+    """By how much predictions gain, in one sentence; what: the change, as in `With it`."""
+    before, after = diagnosis.before.prediction_rmse_mm, diagnosis.after.prediction_rmse_mm
+    if not what or not math.isfinite(before + after):
+        return f"Predictions are off by {_error(diagnosis)}." if math.isfinite(after) else ""
+    if f"{before:.1f}" == f"{after:.1f}":
+        return f"{what}, predictions are off by as much as before, {after:.1f} mm."
+    return f"{what}, predictions are off by {after:.1f} instead of {before:.1f} mm."
+
+
+def certainty(diagnosis: Diagnosis) -> Iterator[str]:
+    """How sure the answer is: a line for each finding, or what the silence rests on."""
+    for finding in diagnosis.findings:
+        yield f"{_upper(plain_name(finding.name))}: {_sure(finding)}"
+    last = diagnosis.rounds[-1] if diagnosis.rounds else ()
+    unseen = sum(c.outcome is Outcome.INVISIBLE for c in last)
+    if diagnosis.verdict is Verdict.NOTHING and last:
+        yield (
+            f"{len(last) - unseen} effects were tested, one by one, and none of them stands out from chance. "
+            f"The predictions of {diagnosis.tracks_judged_on} tracks were compared with what was measured."
+        )
+    if unseen:
+        yield f"These tracks say nothing about {unseen} more effects, which may be there or not."
+    if diagnosis.verdict is Verdict.UNEXPLAINED and diagnosis.unexplained.tests:
+        least = min(test.p_value for test in diagnosis.unexplained.tests)
+        word = next((word for limit, word in SURE if least < limit), "possible")
+        yield f"That something is left: {word}. Chance makes such a pattern with probability {probability(least)}."
+
+
+def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
+    """What to do next: a sentence, and the command to type (empty where there is none)."""
+    dataset, model = shlex.quote(origin.datasets[0]), shlex.quote(f"{origin.out.rstrip('/')}/model.yaml")
+    changed = bool(diagnosis.findings) or diagnosis.unexplained.fallback is not None
+    if changed:
+        yield (
+            "Estimate the states with the corrected model:",
+            f"ballfg estimate {dataset} --model {model} --out states.csv",
+        )
+        yield (
+            "Predict with the corrected model:",
+            f"ballfg predict {dataset} --model {model} --observe 0.3 --out predictions.csv",
+        )
+    else:
+        given = f" --model {shlex.quote(origin.model)}" if origin.model else ""
+        yield (
+            "Keep the model that you have, or take the same one with its coefficients fitted to these tracks:",
+            f"ballfg estimate {dataset} --model {model} --out states.csv",
+        )
+        yield (
+            "To look again once there are more tracks:",
+            f"ballfg diagnose {dataset}{given} --out {shlex.quote(origin.out)}",
+        )
+    for finding in diagnosis.findings:
+        for name in (finding.name, *finding.indistinguishable_from) if finding.indistinguishable_from else ():
+            decide = finding.decide if name == finding.name else EFFECTS[name].decide if name in EFFECTS else ""
+            if decide:
+                yield f"To find out whether it is {plain_name(name)}: {decide}", ""
+    if diagnosis.verdict is Verdict.UNEXPLAINED:
+        yield (
+            f"Look for a cause of what is left ({where(diagnosis.unexplained.where)}): record tracks in which that "
+            "quantity varies more. If you have a suspicion, write it as an effect of your own and diagnose again:",
+            f"ballfg diagnose {dataset} --effects-file my_effects.py --out {shlex.quote(origin.out)}",
+        )
+
+
+def where(words: str) -> str:
+    """The place of a pattern, as the inside of a sentence: `in flight, acceleration along the flight is off ...`."""
+    kind, sign, rest = words.partition(": ")
+    known = PLACES.get(kind)
+    return f"{known}, {rest.rstrip('.')}" if sign and known else re.sub(r"^In ", "in ", words.rstrip("."))
+
+
+def _sure(finding: Finding) -> str:
+    worst = max(p for p in (finding.p_value, finding.held_out_p, 0.0) if math.isfinite(p))
+    word = next((word for limit, word in SURE if worst < limit), "possible")
+    sure = f"{word}. Chance makes a trace so strong with probability {probability(finding.p_value)}"
+    if math.isfinite(finding.held_out_p):
+        sure += f"; tracks that had no part in finding it agree (by chance {probability(finding.held_out_p)})"
+    if finding.indistinguishable_from:
+        sure += (
+            f". That something like it is there is sure; but it may be {_or(finding.indistinguishable_from)} as well"
+        )
+    return f"{sure}."
+
+
+def _what(diagnosis: Diagnosis, effects: int) -> str:
+    if effects:
+        return "With it" if effects == 1 else "With them"
+    return "With a description of the pattern that names no cause" if diagnosis.unexplained.fallback is not None else ""
+
+
+def _or(names: Sequence[str]) -> str:
+    return " or ".join(plain_name(name) for name in names)
+
+
+def _error(diagnosis: Diagnosis) -> str:
+    value = diagnosis.after.prediction_rmse_mm
+    return f"{fixed(value, 1)} mm" if math.isfinite(value) else NONE
+
+
+def _upper(words: str) -> str:
+    return words[:1].upper() + words[1:]

@@ -1,0 +1,142 @@
+"""What the numbers of a benchmark should be, and what follows from them, in sentences under each table."""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Final
+
+from ballfg.benchmarks.results import CURVE_MARK, Row
+
+RIGHT: Final = {"nees": 9.0, "nees_velocity": 3.0, "nis_median": 2.37, "nis_mean": 3.0}
+"""Value of a metric where stated covariances are right: degrees of freedom; of `nis_median` chi-square's median."""
+NEES_PLACE: Final = re.compile(r"nees_\w+")
+COVERAGE: Final = re.compile(r"(?:conformal_)?coverage_(\d+)(?:_\w+)?")
+NONE_WANTED: Final = ("not_converged", "failed", "places_outside_99")
+"""Counts that should be zero."""
+OF_CASE: Final = {
+    "naming, spin labels": "1",
+    "naming, no spin labels": "1",
+    "pairs": "1",
+    "silence": "0",
+    "unknown physics": "1",
+    "repair": "1",
+}
+"""What all shares and ratios of a table of `ballfg-bench loop` should be."""
+JUDGED: Final = ("nees", "coverage_90", "nis_median")
+"""Metrics that tell whether covariances are right, the sharpest first."""
+NEAR, NEAR_SHARE = 0.1, 0.03
+"""A NEES within 10 % of its target, and a coverage within three points of it, count as right."""
+ALIKE: Final = 1.01
+"""Ratio of errors up to which methods count as equally good."""
+COMPARED: Final = {
+    "velocity_rmse": "velocity",
+    "position_rmse": "position",
+    "spin_rmse": "spin",
+    "prediction_rmse_median": "prediction",
+    "rest_rmse": "prediction of the unobserved part",
+    "track_rmse": "whole track",
+    "apex_1_ahead_mean": "apex after the first bounce",
+}
+"""Errors whose best method is named, and their words."""
+
+
+def should_be(case: str, metric: str, unit: str) -> str:
+    """The right value of a metric in words; empty where less (or more) is simply better."""
+    if case in OF_CASE:
+        return OF_CASE[case]
+    if metric in NONE_WANTED:
+        return "0"
+    value = target(metric, unit)
+    return "" if value is None else f"{value:g}"
+
+
+def target(metric: str, unit: str) -> float | None:
+    """The value that a metric has where covariances are right; None for other metrics."""
+    if metric in RIGHT:
+        return RIGHT[metric]
+    if NEES_PLACE.fullmatch(metric):
+        return RIGHT["nees"]
+    level = COVERAGE.fullmatch(metric)
+    return None if level is None else float(level[1]) / (1.0 if unit == "%" else 100.0)
+
+
+def conclusions(case: str, rows: Sequence[Row]) -> list[str]:
+    """What follows from the rows of one case: the best method of each error, and whose covariances are right."""
+    shown = [row for row in rows if CURVE_MARK not in row.metric and row.value is not None]
+    by_metric: dict[str, dict[str, Row]] = {}
+    for row in shown:
+        by_metric.setdefault(row.metric, {})[row.method] = row
+    if case in OF_CASE:
+        return list(_of_loop(case, by_metric))
+    compared = [(words, by_metric.get(metric, {})) for metric, words in COMPARED.items()]
+    found = [said for words, methods in compared if len(methods) > 1 and (said := _best(words, methods))]
+    judged = next((by_metric[metric] for metric in JUDGED if metric in by_metric), None)
+    return [*found, *(_covariances(judged) if judged else ())]
+
+
+def _best(words: str, methods: Mapping[str, Row]) -> str:
+    """The methods with the smallest error, the next one, and whether chance may have ordered them.
+
+    Returns: a sentence; empty where the best error is zero: the quantity was given and not estimated.
+    """
+    ordered = sorted(methods.items(), key=lambda item: _value(item[1]))
+    least, unit = _value(ordered[0][1]), "" if ordered[0][1].unit == "1" else f" {ordered[0][1].unit}"
+    if least <= 0.0:
+        return ""
+    best = [(name, row) for name, row in ordered if _value(row) <= ALIKE * least]
+    names = " and ".join(part for part in (", ".join(n for n, _ in best[:-1]), best[-1][0]) if part)
+    said = f"{words}: {names} {'has' if len(best) == 1 else 'have'} the smallest error, {least:.3g}{unit}"
+    if len(best) == len(ordered):
+        return f"{said}: all methods are equally good."
+    following, second = ordered[len(best)]
+    more = _value(second)
+    overlap = any(row.high is not None and second.low is not None and row.high >= second.low for _, row in best)
+    doubt = "; their intervals overlap, so that the order may be chance" if overlap else ""
+    return f"{said}; next is {following} with {more:.3g} ({100 * (more / least - 1):.0f} % more){doubt}."
+
+
+def _covariances(methods: Mapping[str, Row]) -> Iterator[str]:
+    """Methods whose stated uncertainty is right, too small, too large, by one metric."""
+    metric, unit = next((row.metric, row.unit) for row in methods.values())
+    goal = target(metric, unit)
+    if goal is None:
+        return
+    sorts: dict[str, list[str]] = {"right": [], "too small (more certain than it should be)": [], "too large": []}
+    right, small, large = sorts
+    for method, row in methods.items():
+        value, share = _value(row), metric.startswith("coverage")
+        inside = row.low is not None and row.high is not None and row.low <= goal <= row.high
+        near = abs(value - goal) <= (NEAR_SHARE * (100.0 if unit == "%" else 1.0) if share else NEAR * goal)
+        sort = right if inside or near else small if (value < goal) == share else large
+        sorts[sort].append(f"{method} ({value:.3g})")
+    said = "; ".join(f"{sort}: {', '.join(names)}" for sort, names in sorts.items() if names)
+    yield f"stated uncertainty, by {metric} (should be {goal:g}) - {said}."
+
+
+def _of_loop(case: str, by_metric: Mapping[str, Mapping[str, Row]]) -> Iterator[str]:
+    """The line over all data of a table of `ballfg-bench loop` in words."""
+    total = by_metric.get("all", {})
+    values = {name: _value(row) for name, row in total.items()}
+    number = max((row.n for row in total.values()), default=0)
+    if not values:
+        return
+    if case.startswith("naming"):
+        shares = ", ".join(f"{100 * v:.0f} % at {name}" for name, v in values.items() if name.endswith("typical"))
+        yield f"planted effects named right: {shares} size."
+    elif case == "silence" and {"effect named", "any alarm"} <= values.keys():
+        named, alarm = 100 * values["effect named"], 100 * values["any alarm"]
+        yield f"of {number} datasets without an effect {named:.1f} % got a wrong name, {alarm:.1f} % any alarm."
+    elif case == "repair" and {"after / true", "before / true"} <= values.keys():
+        yield (
+            f"predictions with the corrected model are {values['after / true']:.2f} times as far off as with the true "
+            f"one; with the declared model they were {values['before / true']:.2f} times as far off."
+        )
+    elif case == "pairs" and {"first", "both"} <= values.keys():
+        first, both = 100 * values["first"], 100 * values["both"]
+        yield f"{both:.0f} % of {number} pairs of effects were named completely; {first:.0f} % got a right first name."
+    elif case == "unknown physics" and {"unexplained", "reduced"} <= values.keys():
+        called, reduced = 100 * values["unexplained"], 100 * values["reduced"]
+        yield f"physics of no catalogue: {called:.0f} % called unexplained; errors reduced in {reduced:.0f} %."
+
+
+def _value(row: Row) -> float:
+    return float("nan") if row.value is None else row.value

@@ -1,0 +1,163 @@
+"""`training.html`: a training as a page for people. Whether it helped comes first, then the grounds."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ballfg.arrays import Array
+from ballfg.files.page_parts import Html, explained, items, meanings, picture, section, table, tag, whole_page
+from ballfg.learning.run.metrics import Epoch
+from ballfg.learning.trainee import Learned, PredictedShot
+
+MEASURED, PREDICTED = "#8c8c8c", "#0072b2"
+TERMS = {
+    "epoch": "One pass over all training tracks. Epoch 0 is the model before the first step.",
+    "validation": "Tracks that the training never learns from. Their errors show what the model does for new tracks.",
+    "RMSE": "Root mean square distance between predicted and measured positions.",
+    "loss": "The number that the training makes small. Its scale depends on the config; only its course matters.",
+    "learning rate": "The size of the steps (`optimizer.learning_rate` in the config).",
+}
+"""Words of the page with their meanings."""
+
+
+def improved(epochs: Sequence[Epoch], best_epoch: int) -> bool | None:
+    """Whether the best model predicts validation tracks better than the one before the first step.
+
+    Returns: None where that cannot be said: no step was taken, or no validation track was judged.
+    """
+    judged = [e for e in epochs if e.validation_rmse is not None]
+    if not judged or judged[0].epoch != 0 or len(epochs) < 2:
+        return None
+    return best_epoch > 0
+
+
+def verdict(epochs: Sequence[Epoch], best_epoch: int) -> str:
+    """Whether the training helped, in one sentence."""
+    better = improved(epochs, best_epoch)
+    if better is None:
+        return "Whether the training helped is not known: no validation track was judged before and after it."
+    errors = {e.epoch: 1e3 * e.validation_rmse for e in epochs if e.validation_rmse is not None}
+    if better:
+        return (
+            f"The training helped: on validation tracks, predictions are off by {errors[best_epoch]:.1f} mm in place "
+            f"of {errors[0]:.1f} mm before the first step."
+        )
+    later = [error for number, error in errors.items() if number]
+    least = f"After it the best was {min(later):.1f} mm." if later else "None of the later models could be judged."
+    return (
+        f"The training did not help: the model before the first step predicts validation tracks best, to "
+        f"{errors[0]:.1f} mm. {least} The model file holds the model before the first step."
+    )
+
+
+def page(
+    title: str,
+    epochs: Sequence[Epoch],
+    best_epoch: int,
+    curves: Figure,
+    learned: Sequence[Learned],
+    shot: PredictedShot | None,
+    next_command: str,
+    packages: str,
+) -> str:
+    """The whole page.
+
+    Args:
+        title: kind of the model and number of its tracks.
+        epochs: all that were run.
+        best_epoch: whose weights were written.
+        curves: loss and errors over the epochs.
+        learned: coefficients and noise before and after.
+        shot: a validation track predicted by the written model; None where there is none.
+        next_command: what to type next; empty where no command takes the model.
+        packages: their versions in words.
+    """
+    return whole_page(
+        f"training: {title}",
+        tag("header", tag("p", title), tag("h1", verdict(epochs, best_epoch))),
+        section("What to do next", *_next(improved(epochs, best_epoch), next_command)),
+        _numbers(epochs, best_epoch),
+        section("The course of the training", picture(curves, "Loss and errors after each epoch.")),
+        _shot(shot),
+        _learned(learned),
+        section("Where this page comes from", tag("p", f"Made with {packages}. The config is in config.yaml.")),
+        section("What the words mean", meanings(TERMS)),
+    )
+
+
+def _next(better: bool | None, command: str) -> list[Html]:
+    parts = []
+    if better is False:
+        lines = (
+            "Lower optimizer.learning_rate by a factor of 3 to 10: errors that rise from the first epoch on mean steps "
+            "that are too large.",
+            "Train longer (optimizer.epochs) if the errors still fell at the end.",
+            "Take more tracks if the error of the training tracks falls and that of the validation tracks rises.",
+        )
+        parts += [items(lines)]
+    if command:
+        parts += [tag("p", "Use the model that was written:"), tag("pre", tag("code", command))]
+    return parts
+
+
+def _numbers(epochs: Sequence[Epoch], best_epoch: int) -> Html:
+    chosen = dict.fromkeys((epochs[0].epoch, best_epoch, epochs[-1].epoch))
+    names = {epochs[-1].epoch: "last", best_epoch: "best, written", epochs[0].epoch: "before the first step"}
+    by_number = {e.epoch: e for e in epochs}
+    rows = [
+        (f"{n}: {names[n]}", _mm(by_number[n].train_rmse), _mm(by_number[n].validation_rmse), _plain(by_number[n].loss))
+        for n in chosen
+        if n in by_number
+    ]
+    head = (
+        explained("epoch", TERMS["epoch"]),
+        explained("RMSE, training tracks", TERMS["RMSE"]),
+        explained("RMSE, validation tracks", TERMS["validation"]),
+        explained("loss", TERMS["loss"]),
+    )
+    return section("How good the model is", table(head, rows))
+
+
+def _shot(shot: PredictedShot | None) -> Html:
+    if shot is None:
+        return Html()
+    ahead = shot.times > 0.0
+    error = np.linalg.norm(shot.predicted - shot.measured, axis=-1)
+    off = 1e3 * float(np.sqrt((error[ahead] ** 2).mean())) if ahead.any() else float("nan")
+    caption = (
+        f"Validation track {shot.name}, whose error is the median: after the observed part (left of the dashed line) "
+        f"the prediction is off by {off:.1f} mm (RMSE)."
+    )
+    return section("Predicted against measured", picture(_drawn(shot, error), caption))
+
+
+def _drawn(shot: PredictedShot, error: Array) -> Figure:
+    figure = Figure(figsize=(7.4, 8.0), layout="constrained")
+    panels = figure.subplots(4, 1, sharex=True)
+    for i, axes in enumerate(panels[:3]):
+        axes.plot(
+            shot.times, shot.measured[:, i], "o", color=MEASURED, markersize=4, fillstyle="none", label="measured"
+        )
+        axes.plot(shot.times, shot.predicted[:, i], "-", color=PREDICTED, label="model")
+        axes.set_ylabel(f"{'xyz'[i]}, m")
+    panels[0].legend(fontsize="small")
+    panels[3].plot(shot.times, 1e3 * error, ".-", color=PREDICTED)
+    panels[3].set(ylabel="error, mm", xlabel="time since the last observed sample, s", ylim=(0.0, None))
+    for axes in panels:
+        axes.axvline(0.0, color="black", linestyle="--", linewidth=0.8)
+        axes.grid(visible=True, alpha=0.25)
+    return figure
+
+
+def _learned(learned: Sequence[Learned]) -> Html:
+    rows = [(one.name, f"{one.before:.4g}", f"{one.after:.4g}", one.unit, one.meaning) for one in learned]
+    return section("What was learned of noise, spin and coefficients", table(("", "before", "after", "unit", ""), rows))
+
+
+def _mm(value: float | None) -> str:
+    return "–" if value is None else f"{1e3 * value:.1f} mm"
+
+
+def _plain(value: float | None) -> str:
+    return "–" if value is None else f"{value:.4g}"
