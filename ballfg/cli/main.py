@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from ballfg.cli.balls import balls
 from ballfg.cli.calibrate_cameras import calibrate_cameras
 from ballfg.cli.compile import compile_ahead
 from ballfg.cli.diagnose import diagnose
@@ -45,6 +46,7 @@ app.command()(render)
 app.command()(track)
 app.command(name="calibrate-cameras")(calibrate_cameras)
 app.command(name="compile")(compile_ahead)
+app.command()(balls)
 app.command()(info)
 
 
