@@ -13,6 +13,7 @@ import typer
 from ballfg.cli.balls import balls
 from ballfg.cli.calibrate_cameras import calibrate_cameras
 from ballfg.cli.compile import compile_ahead
+from ballfg.cli.design import design
 from ballfg.cli.diagnose import diagnose
 from ballfg.cli.errors import guarded
 from ballfg.cli.estimate import estimate
@@ -40,6 +41,7 @@ app.command()(estimate)
 app.command()(predict)
 app.command()(live)
 app.command()(diagnose)
+app.command()(design)
 app.command()(noise)
 app.command()(simulate)
 app.command()(render)

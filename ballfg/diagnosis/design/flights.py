@@ -10,8 +10,9 @@ from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, MOST_CONTACTS, Stretch
 from ballfg.dynamics import BallModel, Surfaces, rollout
 from ballfg.state import SPIN, VZ
 
-MARGIN = 0.05
-"""Share of the measured extent by which a flight may leave it on each side."""
+MARGIN = 0.25
+"""Share of the measured extent, along x and y, by which a flight may leave it on each side. Few tracks do not show all
+that the cameras see."""
 LEAST_KICK = 0.3
 """m/s. A contact turns the vertical speed by more; a ball that rises slower than half of it comes to rest soon."""
 
@@ -21,7 +22,7 @@ class View:
     """What the cameras see of a flight.
 
     Attributes:
-        low, high: (3,) m, corners of the box in which the ball is seen.
+        low, high: (3,) m, corners of the box in which the ball is seen. It has no lid: lobs are seen too.
         duration: s, longest flight.
         interval: s between samples.
         sigmas: (3,) m, stated noise of a coordinate.
@@ -41,7 +42,8 @@ class View:
         used = stretches.used.numpy()
         positions, sigmas = stretches.positions.numpy()[used], stretches.sigmas.numpy()[used]
         low, high = positions.min(axis=0), positions.max(axis=0)
-        margin = MARGIN * (high - low)
+        margin = MARGIN * (high - low) * (1.0, 1.0, 0.0)
+        margin[2], high[2] = 0.01 * (high[2] - low[2]), np.inf
         steps = np.diff(stretches.times.numpy(), axis=1)[used[:, 1:]]
         first = np.unique(stretches.track, return_index=True)[1]
         return cls(
