@@ -116,15 +116,14 @@ def design_shots(
 def check_labels(dataset: Dataset, names: Sequence[str]) -> None:
     """Refuse settings that the tracks do not have as labels.
 
-    Raises: ValueError: a label that no track has as a number.
+    Raises: ValueError: a name that no column of labels has.
     """
-    tracks = list(dataset)
     for name in names:
-        if not any(isinstance(track.labels.get(name), float | int) for track in tracks):
-            present = sorted({key for t in tracks for key, value in t.labels.items() if isinstance(value, float | int)})
+        if name not in dataset.label_names:
+            present = ", ".join(dataset.label_names) or "none"
             raise ValueError(
-                f"candidates must be numeric columns of the dataset's labels.csv; '{name}' is none, there "
-                f"{'are ' + ', '.join(present) if present else 'are no labels'}.{did_you_mean(name, present)}"
+                f"candidates must be columns of the dataset's labels.csv; '{name}' is none of them, there are: {present}."
+                f"{did_you_mean(name, dataset.label_names)} Name those that the launcher was set to."
             )
 
 
