@@ -1,9 +1,9 @@
 """The choice of shots: those that together tell most of what is asked.
 
 The measure of a side of r strengths is log det C / 2 r, with C their covariance when all else is unknown: the log of
-its error bar, averaged over its directions. That is D_s-optimality, and c-optimality for a single coefficient. The measures
-of all sides are averaged. Shots are chosen greedily, then exchanged one by one while that lowers the measure, then put
-in the order in which they help most.
+its error bar, averaged over its directions. That is D_s-optimality, and c-optimality for a single coefficient. The
+measures of all sides are averaged. Shots are chosen greedily, then exchanged one by one while that lowers the measure,
+then put in the order in which they help most.
 """
 
 from collections.abc import Callable, Sequence

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from ballfg.arrays import Array, Mask
+from ballfg.arrays import Array, Index, Mask
 from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, MOST_CONTACTS, Stretches
 from ballfg.dynamics import BallModel, Surfaces, rollout
 from ballfg.state import SPIN, VZ
@@ -100,7 +100,7 @@ def planned_flights(
     return Stretches(names, np.arange(n), settings, **tensors).take(kept), kept
 
 
-def _seen(path: Array, gaps: Array, view: View) -> tuple[int, Array]:
+def _seen(path: Array, gaps: Array, view: View) -> tuple[int, Index]:
     """How many samples of a path (k, 9) are seen, and the samples (c,) after which contacts follow."""
     inside = ((path[:, :3] >= view.low) & (path[:, :3] <= view.high)).all(axis=1)
     end = len(path) if inside.all() else int(np.argmin(inside))

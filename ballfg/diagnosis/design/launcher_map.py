@@ -86,7 +86,9 @@ def learn_launcher(names: Sequence[str], settings: Array, states: Array) -> Laun
     design, launches = np.column_stack((np.ones(count), settings)), _launches(states)
     weights, *_ = np.linalg.lstsq(design, launches, rcond=None)
     scatter = np.sqrt(((launches - design @ weights) ** 2).sum(axis=0) / (count - design.shape[1]))
-    return LauncherMap(tuple(names), weights, scatter, settings.min(axis=0), settings.max(axis=0))
+    return LauncherMap(
+        tuple(names), np.asarray(weights, dtype=np.float64), scatter, settings.min(axis=0), settings.max(axis=0)
+    )
 
 
 def _launches(states: Array) -> Array:

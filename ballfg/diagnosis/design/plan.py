@@ -122,8 +122,8 @@ def check_labels(dataset: Dataset, names: Sequence[str]) -> None:
         if name not in dataset.label_names:
             present = ", ".join(dataset.label_names) or "none"
             raise ValueError(
-                f"candidates must be columns of the dataset's labels.csv; '{name}' is none of them, there are: {present}."
-                f"{did_you_mean(name, dataset.label_names)} Name those that the launcher was set to."
+                f"candidates must be columns of the dataset's labels.csv; '{name}' is none of them, there are: "
+                f"{present}.{did_you_mean(name, dataset.label_names)} Name those that the launcher was set to."
             )
 
 

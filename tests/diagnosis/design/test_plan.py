@@ -93,7 +93,7 @@ def test_a_coefficient_shrinks(tmp_path: Path) -> None:
     ):
         with pytest.raises(ValueError, match=message):
             hypothesis_of(fit, text)
-    with pytest.raises(ValueError, match="two different effects; got wind,wind.x"):
+    with pytest.raises(ValueError, match=r"two different effects; got wind,wind\.x"):
         separating(fit, [("wind", "wind.x")])
     with pytest.raises(ValueError, match="either between or shrink"):
         design_shots(dataset, model, LEVELS)
