@@ -10,14 +10,13 @@ from typing import Annotated
 
 import typer
 
-from ballfg.cli.balls import balls
 from ballfg.cli.calibrate_cameras import calibrate_cameras
 from ballfg.cli.compile import compile_ahead
 from ballfg.cli.design import design
 from ballfg.cli.diagnose import diagnose
 from ballfg.cli.errors import guarded
 from ballfg.cli.estimate import estimate
-from ballfg.cli.info import info
+from ballfg.cli.info import balls, info
 from ballfg.cli.live import live
 from ballfg.cli.noise import noise
 from ballfg.cli.predict import predict

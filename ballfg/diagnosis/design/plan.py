@@ -33,9 +33,9 @@ class ShotPlan:
         sides: what is to be told apart or shrunk, by effect and coefficient, for instance (("wind.x",), ("drag.k",)).
         names: of the p coefficients of all sides, by effect and coefficient.
         units: of the coefficients.
-        sigmas: (k + 1, p) standard deviation of each, all else unknown, before the first shot and after each.
-        error: (k + 1,) mean of the error bars of the sides, as a share of how strong the effects may be.
-        random: (k + 1,) the same after as many random shots.
+        sigmas: (k + 1, p) in `units`, standard deviation of each, all else unknown, before the shots and after each.
+        error: (k + 1,) dimensionless, mean error bar of the sides over the priors of the fit.
+        random: (k + 1,) dimensionless, the same after as many random shots.
         as_random: number of random shots that would bring as much as all k.
         candidates: number of candidates that could be judged.
         remarks: sentences on candidates that were left out and on how well the launcher is known.
