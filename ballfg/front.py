@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ballfg.diagnosis import Diagnosis
 from ballfg.diagnosis import diagnose as diagnose_dataset
-from ballfg.dynamics import BallModel, Surfaces, load_model, nominal_model
+from ballfg.dynamics import BallModel, Surfaces, inertia_factor, load_model, nominal_model
 from ballfg.estimation import (
     ConformalScales,
     Estimate,
@@ -230,7 +230,8 @@ def _model(model: Model, source: Tracks | None) -> BallModel:
         return nominal_model(ball)
     if not isinstance(model, str | PathLike):
         return model
-    return load_model(Path(model), radius=ball.radius, room=None if source is None else source.info.name)
+    room = None if source is None else source.info.name
+    return load_model(Path(model), radius=ball.radius, inertia_factor=inertia_factor(ball), room=room)
 
 
 def _opened(measured: object) -> Track | Tracks:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from ballfg.dynamics import AnalyticModel, load_model, nominal_model
+from ballfg.dynamics import AnalyticModel, inertia_factor, load_model, nominal_model
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation import Settings, dataset_settings, dataset_surfaces, table_note, with_readings
 from ballfg.estimation.launcher import Launcher
@@ -79,7 +79,11 @@ def analytic_model(path: str | None, ball: Ball) -> AnalyticModel:
 
     Raises: ValueError: if the file's model has a learned part, or coefficients that differ between tracks.
     """
-    model = nominal_model(ball) if path is None else load_model(path, radius=ball.radius)
+    model = (
+        nominal_model(ball)
+        if path is None
+        else load_model(path, radius=ball.radius, inertia_factor=inertia_factor(ball))
+    )
     if not isinstance(model, AnalyticModel):
         raise ValueError(f"model must be analytic; {path} has a learned part. Give its base, or leave it out.")
     if model.variations:

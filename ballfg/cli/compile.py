@@ -32,10 +32,10 @@ def compile_ahead(
     """
     from ballfg.dynamics import load_model, nominal_model
     from ballfg.dynamics.compiled.build import cache_folder
-    from ballfg.dynamics.nominal import KNOWN_BALLS
+    from ballfg.dynamics.known_balls import KNOWN_BALLS
 
     inputs.know_effects(effects_file)
-    models: dict[str, BallModel] = {name: nominal_model(ball) for name, ball in KNOWN_BALLS.items()}
+    models: dict[str, BallModel] = {name: nominal_model(name) for name in KNOWN_BALLS}
     models |= {str(path): load_model(path) for path in model or ()}
     parts = [part for one in models.values() for part in _parts(one)]
     for _ in progress(_done(parts), len(parts), "parts compiled"):

@@ -29,6 +29,7 @@ def estimate(
     out: inputs.OutTable,
     method: inputs.MethodName = "smoother",
     model: inputs.ModelFile = None,
+    ball: inputs.BallName = None,
     source: Annotated[
         inputs.Source | None,
         typer.Option(
@@ -64,7 +65,7 @@ def estimate(
         check_device(method, device)
         positions = has_positions(dataset) if source is None else source is inputs.Source.POSITIONS
         open_dataset = inputs.open_inputs if positions else inputs.open_sighted
-        opened = open_dataset(dataset, model, effects_file)
+        opened = open_dataset(dataset, model, effects_file, ball=ball)
         count = len(opened.dataset)
         work = partial(_estimated, opened.model)
         results = map_estimates(work, opened.estimator(method), opened.dataset, count, workers, device)

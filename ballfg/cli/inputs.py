@@ -63,6 +63,11 @@ MethodName = Annotated[
 ModelFile = Annotated[
     Path | None, typer.Option("--model", help="Model file; by default the nominal model of the ball.")
 ]
+BallName = Annotated[
+    str | None,
+    typer.Option("--ball", help="Known ball, by its name in ballfg balls; by default the one that the dataset states."),
+]
+"""The option of commands that read a dataset. The dataset's own ball counts; another one is refused."""
 CORES = usable_cores()
 Jobs = Annotated[int, typer.Option("--jobs", min=1, help="Number of processes.", show_default="one per core")]
 Cluster = Annotated[
@@ -124,42 +129,69 @@ def know_effects(files: Iterable[Path] | None) -> None:
 
 
 def open_inputs(
-    dataset: Path, model: Path | None, effects_files: Iterable[Path] | None = None, observed: float = math.inf
+    dataset: Path,
+    model: Path | None,
+    effects_files: Iterable[Path] | None = None,
+    observed: float = math.inf,
+    ball: str | None = None,
 ) -> Inputs[Dataset]:
     """Open and check everything before any work starts; what was repaired is said on stderr.
 
-    Args: observed: s from the start of each track from which the noise may be learned, where nobody states it.
+    Args:
+        observed: s from the start of each track from which the noise may be learned, where nobody states it.
+        ball: name of the known ball that the dataset has to be of; None: of any.
     """
     from ballfg.estimation import with_readings
     from ballfg.tracks import read_dataset
 
     know_effects(effects_files)
-    return _inputs(with_readings(read_dataset(dataset)), model, observed)
+    return _inputs(with_readings(read_dataset(dataset)), model, observed, ball)
 
 
 def open_sighted(
-    dataset: Path, model: Path | None, effects_files: Iterable[Path] | None = None
+    dataset: Path, model: Path | None, effects_files: Iterable[Path] | None = None, ball: str | None = None
 ) -> Inputs[SightedDataset]:
     """`open_inputs` for what cameras saw."""
     from ballfg.estimation import read_sighted
 
     know_effects(effects_files)
-    return _inputs(read_sighted(dataset), model)
+    return _inputs(read_sighted(dataset), model, ball=ball)
 
 
-def _inputs(data: Opened, model: Path | None, observed: float = math.inf) -> Inputs[Opened]:
+def _inputs(data: Opened, model: Path | None, observed: float = math.inf, ball: str | None = None) -> Inputs[Opened]:
     from ballfg.estimation import dataset_surfaces
 
-    return Inputs(data, open_model(data, model), dataset_surfaces(data), observed)
+    return Inputs(data, open_model(data, model, ball), dataset_surfaces(data), observed)
 
 
-def open_model(data: Dataset | SightedDataset, model: Path | None) -> BallModel:
-    """The model of a file, or the nominal one; what the user should know of data and model is said on stderr."""
+def check_ball(data: Dataset | SightedDataset, name: str) -> None:
+    """A dataset states its ball; a name can only agree with it.
+
+    Raises: ValueError: if the name is not known, or the dataset's radius and mass are not that ball's.
+    """
+    from ballfg.dynamics import KNOWN_BALLS, known_ball, known_name
+
+    wanted, own = known_ball(name), data.ball
+    if known_name(own) != wanted:
+        ball = KNOWN_BALLS[wanted].ball
+        raise ValueError(
+            f"--ball {name} has a radius of {ball.radius:g} m and {ball.mass:g} kg; {data.path} states "
+            f"{own.radius:g} m and {own.mass:g} kg. Leave --ball out, or correct ball in dataset.yaml."
+        )
+
+
+def open_model(data: Dataset | SightedDataset, model: Path | None, ball: str | None = None) -> BallModel:
+    """The model of a file, or the nominal one; what the user should know of data and model is said on stderr.
+
+    Args: ball: name of the known ball that the data have to be of; None: of any.
+    """
     import torch
 
-    from ballfg.dynamics import load_model, nominal_model, nominal_note
+    from ballfg.dynamics import inertia_factor, load_model, nominal_model, nominal_note
     from ballfg.estimation import table_note, unused_model
 
+    if ball is not None:
+        check_ball(data, ball)
     torch.set_num_threads(1)  # the batches are small: threads cost more than they bring
     notes = [*data.notes, *filter(None, [table_note(data)])]
     if model is None:
@@ -167,7 +199,8 @@ def open_model(data: Dataset | SightedDataset, model: Path | None) -> BallModel:
     print_notes(notes)
     if model is None:
         return nominal_model(data.ball)
-    return load_model(model, radius=data.ball.radius, room=data.info.name)
+    inertia = inertia_factor(data.ball)
+    return load_model(model, radius=data.ball.radius, inertia_factor=inertia, room=data.info.name)
 
 
 def check_out(out: Path, dataset: Path) -> None:

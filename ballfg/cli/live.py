@@ -27,6 +27,9 @@ BAG_ENDINGS = (".mcap", ".db3")
 
 def live(
     model: inputs.ModelFile = None,
+    ball: Annotated[
+        str | None, typer.Option(help="Known ball, by its name in ballfg balls.", show_default="table_tennis")
+    ] = None,
     replay: Annotated[
         Path | None, typer.Option(help="Dataset, or rosbag2 / MCAP, to replay in place of standard input.")
     ] = None,
@@ -79,7 +82,7 @@ def live(
     inputs.know_effects(effects_file)
     bag = replay is not None and _is_bag(replay)
     data = _dataset(like if bag or replay is None else replay)
-    tracker = Tracker(*_scene(data, model, table, noise), lag=lag)
+    tracker = Tracker(*_scene(data, model, ball, table, noise), lag=lag)
     with _output(out) as write, _watchers(out, viewer, wanted.horizon) as watchers:
         source = _source(replay, bag, listen, speed, topic, data)
         warm_up(tracker, wanted)
@@ -106,24 +109,26 @@ def _dataset(folder: Path | None) -> Dataset | None:
 
 
 def _scene(
-    data: Dataset | None, model: Path | None, table: float | None, noise: float | None
+    data: Dataset | None, model: Path | None, named: str | None, table: float | None, noise: float | None
 ) -> tuple[BallModel, Surfaces, Settings]:
     """Ball, surfaces and noise: the dataset's, or as the options say."""
     from dataclasses import replace
 
     from ballfg.checks import check_number
-    from ballfg.dynamics import Surfaces, load_model, nominal_model
+    from ballfg.dynamics import KNOWN_BALLS, Surfaces, known_ball, load_model, nominal_model
     from ballfg.estimation import dataset_settings, dataset_surfaces
-    from ballfg.tracks import TABLE_TENNIS
 
     if data is not None:
-        ball = inputs.open_model(data, model)
+        ball = inputs.open_model(data, model, named)
         surfaces, settings = dataset_surfaces(data), dataset_settings(data, ball)
     else:
         import torch
 
         torch.set_num_threads(1)
-        ball = nominal_model(TABLE_TENNIS) if model is None else load_model(model)
+        name = known_ball(named or "table_tennis")
+        known = KNOWN_BALLS[name]
+        inertia = known.inertia_factor
+        ball = load_model(model, radius=known.ball.radius, inertia_factor=inertia) if model else nominal_model(name)
         surfaces, settings = Surfaces.table_tennis(0.0), _settings(ball)
     if table is not None:
         surfaces = Surfaces.table_tennis(check_number("table", table, "m", limit=50.0, instead="mm"))

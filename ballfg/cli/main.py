@@ -11,11 +11,12 @@ import typer
 
 from ballfg.cli.calibrate_cameras import calibrate_cameras
 from ballfg.cli.compile import compile_ahead
+from ballfg.cli.design import design
 from ballfg.cli.diagnose import diagnose
 from ballfg.cli.estimate import estimate
 from ballfg.cli.example import example
 from ballfg.cli.import_ import import_
-from ballfg.cli.info import info
+from ballfg.cli.info import balls, info
 from ballfg.cli.live import live
 from ballfg.cli.noise import noise
 from ballfg.cli.predict import predict
@@ -43,6 +44,7 @@ app.command()(predict)
 app.command()(live)
 app.command()(diagnose)
 app.command()(show)
+app.command()(design)
 app.command()(noise)
 app.command()(example)
 app.command()(simulate)
@@ -50,6 +52,7 @@ app.command()(render)
 app.command()(track)
 app.command(name="calibrate-cameras")(calibrate_cameras)
 app.command(name="compile")(compile_ahead)
+app.command()(balls)
 app.command()(info)
 
 

@@ -24,6 +24,7 @@ def predict(
     out: inputs.OutTable,
     method: inputs.MethodName = "smoother",
     model: inputs.ModelFile = None,
+    ball: inputs.BallName = None,
     effects_file: inputs.EffectsFiles = None,
     conformal: Annotated[
         Path | None,
@@ -61,7 +62,7 @@ def predict(
             if conformal is None:
                 raise ValueError("save_conformal must come with --conformal, whose scales it keeps. Add --conformal.")
         check_device(method, device)
-        opened = inputs.open_inputs(dataset, model, effects_file, observe)
+        opened = inputs.open_inputs(dataset, model, effects_file, observe, ball)
         count = len(opened.dataset)
         estimator = opened.estimator(method)
         scales = None

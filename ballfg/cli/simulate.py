@@ -37,7 +37,9 @@ def simulate(
     spin_process_noise: Annotated[float, _noise(help="Density of a white angular acceleration, rad/s^1.5.")] = 0.0,
     contact_noise: Annotated[float, _noise(help="Random kick to the velocity after each bounce, m/s.")] = 0.0,
     contact_spin_noise: Annotated[float, _noise(help="Random kick to the spin after each bounce, rad/s.")] = 0.0,
-    ball: Annotated[str, _ball_option(help="Ball: table-tennis, tennis or a ball file (YAML).")] = "table-tennis",
+    ball: Annotated[
+        str, _ball_option(help="Known ball, by its name in ballfg balls, or a ball file (YAML).")
+    ] = "table-tennis",
     model: Annotated[Path | None, _ball_option(help="Model file that replaces the ball's own model.")] = None,
     settings: Annotated[str, _ball_option(help="Launcher levels, as topspin=-3,sidespin=-5..5,speed=9.")] = "",
     effect: Annotated[

@@ -1,3 +1,5 @@
+from .design.plan import ShotPlan as ShotPlan
+from .design.plan import design_shots as design_shots
 from .diagnosis import diagnose as diagnose
 from .fit.fit import fit_model as fit_model
 from .fit.holdout import hold_out as hold_out

@@ -11,6 +11,9 @@ from .effect import vector as vector
 from .effects.registry import EFFECTS as EFFECTS
 from .effects.registry import load_effects as load_effects
 from .effects.registry import register as register
+from .known_balls import KNOWN_BALLS as KNOWN_BALLS
+from .known_balls import KnownBall as KnownBall
+from .known_balls import known_ball as known_ball
 from .measurement import MeasurementEffect as MeasurementEffect
 from .model import BallModel as BallModel
 from .model import substitute as substitute
@@ -29,6 +32,8 @@ from .networks.architecture import Architecture as Architecture
 from .networks.learned import LearnedModel as LearnedModel
 from .networks.learned import build as build
 from .networks.spin_embedding import SpinEmbedding as SpinEmbedding
+from .nominal import inertia_factor as inertia_factor
+from .nominal import known_name as known_name
 from .nominal import nominal_model as nominal_model
 from .nominal import nominal_note as nominal_note
 from .surfaces import Surfaces as Surfaces

@@ -9,13 +9,11 @@ import yaml
 
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.effect import Effect
+from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
+from ballfg.dynamics.model import THIN_SHELL
 from ballfg.dynamics.model_file import model_from_dict
-from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball
+from ballfg.tracks import TABLE_TENNIS, Ball
 
-KNOWN_BALLS: Final[Mapping[str, Ball]] = {"table_tennis": TABLE_TENNIS, "tennis": TENNIS}
-"""The balls whose nominal model is a file of that name in `ballfg/dynamics`."""
-SPREADS: Final[Mapping[str, Mapping[str, float]]] = {"table_tennis": {}, "tennis": {"drag": 0.3, "magnus": 0.3}}
-"""Prior standard deviations as shares of the values, for known balls to which those of the effects do not apply."""
 TOLERANCE: Final = 0.15
 """Relative. A ball whose radius and mass both differ by less from those of a known ball is taken to be one."""
 AIR_DENSITY: Final = 1.2
@@ -30,7 +28,7 @@ WIDE: Final = {"drag": 0.5, "magnus": 0.6, "restitution": 0.2, "friction": 0.5, 
 """Prior standard deviation of a guessed coefficient, as a share of its value."""
 
 
-def nominal_model(ball: Ball | float = TABLE_TENNIS) -> AnalyticModel:
+def nominal_model(ball: Ball | float | str = TABLE_TENNIS) -> AnalyticModel:
     """The model to start from when nothing else is known about a ball.
 
     A ball that is as good as a known one (see `TOLERANCE`) gets that one's model, with the ball's own radius. For any
@@ -38,25 +36,35 @@ def nominal_model(ball: Ball | float = TABLE_TENNIS) -> AnalyticModel:
     them are wide; `nominal_note` says so in words. A model file does not hold priors: a guessed model that is saved and
     loaded has the usual ones.
 
-    Args: ball: radius m and mass kg; a number is the radius in m of a table-tennis ball.
+    Args: ball: radius m and mass kg; a number is the radius in m of a table-tennis ball, a text the name of a known
+        ball, such as "basketball" (`ballfg balls` lists them).
     Returns: a model of its own, which the caller may change.
-    Raises: ValueError: if the radius is not one of a ball (0.001 to 1 m), or the ball so light that its drag leaves
-        the bounds of the effect.
+    Raises: ValueError: if the radius is not one of a ball (0.001 to 1 m), the ball so light that its drag leaves
+        the bounds of the effect, or the name not known.
     """
+    if isinstance(ball, str):
+        chosen = known_ball(ball)
+        return _known_model(chosen, KNOWN_BALLS[chosen].ball.radius)
     if not isinstance(ball, Ball):
         return _known_model("table_tennis", ball)
-    name = _known_name(ball)
+    name = known_name(ball)
     return _guessed_model(ball) if name is None else _known_model(name, ball.radius)
 
 
 def nominal_note(ball: Ball) -> str | None:
     """One sentence on the nominal model of a ball that is not known; None for a known ball."""
-    if _known_name(ball) is not None:
+    if known_name(ball) is not None:
         return None
     return (
         f"no nominal model for a ball of {ball.radius:g} m radius and {ball.mass:g} kg: drag and Magnus force follow "
         "from radius and mass, the bounce is guessed, priors are wide. Fit a model to your tracks or give a model file."
     )
+
+
+def inertia_factor(ball: Ball) -> float:
+    """Moment of inertia over m R^2: that of the known ball that is near, else a thin shell's; dimensionless."""
+    name = known_name(ball)
+    return THIN_SHELL if name is None else KNOWN_BALLS[name].inertia_factor
 
 
 def air_coefficients(ball: Ball, drag_coefficient: float = DRAG_COEFFICIENT) -> tuple[float, float]:
@@ -72,11 +80,11 @@ def air_coefficients(ball: Ball, drag_coefficient: float = DRAG_COEFFICIENT) -> 
     return drag_coefficient * area_over_mass, area_over_mass * ball.radius / (1 + 2 * SPIN_RATIO)
 
 
-def _known_name(ball: Ball) -> str | None:
+def known_name(ball: Ball) -> str | None:
     """Name of the known ball that is nearest, if it is near."""
 
     def distance(name: str) -> float:
-        known = KNOWN_BALLS[name]
+        known = KNOWN_BALLS[name].ball
         return max(abs(ball.radius / known.radius - 1), abs(ball.mass / known.mass - 1))
 
     nearest = min(KNOWN_BALLS, key=distance)
@@ -85,8 +93,9 @@ def _known_name(ball: Ball) -> str | None:
 
 def _known_model(name: str, radius: float) -> AnalyticModel:
     text = resources.files("ballfg.dynamics").joinpath(f"{name}.yaml").read_text(encoding="utf-8")
-    model = model_from_dict(yaml.safe_load(text), radius=radius, where=f"{name}.yaml")
-    _set_spread(model, SPREADS[name])
+    known, where = KNOWN_BALLS[name], f"{name}.yaml"
+    model = model_from_dict(yaml.safe_load(text), radius=radius, inertia_factor=known.inertia_factor, where=where)
+    _set_spread(model, known.spreads)
     return model
 
 

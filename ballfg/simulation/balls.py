@@ -6,17 +6,18 @@ from pathlib import Path
 from typing import Any, Final
 
 from ballfg.checks import check_number
-from ballfg.dynamics import AnalyticModel, Surfaces, model_from_dict, nominal_model
+from ballfg.dynamics import KNOWN_BALLS, AnalyticModel, Surfaces, known_ball, model_from_dict, nominal_model
 from ballfg.dynamics.model import THIN_SHELL
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.simulation.launcher import TABLE_LAUNCHER, TENNIS_LAUNCHER, SimulatedLauncher
-from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball
+from ballfg.simulation.launchers import LAUNCHERS
+from ballfg.tracks import Ball
 
 TABLE: Final = Surfaces(TABLE_ABOVE_FLOOR, 0.0, (0.0, TABLE_LENGTH, -TABLE_WIDTH / 2, TABLE_WIDTH / 2))
 """A table-tennis table in a room: the floor at z = 0, x along the table from the launcher's end, y from its middle."""
 COURT: Final = Surfaces(0.0)
-"""A court is its own floor and does not end."""
+"""A court is its own floor, and a ball beyond its lines bounces as well: it does not end."""
 
 _FILE_KEYS: Final = ("name", "radius", "mass", "inertia_factor", "surface", "flight", "bounce", "launcher")
 
@@ -43,34 +44,44 @@ class BallKind:
 
 def table_tennis() -> BallKind:
     """A 40+ ball with the nominal model, on a table, before the launcher of the paper."""
-    return BallKind("table-tennis", TABLE_TENNIS, nominal_model(TABLE_TENNIS), TABLE)
+    return _known("table_tennis")
 
 
 def tennis() -> BallKind:
     """A tennis ball with the nominal model, on a hard court, before a machine behind the baseline."""
-    return BallKind("tennis", TENNIS, nominal_model(TENNIS), COURT, TENNIS_LAUNCHER)
-
-
-BALLS: Final = {"table-tennis": table_tennis, "tennis": tennis}
+    return _known("tennis")
 
 
 def ball_kind(name: str) -> BallKind:
-    """A ball by name, `table-tennis` or `tennis`, or from a YAML file; docs/simulate.md shows one.
+    """A known ball by name (`ballfg balls` lists them), or one from a YAML file; docs/simulate.md shows one.
 
-    Raises: FileNotFoundError: neither a name nor a file. ValueError: a file that breaks a rule; the message says which.
+    Raises: FileNotFoundError: neither a name nor a file. ValueError: a file that breaks a rule, the message says which;
+        or badminton, whose shuttle is no ball.
     """
-    if name in BALLS:
-        return BALLS[name]()
     path = Path(name)
     if not path.is_file():
-        raise FileNotFoundError(
-            f"ball must be {' or '.join(BALLS)} or a YAML file that exists; got '{name}'. See docs/simulate.md."
-        )
+        try:
+            return _known(known_ball(name))
+        except ValueError as error:
+            raise (error if "badminton" in str(error) else _neither(name)) from None
     content = read_yaml(path)
     try:
         return ball_from_mapping(content, default_name=path.stem)
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
+
+
+def _neither(name: str) -> FileNotFoundError:
+    known = ", ".join(key.replace("_", "-") for key in KNOWN_BALLS)
+    return FileNotFoundError(
+        f"ball must be {known} or a YAML file that exists; got '{name}'. See ballfg balls and docs/simulate.md."
+    )
+
+
+def _known(name: str) -> BallKind:
+    """A known ball with its nominal model on its ground, before its launcher."""
+    surfaces = TABLE if name == "table_tennis" else COURT
+    return BallKind(name.replace("_", "-"), KNOWN_BALLS[name].ball, nominal_model(name), surfaces, LAUNCHERS[name])
 
 
 def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:

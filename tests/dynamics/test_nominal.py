@@ -11,7 +11,7 @@ from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.nominal import air_coefficients
 from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball
 
-GOLF = Ball(radius=0.02135, mass=0.0459)
+SQUASH = Ball(radius=0.02, mass=0.024)
 TENNIS_DRAG = 0.6
 """Drag coefficient of a tennis ball: 0.5 to 0.65 (docs/physics.md)."""
 
@@ -53,30 +53,30 @@ def test_a_tennis_ball_is_no_table_tennis_ball() -> None:
         (Ball(0.019, 0.0025), "table tennis"),  # the 38 mm ball of before the year 2000
         (Ball(0.0327, 0.056), "tennis"),
         (Ball(0.0343, 0.0594), "tennis"),
-        (GOLF, None),
+        (SQUASH, None),
+        (Ball(0.0367, 0.147), "baseball"),
         (Ball(0.02, 0.0577), None),  # only the mass is that of a tennis ball
-        (Ball(0.11, 0.43), None),
+        (Ball(0.11, 0.35), None),  # between a volleyball and a football
     ],
 )
 def test_a_ball_is_a_known_one_if_radius_and_mass_are_near(ball: Ball, expected: str | None) -> None:
-    known = {"table tennis": 0.12, "tennis": drag(nominal_model(TENNIS)), None: air_coefficients(ball)[0]}
+    known = {"table tennis": 0.12, "tennis": drag(nominal_model(TENNIS)), "baseball": 0.00618}
+    known |= {None: air_coefficients(ball)[0]}
     assert drag(nominal_model(ball)) == known[expected]
     assert nominal_model(ball).radius == ball.radius
     assert (nominal_note(ball) is None) == (expected is not None)
 
 
 def test_an_unknown_ball_gets_physics_wide_priors_and_a_note() -> None:
-    model = nominal_model(GOLF)
-    assert drag(model) == pytest.approx(1.2 * 0.5 * math.pi * GOLF.radius**2 / (2 * GOLF.mass))
+    model = nominal_model(SQUASH)
+    assert drag(model) == pytest.approx(1.2 * 0.5 * math.pi * SQUASH.radius**2 / (2 * SQUASH.mass))
     sigmas = coefficient_sigmas(model)
     assert sigmas["flight.drag.k"] == pytest.approx(0.5 * drag(model))
     assert sigmas["bounce.restitution.e"] == pytest.approx(0.15)
     assert coefficient_sigmas(nominal_model())["bounce.restitution.e"] == 0.02  # other models keep theirs
-    note = nominal_note(GOLF)
+    note = nominal_note(SQUASH)
     assert note is not None
-    assert note.startswith(
-        "no nominal model for a ball of 0.02135 m radius and 0.0459 kg: drag and Magnus force follow"
-    )
+    assert note.startswith("no nominal model for a ball of 0.02 m radius and 0.024 kg: drag and Magnus force follow")
     assert "\n" not in note
 
 

@@ -1,0 +1,138 @@
+"""`ballfg design`: which shots to make next."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ballfg.cli import inputs
+
+if TYPE_CHECKING:
+    from numpy.typing import ArrayLike
+
+    from ballfg.diagnosis import ShotPlan
+    from ballfg.dynamics import AnalyticModel
+    from ballfg.tracks import Dataset
+
+
+def design(
+    dataset: inputs.DatasetFolder,
+    candidates: Annotated[
+        str, typer.Option(help="Launcher settings to choose from, as topspin=-3..5,speed=8..14 or wheel=900..1500:100.")
+    ],
+    model: inputs.ModelFile = None,
+    between: Annotated[
+        str | None, typer.Option(help="Two effects to tell apart, as frame_tilt,table_tilt or wind.x,drag.k.")
+    ] = None,
+    shrink: Annotated[str | None, typer.Option(help="Coefficient whose error bar is to shrink, as drag.k.")] = None,
+    diagnosis: Annotated[
+        Path | None,
+        typer.Option(help="Folder of a diagnosis: tell apart what it could not.", show_default="diagnose now"),
+    ] = None,
+    shots: Annotated[int, typer.Option(help="Number of shots to choose.")] = 10,
+    out: Annotated[Path | None, typer.Option(help="Table of the shots, .csv or .parquet.")] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed, of the random shots to compare with.")] = 0,
+    effects_file: inputs.EffectsFiles = None,
+    jobs: inputs.Jobs = inputs.CORES,
+) -> None:
+    """Choose the launcher's next shots: those that best tell two effects apart, or shrink an error bar most.
+
+    The settings are columns of the dataset's labels.csv, whose tracks teach what they do. Printed are the
+    shots in order, the standard deviations to expect after each, and what as many random shots would bring.
+
+    Example: ballfg design shots --candidates topspin=-3..5,sidespin=-5..5,speed=8..14 --between wind.x,drag.k
+    """
+    from ballfg.diagnosis.design.levels import parse_levels
+    from ballfg.diagnosis.design.plan import check_labels, design_shots
+    from ballfg.dynamics import AnalyticModel
+    from ballfg.tracks import TableWriter
+
+    levels = parse_levels(candidates)
+    if out is not None:
+        TableWriter(out)  # refuses a path that cannot be written
+        inputs.check_out(out, dataset)
+    opened = inputs.open_inputs(dataset, model, effects_file)
+    if not isinstance(opened.model, AnalyticModel):
+        raise ValueError(f"--model must be analytic: effects are added to it; {model} is a learned one. Give another.")
+    check_labels(opened.dataset, tuple(levels))
+    plan = design_shots(
+        opened.dataset,
+        opened.model,
+        levels,
+        between=_pairs(between, shrink, diagnosis, opened.dataset, opened.model, jobs),
+        shrink=shrink or "",
+        shots=shots,
+        seed=seed,
+        jobs=jobs,
+        watch=_say,
+    )
+    print(*_lines(plan), sep="\n")
+    inputs.print_notes(plan.remarks)
+    if out is not None:
+        _write(plan, out)
+        print(f"{out}: {len(plan.settings)} shots")
+
+
+def _say(line: str) -> None:
+    print(line, file=sys.stderr, flush=True)
+
+
+def _pairs(
+    between: str | None, shrink: str | None, folder: Path | None, data: Dataset, model: AnalyticModel, jobs: int
+) -> Sequence[tuple[str, str]]:
+    """What to tell apart: as the options say, else what a diagnosis could not; nothing with --shrink."""
+    from ballfg.diagnosis import diagnose
+    from ballfg.diagnosis.design.reported import pairs_of, reported_pairs
+
+    given = [name for name, value in (("--between", between), ("--shrink", shrink), ("--diagnosis", folder)) if value]
+    if len(given) > 1:
+        raise ValueError(f"{' and '.join(given)} exclude each other. Give one of them.")
+    if shrink:
+        return ()
+    if between:
+        one, _, other = (text.strip() for text in between.partition(","))
+        if not one or not other or "," in other:
+            raise ValueError(f"--between must be two effects, separated by a comma; got '{between}'. Name two.")
+        return [(one, other)]
+    if folder is not None:
+        return reported_pairs(folder)
+    _say("nothing says what the shots are for: diagnosing the dataset")
+    return pairs_of(diagnose(data, model, jobs=jobs, watch=_say))
+
+
+def _lines(plan: ShotPlan) -> Iterator[str]:
+    sides = [" ".join(side) for side in plan.sides]
+    paired = zip(sides[::2], sides[1::2], strict=False)
+    goal = (
+        "; ".join(f"{one} from {other}" for one, other in paired) if len(sides) > 1 else f"the error bar of {sides[0]}"
+    )
+    yield f"{len(plan.settings)} of {plan.candidates} candidates, for {goal}"
+    heads = [f"{name}, {unit}" if unit != "1" else name for name, unit in zip(plan.names, plan.units, strict=True)]
+    rows = [("shot", *plan.setting_names, *heads, "error", "of random shots")]
+    for number, sigmas in enumerate(plan.sigmas):
+        shot = [f"{value:g}" for value in plan.settings[number - 1]] if number else ["-"] * len(plan.setting_names)
+        errors = (plan.error[number], plan.random[number])
+        rows.append((str(number or "now"), *shot, *(f"{s:.2g}" for s in sigmas), *(f"{e:.3g}" for e in errors)))
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    for row in rows:
+        yield "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True))
+    yield "below coefficients: standard deviations, all else unknown; error: their mean as a share of the fit's priors"
+    yield f"{plan.as_random:.0f} random shots would bring as much as these {len(plan.settings)}"
+
+
+def _write(plan: ShotPlan, out: Path) -> None:
+    from ballfg.tracks import TableWriter
+
+    columns: Mapping[str, ArrayLike] = {
+        "shot": list(range(1, len(plan.settings) + 1)),
+        **dict(zip(plan.setting_names, plan.settings.T, strict=True)),
+        **{f"sigma_{name}": column for name, column in zip(plan.names, plan.sigmas[1:].T, strict=True)},
+        "error": plan.error[1:],
+        "error_random": plan.random[1:],
+    }
+    with TableWriter(out) as table:
+        table.write(columns)

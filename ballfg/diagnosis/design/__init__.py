@@ -1,0 +1,1 @@
+"""The shots that tell most: predicted flights, their information, and a choice among them."""

@@ -1,0 +1,128 @@
+"""The choice of shots: those that together tell most of what is asked.
+
+The measure of a side of r strengths is log det C / 2 r, with C their covariance when all else is unknown: the log of
+its error bar, averaged over its directions. That is D_s-optimality, and c-optimality for a single coefficient. The
+measures of all sides are averaged. Shots are chosen greedily, then exchanged one by one while that lowers the measure,
+then put in the order in which they help most.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.diagnosis.design.information import Information
+
+Measure = Callable[[Array], Array]
+"""(m,) measures of information matrices (m, q, q)."""
+LEAST_GAIN = 1e-9
+"""An exchange that lowers the measure by less is none; it could go round in circles."""
+DRAWS = 100
+"""Random choices whose median error bars stand beside those of the chosen shots."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Chosen shots in order, with error bars after each.
+
+    Attributes:
+        shots: (k,) numbers of candidates among `Information.shots`.
+        error: (k + 1,) mean error bar of all sides, in prior standard deviations of the unknowns; first without shots.
+        random: (k + 1,) the same after as many random shots, the median of `DRAWS` choices.
+        sigmas: (k + 1, p) standard deviation of each coefficient asked about, in its own unit.
+        as_random: number of random shots that would bring as much as all that were chosen.
+    """
+
+    shots: list[int]
+    error: Array
+    random: Array
+    sigmas: Array
+    as_random: float
+
+
+def choose(
+    information: Information, sides: Sequence[Sequence[str]], names: Sequence[str], count: int, seed: int
+) -> Choice:
+    """Choose shots, with repetition.
+
+    Args:
+        information: of dataset and candidates.
+        sides: coefficients that are to be known well, by parameter name.
+        names: of coefficients whose error bars are told.
+        count: of shots.
+        seed: of the random choices to compare with.
+    """
+    measure = _measure([information.columns(side) for side in sides])
+    known, shots = information.known, information.shots
+    chosen = _ordered(known, shots, _exchanged(known, shots, _greedy(known, shots, count, measure), measure), measure)
+    totals = known + np.concatenate((np.zeros((1, *known.shape)), np.cumsum(shots[chosen], axis=0)))
+    wanted = information.columns(names)
+    covariances = np.linalg.inv(totals)[:, wanted, wanted]
+    rng = np.random.default_rng(seed)
+    drawn = [np.cumsum(shots[rng.integers(len(shots), size=count)], axis=0) for _ in range(DRAWS)]
+    random = np.median([measure(known + draw) for draw in drawn], axis=0)
+    reached = float(measure(totals[-1:])[0])
+    return Choice(
+        chosen,
+        np.exp(measure(totals)),
+        np.exp(np.concatenate((measure(known[None]), random))),
+        np.sqrt(covariances) * information.units[wanted],
+        _as_random(known, shots.mean(axis=0), measure, reached),
+    )
+
+
+def _measure(sides: Sequence[Sequence[int]]) -> Measure:
+    def measured(totals: Array) -> Array:
+        covariance = np.linalg.inv(totals)
+        logs = [np.linalg.slogdet(covariance[:, side][:, :, side])[1] / (2 * len(side)) for side in sides]
+        return np.asarray(np.mean(logs, axis=0))
+
+    return measured
+
+
+def _greedy(known: Array, shots: Array, count: int, measure: Measure) -> list[int]:
+    chosen: list[int] = []
+    for _ in range(count):
+        best = int(np.argmin(measure(known + shots)))
+        chosen.append(best)
+        known = known + shots[best]
+    return chosen
+
+
+def _exchanged(known: Array, shots: Array, chosen: list[int], measure: Measure) -> list[int]:
+    """Each shot in turn replaced by the best one beside the others, until no exchange helps."""
+    chosen, total = list(chosen), known + shots[chosen].sum(axis=0)
+    now, helped = float(measure(total[None])[0]), True
+    while helped:
+        helped = False
+        for place, old in enumerate(chosen):
+            others = total - shots[old]
+            values = measure(others + shots)
+            best = int(np.argmin(values))
+            if values[best] < now - LEAST_GAIN:
+                chosen[place], total, now, helped = best, others + shots[best], float(values[best]), True
+    return chosen
+
+
+def _ordered(known: Array, shots: Array, chosen: Sequence[int], measure: Measure) -> list[int]:
+    left, order = sorted(chosen), list[int]()
+    while left:
+        best = left.pop(int(np.argmin(measure(known + shots[left]))))
+        order.append(best)
+        known = known + shots[best]
+    return order
+
+
+def _as_random(known: Array, mean: Array, measure: Measure, reached: float) -> float:
+    """How many shots of mean information reach a measure: by bisection, since more information never raises it."""
+    low, high = 0.0, 1.0
+    while float(measure((known + high * mean)[None])[0]) > reached and high < 1e6:
+        low, high = high, 2.0 * high
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        if float(measure((known + middle * mean)[None])[0]) > reached:
+            low = middle
+        else:
+            high = middle
+    return high

@@ -1,0 +1,112 @@
+"""Flights that a launcher would shoot, as stretches without noise: what the diagnosis would see of them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from ballfg.arrays import Array, Index, Mask
+from ballfg.diagnosis.fit.stretches import LEAST_SAMPLES, MOST_CONTACTS, Stretches
+from ballfg.dynamics import BallModel, Surfaces, rollout
+from ballfg.state import SPIN, VZ
+
+MARGIN = 0.25
+"""Share of the measured extent, along x and y, by which a flight may leave it on each side. Few tracks do not show all
+that the cameras see."""
+LEAST_KICK = 0.3
+"""m/s. A contact turns the vertical speed by more; a ball that rises slower than half of it comes to rest soon."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What the cameras see of a flight.
+
+    Attributes:
+        low, high: (3,) m, corners of the box in which the ball is seen. It has no lid: lobs are seen too.
+        duration: s, longest flight.
+        interval: s between samples.
+        sigmas: (3,) m, stated noise of a coordinate.
+        labelled: whether the spin at the first sample is measured.
+    """
+
+    low: Array
+    high: Array
+    duration: float
+    interval: float
+    sigmas: Array
+    labelled: bool
+
+    @classmethod
+    def of(cls, stretches: Stretches) -> "View":
+        """The view that measured stretches show."""
+        used = stretches.used.numpy()
+        positions, sigmas = stretches.positions.numpy()[used], stretches.sigmas.numpy()[used]
+        low, high = positions.min(axis=0), positions.max(axis=0)
+        margin = MARGIN * (high - low) * (1.0, 1.0, 0.0)
+        margin[2], high[2] = 0.01 * (high[2] - low[2]), np.inf
+        steps = np.diff(stretches.times.numpy(), axis=1)[used[:, 1:]]
+        first = np.unique(stretches.track, return_index=True)[1]
+        return cls(
+            low - margin,
+            high + margin,
+            float(stretches.ends.max()),
+            float(np.median(steps)),
+            np.median(sigmas, axis=0),
+            bool(stretches.labelled[first].mean() > 0.5),
+        )
+
+
+def planned_flights(
+    model: BallModel, starts: Array, settings: Array, surfaces: Surfaces, view: View
+) -> tuple[Stretches, Mask]:
+    """Flights from first states as stretches, up to where they leave the view.
+
+    Args:
+        model: the ball.
+        starts: (m, 9) first states.
+        settings: (m, s) launcher settings as the stretches of the dataset have them.
+        surfaces: where the ball bounces.
+        view: what is seen.
+    Returns: the flights that are long enough, and which (m,) of all they are.
+    """
+    times = torch.arange(0.0, view.duration + 0.5 * view.interval, view.interval, dtype=torch.float64)
+    with torch.no_grad():
+        paths = rollout(model, torch.from_numpy(starts), times, surfaces)
+        heights = surfaces.level_below(paths)
+        gaps = model.gap(paths, heights).numpy()
+    states, n, k = paths.numpy(), len(starts), len(times)
+    lengths, contacts, levels = np.zeros(n, dtype=np.int64), *(np.full((n, MOST_CONTACTS), np.nan) for _ in range(2))
+    for i, path in enumerate(states):
+        end, met = _seen(path, gaps[i], view)
+        lengths[i] = end
+        falling = -path[met, VZ]
+        contacts[i, : len(met)] = times.numpy()[met] + np.clip(gaps[i, met] / falling, 0.0, view.interval)
+        levels[i, : len(met)] = heights.numpy()[i, met]
+    index = np.minimum(np.arange(k), lengths[:, None] - 1).clip(0)
+    seen = (np.arange(k) < lengths[:, None])[..., None]
+    labels = states[:, 0, SPIN] if view.labelled else np.full((n, 3), np.nan)
+    rows = {
+        "times": times.numpy()[index],
+        "positions": np.take_along_axis(states[..., :3], index[..., None], axis=1),
+        "sigmas": np.where(seen, view.sigmas, np.inf),
+        "starts": starts,
+        "heights": levels,
+        "contacts": contacts,
+        "labels": labels,
+    }
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(row, dtype=np.float64)) for name, row in rows.items()}
+    names = tuple(str(i) for i in range(n))
+    kept = lengths >= LEAST_SAMPLES
+    return Stretches(names, np.arange(n), settings, **tensors).take(kept), kept
+
+
+def _seen(path: Array, gaps: Array, view: View) -> tuple[int, Index]:
+    """How many samples of a path (k, 9) are seen, and the samples (c,) after which contacts follow."""
+    inside = ((path[:, :3] >= view.low) & (path[:, :3] <= view.high)).all(axis=1)
+    end = len(path) if inside.all() else int(np.argmin(inside))
+    before, after = path[: end - 1, VZ], path[1:end, VZ]
+    near = gaps[: end - 1] < 1.5 * view.interval * np.abs(before)
+    met = np.flatnonzero((before < 0.0) & (after > 0.0) & (after - before > LEAST_KICK) & near)
+    slow = np.flatnonzero(after[met] < 0.5 * LEAST_KICK)
+    last = min([MOST_CONTACTS, *slow.tolist()])
+    return (int(met[last]) + 1, met[:last]) if len(met) > last else (end, met)

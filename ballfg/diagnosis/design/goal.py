@@ -1,0 +1,75 @@
+"""What shots are chosen for: to tell two effects apart, or to shrink the error bar of a coefficient."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from ballfg.checks import did_you_mean
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.search.candidates import score_all
+from ballfg.diagnosis.search.hypothesis import Hypothesis, has_effect, hypotheses, scene_of
+from ballfg.dynamics import EFFECTS
+
+
+@dataclass(frozen=True)
+class Goal:
+    """Sides of coefficients that are to be known well, each with everything else unknown.
+
+    Attributes:
+        hypotheses: effects whose strengths are unknown, beside what the model declares.
+        sides: parameter names; two sides for effects to tell apart, one for a coefficient.
+    """
+
+    hypotheses: tuple[Hypothesis, ...]
+    sides: tuple[tuple[str, ...], ...]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """All parameter names, each once."""
+        return tuple(dict.fromkeys(name for side in self.sides for name in side))
+
+
+def separating(fit: Fit, pairs: Sequence[tuple[str, str]]) -> Goal:
+    """The goal to tell the effects of some pairs apart.
+
+    Args: fit: of the declared model.  pairs: effects (`frame_tilt`) or single strengths of them (`wind.x`).
+    Raises: ValueError: an effect or coefficient that is not known or cannot act in these data, or one named twice.
+    """
+    found = {text: hypothesis_of(fit, text) for pair in pairs for text in pair}
+    for one, other in pairs:
+        if set(found[one].columns) & set(found[other].columns):
+            raise ValueError(f"between must name two different effects; got {one},{other}. Name another one.")
+    return Goal(tuple(found.values()), tuple(found[text].columns for pair in pairs for text in pair))
+
+
+def shrinking(fit: Fit, text: str) -> Goal:
+    """The goal to shrink the error bar of a coefficient, such as `drag.k`, or those of an effect.
+
+    Args: fit: of the declared model. A coefficient that it estimates keeps its prior.
+    Raises: ValueError: as `separating`.
+    """
+    hypothesis = hypothesis_of(fit, text)
+    declared = all(name in fit.problem.free for name in hypothesis.columns)
+    return Goal(() if declared else (hypothesis,), (hypothesis.columns,))
+
+
+def hypothesis_of(fit: Fit, text: str) -> Hypothesis:
+    """The effect that a text names (`wind`, or one strength of it, `wind.x`), in the shape that explains most."""
+    name, _, strength = text.strip().partition(".")
+    if name not in EFFECTS:
+        raise ValueError(f"effect '{name}' is not known.{did_you_mean(name, EFFECTS)} See ballfg info.")
+    effect, model = EFFECTS[name], fit.problem.model
+    if has_effect(model, name):
+        found = Hypothesis(effect, {}, tuple(c.name for c in effect.coefficients if c.absent is not None))
+    else:
+        possible = [h for h in hypotheses(model, scene_of(fit), [effect]) if h.strengths]
+        if not possible:
+            needs = f" It needs {', '.join(effect.needs)} in the model." if effect.needs else ""
+            raise ValueError(f"effect '{name}' cannot act in these tracks.{needs} Name another one.")
+        found = possible[0] if len(possible) == 1 else score_all(fit, possible)[0].hypothesis
+    if not strength:
+        return found
+    if strength not in found.strengths:
+        raise ValueError(
+            f"effect '{name}' has the strengths {', '.join(found.strengths)}; got '{strength}'. Rename it."
+        )
+    return replace(found, strengths=(strength,))

@@ -1,0 +1,105 @@
+"""From settings of a launcher to the first state of its shots, learned from the shots of a dataset.
+
+Place, speed, azimuth, elevation and spin of a first state are taken to be linear in the settings. The spin is that
+about forward, across and up, so that a launcher that aims elsewhere turns it along.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.diagnosis.fit.problem import launch_axes
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+
+SPARE = 2
+"""Shots beyond one for each number of the line; fewer tell nothing of the scatter about it."""
+LEAST_SHARE = 1e-8
+"""Smallest over largest eigenvalue of the settings' correlations: below, settings changed together only."""
+
+
+@dataclass(frozen=True)
+class LauncherMap:
+    """First states as a line in the settings.
+
+    Attributes:
+        names: of s settings, as labels have them.
+        weights: (s + 1, 9) of a constant and the settings, for place (m), speed (m/s), azimuth and elevation (rad), and
+            spin about forward, across and up (rad/s).
+        scatter: (9,) standard deviations of the shots about the line, in the same units.
+        low, high: (s,) settings that were shot.
+    """
+
+    names: tuple[str, ...]
+    weights: Array
+    scatter: Array
+    low: Array
+    high: Array
+
+    def states(self, settings: Array) -> Array:
+        """(m, 9) first states of shots with settings (m, s)."""
+        launches = np.column_stack((np.ones(len(settings)), settings)) @ self.weights
+        speed, azimuth, elevation = launches[:, 3:6].T
+        states = launches.copy()
+        level = speed * np.cos(elevation)
+        states[:, 3:6] = np.stack((level * np.cos(azimuth), level * np.sin(azimuth), speed * np.sin(elevation)), axis=1)
+        states[:, SPIN] = (launch_axes(states) @ launches[:, 6:, None])[..., 0]
+        return np.asarray(states)
+
+    def outside(self, settings: Array) -> list[str]:
+        """A sentence for each setting whose candidates (m, s) lie beyond what was shot."""
+        least, most = settings.min(axis=0), settings.max(axis=0)
+        return [
+            f"{name} was shot from {self.low[i]:g} to {self.high[i]:g}; candidates from {least[i]:g} to {most[i]:g} "
+            "continue the launcher's line beyond that"
+            for i, name in enumerate(self.names)
+            if least[i] < self.low[i] or most[i] > self.high[i]
+        ]
+
+
+def learn_launcher(names: Sequence[str], settings: Array, states: Array) -> LauncherMap:
+    """The line through the first states of shots.
+
+    Args: names: of s settings.  settings: (n, s) of n shots.  states: (n, 9) their first states.
+    Raises: ValueError: too few shots, or settings that did not change independently of each other.
+    """
+    count, needed = len(settings), settings.shape[1] + 1 + SPARE
+    if count < needed:
+        raise ValueError(
+            f"the dataset must hold at least {needed} shots with the labels {', '.join(names)}, to learn what they do; "
+            f"got {count}. Shoot more."
+        )
+    still = [name for name, column in zip(names, settings.T, strict=True) if np.ptp(column) == 0.0]
+    if still:
+        raise ValueError(
+            f"label {still[0]} must change from shot to shot, or nobody knows what it does; all shots have "
+            f"{settings[0, list(names).index(still[0])]:g}. Leave it out of the candidates."
+        )
+    scaled = (settings - settings.mean(axis=0)) / settings.std(axis=0)
+    values = np.linalg.eigvalsh(scaled.T @ scaled)
+    if values[0] < LEAST_SHARE * values[-1]:
+        raise ValueError(
+            f"labels {', '.join(names)} must change independently of each other; in these shots some change together "
+            "only. Name fewer of them."
+        )
+    design, launches = np.column_stack((np.ones(count), settings)), _launches(states)
+    weights, *_ = np.linalg.lstsq(design, launches, rcond=None)
+    scatter = np.sqrt(((launches - design @ weights) ** 2).sum(axis=0) / (count - design.shape[1]))
+    return LauncherMap(
+        tuple(names), np.asarray(weights, dtype=np.float64), scatter, settings.min(axis=0), settings.max(axis=0)
+    )
+
+
+def _launches(states: Array) -> Array:
+    """(n, 9) place, speed, azimuth, elevation, spin about forward, across and up. Azimuths stay near their mean."""
+    velocity = states[:, VELOCITY]
+    mean = np.arctan2(velocity[:, 1].sum(), velocity[:, 0].sum())
+    turned = np.arctan2(velocity[:, 1], velocity[:, 0]) - mean
+    azimuth = mean + np.arctan2(np.sin(turned), np.cos(turned))
+    elevation = np.arctan2(velocity[:, 2], np.hypot(velocity[:, 0], velocity[:, 1]))
+    launches = np.zeros((len(states), STATE_DIM))
+    launches[:, POSITION] = states[:, POSITION]
+    launches[:, 3:6] = np.stack((np.linalg.norm(velocity, axis=1), azimuth, elevation), axis=1)
+    launches[:, 6:] = (launch_axes(states).swapaxes(-1, -2) @ states[:, SPIN, None])[..., 0]
+    return launches

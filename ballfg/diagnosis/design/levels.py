@@ -1,0 +1,57 @@
+"""Candidate settings of a launcher: from a text such as `topspin=-3..5,speed=8..14` to all their combinations."""
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from ballfg.arrays import Array
+
+MOST = 5000
+"""Combinations of levels. More take minutes to fly, and neighbours hardly differ."""
+
+
+def parse_levels(text: str) -> dict[str, list[float]]:
+    """Levels by setting, of a text such as `topspin=-3..5,wheel=1200..2000:200,speed=9`.
+
+    Args: text: `NAME=FROM..TO` in steps of one, `NAME=FROM..TO:STEP`, or `NAME=LEVEL`, separated by commas.
+    Returns: the levels, rising, in the unit of the label of that name.
+    Raises: ValueError: a text of another form, a setting named twice, a step that is not positive, or too many
+        combinations.
+    """
+    found: dict[str, list[float]] = {}
+    for part in text.split(","):
+        name, _, span = part.partition("=")
+        name = name.strip()
+        if name in found:
+            raise ValueError(f"candidates must name each setting once; got '{name}' twice. Remove one.")
+        found[name] = _levels(name, span, part.strip())
+    count = math.prod(len(levels) for levels in found.values())
+    if count > MOST:
+        raise ValueError(
+            f"candidates must be at most {MOST} combinations; got {count}. Use larger steps: NAME=FROM..TO:STEP."
+        )
+    return found
+
+
+def _levels(name: str, span: str, part: str) -> list[float]:
+    ends, _, width = span.partition(":")
+    low, dots, high = ends.partition("..")
+    try:
+        first, last, step = float(low), float(high if dots else low), float(width) if width else 1.0
+    except ValueError:
+        first = last = step = math.nan
+    if not name or not (math.isfinite(first) and math.isfinite(last) and first <= last and 0.0 < step < math.inf):
+        raise ValueError(
+            f"candidates must read NAME=LEVEL, NAME=FROM..TO or NAME=FROM..TO:STEP, separated by commas; got '{part}'. "
+            "Write for instance topspin=-3..5,sidespin=-5..5,speed=8..14."
+        )
+    if (last - first) / step >= MOST:
+        raise ValueError(f"candidates must be at most {MOST} combinations; {name} alone has more. Use a larger step.")
+    return [first + step * k for k in range(math.floor((last - first) / step + 1e-9) + 1)]
+
+
+def combinations(levels: Mapping[str, Sequence[float]]) -> Array:
+    """(m, s) every combination of the levels of s settings, the last setting changing fastest."""
+    return np.array(list(itertools.product(*levels.values())), dtype=np.float64)

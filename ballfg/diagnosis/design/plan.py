@@ -1,0 +1,182 @@
+"""The plan: which shots to make next with a launcher, so that they tell most."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.checks import did_you_mean
+from ballfg.diagnosis.design.choice import choose
+from ballfg.diagnosis.design.goal import Goal, separating, shrinking
+from ballfg.diagnosis.design.information import information_of
+from ballfg.diagnosis.design.launcher_map import LauncherMap, learn_launcher
+from ballfg.diagnosis.design.levels import combinations
+from ballfg.diagnosis.fit.holdout import Holdout, hold_out
+from ballfg.diagnosis.fit.problem import Fit
+from ballfg.diagnosis.search.evaluation import on_all, on_others
+from ballfg.diagnosis.search.stamp_effects import first_fit
+from ballfg.dynamics import AnalyticModel
+from ballfg.tracks import Dataset, Track
+
+MOST_SHOTS = 1000
+"""More shots at once are better planned in parts, each with the tracks of the parts before."""
+
+
+@dataclass(frozen=True)
+class ShotPlan:
+    """Shots to make next, in order, and what they would bring.
+
+    Attributes:
+        settings: (k, s) of the launcher, in the units of the labels.
+        setting_names: of the s settings.
+        sides: what is to be told apart or shrunk, by effect and coefficient, for instance (("wind.x",), ("drag.k",)).
+        names: of the p coefficients of all sides, by effect and coefficient.
+        units: of the coefficients.
+        sigmas: (k + 1, p) in `units`, standard deviation of each, all else unknown, before the shots and after each.
+        error: (k + 1,) dimensionless, mean error bar of the sides over the priors of the fit.
+        random: (k + 1,) dimensionless, the same after as many random shots.
+        as_random: number of random shots that would bring as much as all k.
+        candidates: number of candidates that could be judged.
+        remarks: sentences on candidates that were left out and on how well the launcher is known.
+    """
+
+    settings: Array
+    setting_names: tuple[str, ...]
+    sides: tuple[tuple[str, ...], ...]
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    sigmas: Array
+    error: Array
+    random: Array
+    as_random: float
+    candidates: int
+    remarks: tuple[str, ...]
+
+
+def design_shots(
+    dataset: Dataset,
+    model: AnalyticModel,
+    levels: Mapping[str, Sequence[float]],
+    *,
+    between: Sequence[tuple[str, str]] = (),
+    shrink: str = "",
+    shots: int = 10,
+    seed: int = 0,
+    jobs: int = 1,
+    watch: Callable[[str], None] | None = None,
+) -> ShotPlan:
+    """Choose the shots that best tell effects apart, or that shrink the error bar of a coefficient most.
+
+    Args:
+        dataset: tracks of the launcher, with its settings as labels.
+        model: as declared; it is fitted to the tracks first.
+        levels: candidates, the levels of each setting by the name of its label; all combinations count.
+        between: pairs of effects or coefficients to tell apart, `("wind.x", "drag.k")`.
+        shrink: a coefficient, `drag.k`; either this or `between`.
+        shots: number to choose; a setting may be chosen again.
+        seed: of the random shots that stand beside those chosen.
+        jobs: processes.
+        watch: is told of progress, in lines.
+    Returns: the shots with the standard deviations to expect.
+    Raises: ValueError: neither or both of `between` and `shrink`, labels that the tracks do not have as numbers, too
+        few or too uniform tracks to learn the launcher from, effects that are not known, or no candidate that flies.
+    """
+    if bool(between) == bool(shrink):
+        raise ValueError("either between or shrink must say what the shots are for. Give one of them.")
+    if not 1 <= shots <= MOST_SHOTS:
+        raise ValueError(f"shots must be 1 to {MOST_SHOTS}; got {shots}. Choose another number.")
+    check_labels(dataset, tuple(levels))
+    holdout = hold_out(dataset, model, jobs, watch)
+    fit = _fit_of_all(model, holdout)
+    goal = separating(fit, between) if between else shrinking(fit, shrink)
+    candidates = combinations(levels)
+    launcher = _launcher(fit, holdout.tracks, tuple(levels))
+    starts, settings = launcher.states(candidates), _known_settings(holdout, fit, tuple(levels), candidates)
+    if watch is not None:
+        watch(f"flying {len(candidates)} candidates")
+    information = information_of(fit, goal, starts, settings, holdout.surfaces)
+    choice = choose(information, goal.sides, goal.names, shots, seed)
+    listed = _units(goal, fit)
+    return ShotPlan(
+        candidates[information.kept[choice.shots]],
+        tuple(levels),
+        tuple(tuple(map(_short, side)) for side in goal.sides),
+        tuple(map(_short, goal.names)),
+        tuple(listed[name] for name in goal.names),
+        choice.sigmas,
+        choice.error,
+        choice.random,
+        choice.as_random,
+        len(information.kept),
+        (*_remarks(launcher, candidates, len(information.kept)), *holdout.excluded),
+    )
+
+
+def check_labels(dataset: Dataset, names: Sequence[str]) -> None:
+    """Refuse settings that the tracks do not have as labels.
+
+    Raises: ValueError: a name that no column of labels has.
+    """
+    for name in names:
+        if name not in dataset.label_names:
+            present = ", ".join(dataset.label_names) or "none"
+            raise ValueError(
+                f"candidates must be columns of the dataset's labels.csv; '{name}' is none of them, there are: "
+                f"{present}.{did_you_mean(name, dataset.label_names)} Name those that the launcher was set to."
+            )
+
+
+def _units(goal: Goal, fit: Fit) -> dict[str, str]:
+    """Units of the coefficients of a goal, by parameter name."""
+    units = {name: c.unit for name, c in fit.problem.free.items()}
+    for hypothesis in goal.hypotheses:
+        units |= {hypothesis.parameter(n): hypothesis.coefficients[n].unit for n in hypothesis.strengths}
+    return units
+
+
+def _fit_of_all(model: AnalyticModel, holdout: Holdout) -> Fit:
+    """The declared model fitted to the tracks of both halves."""
+    searched = first_fit(model, holdout)
+    return on_all(searched, on_others(searched, holdout.held_out))
+
+
+def _launcher(fit: Fit, tracks: Sequence[Track], names: tuple[str, ...]) -> LauncherMap:
+    """What the settings do, by the first states of the tracks that have all of them as labels."""
+    labels = {track.name: track.labels for track in tracks}
+    stretches = fit.problem.stretches
+    firsts = np.unique(stretches.track, return_index=True)[1]
+    told = [i for i in firsts if all(isinstance(labels[stretches.names[i]].get(n), float | int) for n in names)]
+    rows = [[float(labels[stretches.names[i]][n]) for n in names] for i in told]
+    return learn_launcher(names, np.array(rows).reshape(-1, len(names)), fit.unknowns.starts[told])
+
+
+def _known_settings(holdout: Holdout, fit: Fit, names: tuple[str, ...], candidates: Array) -> Array:
+    """(m, s) settings as the fit's launcher has them; those that are not candidates stay at their mean."""
+    launcher, used = holdout.launcher.embedding.names, fit.problem.stretches.settings
+    settings = np.repeat(
+        used[used.any(axis=1)].mean(axis=0, keepdims=True) if used.any() else used[:1], len(candidates), 0
+    )
+    for place, name in enumerate(names):
+        if name in launcher:
+            settings[:, launcher.index(name)] = candidates[:, place]
+    return settings
+
+
+def _remarks(launcher: LauncherMap, candidates: Array, usable: int) -> list[str]:
+    scatter = launcher.scatter
+    lost = (
+        []
+        if usable == len(candidates)
+        else [f"{len(candidates) - usable} of {len(candidates)} candidates leave the cameras' view at once or roll"]
+    )
+    spread = (
+        f"first states follow the settings to {1e3 * np.sqrt((scatter[:3] ** 2).mean()):.0f} mm, {scatter[3]:.2g} m/s, "
+        f"{np.degrees(max(scatter[4:6])):.1f} degrees and {np.sqrt((scatter[6:] ** 2).mean()):.0f} rad/s"
+    )
+    return [spread, *launcher.outside(candidates), *lost]
+
+
+def _short(parameter: str) -> str:
+    """Effect and coefficient, without the kind: `wind.x` of `flight.wind.x`."""
+    return parameter.partition(".")[2]

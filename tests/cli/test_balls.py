@@ -1,0 +1,64 @@
+"""`ballfg balls` and the option --ball of other commands."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from ballfg.cli.live import _scene
+from ballfg.dynamics import KNOWN_BALLS
+from ballfg.simulation import SimulationConfig, ball_kind, write_simulation
+from tests.commands import status
+
+
+def test_the_list(capsys: pytest.CaptureFixture[str]) -> None:
+    assert status("balls") == 0
+    header, *lines = capsys.readouterr().out.splitlines()
+    assert header.split()[:5] == ["name", "radius", "mm", "mass", "g"]
+    assert [line.split()[0] for line in lines] == list(KNOWN_BALLS)
+    (basketball,) = [line.split() for line in lines if line.startswith("basketball")]
+    assert basketball[1:6] == ["121.00", "600.0", "0.0248", "19.9", "0.767"]  # sqrt(9.81 / 0.0248) is 19.9 m/s
+
+
+@pytest.fixture(scope="module")
+def basketball(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("balls") / "shots"
+    write_simulation(folder, SimulationConfig(2, 60.0, seed=2, ball=ball_kind("basketball")))
+    return folder
+
+
+def test_the_ball_of_the_dataset_is_named(basketball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    named, plain = tmp_path / "named.csv", tmp_path / "plain.csv"
+    assert status("estimate", basketball, "--ball", "basketball", "--jobs", 1, "--out", named) == 0
+    assert status("estimate", basketball, "--jobs", 1, "--out", plain) == 0
+    assert named.read_bytes() == plain.read_bytes()  # the dataset's own ball wins, named or not
+    assert "no nominal model" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["estimate", "predict", "live"])
+def test_another_ball_is_refused(
+    command: str, basketball: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out.csv"
+    words = {
+        "estimate": ["estimate", basketball, "--out", out],
+        "predict": ["predict", basketball, "--observe", 0.3, "--out", out],
+        "live": ["live", "--replay", basketball, "--out", tmp_path / "out.jsonl"],
+    }
+    assert status(*words[command], "--ball", "tennis") == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert "--ball tennis has a radius of 0.0335 m and 0.0577 kg" in line
+    assert "states 0.121 m and 0.6 kg" in line
+    assert not out.exists()
+
+
+def test_a_shuttle(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert status("simulate", "--ball", "badminton", "--out", tmp_path / "shots") == 2
+    assert "a badminton shuttle is no ball" in capsys.readouterr().err
+
+
+def test_a_stream_without_a_dataset_is_of_the_ball_that_is_named() -> None:
+    ball, _, _ = _scene(None, None, "golf", None, None)
+    assert (ball.radius, ball.inertia_factor) == (0.021335, 0.4)
+    assert _scene(None, None, None, None, None)[0].radius == 0.02

@@ -1,0 +1,75 @@
+"""`ballfg design` as a user meets it: the table, the file, the messages."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+from ballfg.simulation import SimulationConfig, write_simulation
+from tests.commands import status
+
+CANDIDATES = "topspin=-3..5:2,sidespin=-5..5:5,speed=8..14:2"
+
+
+@pytest.fixture(scope="module")
+def launched(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("design") / "shots"
+    write_simulation(folder, SimulationConfig(8, 60.0, seed=2))
+    return folder
+
+
+def test_table_and_file(launched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    one, again = tmp_path / "one.csv", tmp_path / "again.csv"
+    words = ["design", launched, "--candidates", CANDIDATES, "--between", "wind.x,drag.k", "--shots", 3, "--jobs", 1]
+    assert status(*words, "--out", one) == 0
+    said = capsys.readouterr().out
+    assert "3 of 60 candidates, for wind.x from drag.k" in said
+    assert "random shots would bring as much as these 3" in said
+    assert status(*words, "--out", again) == 0
+    assert one.read_bytes() == again.read_bytes()
+    with one.open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["shot"] for row in rows] == ["1", "2", "3"]
+    sigmas = [float(row["sigma_wind.x"]) for row in rows]
+    assert sigmas == sorted(sigmas, reverse=True)
+    assert all(float(row["topspin"]) in (-3, -1, 1, 3, 5) for row in rows)
+
+
+def test_pairs_of_a_diagnosis(launched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    finding = {"name": "frame_tilt", "indistinguishable_from": ["table_tilt", "a change of cameras"]}
+    (tmp_path / "report.json").write_text(json.dumps({"effects": [finding]}))
+    words = ["design", launched, "--candidates", CANDIDATES, "--diagnosis", tmp_path, "--shots", 1, "--jobs", 1]
+    assert status(*words) == 0
+    assert "frame_tilt.x frame_tilt.y from table_tilt.x table_tilt.y" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--candidates", "wheel=1..2", "--shrink", "drag.k"], "'wheel' is none of them, there are: spin_x"),
+        (["--candidates", "speed=8..x", "--shrink", "drag.k"], "must read NAME=LEVEL"),
+        (["--candidates", "speed=8..9", "--between", "wind"], "two effects, separated by a comma; got 'wind'"),
+        (["--candidates", "speed=8..9", "--between", "a,b", "--shrink", "c"], "exclude each other"),
+        (["--candidates", "speed=8..9", "--diagnosis", "nowhere"], "must be a folder with report.json"),
+        (["--candidates", "speed=8..9", "--shrink", "drag.k", "--out", "shots.txt"], ".csv or .parquet"),
+        (["--candidates", "speed=8..9", "--shrink", "drag.k", "--shots", "0"], "shots must be 1 to 1000; got 0"),
+        (["--candidates", "speed=8..9", "--between", "wind,darg"], "effect 'darg' is not known. Did you mean 'drag'"),
+    ],
+)
+def test_mistakes(words: list[str], message: str, launched: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert status("design", launched, *words, "--jobs", 1) == 2
+    assert message in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_a_report_without_a_pair(launched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for text, message in (
+        ('{"effects": []}', "names no pair"),
+        ('{"effects": [{"name": "gravity", "indistinguishable_from": ["buoyancy"]}]}', "names no pair"),
+        ("{}", "is not the report of a diagnosis"),
+    ):
+        (tmp_path / "report.json").write_text(text)
+        assert status("design", launched, "--candidates", "speed=8..9", "--diagnosis", tmp_path, "--jobs", 1) == 2
+        assert message in capsys.readouterr().err

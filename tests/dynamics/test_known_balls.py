@@ -1,0 +1,101 @@
+"""The known balls: terminal speeds, drop tests, names; drag and lift from their coefficients by the formulas."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from ballfg.dynamics import KNOWN_BALLS, Surfaces, advance, fly, known_ball, known_name, nominal_model
+from ballfg.dynamics.analytic import coefficient_sigmas
+
+AIR = 1.2
+"""kg/m^3."""
+COEFFICIENTS = {
+    "basketball": (0.54, 1 / 1.4),
+    "volleyball": (0.35, 1 / 1.4),
+    "football": (0.22, 1.0),
+    "baseball": (0.35, 1 / (0.4 + 2.32 * 0.2)),
+    "golf": (0.25, 1.25),
+}
+"""Drag coefficient, and lift coefficient over the spin ratio R w / v, as the files state them."""
+DROPS = {
+    "tennis": (2.54, 1.35, 1.47, 0.0),
+    "basketball": (1.8, 1.2, 1.4, 2 * 0.121),
+    "football": (2.0, 0.6, 0.85, 0.0),
+}
+"""m: height of the drop, least and most rebound by the rules, and how far above the ball's bottom that is measured."""
+
+
+def coefficient(name: str, group: str, effect: str, symbol: str) -> float:
+    return float(getattr(getattr(nominal_model(name), group)[effect], symbol).detach())
+
+
+@pytest.mark.parametrize("name", COEFFICIENTS)
+def test_drag_and_lift_follow_from_the_coefficients_in_the_file(name: str) -> None:
+    ball, (drag, lift) = KNOWN_BALLS[name].ball, COEFFICIENTS[name]
+    half = AIR * math.pi * ball.radius**2 / (2 * ball.mass)
+    assert coefficient(name, "flight", "drag", "k") == pytest.approx(half * drag, rel=0.01)
+    assert coefficient(name, "flight", "magnus", "k") == pytest.approx(half * ball.radius * lift, rel=0.01)
+
+
+@pytest.mark.parametrize("name", KNOWN_BALLS)
+def test_a_ball_that_falls_long_falls_at_the_terminal_speed(name: str) -> None:
+    """With a = g - k v^2 the speed after t is sqrt(g / k) tanh(sqrt(g k) t)."""
+    model, time = nominal_model(name), 3.0
+    k = coefficient(name, "flight", "drag", "k")
+    state = torch.zeros(1, 9, dtype=torch.float64)
+    with torch.no_grad():
+        fallen = fly(model, state, torch.full((1,), time, dtype=torch.float64))
+        for _ in range(9):
+            fallen = fly(model, fallen, torch.full((1,), time, dtype=torch.float64))
+    speed = math.sqrt(9.81 / k)
+    assert -float(fallen[0, 5]) == pytest.approx(speed * math.tanh(math.sqrt(9.81 * k) * 30.0), rel=1e-4)
+
+
+@pytest.mark.parametrize("name", DROPS)
+def test_the_drop_test_of_the_rules_of_the_game(name: str) -> None:
+    """A ball that hits the ground at v = sqrt(2 g h) rises to e^2 h."""
+    drop, low, high, above = DROPS[name]
+    model = nominal_model(name)
+    state = torch.zeros(1, 9, dtype=torch.float64)
+    state[0, 2], state[0, 5] = model.radius, -math.sqrt(2 * 9.81 * drop)
+    with torch.no_grad():
+        speed = float(model.after_bounce(state)[0, 5])
+    assert low < speed**2 / (2 * 9.81) + above < high
+
+
+def test_names() -> None:
+    assert (known_ball("Table-Tennis"), known_ball("soccer"), known_ball("golf ball")) == (
+        "table_tennis",
+        "football",
+        "golf",
+    )
+    assert all(known_name(known.ball) == name for name, known in KNOWN_BALLS.items())
+    with pytest.raises(ValueError, match=r"got 'basket ball' Did you mean 'basketball'\?"):
+        known_ball("basket ball")
+
+
+@pytest.mark.parametrize("name", ["badminton", "Shuttlecock"])
+def test_a_shuttle_is_no_ball(name: str) -> None:
+    with pytest.raises(ValueError, match="a badminton shuttle is no ball: it turns its cork ahead"):
+        nominal_model(name)
+
+
+def test_spreads_are_shares_of_the_values() -> None:
+    sigmas = coefficient_sigmas(nominal_model("football"))
+    assert sigmas["flight.drag.k"] == pytest.approx(0.4 * 0.0116)
+    assert sigmas["bounce.restitution.e"] == pytest.approx(0.12 * 0.6)
+
+
+def test_a_solid_ball_keeps_more_of_its_way_when_it_grips() -> None:
+    """From a slide without spin, a ball that grips keeps 1 / (1 + c) of its speed; c is 2/5 solid, 2/3 hollow."""
+    for name, kept in (("baseball", 1 / 1.4), ("basketball", 1 / (1 + 2 / 3))):
+        model = nominal_model(name)
+        state = torch.zeros(1, 9, dtype=torch.float64)
+        state[0, 2], state[0, 3], state[0, 5] = model.radius + 1e-6, 1.0, -5.0
+        with torch.no_grad():
+            after = advance(model, state, torch.full((1,), 1e-3, dtype=torch.float64), Surfaces(0.0))
+        # slip stops at v = R w; the impulse J gives v = 1 - J and R w = J / c
+        assert float(after[0, 3]) == pytest.approx(kept, rel=1e-2)
