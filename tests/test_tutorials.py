@@ -19,4 +19,6 @@ def test_a_command_that_fails_is_noticed(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.chdir(tmp_path)
     with pytest.raises(RuntimeError, match="status 2"):
         run_document("```\nballfg estimate nothing --out states.csv\n```\n")
-    assert run_document("```python\nprint(1)\n```\n\n```text\n2\n```\n") == "```python\nprint(1)\n```\n\n```text\n1\n```\n"
+    assert (
+        run_document("```python\nprint(1)\n```\n\n```text\n2\n```\n") == "```python\nprint(1)\n```\n\n```text\n1\n```\n"
+    )

@@ -9,22 +9,22 @@ from typing import Annotated
 
 import typer
 
-from ballfg.cli.calibrate_cameras import calibrate_cameras
-from ballfg.cli.compile import compile_ahead
-from ballfg.cli.design import design
-from ballfg.cli.diagnose import diagnose
-from ballfg.cli.estimate import estimate
-from ballfg.cli.example import example
-from ballfg.cli.import_ import import_
-from ballfg.cli.info import balls, info
-from ballfg.cli.live import live
-from ballfg.cli.noise import noise
-from ballfg.cli.predict import predict
-from ballfg.cli.render import render
-from ballfg.cli.show import show
-from ballfg.cli.simulate import simulate
+from ballfg.cli.commands.calibrate_cameras import calibrate_cameras
+from ballfg.cli.commands.compile import compile_ahead
+from ballfg.cli.commands.design import design
+from ballfg.cli.commands.diagnose import diagnose
+from ballfg.cli.commands.estimate import estimate
+from ballfg.cli.commands.example import example
+from ballfg.cli.commands.import_ import import_
+from ballfg.cli.commands.info import balls, info
+from ballfg.cli.commands.live import live
+from ballfg.cli.commands.noise import noise
+from ballfg.cli.commands.predict import predict
+from ballfg.cli.commands.render import render
+from ballfg.cli.commands.show import show
+from ballfg.cli.commands.simulate import simulate
+from ballfg.cli.commands.track import track
 from ballfg.cli.start import start
-from ballfg.cli.track import track
 
 EARLIER_OPTIONS = {"effects": "effects-file"}
 """Options, without their dashes, that scripts may still write under an earlier name; `--help` shows today's alone."""

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.cli.live import _scene
+from ballfg.cli.commands.live import _scene
 from ballfg.dynamics import KNOWN_BALLS
 from ballfg.simulation import SimulationConfig, ball_kind, write_simulation
 from tests.commands import status

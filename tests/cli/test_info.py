@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.cli.info import extras, packages, required
+from ballfg.cli.commands.info import extras, packages, required
 from tests.places import DOCS
 
 ROOT = Path(__file__).parents[2]

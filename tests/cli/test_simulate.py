@@ -87,7 +87,7 @@ def test_ctrl_c_exits_130_and_leaves_nothing(
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("ballfg.cli.simulate.progress", interrupt)
+    monkeypatch.setattr("ballfg.cli.commands.simulate.progress", interrupt)
     assert status("simulate", "--out", tmp_path / "d", "--tracks", 2) == 130
     assert "interrupted" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,1 @@
+"""The commands of `ballfg`, one file each: they parse, call and print."""
