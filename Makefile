@@ -8,7 +8,7 @@ SOURCES := ballfg factors learning benchmarks tests
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: bench test check check-speed docs package format clean
+.PHONY: bench test check check-speed docs package readme format clean
 
 bench: $(READY)  ## the estimator comparison: table, results/results.json, pictures; measured tracks too where they are
 	$(BIN)/ballfg-bench estimators --out results
@@ -31,6 +31,9 @@ docs: check  ## the documentation as a site: build/site/index.html
 
 check-speed: $(READY)  ## times as multiples of a control, against those of the baseline; two minutes, nothing else running
 	$(BIN)/ballfg-bench speed --gate benchmarks/speed/baseline.json --out results/speed
+
+readme:  ## types all blocks of the README in a fresh clone, installation included; needs no environment
+	$(PYTHON) tests/type_readme.py
 
 package: $(READY)  ## wheel and sdist in dist/, tried in a bare environment away from the sources
 	rm -rf dist build/bare build/lib && $(BIN)/python -m build --no-isolation --outdir dist .

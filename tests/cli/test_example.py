@@ -26,6 +26,10 @@ def test_two_datasets_and_what_to_do_next(
     (command,) = (line.split()[1:] for line in said.splitlines() if line.strip().startswith("ballfg estimate"))
     assert status(*command) == 0
     assert Path("states.csv").is_file()
+    assert status("import", "example/capture.csv", "--out", "mine") == 0
+    mine = read_dataset("mine")
+    assert len(mine) == 6
+    assert mine.info.table_height == pytest.approx(0.76, abs=0.01)
     assert "BSD-3-Clause" in said
 
 

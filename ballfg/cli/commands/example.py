@@ -4,14 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ballfg.cli.inputs import Seed
 from ballfg.progress import progress
 
-PLAIN, WINDY = "shots", "windy"
+if TYPE_CHECKING:
+    from ballfg.simulation import SimulationConfig
+
+PLAIN, WINDY, CAPTURE = "shots", "windy", "capture.csv"
 WIND = "wind.x=0.5"
 MEASURED = (
     ("aimy", "88 shots of a launcher with three wheels", "intelligent-soft-robots/ball_prediction", "BSD-3-Clause"),
@@ -20,6 +23,8 @@ MEASURED = (
     ("spindoe", "shots with measured spin", "cogsys-tuebingen/spindoe", "none stated: for evaluation only"),
 )
 """Name, what it is, the repository on GitHub that publishes it, its licence."""
+PAUSE = 1.5
+"""s between two shots of the recording."""
 
 
 def example(
@@ -35,6 +40,7 @@ def example(
     Example: ballfg example --out example
     """
     from ballfg import simulation
+    from ballfg.files.whole_file import write_text
     from ballfg.files.whole_folder import check_folder, check_replaceable
     from ballfg.simulation.writing import TRUTH_FILE
 
@@ -48,11 +54,27 @@ def example(
     out.mkdir(exist_ok=True)
     for name, config in named:
         simulation.write_simulation(out / name, config, force=force, watch=progress)
+    write_text(out / CAPTURE, _capture(replace(plain, tracks=min(tracks, 12), seed=seed + 2)))
     print(f"{out / PLAIN}: {tracks} simulated table-tennis shots with bounces, truth.csv beside them")
     print(f"{out / WINDY}: {tracks} more, with an effect that their model.yaml does not declare")
+    print(f"{out / CAPTURE}: a recording as another program writes it: one file, mm and ms, y up, decimal commas")
     print("\nnext:")
     print(f"  ballfg estimate {out / PLAIN} --out states.csv")
+    print(f"  ballfg import {out / CAPTURE} --out mine")
     print(f"  ballfg diagnose {out / WINDY} --out diagnosis")
     print("\nmeasured sets, to be had from their authors (ballfg import reads their files):")
     for name, what, source, licence in MEASURED:
         print(f"  {name}: {what}; https://github.com/{source}; licence {licence}")
+
+
+def _capture(config: SimulationConfig) -> str:
+    """Shots one after another in one table, in the units and axes of somebody else."""
+    from ballfg.simulation import simulate
+
+    lines, begin = ["Zeit [ms];X [mm];Y [mm];Z [mm]"], 0.0
+    for shot in simulate(config):
+        times, (x, y, z) = begin + shot.track.times, shot.track.positions.T
+        for row in zip(times, x, z, -y, strict=True):
+            lines.append(";".join(f"{1e3 * number:.3f}".replace(".", ",") for number in row))
+        begin = float(times[-1]) + PAUSE
+    return "\n".join(lines) + "\n"
