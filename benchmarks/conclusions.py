@@ -37,6 +37,34 @@ COMPARED: Final = {
     "apex_1_ahead_mean": "apex after the first bounce",
 }
 """Errors whose best method is named, and their words."""
+WORDS: Final = (
+    (re.compile(r"_vs_"), "*_vs_METHOD: ratio of the errors to those of that method, track by track"),
+    (re.compile(r"_rmse_all$"), "*_all: with the first samples, where a filter knows little yet"),
+    (re.compile(r"_rmse_newest$"), "*_newest: at the newest sample, without any later one"),
+    (re.compile(r"^nees"), "nees: squared errors in units of their covariance; more than it should be means too sure"),
+    (re.compile(r"^nis"), "nis: the same of new measurements"),
+    (re.compile(r"coverage_"), "coverage: share of true values or measurements within their intervals"),
+    (re.compile(r"^places_outside"), "places_outside_99: places of the track whose nees is outside its 99 % range"),
+)
+"""What metrics mean, for those who meet them first."""
+CASES: Final = {
+    "paper": "free flights, true dynamics and spin known to all, noise on states at every step, as in the paper",
+    "fair": "flights with bounces, the same declared noise and the same settings for all",
+    "consistency": "more tracks of the fair protocol; brackets of nees_* are the range that chance allows",
+}
+"""What is compared, by the name of the case."""
+
+
+def legend(case: str, rows: Sequence[Row]) -> list[str]:
+    """Words for a table: what its case is, what brackets are, and what its metrics mean."""
+    metrics = {row.metric for row in rows if CURVE_MARK not in row.metric}
+    ranges = any(row.low is not None for row in rows)
+    found = [CASES[case]] if case in CASES else []
+    found += (
+        ["brackets: 95 % range of the number, by resampling tracks"] if ranges and case in ("paper", "fair") else []
+    )
+    found += ["unit 1: a pure number"] if any(row.unit == "1" for row in rows) else []
+    return found + [words for pattern, words in WORDS if any(pattern.search(metric) for metric in metrics)]
 
 
 def should_be(case: str, metric: str, unit: str) -> str:
@@ -100,10 +128,11 @@ def _covariances(methods: Mapping[str, Row]) -> Iterator[str]:
     goal = target(metric, unit)
     if goal is None:
         return
-    sorts: dict[str, list[str]] = {"right": [], "too small (more certain than it should be)": [], "too large": []}
-    right, small, large = sorts
+    share = metric.startswith("coverage")
+    right, small, large = "right", "too small, errors are larger", "too large, errors are smaller"
+    sorts: dict[str, list[str]] = {right: [], small: [], large: []}
     for method, row in methods.items():
-        value, share = _value(row), metric.startswith("coverage")
+        value = _value(row)
         inside = row.low is not None and row.high is not None and row.low <= goal <= row.high
         near = abs(value - goal) <= (NEAR_SHARE * (100.0 if unit == "%" else 1.0) if share else NEAR * goal)
         sort = right if inside or near else small if (value < goal) == share else large

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Iterable
 from typing import TextIO
 
-from ballfg.benchmarks.conclusions import conclusions, should_be
+from ballfg.benchmarks.conclusions import conclusions, legend, should_be
 from ballfg.benchmarks.results import CURVE_MARK, Row
 
 
@@ -28,6 +28,8 @@ def print_table(rows: Iterable[Row], stream: TextIO | None = None) -> None:
             _print_plain(case, columns, lines, stream)
         for sentence in conclusions(case, of_case):
             print(f"-> {sentence}", file=stream)
+        for words in legend(case, of_case):
+            print(f"   {words}", file=stream)
 
 
 def _pivot(rows: list[Row]) -> tuple[list[str], list[list[str]]]:

@@ -4,7 +4,7 @@ import io
 
 import pytest
 
-from ballfg.benchmarks.conclusions import conclusions, should_be, target
+from ballfg.benchmarks.conclusions import conclusions, legend, should_be, target
 from ballfg.benchmarks.metrics import Figure
 from ballfg.benchmarks.results import Results
 from ballfg.benchmarks.tables import print_table
@@ -72,7 +72,7 @@ def test_whose_covariances_are_right() -> None:
     said = conclusions("fair", rows("fair", *((name, "nees", "1", value) for name, value in nees)))
     assert said == [
         "stated uncertainty, by nees (should be 9) - right: a (9.5), d (11); "
-        "too small (more certain than it should be): b (14); too large: c (4)."
+        "too small, errors are larger: b (14); too large, errors are smaller: c (4)."
     ]
     shares = [("a", 0.88), ("b", 0.7), ("c", 0.99)]
     (said,) = conclusions("aimy", rows("aimy", *((name, "coverage_90", "1", value) for name, value in shares)))
@@ -107,3 +107,11 @@ def test_a_table_shows_right_values_and_conclusions() -> None:
     plain = io.StringIO()
     print_table(rows("time", ("two processes", "one diagnosis", "s", 3.5)), plain)
     assert "should be" not in plain.getvalue()
+
+
+def test_a_legend_says_what_the_metrics_of_a_table_are() -> None:
+    numbers = (("ekf", "nees", "1", 9.0), ("ekf", "velocity_rmse_vs_smoother", "1", 2.0))
+    said = legend("fair", rows("fair", *numbers))
+    assert [words.split(":")[0] for words in said[1:]] == ["*_vs_METHOD", "nees", "unit 1"]
+    assert "bounces" in said[0]
+    assert legend("ballgun", rows("ballgun", ("ekf", "time", "s", 1.0))) == []
