@@ -63,8 +63,8 @@ def legend(case: str, rows: Sequence[Row]) -> list[str]:
     found += (
         ["brackets: 95 % range of the number, by resampling tracks"] if ranges and case in ("paper", "fair") else []
     )
-    found += ["unit 1: a pure number"] if any(row.unit == "1" for row in rows) else []
-    return found + [words for pattern, words in WORDS if any(pattern.search(metric) for metric in metrics)]
+    found += [words for pattern, words in WORDS if any(pattern.search(metric) for metric in metrics)]
+    return [*found, "unit 1: a pure number"] if any(row.unit == "1" for row in rows) else found
 
 
 def should_be(case: str, metric: str, unit: str) -> str:

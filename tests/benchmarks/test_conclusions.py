@@ -76,7 +76,9 @@ def test_whose_covariances_are_right() -> None:
     ]
     shares = [("a", 0.88), ("b", 0.7), ("c", 0.99)]
     (said,) = conclusions("aimy", rows("aimy", *((name, "coverage_90", "1", value) for name, value in shares)))
-    assert said.endswith("right: a (0.88); too small (more certain than it should be): b (0.7); too large: c (0.99).")
+    assert said.endswith(
+        "right: a (0.88); too small, errors are larger: b (0.7); too large, errors are smaller: c (0.99)."
+    )
     percent = rows("aimy", ("nominal", "coverage_90", "%", 92.0))
     assert conclusions("aimy", percent) == ["stated uncertainty, by coverage_90 (should be 90) - right: nominal (92)."]
 
