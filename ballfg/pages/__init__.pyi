@@ -1,12 +1,16 @@
 from .given import Given as Given
 from .given import recognise as recognise
 from .html import Html as Html
+from .html import bar as bar
+from .html import explained as explained
 from .html import items as items
+from .html import meanings as meanings
+from .html import picture as picture
 from .html import section as section
 from .html import table as table
 from .html import tag as tag
-from .html import term as term
 from .html import text as text
+from .html import typed as typed
 from .page import whole_page as whole_page
 from .recording import record as record
 from .shot import Shot as Shot

@@ -1,8 +1,21 @@
-"""The elements of a page: escaped text, tables, lists, terms with an explanation."""
+"""The elements of a page: escaped text, tables, lists, pictures, bars, words with an explanation."""
 
+from __future__ import annotations
+
+import base64
 import html
+import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DPI = 110
+"""Dots per inch of pictures, which are then about as wide as a page on a common screen."""
+WIDE = 8.0
+"""Inches. Wider pictures keep their size on a phone and scroll sideways, so that their words can be read."""
 
 
 class Html(str):
@@ -12,13 +25,15 @@ class Html(str):
 
 
 def text(words: str) -> Html:
-    """Escaped words; `Html` stays. Minus signs and powers of ten are typeset: 3e-12 as 3·10 with −12 raised.
+    """Escaped words; `Html` stays.
+
+    Minus signs, squares in units and powers of ten are typeset: 3e-12 as 3·10 with −12 raised.
 
     Args: words: plain text, or HTML.
     """
     if isinstance(words, Html):
         return words
-    escaped = html.escape(words)
+    escaped = html.escape(words).replace("/s^2", "/s²").replace("m^2", "m²")
     raised = re.sub(r"\b(\d[\d.]*)e([+-]\d+)\b", _power, escaped)
     return Html(re.sub(r"(?<![\w>.)-])-(?=\d)", "−", raised))
 
@@ -72,9 +87,46 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Html:
     return tag("div", tag("table", top, tag("tbody", *lines)), kind="scroll")
 
 
-def term(word: str, explanation: str) -> Html:
-    """A word whose explanation appears under the pointer, or when it is touched or reached by the keyboard.
+def typed(words: str) -> Html:
+    """What a reader copies into a terminal, to the letter: a typeset minus sign would not be understood there.
 
-    Args: word: as it stands in the sentence.  explanation: one sentence.
+    Args: words: a command or an option.
     """
-    return tag("span", word, tag("span", explanation, kind="tip", role="tooltip"), kind="term", tabindex="0")
+    return Html(f"<code>{html.escape(words)}</code>")
+
+
+def explained(word: str, meaning: str, kind: str = "") -> Html:
+    """A word whose meaning appears under the pointer, and below it when it is touched or reached by the keyboard.
+
+    Args: word: as it stands in the sentence.  meaning: one sentence or two.  kind: its CSS class.
+    """
+    return tag("abbr", word, kind=kind, title=meaning, tabindex="0")
+
+
+def meanings(words: Mapping[str, str]) -> Html:
+    """A list of words with their meanings.
+
+    Args: words: word -> meaning.
+    """
+    return tag("dl", *(part for name, meaning in words.items() for part in (tag("dt", name), tag("dd", meaning))))
+
+
+def bar(share: float, colour: str) -> Html:
+    """A horizontal bar.
+
+    Args: share: of the full width, 0 to 1.  colour: a CSS class of the page.
+    """
+    return tag("span", tag("span", kind=f"bar {colour}", style=f"width:{100 * share:.1f}%"), kind="track")
+
+
+def picture(figure: Figure, caption: str) -> Html:
+    """A figure as a PNG inside the page.
+
+    Args: figure: of matplotlib.  caption: below it, and for readers who do not see it.
+    """
+    memory = io.BytesIO()
+    figure.savefig(memory, dpi=DPI, format="png")
+    data = base64.b64encode(memory.getvalue()).decode("ascii")
+    image = Html(f'<img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">')
+    wide = "wide" if figure.get_figwidth() > WIDE else ""
+    return tag("figure", tag("div", image, kind="scroll"), tag("figcaption", caption), kind=wide)

@@ -1,28 +1,35 @@
 """One self-contained HTML file: style, scripts and data are inside, and nothing is loaded from elsewhere."""
 
+import html
 import json
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from typing import Any
 
-from ballfg.pages.html import Html, tag, text
+from ballfg.pages.html import tag
 
 
 def whole_page(
-    title: str, body: Html, *, data: Mapping[str, Any] | None = None, scripts: Sequence[str] = (), plotly: bool = False
+    title: str,
+    *content: str,
+    style: str = "",
+    data: Mapping[str, Any] | None = None,
+    scripts: Sequence[str] = (),
+    plotly: bool = False,
 ) -> str:
     """The text of a page that adapts to wide and narrow screens and to paper.
 
     Args:
         title: of the window.
-        body: the content of the page.
+        content: text or HTML of the page, part after part.
+        style: CSS rules of this page, which go beyond those of all pages.
         data: for the scripts, which find it as JSON in the element `data`; without NaN and infinity.
         scripts: JavaScript, run in this order once the page is there.
         plotly: embed plotly.js before them; it has 4.8 MB.
     Raises: ValueError: data with NaN or infinity.
     """
     parts = ['<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">']
-    parts += [tag("title", title), f"<style>\n{_own('style.css')}</style>"]
+    parts += [f"<title>{html.escape(title)}</title>", f"<style>\n{own('style.css')}{style}</style>"]
     end = []
     if data is not None:
         end.append(f'<script type="application/json" id="data">{_inside_script(data)}</script>')
@@ -31,18 +38,15 @@ def whole_page(
 
         end.append(f"<script>{get_plotlyjs()}</script>")
     end += [f"<script>\n{script}</script>" for script in scripts]
-    content = tag("main", text(body))
-    return (
-        f'<!DOCTYPE html>\n<html lang="en"><head>{"".join(parts)}</head>\n<body>{content}{"".join(end)}</body></html>\n'
-    )
+    body = tag("main", *content)
+    return f'<!DOCTYPE html>\n<html lang="en"><head>{"".join(parts)}</head>\n<body>{body}{"".join(end)}</body></html>\n'
 
 
-def script(name: str) -> str:
-    """The text of a script of this room."""
-    return _own(name)
+def own(name: str) -> str:
+    """The text of a style or a script of this room.
 
-
-def _own(name: str) -> str:
+    Args: name: of its file.
+    """
     return files(__package__).joinpath(name).read_text(encoding="utf-8")
 
 

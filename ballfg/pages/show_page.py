@@ -9,10 +9,10 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.pages.coverage import HALF_WIDTH, LEVEL
-from ballfg.pages.html import Html, items, section, table, tag, term
+from ballfg.pages.html import Html, explained, items, section, table, tag
 from ballfg.pages.marks import GAP
 from ballfg.pages.outline import NET_HEIGHT, Outline
-from ballfg.pages.page import script, whole_page
+from ballfg.pages.page import own, whole_page
 from ballfg.pages.shot import Shot
 from ballfg.pages.shown import Shown
 from ballfg.state import POSITION, SPIN, VELOCITY
@@ -35,8 +35,15 @@ def show_page(shown: Shown) -> str:
     name = _name(shown)
     header = tag("header", tag("p", name), tag("h1", _sentence(shown)), items(shown.notes))
     parts = [_flight(shown), _measured_and_predicted(shown), _residuals(shown), _coverage(shown), _diagnosis(shown)]
-    body = Html(header + "".join(part for part in parts if part))
-    return whole_page(f"{name}: shots", body, data=_data(shown), scripts=(script("show.js"),), plotly=True)
+    return whole_page(
+        f"{name}: shots",
+        header,
+        *parts,
+        style=own("show.css"),
+        data=_data(shown),
+        scripts=(own("show.js"),),
+        plotly=True,
+    )
 
 
 def _name(shown: Shown) -> str:
@@ -109,7 +116,7 @@ def _measured_and_predicted(shown: Shown) -> Html:
 def _residuals(shown: Shown) -> Html:
     if not shown.shots or shown.given.states is None or shown.given.dataset is None:
         return Html()
-    explained = "The measured position less the estimated one. A pattern in time is something that the model lacks."
+    meaning = "The measured position less the estimated one. A pattern in time is something that the model lacks."
     figures = [_figure("residuals", "In mm", "Along x, y and z.", "plot")]
     if shown.noise:
         words = (
@@ -117,7 +124,7 @@ def _residuals(shown: Shown) -> Html:
             f"samples, belong between the dashed lines. Those beyond {LARGEST:g} are drawn there, with open signs."
         )
         figures.append(_figure("whitened", "In standard deviations", words, "plot"))
-    words_ = tag("p", "The ", term("residuals", explained), " of the estimate at each sample. ", shown.noise)
+    words_ = tag("p", "The ", explained("residuals", meaning), " of the estimate at each sample. ", shown.noise)
     return section("Residuals: measured less estimated", words_, tag("div", *figures, kind="plots"))
 
 
@@ -129,7 +136,7 @@ def _coverage(shown: Shown) -> Html:
     words = tag(
         "p",
         "The share of measured coordinates inside their 90 % intervals, by ",
-        term("horizon", "Time from the last observed sample to the predicted one."),
+        explained("horizon", "Time from the last observed sample to the predicted one."),
         ", over all predicted shots. It belongs at the dashed line: "
         "below it the intervals are too narrow, above it too wide.",
     )

@@ -6,9 +6,10 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ballfg.arrays import Array
-from ballfg.files.page_parts import Html, explained, items, meanings, picture, section, table, tag, whole_page
 from ballfg.learning.run.metrics import Epoch
 from ballfg.learning.trainee import Learned, PredictedShot
+from ballfg.pages.html import Html, explained, items, meanings, picture, section, table, tag, typed
+from ballfg.pages.page import whole_page
 
 MEASURED, PREDICTED = "#8c8c8c", "#0072b2"
 TERMS = {
@@ -97,7 +98,7 @@ def _next(better: bool | None, command: str) -> list[Html]:
         )
         parts += [items(lines)]
     if command:
-        parts += [tag("p", "Use the model that was written:"), tag("pre", tag("code", command))]
+        parts += [tag("p", "Use the model that was written:"), tag("pre", typed(command))]
     return parts
 
 

@@ -5,18 +5,15 @@ from __future__ import annotations
 import html
 import json
 import re
-import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
 
 from ballfg.pages import collect, recognise, show_page
+from tests.browser import needs_browser, opened
 from tests.pages.made import Fall, Made, make
 
-BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-pytestmark = pytest.mark.skipif(BROWSER is None, reason="no Chromium on this machine")
-FLAGS = ("--headless", "--no-sandbox", "--disable-gpu", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+pytestmark = needs_browser
 MEASURE = """
 const frame = document.querySelector("iframe");
 frame.addEventListener("load", () => setTimeout(() => {
@@ -47,16 +44,8 @@ frame.addEventListener("load", () => setTimeout(() => {
 
 def browsed(page: str, width: int, folder: Path) -> tuple[dict[str, object], str]:
     """What is drawn in a window of a width in px, and the messages of the console."""
-    # a window cannot be made narrower than 500 px, but a frame can; its text comes with it, so that it can be measured
-    frame = f'<iframe srcdoc="{html.escape(page)}" style="width:{width}px;height:900px;border:0"></iframe>'
-    (folder / "frame.html").write_text(
-        f"<!DOCTYPE html><body>{frame}<script>{MEASURE}</script></body>", encoding="utf-8"
-    )
-    command = [str(BROWSER), *FLAGS, "--enable-logging=stderr", "--v=0", "--virtual-time-budget=12000"]
-    command += [f"--user-data-dir={folder / 'profile'}", "--window-size=1400,1000", "--dump-dom"]
-    done = subprocess.run([*command, (folder / "frame.html").as_uri()], capture_output=True, text=True, timeout=120)
-    (found,) = re.findall(r'<body data-found="([^"]*)"', done.stdout)
-    console = [line for line in done.stderr.splitlines() if "CONSOLE" in line and "GL Driver Message" not in line]
+    elements, console = opened(page, width, MEASURE, folder)
+    (found,) = re.findall(r'<body data-found="([^"]*)"', elements)
     return json.loads(html.unescape(found)), "\n".join(console)
 
 

@@ -3,7 +3,7 @@
 from typing import Final
 
 from ballfg.diagnosis.result import Outcome
-from ballfg.files.page_parts import Html, explained, meanings
+from ballfg.pages.html import Html, explained, meanings
 
 TERMS: Final = {
     "prediction error": "Distance between a predicted and a measured position, in mm: the root mean square (RMSE) over "

@@ -104,3 +104,8 @@ def _named(findings: Sequence[Finding]) -> str:
     return joined(
         tuple(f"{' or '.join((f.name, *f.indistinguishable_from))} ({listed(f.parameters)})" for f in findings)
     )
+
+
+def capital(words: str) -> str:
+    """The same words as the start of a sentence: with a capital first letter."""
+    return words[:1].upper() + words[1:]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -21,38 +20,11 @@ from ballfg.diagnosis.result import Diagnosis, GenericTest, Outcome, Unexplained
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.noise.tracker import NUMBERS
 from tests.diagnosis.made_diagnosis import found, silent, unexplained
+from tests.html_page import HtmlPage
 
 ORIGIN = Origin("ballfg diagnose 'my shots' --out out", ("my shots",), "", "out")
 WIND = replace(found().findings[0], indistinguishable_from=())
 OWN = replace(WIND, name="tide", sentence="The sea pulls. It has two.", parameters={"a": Value(0.2, 0.01, "m")})
-
-
-class Words(HTMLParser):
-    """Words outside of the style, and words with an explanation; every element must be closed."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.words: list[str] = []
-        self.explained: dict[str, str] = {}
-        self.title = ""
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag not in ("meta", "img"):
-            self.open.append(tag)
-        if tag == "abbr":
-            self.title = dict(attrs)["title"] or ""
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if "style" not in self.open:
-            self.words.append(data)
-        if self.open and self.open[-1] == "abbr":
-            self.explained[data] = self.title
 
 
 def with_wind(**components: float) -> Diagnosis:
@@ -161,11 +133,10 @@ def test_an_effect_of_a_user_is_said_in_its_own_words() -> None:
     assert in_plain_words(replace(OWN, parameters={})) == "The sea pulls."
 
 
+@pytest.mark.usefixtures("blank_pictures")
 @pytest.mark.parametrize("made", [found, silent, unexplained])
-def test_a_page_has_no_nan_no_empty_parentheses_and_explains_its_terms(made, monkeypatch) -> None:
-    monkeypatch.setattr("ballfg.diagnosis.report.page.picture", lambda figure, caption: caption)
-    read = Words(page(made(), ORIGIN))
-    assert not read.open
+def test_a_page_has_no_nan_no_empty_parentheses_and_explains_its_terms(made) -> None:
+    read = HtmlPage(page(made(), ORIGIN))
     words = " ".join(read.words)
     assert not re.search(r"\bnan\b|\(\s*\)", words)
     assert "made on" in words
@@ -179,8 +150,8 @@ def test_a_page_has_no_nan_no_empty_parentheses_and_explains_its_terms(made, mon
         assert read.explained["added"] == OUTCOMES[Outcome.ADDED]
 
 
-def test_tests_without_a_finding_show_no_share(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ballfg.diagnosis.report.page.picture", lambda figure, caption: caption)
+@pytest.mark.usefixtures("blank_pictures")
+def test_tests_without_a_finding_show_no_share() -> None:
     quiet = Unexplained("", 0.0, (GenericTest("label", "nothing", 0.9, 1.0),), None)
     text = page(replace(found(), unexplained=quiet))
     shown = text[text.index("What is left unexplained") : text.index("What the model leaves")]
@@ -221,8 +192,8 @@ def test_the_map_holds_the_mean_square_of_each_cell() -> None:
     assert shown == {f"{1e3 * np.sqrt(value):.0f}" for value in total[seen] / count[seen]}
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_the_date_of_a_page_can_be_set(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ballfg.diagnosis.report.page.picture", lambda figure, caption: caption)
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
     assert "1970-01-02 00:00 UTC" in page(found())
     assert page(found()) == page(found())

@@ -6,11 +6,9 @@ import json
 import math
 import re
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
-from matplotlib.figure import Figure
 
 from ballfg.diagnosis.report import report
 from ballfg.diagnosis.report.headline import headline
@@ -21,59 +19,13 @@ from ballfg.diagnosis.result import Diagnosis, Errors, Fallback
 from ballfg.dynamics import Architecture, build, load_model, model_to_dict, nominal_model
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.networks.learned import LearnedModel
-from ballfg.files.page_parts import Html, picture
 from tests.diagnosis.made_diagnosis import found, silent, unexplained
-
-VOID = {"meta", "img"}
-
-
-class Page(HTMLParser):
-    """Words of each heading and of the body, addresses, and whether every element is closed."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.words: list[str] = []
-        self.headings: list[str] = []
-        self.addresses: list[str] = []
-        self.feed(text)
-        self.close()
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.addresses += [value or "" for name, value in attrs if name in ("src", "href")]
-        if tag not in VOID:
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if "style" not in self.open:
-            self.words.append(data)
-        if self.open and self.open[-1] in ("h1", "h2"):
-            self.headings.append(data)
-
-    @property
-    def text(self) -> str:
-        return " ".join("".join(self.words).split())
+from tests.html_page import HtmlPage
 
 
 @pytest.fixture(scope="module")
-def found_page() -> Page:
-    return Page(page(found()))
-
-
-@pytest.fixture
-def drawn(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Captions of the pictures of a page, which are left blank: to draw them takes seconds."""
-    captions: list[str] = []
-
-    def blank(figure: Figure, caption: str) -> Html:
-        captions.append(caption)
-        return picture(Figure(figsize=(0.1, 0.1)), caption)
-
-    monkeypatch.setattr("ballfg.diagnosis.report.page.picture", blank)
-    return captions
+def found_page() -> HtmlPage:
+    return HtmlPage(page(found()))
 
 
 @pytest.fixture
@@ -121,13 +73,12 @@ def test_json_of_a_fallback() -> None:
     assert fallback["error"]["after"]["prediction_rmse_mm"] == made.after.prediction_rmse_mm
 
 
-def test_the_page_stands_alone_and_is_whole(found_page: Page) -> None:
-    assert found_page.open == []
+def test_the_page_stands_alone_and_is_whole(found_page: HtmlPage) -> None:
     assert len(found_page.addresses) == 9
     assert all(address.startswith("data:image/png;base64,") for address in found_page.addresses)
 
 
-def test_the_page_says_what_was_found(found_page: Page) -> None:
+def test_the_page_says_what_was_found(found_page: HtmlPage) -> None:
     assert found_page.headings[0] == headline(found())
     for words in (
         "shots <in a draught>",
@@ -153,20 +104,21 @@ def test_the_page_says_what_was_found(found_page: Page) -> None:
     )
 
 
-def test_pages_without_a_finding(drawn: list[str]) -> None:
-    quiet = Page(page(silent()))
+@pytest.mark.usefixtures("blank_pictures")
+def test_pages_without_a_finding() -> None:
+    quiet = HtmlPage(page(silent()))
     assert quiet.headings[:3] == [headline(silent()), "What to do next", "How well the model predicts"]
     assert "→" not in quiet.text
     assert "No pattern is left" in quiet.text
-    assert len(drawn) == 6  # no errors side by side, no contacts, no second round
-    assert not any("contact" in caption for caption in drawn)
-    left = Page(page(unexplained()))
+    assert len(quiet.addresses) == 6  # no errors side by side, no contacts, no second round
+    assert not any("contact" in caption for caption in quiet.captions)
+    left = HtmlPage(page(unexplained()))
     assert "What is left unexplained" in left.headings
     assert "That is 80 % of the pattern that was there at the start." in left.text
     assert "20.1 mm without, 11.8 mm with it" in left.text
 
 
-@pytest.mark.usefixtures("drawn")
+@pytest.mark.usefixtures("blank_pictures")
 def test_the_three_files_appear_and_the_model_can_be_read(tmp_path: Path) -> None:
     out = tmp_path / "diagnosis"
     write_report(silent(), out)
@@ -176,7 +128,7 @@ def test_the_three_files_appear_and_the_model_can_be_read(tmp_path: Path) -> Non
     assert isinstance(model, AnalyticModel)
     assert model_to_dict(model) == model_to_dict(nominal_model())
     assert json.loads((out / "report.json").read_text(encoding="utf-8"))["verdict"] == "nothing lacking"
-    assert Page((out / "report.html").read_text(encoding="utf-8")).headings[0] == headline(silent())
+    assert HtmlPage((out / "report.html").read_text(encoding="utf-8")).headings[0] == headline(silent())
 
 
 @pytest.mark.usefixtures("no_page")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +18,7 @@ from ballfg.learning.run import record, training
 from ballfg.learning.run.metrics import Epoch, read_metrics
 from ballfg.learning.run.training_page import improved, page, verdict
 from ballfg.learning.trainee import Learned, PredictedShot
+from tests.html_page import HtmlPage
 
 
 def epochs(*errors: float | None) -> list[Epoch]:
@@ -28,27 +28,6 @@ def epochs(*errors: float | None) -> list[Epoch]:
 def config(rate: float, count: int, **fields: Any) -> TrainConfig:
     optimizer = OptimizerConfig(learning_rate=rate, batch=4, epochs=count, schedule="constant", clip=None)
     return TrainConfig(**{"kind": "falling-balls", "seed": 3, "data": "plain", "optimizer": optimizer} | fields)
-
-
-class Balanced(HTMLParser):
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.open: list[str] = []
-        self.words: list[str] = []
-        self.feed(text)
-        self.close()
-        assert not self.open
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        if tag not in ("meta", "img"):
-            self.open.append(tag)
-
-    def handle_endtag(self, tag: str) -> None:
-        assert self.open.pop() == tag
-
-    def handle_data(self, data: str) -> None:
-        if "style" not in self.open:
-            self.words.append(data)
 
 
 def test_whether_it_helped_in_one_sentence() -> None:
@@ -74,7 +53,7 @@ def test_a_page_shows_the_numbers_and_a_shot() -> None:
     learned = [Learned("spin", 1.0, 0.37, "rad/s/√s", "random change of the spin in flight")]
     curves = record.curves(rows, "mlp")
     text = page("mlp: 9 tracks", rows, 1, curves, learned, shot, "ballfg predict D --model m.yaml", "ballfg 1")
-    words = " ".join(" ".join(Balanced(text).words).split())
+    words = " ".join(" ".join(HtmlPage(text).words).split())
     for part in (
         "The training helped: on validation",
         "ballfg predict D --model m.yaml",
@@ -88,7 +67,7 @@ def test_a_page_shows_the_numbers_and_a_shot() -> None:
     assert text.count("data:image/png") == 2
     bare = page("mlp", rows, 0, curves, [], None, "", "ballfg 1")
     assert "Lower optimizer.learning_rate" in bare
-    assert "nan" not in " ".join(Balanced(bare).words)
+    assert "nan" not in " ".join(HtmlPage(bare).words)
 
 
 def test_a_training_that_does_not_improve_says_so_and_ends_with_status_1(

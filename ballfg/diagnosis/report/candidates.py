@@ -1,0 +1,78 @@
+"""The candidates of a diagnosis: a ranking of each round, and those about which the data say nothing."""
+
+import math
+from collections.abc import Iterator, Sequence
+
+from ballfg.diagnosis.report import pictures
+from ballfg.diagnosis.report.glossary import outcome_badge, term
+from ballfg.diagnosis.report.plain_effects import plain_name
+from ballfg.diagnosis.report.wording import NONE, capital, listed, number, probability
+from ballfg.diagnosis.result import Candidate, Diagnosis, Outcome
+from ballfg.dynamics import EFFECTS
+from ballfg.pages.html import Html, bar, picture, section, table, tag
+
+COLOURS = {Outcome.ADDED: "added", Outcome.ALIKE: "alike"}
+"""Classes of the style for the outcome of a candidate."""
+SHOWN = 8
+"""Rows of a ranking that are seen at once; the others unfold."""
+RANKING = (
+    "candidate",
+    term("squared residual", "squared residual it would explain"),
+    term("by chance"),
+    term("BIC"),
+    "first estimate",
+    "outcome",
+)
+
+
+def rankings(diagnosis: Diagnosis) -> Html:
+    """The candidates of each round, best first."""
+    if not diagnosis.rounds:
+        return Html()
+    words = (
+        "Each candidate is tested by its trace in the residuals, with all unknowns free to adapt. The best ones are "
+        "refitted, one is added, and the rest is tested again. Bars have a logarithmic scale."
+    )
+    parts = [tag("p", words)]
+    if len(diagnosis.rounds) > 1:
+        caption = "Candidates that only resemble an added effect explain little once it is in the model."
+        parts.append(picture(pictures.ranking(diagnosis.rounds), caption))
+    most = max((c.explained for row in diagnosis.rounds for c in row), default=0.0)
+    for n, row in enumerate(diagnosis.rounds, start=1):
+        lines = list(_lines(row, most))
+        parts += [tag("h3", f"Round {n}"), table(RANKING, lines[:SHOWN])]
+        if rest := table(RANKING, lines[SHOWN:]):
+            parts.append(tag("details", tag("summary", f"{len(lines) - SHOWN} more candidates"), rest))
+    return section("Which effects were tested", *parts)
+
+
+def _lines(row: Sequence[Candidate], most: float) -> Iterator[tuple[str, ...]]:
+    """The rows of a table; most: squared residual of a full bar."""
+    for c in row:
+        colour = COLOURS.get(c.outcome, "other")
+        unseen = c.outcome is Outcome.INVISIBLE
+        length = math.log1p(max(c.explained, 0.0)) / math.log1p(most) if most > 0.0 and not unseen else 0.0
+        yield (
+            tag("span", tag("b", capital(plain_name(c.name))), " ", tag("code", c.name, kind="quiet")),
+            NONE if unseen else tag("span", bar(length, colour), number(c.explained)),
+            NONE if unseen else probability(c.p_value),
+            NONE if c.delta_bic is None else f"{c.delta_bic:+.0f}",
+            NONE if unseen else listed(c.estimate),
+            outcome_badge(c.outcome, colour),
+        )
+
+
+def invisible(diagnosis: Diagnosis) -> Html:
+    """Candidates about which these data say nothing: they may be there all the same."""
+    last = {c.name: c for row in diagnosis.rounds for c in row}
+    names = [name for name, c in last.items() if c.outcome is Outcome.INVISIBLE]
+    words = (
+        "These effects may be there or not: nothing in the tracks depends on them, or something unknown takes up all "
+        "that they would change. They are not ruled out."
+    )
+    rows = (
+        (tag("b", plain_name(n)), *((EFFECTS[n].sentence, EFFECTS[n].decide) if n in EFFECTS else (NONE, NONE)))
+        for n in names
+    )
+    parts = (tag("p", words), table(("candidate", "it is", "to see it"), rows)) if names else ()
+    return section("What these data cannot show", *parts)

@@ -1,0 +1,66 @@
+"""Which ball flew, by its drag, and how high the table stands, by the bounces."""
+
+from collections.abc import Sequence
+from typing import Final
+
+from ballfg.importing.bounces import surface
+from ballfg.importing.choices import Choices, Guess, UndecidedError
+from ballfg.importing.frame import Frame
+from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball, Track
+
+BALLS: Final = {"table-tennis": TABLE_TENNIS, "tennis": TENNIS}
+_TENNIS_DRAG: Final = 0.045
+"""1/m; halfway, in ratio, between the drags of the two balls."""
+_SURE_WINDOWS: Final = 30
+"""Parts of flights from which on their drag tells one ball from the other."""
+
+
+def ball_of(choices: Choices, frame: Frame) -> tuple[Ball, Guess]:
+    """The ball, and how sure that is.
+
+    Args: choices: what is decided.  frame: with the drag (1/m) that the flights show.
+    Raises: FileNotFoundError, ValueError: a ball that was chosen and is not known, or whose file cannot be read.
+    """
+    if choices.ball is not None:
+        if choices.ball in BALLS:
+            ball = BALLS[choices.ball]
+        else:
+            from ballfg.simulation import ball_kind
+
+            ball = ball_kind(choices.ball).ball
+        return ball, Guess("ball", choices.ball, "as given", "stated", f"--ball {choices.ball}")
+    if frame.drag is None or frame.windows < _SURE_WINDOWS:
+        return TABLE_TENNIS, Guess(
+            "ball", "table-tennis", "too little flight to show the drag", "unsure", "--ball tennis"
+        )
+    if frame.drag < _TENNIS_DRAG:
+        why = f"the drag is only {frame.drag:.2f} 1/m (a tennis ball has 0.02): if it is another ball, name it"
+        return TABLE_TENNIS, Guess("ball", "table-tennis", why, "unsure", "--ball tennis")
+    why = f"drag {frame.drag:.2f} 1/m; a table-tennis ball has 0.13, a tennis ball 0.02"
+    return TABLE_TENNIS, Guess("ball", "table-tennis", why, "likely", "--ball tennis")
+
+
+def table_of(tracks: Sequence[Track], ball: Ball, choices: Choices) -> tuple[float, Guess]:
+    """The height of the table's surface in m, and how sure that is.
+
+    Args: tracks: in m and s with z up.  ball: whose radius lies between a bounce and the surface.  choices: decided.
+    Raises: UndecidedError: no bounce shows it.
+    """
+    if choices.table_height is not None:
+        height = choices.table_height
+        return height, Guess("table height", f"{height:g} m", "as given", "stated", f"--table-height {height:g}")
+    found = surface((track.times, track.positions) for track in tracks)
+    if found is None:
+        lowest = min(float(track.positions[:, 2].min()) for track in tracks)
+        raise UndecidedError(
+            f"no bounce shows the height of the table (m, along the up axis); the lowest sample is at {lowest:.2f} m",
+            "table-height",
+            (),
+            f"{lowest - ball.radius:.2f}" if lowest > 0.5 else "0.76",
+        )
+    height = round(found.centre - ball.radius, 4)
+    others = "".join(f"; also at {other - ball.radius:.2f} m" for other in found.others)
+    one = "1 bounce" if found.bounces == 1 else f"{found.bounces} bounces"
+    why = f"{one}, scatter {1e3 * found.spread:.1f} mm{others}"
+    sure = "sure" if found.bounces >= 3 and not found.others else "likely"
+    return height, Guess("table height", f"{height:g} m", why, sure, f"--table-height {height:g}")

@@ -1,0 +1,191 @@
+"""The tables of a source become its shots: which tables hold positions, and the names, ends and labels of shots."""
+
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any, Final
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.importing.choices import Choices, Guess, UndecidedError
+from ballfg.importing.columns import Roles, roles_of
+from ballfg.importing.fall import TIMES
+from ballfg.importing.formats.raw import RawTable
+from ballfg.importing.frame import Frame, likely_rate
+from ballfg.importing.shots import GAP, GAP_STEPS, Counts, Shot, cut, split_at_gaps
+from ballfg.tracks.track import Label
+
+MOST_SHOTS: Final = 60
+"""Shots from which the units are read, evenly over the source."""
+_INTERRUPTED: Final = 0.5
+"""Share of the files or recordings with gaps, from which on a gap ends a shot and is not a ball out of sight."""
+
+
+def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTable], Roles, list[RawTable]]:
+    """What each table of a source is.
+
+    Args: tables: one or more.  choices: what is decided.
+    Returns: the tables of positions, which all have the same columns; their roles; and the tables beside them.
+    Raises: UndecidedError: no positions, or positions in different columns.
+    """
+    kinds: dict[tuple[Any, ...], list[RawTable]] = {}
+    for table in tables:
+        kinds.setdefault((table.named, *table.columns), []).append(table)
+    read: list[tuple[list[RawTable], Roles]] = []
+    beside: list[RawTable] = []
+    questions: list[UndecidedError] = []
+    for same in kinds.values():
+        try:
+            roles = roles_of(max(same, key=len), choices)
+        except UndecidedError as question:
+            questions.append(question)
+            roles = None
+        if roles is None:
+            beside += same
+        else:
+            read.append((same, roles))
+    if questions and not any(roles.by_name for _, roles in read):
+        raise questions[0]
+    if not read:
+        largest = max(tables, key=len)
+        columns = ", ".join(list(largest.columns)[:12])
+        raise UndecidedError(
+            f"{largest.where}: no columns look like x, y and z; there are {columns}",
+            "columns",
+            (),
+            "t=NAME,x=NAME,y=NAME,z=NAME",
+        )
+    signatures = {(one.places, one.time, one.trajectory) for _, one in read}
+    if len(signatures) > 1 and len(read) > 1:
+        names = [same[0].name or same[0].source for same, _ in read]
+        raise UndecidedError(f"{' and '.join(names[:4])} hold positions in different columns", "key", names)
+    chosen = [table for same, _ in read for table in same]
+    return chosen, read[0][1], beside
+
+
+def shots_of(tables: Sequence[RawTable], roles: Roles, choices: Choices, counts: Counts) -> list[Shot]:
+    """The shots of all tables, in the source's units, with names of their own.
+
+    Args:
+        tables: of positions.  roles: of their columns.  choices: what is decided.
+        counts: adds what was left out or put in order.
+    Raises:
+        UndecidedError: no times and no rate; it says which rate fits.
+        ValueError: no shot with two samples.
+    """
+    try:
+        parts = [(table, cut(table, roles, choices, counts)) for table in tables]
+    except UndecidedError as undecided:
+        if undecided.option != "rate":
+            raise
+        guessed = replace(choices, rate=1.0)
+        frames = [shot for table in tables for shot in cut(table, roles, guessed, Counts())]
+        rate = likely_rate([relative(shot) for shot in frames[:MOST_SHOTS]], roles.length_unit)
+        if rate is None:
+            raise
+        raise UndecidedError(
+            f"{tables[0].where} has no times in s: the number of frames per second is needed; the fall of the ball "
+            f"fits about {rate} Hz",
+            "rate",
+            (str(rate),),
+        ) from None
+    if not any(shots for _, shots in parts):
+        raise ValueError(f"{tables[0].where} must hold two samples of a shot or more; each has less. Check the export.")
+    named = Counter(shot.name for _, shots in parts for shot in shots)
+    clash = len(parts) > 1 and max(named.values()) > 1
+    found: list[Shot] = []
+    for table, shots in parts:
+        own = table.name.rpartition("/")[2] or table.source
+        for shot in shots:
+            name = shot.name
+            if roles.trajectory is None and len(parts) > 1:
+                name = own if len(shots) == 1 else f"{own}-{shot.name}"
+            elif clash:
+                name = f"{own}/{shot.name}"
+            found.append(replace(shot, name=name))
+    return _unique(found)
+
+
+def _unique(shots: Iterable[Shot]) -> list[Shot]:
+    seen: Counter[str] = Counter()
+    found = []
+    for shot in shots:
+        seen[shot.name] += 1
+        found.append(shot if seen[shot.name] == 1 else replace(shot, name=f"{shot.name}#{seen[shot.name]}"))
+    return found
+
+
+def relative(shot: Shot) -> tuple[Array, Array]:
+    """(n,) stamps since the first one and (n, 3) positions of a shot, in the source's units."""
+    return np.asarray(shot.stamps - shot.stamps[0], dtype=np.float64), shot.positions
+
+
+def split(shots: list[Shot], roles: Roles, frame: Frame, choices: Choices) -> tuple[list[Shot], Guess]:
+    """The shots cut at gaps in time where a gap ends a shot, and the guess that this is.
+
+    Args: shots: in the source's units.  roles: of their columns.  frame: its units.  choices: what is decided.
+    """
+    unit = TIMES[frame.time]
+    count = len(shots)
+    if choices.split_gap is not None:
+        done = _unique(split_at_gaps(shots, unit, choices.split_gap))
+        return done, Guess(
+            "shots",
+            str(len(done)),
+            f"cut at gaps of {choices.split_gap:g} s, as given",
+            "stated",
+            f"--split-gap {choices.split_gap:g}",
+        )
+    if roles.trajectory is not None:
+        why = f"one for each value of {roles.trajectory!r}"
+        return shots, Guess("shots", str(count), why, "sure", f"--columns trajectory={roles.trajectory}")
+    steps = [np.diff(shot.stamps).astype(np.float64) * unit for shot in shots]
+    typical = float(np.median(np.concatenate(steps)))
+    gap = max(GAP, GAP_STEPS * typical)
+    interrupted = sum(bool((one > gap).any()) for one in steps)
+    typed = f"--split-gap {gap:g}"
+    if interrupted < _INTERRUPTED * count:
+        why = "a shot ends where time starts again or the file ends"
+        if interrupted:
+            why += f"; gaps over {gap:g} s in {interrupted} of them are taken for a ball out of sight"
+        return shots, Guess("shots", str(count), why, "likely" if interrupted else "sure", typed)
+    done = split_at_gaps(shots, unit, gap)
+    if count == 1:
+        done = [replace(shot, name=f"{i:03d}") for i, shot in enumerate(done)]
+    held = np.concatenate(steps)
+    longest = float(held[held <= gap].max())
+    why = f"a shot ends at a gap over {gap:.3g} s; the longest gap within one is {longest:.2g} s"
+    return _unique(done), Guess("shots", str(len(done)), why, "sure" if longest < gap / 2 else "likely", typed)
+
+
+def with_labels(shots: list[Shot], beside: Sequence[RawTable]) -> list[Shot]:
+    """The shots with the labels of tables that have one row for each of them.
+
+    Args: shots: of the tables of positions.  beside: the other tables.
+    """
+    names = {shot.name for shot in shots}
+    for table in beside:
+        for key, column in table.columns.items():
+            keys = [str(value) for value in column.tolist()]
+            if not set(keys) & names or len(set(keys)) < len(keys):
+                continue
+            rows = {one: i for i, one in enumerate(keys)}
+            others = {name: values.tolist() for name, values in table.columns.items() if name != key}
+            shots = [
+                replace(shot, labels={**shot.labels, **_row(others, rows[shot.name])}) if shot.name in rows else shot
+                for shot in shots
+            ]
+            break
+    return shots
+
+
+def _row(columns: Mapping[str, list[Any]], row: int) -> dict[str, Label]:
+    found: dict[str, Label] = {}
+    for name, values in columns.items():
+        value = values[row]
+        if isinstance(value, str) and value:
+            found[name] = value
+        elif isinstance(value, int | float) and np.isfinite(value):
+            found[name] = float(value)
+    return found
