@@ -94,6 +94,13 @@ class Trainee(ABC):
         """
         return None
 
+    def without_training(self, tracks: Sequence[int]) -> BatchLoss | None:
+        """As `judge`, of the model that one has without any training; None, by default, where that is no other model.
+
+        Args: tracks: numbers.
+        """
+        return None
+
     def learned(self) -> Sequence[Learned]:
         """Numbers with a meaning that were learned, such as noise and coefficients; none by default."""
         return ()

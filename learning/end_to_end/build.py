@@ -1,5 +1,6 @@
 """From a config to a model of the dynamics that is trained through the estimator."""
 
+import copy
 from collections.abc import Mapping
 
 from ballfg.dynamics import AnalyticModel, BallModel
@@ -33,6 +34,10 @@ def build_end_to_end(config: TrainConfig) -> Prepared:
         begin_with_tracks(data.embedding, [data.shots[k] for k in data.train], data.analytic)
     process, scale = data.shots[0].settings.process, config.noise.position_scale or 1.0
     noise = NoiseScales(process, position=scale, learned=config.loss.likelihood > 0.0)
+    untrained = None
+    if config.kind in NETWORKS:
+        alone = Learnables(*copy.deepcopy((data.analytic, data.embedding, noise)))
+        untrained = EndToEnd(data.shots, alone, config.loss)
     model = _model(config, data.analytic)
     trainee = EndToEnd(
         data.shots,
@@ -46,6 +51,7 @@ def build_end_to_end(config: TrainConfig) -> Prepared:
         noise_step=config.optimizer.noise_step,
         fades=data.train,
         held_out=data.validation,
+        untrained=untrained,
     )
     return Prepared(trainee, data.train, data.validation)
 

@@ -4,6 +4,8 @@ The estimate is a function of the model, the launcher's embedding and the noise.
 implicit function theorem (`ballfg.learning.gradient.implicit`). Source: Q. Xiao, Z. Wu, M. Gombolay 2024, section III.
 """
 
+from __future__ import annotations
+
 from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -86,6 +88,7 @@ class EndToEnd(Trainee):
         anchor: distance of the model from the analytic one; None if it is not part of the loss.
         coefficient_step: scale of the learning rate of declared coefficients, in their prior standard deviations.
         noise_step: scale of the learning rate of the noise's logarithms.
+        untrained: the same shots with the model that one has without a training; None if there is no other.
     """
 
     def __init__(
@@ -104,6 +107,7 @@ class EndToEnd(Trainee):
         noise_step: float = NOISE_STEP,
         fades: Sequence[int] = (),
         held_out: Sequence[int] = (),
+        untrained: EndToEnd | None = None,
     ) -> None:
         self.module = learnables
         self.learnables = learnables
@@ -119,6 +123,7 @@ class EndToEnd(Trainee):
         self.noise_step = noise_step
         self.fades = tuple(fades)
         self.held_out = tuple(held_out)
+        self.untrained = untrained
         scale = None if loss.position_scale is None else loss.position_scale / LOSS_UNIT
         self.before = self._numbers()
         self.point_loss = Loss() if scale is None else Loss("huber", scale)
@@ -210,6 +215,10 @@ class EndToEnd(Trainee):
         times = (shot.track.times - shot.track.times[shot.observed - 1])[: len(counted)][counted]
         error = prediction.error[0, : len(counted)].numpy()[counted]
         return PredictedShot(shot.name, times, measured, measured + error)
+
+    def without_training(self, tracks: Sequence[int]) -> BatchLoss | None:
+        """The loss of the analytic model on tracks, where a network is trained."""
+        return None if self.untrained is None else self.untrained.judge(tracks)
 
     def learned(self) -> Sequence[Learned]:
         """Declared coefficients and, where it is learned, the noise."""

@@ -18,7 +18,7 @@ from ballfg.learning.run.loop import Task, Training, TrainingStoppedError
 from ballfg.learning.run.metrics import Epoch
 from ballfg.learning.run.ranks import TOLD_BY_FIRST, Ranks, join_ranks
 from ballfg.learning.run.record import Record, curves
-from ballfg.learning.run.training_page import improved, page, verdict
+from ballfg.learning.run.training_page import beside_untrained, improved, page, verdict
 from ballfg.learning.trainee import PredictedShot, Prepared
 from ballfg.machine import versions
 from ballfg.progress import Watch, unwatched
@@ -107,9 +107,12 @@ def _finish(training: Training, record: Record | None, folder: Path) -> int:
     if progress is None or record is None:
         return 0
     shot = median_shot(training.task)
-    _write_page(training, record, folder, model, shot)
+    untrained = _untrained(training.task)
+    _write_page(training, record, folder, model, shot, untrained)
     better = improved(epochs, progress.best_epoch)
     print(verdict(epochs, progress.best_epoch))
+    beside = beside_untrained(epochs, progress.best_epoch, untrained)
+    print(beside, end="\n" if beside else "")
     if progress.best_rmse is not None:
         print(f"best: epoch {progress.best_epoch}, validation RMSE {1e3 * progress.best_rmse:.2f} mm")
     else:
@@ -132,14 +135,28 @@ def _stop(training: Training, record: Record, folder: Path) -> None:
     print(f"{model}: the best model so far, of epoch {training.progress.best_epoch}", file=sys.stderr)
 
 
-def _write_page(training: Training, record: Record, folder: Path, model: Path, shot: PredictedShot | None) -> None:
+def _untrained(task: Task) -> float | None:
+    """RMSE of the model that one has without a training on the validation tracks, m; None where there is no other."""
+    judged = task.trainee.without_training(task.validation) if task.validation else None
+    return math.sqrt(judged.squared_error / judged.points) if judged is not None and judged.points else None
+
+
+def _write_page(
+    training: Training,
+    record: Record,
+    folder: Path,
+    model: Path,
+    shot: PredictedShot | None,
+    untrained: float | None = None,
+) -> None:
     best = 0 if training.progress is None else training.progress.best_epoch
     data = training.task.config.data
     dataset = data[0] if data else "DATASET"
     command = f"ballfg predict {dataset} --model {model} --observe 0.3 --out predictions.csv" if model.is_file() else ""
     packages = ", ".join(f"{name} {version}" for name, version in versions(files.PACKAGES).items())
     drawn, learned = curves(record.epochs, record.title), training.task.trainee.learned()
-    write_text(folder / files.PAGE, page(record.title, record.epochs, best, drawn, learned, shot, command, packages))
+    text = page(record.title, record.epochs, best, drawn, learned, shot, command, packages, untrained)
+    write_text(folder / files.PAGE, text)
 
 
 def median_shot(task: Task) -> PredictedShot | None:

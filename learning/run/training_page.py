@@ -33,6 +33,18 @@ def improved(epochs: Sequence[Epoch], best_epoch: int) -> bool | None:
     return best_epoch > 0
 
 
+def beside_untrained(epochs: Sequence[Epoch], best_epoch: int, untrained: float | None) -> str:
+    """How the analytic model does on the same tracks, in one sentence; empty where nobody knows.
+
+    Args: untrained: RMSE of the analytic model on the validation tracks, m.
+    """
+    found = {e.epoch: e.validation_rmse for e in epochs}.get(best_epoch)
+    if untrained is None or found is None:
+        return ""
+    said = f"The analytic model alone predicts them to {1e3 * untrained:.1f} mm"
+    return f"{said}." if found < untrained else f"{said}, which is better still: train longer, or keep that one."
+
+
 def verdict(epochs: Sequence[Epoch], best_epoch: int) -> str:
     """Whether the training helped, in one sentence."""
     better = improved(epochs, best_epoch)
@@ -61,6 +73,7 @@ def page(
     shot: PredictedShot | None,
     next_command: str,
     packages: str,
+    untrained: float | None = None,
 ) -> str:
     """The whole page.
 
@@ -73,10 +86,16 @@ def page(
         shot: a validation track predicted by the written model; None where there is none.
         next_command: what to type next; empty where no command takes the model.
         packages: their versions in words.
+        untrained: RMSE of the analytic model on the validation tracks, m; None where it is not known.
     """
+    first = f"{verdict(epochs, best_epoch)} {beside_untrained(epochs, best_epoch, untrained)}".strip()
     return whole_page(
         f"training: {title}",
-        tag("header", tag("p", title), tag("h1", verdict(epochs, best_epoch))),
+        tag(
+            "header",
+            tag("p", title),
+            tag("h1", first),
+        ),
         section("What to do next", *_next(improved(epochs, best_epoch), next_command)),
         _numbers(epochs, best_epoch),
         section("The course of the training", picture(curves, "Loss and errors after each epoch.")),

@@ -18,14 +18,15 @@ TERMS: Final = {
     "log likelihood": "How probable the measurements are under the predictions, as a logarithm per coordinate; larger "
     "is better. It judges the error and the stated uncertainty together.",
     "by chance": "Probability that noise alone gives a trace as strong as this one (p-value), corrected for the number "
-    "of effects tested. Below 0.005 it counts as found.",
+    "of effects tested. Below 0.005 an effect is a candidate, and is added if it passes the other questions too. Very "
+    "small numbers say: certainly not chance.",
     "BIC": "Bayesian information criterion: badness of fit plus a penalty for each further coefficient. An effect pays "
     "for itself where the BIC falls; by 10 is strong evidence.",
     "coefficient": "A number of the model, such as the strength of the drag. After ± stands one standard deviation: "
     "the true value lies within two of them in 95 of 100 cases.",
     "residual": "Measured minus predicted.",
-    "squared residual": "Squared residuals in units of their noise, summed. Chance explains about 1 for each "
-    "coefficient.",
+    "squared residual": "Squared residuals in units of their noise, summed. Under independent errors chance explains "
+    "about 1 for each coefficient; errors of one track go together, which the probability beside it allows for.",
     "stretch": "The part of a track between two hits by a player or launcher.",
     "round": "One pass of the search: all effects are tested, and at most one is added to the model.",
     "generic test": "A test for a pattern of any cause: by place, speed, spin, time or order in the recording.",
@@ -41,7 +42,8 @@ OUTCOMES: Final = {
     Outcome.INSIGNIFICANT: "Its fitted coefficients may as well be zero.",
     Outcome.CONTRADICTORY: "The two halves of the tracks want values of it that exclude each other.",
     Outcome.SAME_PATTERN: "It explains the pattern of another effect, which explains more.",
-    Outcome.NOT_NEEDED: "Nothing in the tracks asks for it: what it would explain, chance explains as well.",
+    Outcome.NOT_NEEDED: "With the model of this round nothing asks for it any more: what it would explain, the effects "
+    "that were added explain, or chance.",
     Outcome.INVISIBLE: "Nothing in these tracks depends on it, so they neither show it nor rule it out.",
 }
 """What each outcome of a candidate means."""

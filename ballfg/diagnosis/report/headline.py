@@ -96,7 +96,7 @@ def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
             f"ballfg estimate {dataset} --model {model} --out states.csv",
         )
         yield (
-            "Predict with the corrected model:",
+            "Predict with the corrected model, from the first 0.3 s of each track:",
             f"ballfg predict {dataset} --model {model} --observe 0.3 --out predictions.csv",
         )
     else:
@@ -106,7 +106,7 @@ def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
             f"ballfg estimate {dataset} --model {model} --out states.csv",
         )
         yield (
-            "To look again once there are more tracks:",
+            "Once there are more tracks, look again; the report of today is then replaced:",
             f"ballfg diagnose {dataset}{given} --out {shlex.quote(origin.out)}",
         )
     for finding in diagnosis.findings:
@@ -134,7 +134,8 @@ def _sure(finding: Finding) -> str:
     word = next((word for limit, word in SURE if worst < limit), "possible")
     sure = f"{word}. Chance makes a trace so strong with probability {probability(finding.p_value)}"
     if math.isfinite(finding.held_out_p):
-        sure += f"; tracks that had no part in finding it agree (by chance {probability(finding.held_out_p)})"
+        by_chance = probability(finding.held_out_p)
+        sure += f"; its strength, fitted to half of the tracks, helps on the other half (by chance: {by_chance})"
     if finding.indistinguishable_from:
         sure += (
             f". That something like it is there is sure; but it may be {_or(finding.indistinguishable_from)} as well"

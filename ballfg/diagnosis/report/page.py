@@ -27,7 +27,7 @@ def page(diagnosis: Diagnosis, origin: Origin | None = None) -> str:
     """The whole page; origin: the command and the files that it comes from, where they are known."""
     badge = tag("span", diagnosis.verdict.value, kind=f"badge {BADGES[diagnosis.verdict]}")
     question = tag("p", f"{diagnosis.dataset} · what does the model lack? ", badge)
-    values = (term("coefficient"), "declared", "fitted with the added effects")
+    values = (term("coefficient"), "declared", "fitted" + (" with the added effects" if diagnosis.findings else ""))
     calibrated = table(values, _values(diagnosis.calibrated))
     noise = table(("position noise along", "stated", "estimated"), _values(diagnosis.noise))
     return whole_page(
@@ -177,16 +177,19 @@ def _residuals(diagnosis: Diagnosis) -> Html:
 
 def _values(values: Mapping[str, Value]) -> Iterator[tuple[str, ...]]:
     for name, value in values.items():
-        yield tag("code", name), NONE if value.declared is None else number(value.declared, 4), plus_minus(value)
+        unit = "" if value.unit == "1" else f" {value.unit}"
+        declared = NONE if value.declared is None else f"{number(value.declared, 4)}{unit}"
+        yield tag("code", name), declared, plus_minus(value)
 
 
 def _evaluation(diagnosis: Diagnosis) -> Html:
     """The halves, their use, and tracks that were left out."""
     words = (
-        f"Effects were looked for in all tracks, fitted to {diagnosis.tracks_found_on} of them, and had to help on the "
-        f"other {diagnosis.tracks_judged_on}, whose errors are given. The coefficients of the corrected model are "
-        "those of all tracks. Probabilities are corrected for the number of candidates and use the noise that the "
-        "tracks show."
+        "Traces of effects were looked for in all tracks: half of them would show only larger ones. The strength of an "
+        f"effect was then fitted to {diagnosis.tracks_found_on} tracks, and with that strength it had to help on the "
+        f"other {diagnosis.tracks_judged_on}, the held-out ones, whose errors are given. Once the search was over, the "
+        "coefficients of the model that is written were fitted to all tracks. Probabilities are corrected for the "
+        "number of candidates and use the noise that the tracks show."
     )
     excluded = items(diagnosis.excluded)
     return section("How it was evaluated", tag("p", words), tag("p", "Left out:") if excluded else "", excluded)

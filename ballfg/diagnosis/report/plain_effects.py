@@ -34,9 +34,9 @@ class Plain:
 
 def plain_name(effect: str) -> str:
     """An effect as a noun: `a wind`; of an unknown effect its name with spaces."""
-    for ending, words in ((BY_GROUP, "that differs between groups"), (DRIFT, "that changes along the recording")):
+    for ending, words in ((BY_GROUP, "different from group to group"), (DRIFT, "changing along the recording")):
         if effect.endswith(ending):
-            return f"{plain_name(effect.removesuffix(ending))} {words}"
+            return f"{plain_name(effect.removesuffix(ending))}, {words}"
     return PLAIN[effect].name if effect in PLAIN else effect.replace("_", " ")
 
 

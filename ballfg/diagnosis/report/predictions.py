@@ -25,8 +25,11 @@ def errors(diagnosis: Diagnosis) -> Html:
         f"Of {diagnosis.tracks_judged_on} ",
         term("held-out tracks"),
         " the first 40 % was observed. The rest was predicted and compared with the measured positions. "
-        + ("Both models were" if changed else "The model was")
-        + " fitted to the other tracks.",
+        + (
+            "Both models were fitted to the other tracks, the declared one without what was added."
+            if changed
+            else "The model was fitted to the other tracks."
+        ),
     )
     if not changed:
         rows = [(name, _fixed(now, unit), goal) for name, _, now, unit, goal in numbers]

@@ -41,7 +41,8 @@ def plus_minus(value: Value) -> str:
     decimals = max(0, 1 - math.floor(math.log10(value.sigma)))
     if decimals > MOST_DECIMALS:
         return f"{value.value:.3g} ± {value.sigma:.2g}{unit}"
-    return f"{value.value:.{decimals}f} ± {value.sigma:.{decimals}f}{unit}"
+    shown = f"{value.value:.{decimals}f}"
+    return f"{shown.removeprefix('-') if float(shown) == 0.0 else shown} ± {value.sigma:.{decimals}f}{unit}"
 
 
 def listed(values: Mapping[str, Value]) -> str:
@@ -55,7 +56,7 @@ def probability(p: float) -> str:
         return NONE
     if p < LEAST_PROBABILITY:
         return f"less than {LEAST_PROBABILITY:.0e}"
-    return f"{p:.2g}" if p >= 0.01 else f"{p:.0e}".replace("e-0", "e-")
+    return f"{p:.2g}" if p >= 1e-3 else f"{p:.0e}".replace("e-0", "e-")
 
 
 def change(before: float, after: float) -> str:

@@ -157,7 +157,7 @@ class Wind(FlightEffect):
     """All air forces act on v - u, with a constant air velocity u; drag alone becomes -k |v - u| (v - u)."""
 
     name = "wind"
-    sentence = "The air moves at a constant velocity: drag and Magnus force act on the velocity against the air."
+    sentence = "The air moves at a constant velocity: drag and Magnus force act on the velocity relative to the air."
     decide = "Shoot in the opposite direction, or across: the wind keeps its direction, drag turns with the shot."
     coefficients = tuple(Coefficient(axis, 0.0, 0.3, "m/s", -20.0, 20.0) for axis in "xyz")
 

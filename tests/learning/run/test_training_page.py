@@ -16,7 +16,7 @@ from ballfg.learning.cli import run as command
 from ballfg.learning.config.training import OptimizerConfig, SplitConfig, TrainConfig
 from ballfg.learning.run import record, training
 from ballfg.learning.run.metrics import Epoch, read_metrics
-from ballfg.learning.run.training_page import improved, page, verdict
+from ballfg.learning.run.training_page import beside_untrained, improved, page, verdict
 from ballfg.learning.trainee import Learned, PredictedShot
 from tests.html_page import HtmlPage
 
@@ -126,3 +126,13 @@ def test_ctrl_c_leaves_the_best_model_so_far_and_resume_ends_the_same(
         assert (stopped / file).read_bytes() == (whole / file).read_bytes()
     pairs = zip(read_metrics(stopped / "metrics.csv"), read_metrics(whole / "metrics.csv"), strict=True)
     assert all(replace(a, seconds=0.0) == replace(b, seconds=0.0) for a, b in pairs)
+
+
+def test_the_analytic_model_stands_beside_the_trained_one() -> None:
+    """A network that is better than before its first step may still be worse than no network."""
+    trained = epochs(0.0696, 0.0267)
+    assert beside_untrained(trained, 1, 0.019) == (
+        "The analytic model alone predicts them to 19.0 mm, which is better still: train longer, or keep that one."
+    )
+    assert beside_untrained(trained, 1, 0.05) == "The analytic model alone predicts them to 50.0 mm."
+    assert beside_untrained(trained, 1, None) == ""
