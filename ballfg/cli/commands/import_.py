@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import typer
 
+from ballfg.progress import idle
+
 if TYPE_CHECKING:
     from ballfg.importing import Choices, Proposal, UndecidedError
 
@@ -30,7 +32,7 @@ def import_(
     flip: Annotated[str | None, _guess(help="Axis to mirror, for a left-handed frame: x, y or z.")] = None,
     table_height: Annotated[float | None, _guess(help="z of the table's surface in the new frame, m.")] = None,
     split_gap: Annotated[float | None, _guess(help="Gap after which a new shot begins, s.")] = None,
-    ball: Annotated[str | None, _guess(help="Ball: table-tennis, tennis or a ball file (YAML).")] = None,
+    ball: Annotated[str | None, _guess(help="One of `ballfg balls`, or a ball file (YAML).")] = None,
     rate: Annotated[float | None, _guess(help="Frames per second, where there are frames and no times.")] = None,
     key: Annotated[
         str | None, _guess("--key", "--sheet", help="Table, sheet or group, where a source holds several.")
@@ -83,7 +85,8 @@ def _answered(question: UndecidedError, choices: Choices) -> Choices:
     from ballfg.importing import parse_columns
 
     default = question.choices[0] if question.choices else None
-    answer = typer.prompt(f"{question}\n--{question.option}", default=default, err=True)
+    with idle():  # who is asked may take time to answer
+        answer = typer.prompt(f"{question}\n--{question.option}", default=default, err=True)
     field = question.option.replace("-", "_")
     if field == "columns":
         return replace(choices, columns={**choices.columns, **parse_columns(answer)})
