@@ -94,7 +94,10 @@ def test_other_verdicts(
     assert said.startswith(f"{headline(silent())}\nnothing lacking: Nothing is lacking")
     assert "effect " not in said
     answer(unexplained())
-    assert status("diagnose", dataset, "--out", tmp_path / "a") == 0
+    assert status("diagnose", dataset, "--out", tmp_path / "a") == 2
+    refused(capsys, "out must be new or empty; ")
+    assert json.loads((tmp_path / "a" / "report.json").read_text(encoding="utf-8"))["verdict"] == "nothing lacking"
+    assert status("diagnose", dataset, "--out", tmp_path / "a", "--force") == 0
     said = capsys.readouterr().out
     assert "left unexplained: In flight, along the motion" in said
     assert "  sparse terms: 0.31 t |v| v; prediction RMSE 11.8 mm with it" in said

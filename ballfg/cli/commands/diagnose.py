@@ -18,12 +18,13 @@ if TYPE_CHECKING:
 
 def diagnose(
     datasets: DatasetFolders,
-    out: Annotated[Path, typer.Option(help="Folder of the report: new, empty or with an earlier report.")],
+    out: Annotated[Path, typer.Option(help="Folder of the report, new or empty.")],
     model: Annotated[Path | None, typer.Option(help="Model file. Default: the nominal model of the ball.")] = None,
     effects_file: EffectsFiles = None,
     jobs: Jobs = CORES,
     cluster: Cluster = None,
     address: Address = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace an earlier report.")] = False,
 ) -> None:
     """Find effects that the model lacks, with their evidence, their alternatives and the gain in prediction.
 
@@ -46,9 +47,9 @@ def diagnose(
 
     if any(out.resolve() == dataset.resolve() for dataset in datasets):
         raise ValueError(f"out must not be the dataset itself; got {out}. Choose another folder.")
-    check_report_folder(out)
     if model is not None and model.resolve() == out.resolve() / MODEL:
         raise ValueError(f"out must not hold the model itself; {model} would be replaced. Choose another folder.")
+    check_report_folder(out, force=force)
     inputs, *others = [open_inputs(dataset, model, effects_file) for dataset in datasets]
     if not isinstance(inputs.model, AnalyticModel):
         raise ValueError(

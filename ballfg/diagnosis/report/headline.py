@@ -89,6 +89,7 @@ def certainty(diagnosis: Diagnosis) -> Iterator[str]:
 def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
     """What to do next: a sentence, and the command to type (empty where there is none)."""
     dataset, model = shlex.quote(origin.datasets[0]), shlex.quote(f"{origin.out.rstrip('/')}/model.yaml")
+    again = shlex.quote(f"{origin.out.rstrip('/')}_again")
     changed = bool(diagnosis.findings) or diagnosis.unexplained.fallback is not None
     if changed:
         yield (
@@ -106,8 +107,8 @@ def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
             f"ballfg estimate {dataset} --model {model} --out states.csv",
         )
         yield (
-            "Once there are more tracks, look again; the report of today is then replaced:",
-            f"ballfg diagnose {dataset}{given} --out {shlex.quote(origin.out)}",
+            "Once there are more tracks, look again:",
+            f"ballfg diagnose {dataset}{given} --out {again}",
         )
     for finding in diagnosis.findings:
         for name in (finding.name, *finding.indistinguishable_from) if finding.indistinguishable_from else ():
@@ -118,7 +119,7 @@ def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
         yield (
             f"Look for a cause of what is left ({where(diagnosis.unexplained.where)}): record tracks in which that "
             "quantity varies more. If you have a suspicion, write it as an effect of your own and diagnose again:",
-            f"ballfg diagnose {dataset} --effects-file my_effects.py --out {shlex.quote(origin.out)}",
+            f"ballfg diagnose {dataset} --effects-file my_effects.py --out {again}",
         )
 
 

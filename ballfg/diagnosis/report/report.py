@@ -62,14 +62,15 @@ def write_report(
         (made / REPORT).write_text(text + "\n", encoding="utf-8")
 
 
-def check_report_folder(folder: Path) -> None:
+def check_report_folder(folder: Path, *, force: bool = True) -> None:
     """Refuse a folder whose content must not be lost.
 
+    Args: folder: for a report.  force: an earlier report may be replaced.
     Raises:
-        ValueError: if it is a file or a folder with other content than an earlier report.
+        ValueError: if it is a file or a folder with other content than an earlier report, or with one and no force.
         FileNotFoundError: if its parent does not exist.
     """
-    check_replaceable(folder, mark=REPORT, what="an earlier report")
+    check_replaceable(folder, mark=REPORT, what="an earlier report", force=force)
 
 
 def content(diagnosis: Diagnosis) -> dict[str, Any]:
