@@ -96,7 +96,8 @@ def estimate(
     check_device(method, device)
     data = _opened(measured)
     if isinstance(data, Track):
-        return estimate_together(estimator_for(data, method, model, surfaces, settings), [data], device)[0]
+        estimator = estimator_for(data, method, model, surfaces, settings)
+        return estimator.estimate(data) if device is None else estimate_together(estimator, [data], device)[0]
     estimator = estimator_for(data, method, model, surfaces, settings)
     return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs, device)}
 

@@ -230,7 +230,7 @@ def test_ctrl_c_leaves_nothing(
         yield next(iter(items))  # type: ignore[call-overload]
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(f"ballfg.cli.{command}.progress", interrupt)
+    monkeypatch.setattr(f"ballfg.cli.commands.{command}.progress", interrupt)
     options = ["--observe", "0.2"] if command == "predict" else []
     assert status(command, dataset, "--method", "sliding-window", *options, "--out", tmp_path / "s.csv") == 130
     assert "interrupted" in capsys.readouterr().err

@@ -47,7 +47,7 @@ def test_other_balls_and_models(tmp_path: Path) -> None:
         (["--tracks", "0"], "tracks must lie in 1"),
         (["--tracks", "many"], "'--tracks'"),
         (["--noise", "-1"], "position must be at least 0"),
-        (["--ball", "golf"], "ball must be table-tennis or tennis"),
+        (["--ball", "squash"], "ball must be "),
         (["--model", "none.yaml"], "none.yaml does not exist"),
         (["--format", "xls"], "'csv' or 'parquet'; got 'xls'"),
         (["--settings", "topspin=9"], "topspin must lie in -3 .. 5; got 9"),

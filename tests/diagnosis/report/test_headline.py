@@ -64,7 +64,7 @@ def test_nothing_found_says_so_and_what_that_rests_on() -> None:
     assert sure[0].startswith(f"{tested - 2} effects")
     assert sure[1] == "These tracks say nothing about 2 more effects, which may be there or not."
     assert [c for _, c in advice(silent(), replace(ORIGIN, model="m.yaml"))][1] == (
-        "ballfg diagnose 'my shots' --model m.yaml --out out"
+        "ballfg diagnose 'my shots' --model m.yaml --out out_again"
     )
 
 

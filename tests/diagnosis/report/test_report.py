@@ -90,7 +90,7 @@ def test_the_page_says_what_was_found(found_page: HtmlPage) -> None:
         "These data cannot tell a wind and a wind in one part of the room apart. What would decide it:",
         "a wind: Shoot in the opposite direction, or across",
         "fitted to 25 tracks, and with that strength it had to help on the other 25",
-        "flight.drag.k 0.12 0.1213 ± 0.0011 1/m",
+        "flight.drag.k 0.12 1/m 0.1213 ± 0.0011 1/m",
         "shot 7 has no free flight of 10 samples.",
         "error of the apex 12.1 mm – nothing to compare small",
     ):
