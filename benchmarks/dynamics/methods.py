@@ -1,5 +1,6 @@
 """The methods of the dynamics comparison."""
 
+import importlib.util
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -20,12 +21,19 @@ class Method:
         trained: whether a seed makes a difference; if not it runs once.
         takes_part: on which tracks: `all`, `simulated` or `measured` ones.
         transfers: whether it can be judged on tracks of a launcher that it did not learn from.
+        package: that it needs and that only an extra installs; empty if there is none.
     """
 
     make: Callable[[Job, Task], Contender]
     trained: bool = True
     takes_part: Literal["all", "simulated", "measured"] = "all"
     transfers: bool = True
+    package: str = ""
+
+    @property
+    def installed(self) -> bool:
+        """Whether everything that it needs is there."""
+        return not self.package or importlib.util.find_spec(self.package) is not None
 
     def fits(self, tasks: Sequence[Task]) -> bool:
         """Whether it takes part on these tracks."""
@@ -41,7 +49,12 @@ METHODS: Final = {
     "truth": Method(contenders.truth_contender, trained=False, takes_part="simulated"),
     "nominal": Method(contenders.nominal_contender, trained=False),
     "nominal+track": Method(contenders.adapting_contender, trained=False, takes_part="measured"),
-    **{name: Method(trained_contender, transfers=name not in SEQUENCES) for name in TRAINED},
+    **{
+        name: Method(
+            trained_contender, transfers=name not in SEQUENCES, package="diffusers" if "diffusion" in name else ""
+        )
+        for name in TRAINED
+    },
     RESIDUAL: Method(trained_contender, takes_part="measured"),
 }
 """Every method by name, in the order of the table: controls, then those that learn. `nominal+track` is the nominal

@@ -1,6 +1,7 @@
 """The suite of `ballfg-bench dynamics`: every method learns from the same shots and predicts the same others."""
 
 import re
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import groupby
@@ -57,11 +58,12 @@ def run_dynamics(
     for name in methods or ():
         if name not in METHODS:
             raise ValueError(f"--method must be one of {', '.join(METHODS)}; got '{name}'. Choose one of them.")
+    chosen = _installed(methods)
     tasks = [synthetic_task(results.seed, plan.tracks)] if data is None else measured_tasks(data, jobs, plan.measured)
     for task in tasks:
         print(describe(task))
     seeds = range(results.seed, results.seed + plan.seeds)
-    of_tasks = collect_records(tasks, methods or tuple(METHODS), seeds, out / RUNS_FOLDER, jobs, quick=plan.quick)
+    of_tasks = collect_records(tasks, chosen, seeds, out / RUNS_FOLDER, jobs, quick=plan.quick)
     pictures = []
     for task, records in zip(tasks, of_tasks, strict=True):
         for _, group in groupby(records, key=lambda record: record.method):
@@ -73,6 +75,20 @@ def run_dynamics(
         if any(record.fan is not None for record in records):
             pictures.append(fan_picture(records, task.surfaces.table_height, out / f"dynamics_fan{ending}.png"))
     return pictures
+
+
+def _installed(asked: Sequence[str] | None) -> tuple[str, ...]:
+    """The methods to compare; of all of them those that are installed.
+
+    Raises: ValueError: if one that was asked for needs a package that is not there.
+    """
+    missing = {name: METHODS[name].package for name in asked or METHODS if not METHODS[name].installed}
+    for name, package in missing.items():
+        remedy = f"it needs the package {package}. Install it: pip install 'ballfg[diffusion]'."
+        if asked:
+            raise ValueError(f"--method {name} cannot be compared: {remedy}")
+        print(f"note: {name} is left out: {remedy}", file=sys.stderr)
+    return tuple(name for name in asked or METHODS if name not in missing)
 
 
 def describe(task: Task) -> str:

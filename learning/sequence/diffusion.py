@@ -126,12 +126,12 @@ class Denoiser(nn.Module):
 
 
 def noise_schedule() -> Any:
-    """Cosine levels from nearly clean to pure noise. Raises: ImportError: without the package diffusers."""
+    """Cosine levels from nearly clean to pure noise. Raises: ValueError: without the package diffusers."""
     try:
         from diffusers import DDIMScheduler
     except ImportError as error:
-        raise ImportError(
-            f"diffusion needs the package diffusers, which is missing ({error}). Run: pip install diffusers."
+        raise ValueError(
+            f"kind diffusion must have the package diffusers; got {error}. Install it: pip install 'ballfg[diffusion]'."
         ) from error
     return DDIMScheduler(
         num_train_timesteps=LEVELS,

@@ -1,5 +1,6 @@
 """A small run with the two methods that need no training, its records, rows and pictures."""
 
+import importlib.util
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -11,9 +12,10 @@ from ballfg.benchmarks.dynamics.contenders import Job, nominal_contender, truth_
 from ballfg.benchmarks.dynamics.fan import fan_of
 from ballfg.benchmarks.dynamics.jobs import collect_records
 from ballfg.benchmarks.dynamics.measured import measured_shot
+from ballfg.benchmarks.dynamics.methods import METHODS
 from ballfg.benchmarks.dynamics.record import read_record, task_digest
 from ballfg.benchmarks.dynamics.rows import add_rows
-from ballfg.benchmarks.dynamics.suite import Plan, run_dynamics
+from ballfg.benchmarks.dynamics.suite import Plan, _installed, run_dynamics
 from ballfg.benchmarks.dynamics.truth import synthetic_task
 from ballfg.benchmarks.results import Results
 from ballfg.estimation import Estimate, Status
@@ -150,3 +152,16 @@ def test_the_command_has_help_with_an_example(capsys: pytest.CaptureFixture[str]
         run(["dynamics", "--help"])
     assert ended.value.code == 0
     assert "ballfg-bench dynamics --quick" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_method_whose_package_is_missing_is_left_out_and_said_to_be(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "diffusers" else find(name))
+    assert "diffusion+aug" not in _installed(None)
+    assert set(_installed(None)) == set(METHODS) - {"diffusion+aug"}
+    assert "note: diffusion+aug is left out: it needs the package diffusers" in capsys.readouterr().err
+    with pytest.raises(ValueError, match=r"--method diffusion\+aug .* pip install 'ballfg\[diffusion\]'"):
+        _installed(["nominal", "diffusion+aug"])
+    assert _installed(["nominal"]) == ("nominal",)
