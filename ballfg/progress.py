@@ -72,7 +72,7 @@ def say(line: str) -> None:
     """Prints a line about the course of the work on stderr, unless progress is not wanted."""
     _SIGNS.said = time.monotonic()
     if not is_quiet():
-        print(line, file=sys.stderr, flush=True)
+        print(f"{line}\n", end="", file=sys.stderr, flush=True)  # at once: two threads speak
 
 
 def announce(line: str) -> None:

@@ -54,7 +54,7 @@ def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
         def for_call(*_: Any, **__: Any) -> Any:
             """The machine code, which numba asks for at the first call from Python."""
             del dispatcher._compile_for_args, dispatcher.get_call_template
-            with doing("compiling, once on this machine; `ballfg compile` does it ahead"):
+            with doing("compiling machine code, once on this machine"):
                 entry = dispatcher.compile(signature)
             dispatcher.disable_compile()  # as of a function whose signature numba is given at once
             return entry
