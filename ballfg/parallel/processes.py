@@ -1,6 +1,7 @@
 """Processes of this machine, by joblib's loky: they are kept for the next work, and replaced when one dies."""
 
 import pickle
+import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
 from typing import Any, Final
@@ -16,6 +17,9 @@ IDLE: Final = 300
 ONE_THREAD: Final = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 MOST_DEATHS: Final = 3
 """A chunk that lost so many processes is given up: it is probably what ends them."""
+
+warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
+"""loky replaces a worker that has grown by 300 MB, as one does that compiles machine code; nobody need hear of it."""
 
 _started: set[int] = set()
 
