@@ -14,7 +14,7 @@ import typer
 from ballfg.cli.errors import guarded
 from ballfg.cli.start import start
 from ballfg.machine import usable_cores
-from ballfg.progress import alive, idle, progress
+from ballfg.progress import alive, announce, idle, progress
 
 if TYPE_CHECKING:
     from ballfg.learning.config.training import TrainConfig
@@ -79,6 +79,7 @@ def _train(config: TrainConfig, folder: Path, resume: bool) -> int:
     if jobs == 1 or started_by_launcher():
         return _train_here(config, folder, resume)
     check(folder, config, resume=resume)  # refuse a bad folder before the processes start
+    announce(f"starting {jobs} processes")
     with idle():  # the first of the processes speaks, and prints the reason of its status
         return launch(jobs, _train_guarded, config, folder, resume)
 
