@@ -95,10 +95,9 @@ def estimate(
     """
     check_device(method, device)
     data = _opened(measured)
-    if isinstance(data, Track):
-        estimator = estimator_for(data, method, model, surfaces, settings)
-        return estimator.estimate(data) if device is None else estimate_together(estimator, [data], device)[0]
     estimator = estimator_for(data, method, model, surfaces, settings)
+    if isinstance(data, Track):
+        return estimator.estimate(data) if device is None else estimate_together(estimator, [data], device)[0]
     return {one.name: one for one in estimate_tracks(estimator, data, len(data), jobs, device)}
 
 

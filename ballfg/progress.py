@@ -83,15 +83,15 @@ def announce(line: str) -> None:
 
 
 @contextmanager
-def doing(what: str) -> Iterator[None]:
-    """Names a stage of the work, for `alive`.
+def doing(what: str) -> Iterator[_Stage]:
+    """Names a stage of the work, for `alive`; its text may change on the way.
 
     Args: what: for instance `compiling machine code`.
     """
     stage = _Stage(what, time.monotonic())
     _SIGNS.stages.append(stage)
     try:
-        yield
+        yield stage
     finally:
         _SIGNS.stages.remove(stage)
 
@@ -174,9 +174,7 @@ def _bar(items: Iterable[T], total: int, what: str) -> Iterator[T]:
 def _lines(items: Iterable[T], total: int, what: str) -> Iterator[T]:
     due = time.monotonic() + QUIET
     since: tuple[float, int] | None = None
-    stage = _Stage(what, time.monotonic())
-    _SIGNS.stages.append(stage)
-    try:
+    with doing(what) as stage:
         for done, item in enumerate(items, start=1):
             yield item
             stage.text = f"{done} of {total} {what}"
@@ -190,5 +188,3 @@ def _lines(items: Iterable[T], total: int, what: str) -> Iterator[T]:
                 left = f", {(now - since[0]) / (done - since[1]) * (total - done):.0f} s left"
             say(f"{stage.text}{left}")
             due = now + LINE_EVERY
-    finally:
-        _SIGNS.stages.remove(stage)

@@ -27,9 +27,9 @@ def run_together(searches: Sequence[Search[R]], device: torch.device | None = No
     results: dict[int, R] = {}
     questions: dict[int, Question] = {}
 
-    def ask(number: int, answer: list[Rows] | Step | None, *, first: bool = False) -> None:
+    def ask(number: int, answer: list[Rows] | Step | None) -> None:
         try:
-            question = next(searches[number]) if first else searches[number].send(answer)
+            question = searches[number].send(answer)  # None begins a search
             while device is None and isinstance(question, LinearSolution):
                 question = searches[number].send(question.answer())
             questions[number] = question
@@ -38,7 +38,7 @@ def run_together(searches: Sequence[Search[R]], device: torch.device | None = No
             results[number] = end.value
 
     for number in range(len(searches)):
-        ask(number, None, first=True)
+        ask(number, None)
     while questions:
         points = {number: one for number, one in questions.items() if isinstance(one, Linearization)}
         systems = {number: one for number, one in questions.items() if isinstance(one, LinearSolution)}

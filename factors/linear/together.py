@@ -36,16 +36,11 @@ def _solved(problems: Sequence[LinearSolution], width: int, p: int, device: torc
     lengths = np.array([len(one.values.states) for one in problems])
     rows, starts = _gathered([(system, start) for system, start, _ in made], lengths, width, p)
     triangles, shared = _eliminated(torch.from_numpy(rows).to(device), starts, lengths, width, p)
-    steps, coefficients = _substituted(triangles, shared, lengths, width, p)
+    solved = _substituted(triangles, shared, lengths, width, p)
+    roots, last, steps, coefficients = (tensor.cpu().numpy() for tensor in (triangles, shared, *solved))
     return [
-        _step(one, n, *parts)
-        for one, n, *parts in zip(
-            problems,
-            lengths.tolist(),
-            *(tensor.cpu().numpy() for tensor in (triangles, shared, steps, coefficients)),
-            [diagonal for _, _, diagonal in made],
-            strict=True,
-        )
+        Step.of(Root(roots[k, :n], last[k]), steps[k, :n].copy(), coefficients[k, :, 0].copy(), one.damping, made[k][2])
+        for k, (one, n) in enumerate(zip(problems, lengths, strict=True))
     ]
 
 
@@ -125,10 +120,3 @@ def _substituted(triangles: Tensor, shared: Tensor, lengths: Index, width: int, 
 
 def _solve_triangle(upper: Tensor, right: Tensor) -> Tensor:
     return torch.linalg.solve_triangular(upper, right, upper=True)
-
-
-def _step(
-    problem: LinearSolution, n: int, triangles: Array, shared: Array, steps: Array, coefficients: Array, diagonal: Array
-) -> Step | None:
-    """The step of one track out of what was found for all."""
-    return Step.of(Root(triangles[:n], shared), steps[:n].copy(), coefficients[:, 0].copy(), problem.damping, diagonal)
