@@ -27,7 +27,7 @@ PROBED = 10
 START_UP = 5.0
 """s that worker processes take to start (they import torch and gtsam): less work than that stays here."""
 TOGETHER = 1000
-"""Tracks whose linear systems lie on a device at once, a kilobyte a number of each state: 100 MB."""
+"""Tracks whose linear systems lie on a device at once; with 80 samples each they take 100 MB there."""
 HAND_OVER = 0.3
 """s that it takes to hand work to processes that were started before."""
 

@@ -126,9 +126,9 @@ def _fly_arc(model: BallModel, state: Tensor, left: Tensor, surfaces: Surfaces) 
     resting = stays(model, state.detach(), surfaces.level_below(state.detach()), surfaces)
     done = resting.clone()
     landed, step, level = torch.zeros_like(done), torch.zeros_like(done, dtype=torch.long), torch.zeros_like(left)
-    start, nodes, steps = state, [state.detach()], [done]
+    start, nodes, still = state, [state.detach()], list[Tensor]()
     with torch.no_grad():
-        while len(nodes) == 1 or not bool(done.all()):
+        while not still or not bool(done.all()):
             state = nodes[-1]
             after = fly(model, state, torch.full_like(left, MAX_STEP))
             height = surfaces.level_below(state)
@@ -136,11 +136,11 @@ def _fly_arc(model: BallModel, state: Tensor, left: Tensor, surfaces: Surfaces) 
             step = torch.where(landing, len(nodes) - 1, step)
             level, landed = torch.where(landing, height, level), landed | landing
             nodes.append(torch.where(done.unsqueeze(-1), state, after))
-            steps.append(done)
+            still.append(done)
             done = done | landing | ((len(nodes) - 1) * MAX_STEP >= left)
     joined = torch.stack(nodes)
     if torch.is_grad_enabled():
-        joined = _followed(model, start, joined, torch.stack(steps[1:]))
+        joined = _followed(model, start, joined, torch.stack(still))
     return _Arc(joined, derivative(model.rates, joined), landed, step, level, resting)
 
 
