@@ -5,7 +5,9 @@ check themselves.
 """
 
 import difflib
+import itertools
 import math
+import reprlib
 from collections.abc import Collection, Iterable
 from numbers import Real
 from typing import Any
@@ -23,6 +25,14 @@ _SYNONYMS = {
 }
 
 
+MAX_SHOWN = 80
+"""Characters of a value in a message."""
+MAX_LISTED = 12
+"""Names in a list in a message."""
+_MAX_COMPARED = 200
+"""Candidates that a misspelt name is compared with; each takes some 20 microseconds."""
+
+
 def type_name(value: object) -> str:
     """The name of a value's type, for a message."""
     return "nothing" if value is None else type(value).__name__
@@ -33,6 +43,30 @@ def one_line(error: object) -> str:
     return " ".join(str(error).split()).rstrip(".")
 
 
+def shown(value: object) -> str:
+    """A value in a message: as Python writes it, or its beginning where that is longer than 80 characters.
+
+    Nothing of a long value is written out in between, so that one that holds a million others costs no time.
+    """
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = short.maxlong = MAX_SHOWN
+    short.maxlevel = 3
+    short.maxdict = short.maxlist = short.maxtuple = 8
+    return short_text(short.repr(value))
+
+
+def short_text(text: str) -> str:
+    """The text, or its beginning where it is longer than a message can hold."""
+    return text if len(text) <= MAX_SHOWN else f"{text[: MAX_SHOWN - 3]}..."
+
+
+def listed(names: Collection[object]) -> str:
+    """Names in a message: the first ones, and how many more there are."""
+    first = [short_text(str(name)) for name in itertools.islice(names, MAX_LISTED)]
+    more = len(names) - len(first)
+    return (", ".join(first) or "nothing") + (f" and {more} more" if more else "")
+
+
 def check_text(label: str, value: object, *, optional: bool = False) -> None:
     """Refuses a value that is not text with something in it.
 
@@ -41,9 +75,9 @@ def check_text(label: str, value: object, *, optional: bool = False) -> None:
     if value is None and optional:
         return
     if not isinstance(value, str):
-        raise TypeError(f"{label} must be text; got {type_name(value)} {value}. Put it in quotes.")
+        raise TypeError(f"{label} must be text; got {type_name(value)} {short_text(str(value))}. Put it in quotes.")
     if not value.strip():
-        raise ValueError(f"{label} must not be empty; got {value!r}. Give it a text.")
+        raise ValueError(f"{label} must not be empty; got {shown(value)}. Give it a text.")
 
 
 def check_keys(where: str, content: dict[Any, Any], known: Collection[str], needed: Collection[str]) -> None:
@@ -57,17 +91,19 @@ def check_keys(where: str, content: dict[Any, Any], known: Collection[str], need
         if key not in known:
             hint = did_you_mean(str(key), absent)
             raise ValueError(
-                f"{where}: fields must be among {', '.join(known)}; got {key!r}.{hint} Rename or delete it."
+                f"{where}: fields must be among {', '.join(known)}; got {shown(key)}.{hint} Rename or delete it."
             )
     for key in needed:
         if content.get(key) is None:
-            got = ", ".join(map(str, content)) or "nothing"
-            raise ValueError(f"{where}: field {key!r} is required; got {got}. Add it.")
+            raise ValueError(f"{where}: field {shown(key)} is required; got {listed(content)}. Add it.")
 
 
 def nearest(name: str, candidates: Iterable[str]) -> str | None:
     """The candidate most like `name` (spaces, case and common synonyms set aside), or None if none is near."""
-    plain = {candidate.strip().lower(): candidate for candidate in candidates}
+    if len(name) > MAX_SHOWN:
+        return None
+    near = (candidate for candidate in candidates if len(candidate) <= MAX_SHOWN)
+    plain = {candidate.strip().lower(): candidate for candidate in itertools.islice(near, _MAX_COMPARED)}
     wanted = name.strip().lower()
     for main, others in _SYNONYMS.items():
         group = (main, *others)
@@ -96,6 +132,7 @@ def check_number(
     unit: str = "",
     *,
     above: float | None = None,
+    least: float = -math.inf,
     limit: float = math.inf,
     instead: str = "",
 ) -> float:
@@ -106,15 +143,21 @@ def check_number(
         value: to check.
         unit: of the number.
         above: the value must be greater, if given.
+        least: the smallest value that can be meant, where that is another one than `above`.
         limit: the largest size that can be meant in this unit.
         instead: the unit that a larger value is probably in.
     Raises: TypeError: not a number. ValueError: not finite, or out of range.
     """
     _check_type(label, value, unit)
-    number = float(value)
+    try:
+        number = float(value)
+    except OverflowError:  # a whole number of 400 digits
+        number = math.inf
     if not math.isfinite(number) or (above is not None and number <= above):
         rule = "finite" if above is None else f"finite and above {above:g}"
         raise ValueError(f"{label} must be {rule}; got {number:g}. Correct it{f' (unit: {unit})' if unit else ''}.")
+    if number < least:
+        raise ValueError(f"{label} must be at least {least:g} {unit}; got {number:g}. Correct it.")
     if abs(number) > limit:
         raise ValueError(
             f"{label} must be in {unit}, at most {limit:g}; got {number:g}. "
@@ -141,7 +184,7 @@ def check_count(label: str, value: Any, low: int, high: int) -> int:
     Raises: TypeError: not a whole number. ValueError: out of range.
     """
     if isinstance(value, bool) or not isinstance(value, int | np.integer):
-        raise TypeError(f"{label} must be a whole number; got {value!r}. Write it without a point.")
+        raise TypeError(f"{label} must be a whole number; got {shown(value)}. Write it without a point.")
     if not low <= value <= high:
         raise ValueError(f"{label} must lie in {low} .. {high}; got {value}. Choose another.")
     return int(value)
@@ -149,7 +192,9 @@ def check_count(label: str, value: Any, low: int, high: int) -> int:
 
 def _check_type(label: str, value: object, unit: str = "") -> None:
     if not is_number(value):
-        rule, got = (f"a number in {unit}", f"{type_name(value)} {value!r}") if unit else ("a number", f"{value!r}")
+        rule, got = (
+            (f"a number in {unit}", f"{type_name(value)} {shown(value)}") if unit else ("a number", shown(value))
+        )
         raise TypeError(f"{label} must be {rule}; got {got}. Write it like 0.02 or 2.0e-2.")
 
 

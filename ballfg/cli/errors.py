@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Callable
+from typing import Final
 
 import typer
 
@@ -10,6 +11,8 @@ BAD_INPUT = 2
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells have it."""
 
+_LONGEST: Final = 2000
+"""Characters of a message; a file of one endless line would fill the terminal."""
 USER_ERRORS = (ValueError, TypeError, OSError)
 """What a user can mend: input, paths, a full disk. Anything else is a fault of the program and keeps its traceback."""
 
@@ -49,7 +52,9 @@ def _in_words(error: Exception) -> str:
 
 
 def _bad_input(message: str, context: typer.Context | None = None) -> int:
-    text = " ".join(message.split())
+    text = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in " ".join(message.split()))
+    if len(text) > _LONGEST:
+        text = f"{text[:_LONGEST]} ... ({len(text) - _LONGEST} characters more)"
     hint = "" if context is None else f" See '{context.command_path} --help'."
     print(f"ballfg: error: {text}{hint}", file=sys.stderr)
     return BAD_INPUT

@@ -7,7 +7,7 @@ from typing import Any, Final, cast
 
 import yaml
 
-from ballfg.checks import check_range
+from ballfg.checks import check_range, shown
 from ballfg.dynamics.analytic import AnalyticModel, after_needs
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import effect_class
@@ -53,7 +53,7 @@ def load_model(
     if learned is None:
         return model_from_dict(content, radius=radius, inertia_factor=inertia_factor, where=str(path))
     if not isinstance(learned, str) or not learned:
-        raise ValueError(f"{path}: section 'learned' must be null or the name of a folder; got {learned!r}")
+        raise ValueError(f"{path}: section 'learned' must be null or the name of a folder; got {shown(learned)}")
     analytic = model_from_dict(
         {**content, "learned": None}, radius=radius, inertia_factor=inertia_factor, where=str(path)
     )
@@ -77,7 +77,7 @@ def model_from_dict(
     Raises: ValueError: if it names a section, effect or coefficient that does not exist, or a value out of its bounds.
     """
     if not isinstance(content, Mapping):
-        raise ValueError(f"{where}: a model is a mapping with the sections {', '.join(SECTIONS)}; got {content!r}")
+        raise ValueError(f"{where}: a model is a mapping with the sections {', '.join(SECTIONS)}; got {shown(content)}")
     for section in content:
         if section not in SECTIONS:
             raise ValueError(f"{where}: unknown section '{section}'{_nearest(section, SECTIONS)}")
@@ -92,7 +92,7 @@ def model_from_dict(
                 continue
             raise ValueError(f"{where}: section '{kind}' is missing; write '{kind}: {{}}' for no effects")
         if not isinstance(section, Mapping):
-            raise ValueError(f"{where}: section '{kind}' must map effects to coefficients; got {section!r}")
+            raise ValueError(f"{where}: section '{kind}' must map effects to coefficients; got {shown(section)}")
         effects += [_effect(name, kind, values, where) for name, values in section.items()]
     try:
         effects = after_needs(effects)
@@ -109,7 +109,7 @@ def _variations(section: Any, model: AnalyticModel, where: str) -> dict[str, Var
     if section is None:
         return {}
     if not isinstance(section, Mapping):
-        raise ValueError(f"{where}: section '{VARIATIONS}' must map coefficients to their values; got {section!r}")
+        raise ValueError(f"{where}: section '{VARIATIONS}' must map coefficients to their values; got {shown(section)}")
     declared, found = model.declared_coefficients(), {}
     for name, content in section.items():
         if name not in declared:
@@ -138,11 +138,11 @@ def _without_noise(content: Mapping[str, Any], where: str) -> tuple[Mapping[str,
 def _effect(name: str, kind: Kind, values: Any, where: str) -> Effect:
     values = {} if values is None else values
     if not isinstance(values, Mapping):
-        raise ValueError(f"{where}: {kind}.{name} must map coefficients to numbers; got {values!r}")
+        raise ValueError(f"{where}: {kind}.{name} must map coefficients to numbers; got {shown(values)}")
     for key, value in values.items():
         if isinstance(value, bool) or not isinstance(value, int | float):
             hint = ". YAML reads 3e-3 as text; write 3.0e-3" if isinstance(value, str) else ""
-            raise ValueError(f"{where}: {kind}.{name}.{key} must be a number; got {value!r}{hint}")
+            raise ValueError(f"{where}: {kind}.{name}.{key} must be a number; got {shown(value)}{hint}")
     try:
         return effect_class(name, kind)(**{str(key): value for key, value in values.items()})
     except (ValueError, OverflowError) as error:

@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ballfg.checks import check_number
+from ballfg.checks import check_number, shown
 from ballfg.tracks import Track
 
 TRACK: Final = "track"
@@ -85,11 +85,11 @@ class Variation:
         if not isinstance(content, Mapping) or not {"by", "values"} <= set(content) <= set(_FIELDS):
             raise ValueError(
                 f"must be a mapping with 'by' (a label, or '{TRACK}'), 'values' (numbers by label or by name of a "
-                f"track) and perhaps 'line' (true or false); got {content!r}"
+                f"track) and perhaps 'line' (true or false); got {shown(content)}"
             )
         by, values, line = content["by"], content["values"], content.get("line", False)
         if not isinstance(by, str) or not isinstance(values, Mapping) or not isinstance(line, bool):
-            raise ValueError(f"'by' must be text, 'values' a mapping and 'line' true or false; got {content!r}")
+            raise ValueError(f"'by' must be text, 'values' a mapping and 'line' true or false; got {shown(content)}")
         return cls(by, {str(key): check_number(f"values[{str(key)!r}]", v) for key, v in values.items()}, line)
 
     def to_mapping(self) -> dict[str, Any]:

@@ -1,15 +1,33 @@
-"""Reading YAML files: safe loader only, no key twice."""
+"""Reading YAML files that anybody may have written: plain values only, no key twice, within bounds.
 
+The text is looked at as a stream of events first. This takes no recursion and builds nothing, so that nesting, aliases
+that multiply, tags and long numbers are refused before they can cost time or memory.
+"""
+
+import math
+from collections.abc import Hashable
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import yaml
 
-from ballfg.checks import type_name
+from ballfg.checks import shown, type_name
+
+MAX_BYTES: Final = 16_000_000
+MAX_NODES: Final = 250_000
+"""Values and keys with all aliases written out; they are read in 2 s."""
+MAX_DEPTH: Final = 40
+MAX_DIGITS: Final = 100
+"""Characters of a number."""
+_TAG: Final = "tag:yaml.org,2002:"
+_NUMBERS: Final = (f"{_TAG}int", f"{_TAG}float")
+_LOADER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""libyaml's parser, ten times as fast, where PyYAML was built with it."""
+_TEXT_LOADER: Final = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
 
 
 class YamlError(ValueError):
-    """A file that is not YAML, or has a key twice. Its text is one line with the file and the place.
+    """A file that is not YAML, goes beyond a bound, or has a key twice. Its text is one line with file and place.
 
     Attributes:
         problem: what is wrong, without the place.
@@ -17,33 +35,47 @@ class YamlError(ValueError):
         repeated: the key that stands twice, with the keys above it and dots between; None for another problem.
     """
 
-    def __init__(self, path: Path, problem: str, line: int | None = None, repeated: str | None = None) -> None:
+    def __init__(self, where: str, problem: str, line: int | None = None, repeated: str | None = None) -> None:
         self.problem, self.line, self.repeated = " ".join(problem.split()), line, repeated
         place = "" if line is None else f" in its line {line}"
-        super().__init__(f"{path}: not readable as YAML ({self.problem}{place})")
+        super().__init__(f"{where}: not readable as YAML ({self.problem}{place})")
 
 
 def read_yaml(path: Path) -> Any:
     """The content of a YAML file; None if it is empty.
 
-    Raises: ValueError: if it is not YAML, or has a key twice (a `YamlError`).
+    Raises: ValueError: if it is not YAML, goes beyond a bound, or has a key twice (a `YamlError`).
+    """
+    if path.stat().st_size > MAX_BYTES:
+        raise YamlError(str(path), f"it must have at most {MAX_BYTES / 1e6:g} MB")
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise YamlError(str(path), f"it must be UTF-8 text; {error.reason}") from None
+    return parse_yaml(text, str(path))
+
+
+def parse_yaml(text: str, where: str, *, text_only: bool = False) -> Any:
+    """The content of YAML text; None if it is empty.
+
+    Args: where: begins the message of an error.  text_only: each value is text as it is written.
+    Raises: ValueError: as `read_yaml`.
     """
     try:
-        loader = yaml.SafeLoader(path.read_text(encoding="utf-8-sig"))
+        _check_events(where, text)
+        loader = (_TEXT_LOADER if text_only else _LOADER)(text)
         try:
             node = loader.get_single_node()
-            _check_keys(path, node, "", set())
+            _check_values(where, loader, node, "", set())
             return None if node is None else loader.construct_document(node)
         finally:
             loader.dispose()
-    except UnicodeDecodeError as error:
-        raise YamlError(path, f"it must be UTF-8 text; {error.reason}") from None
     except yaml.MarkedYAMLError as error:
         problem = ", ".join(part for part in (error.context, error.problem) if part)
         mark = error.problem_mark or error.context_mark
-        raise YamlError(path, problem, None if mark is None else mark.line + 1) from None
+        raise YamlError(where, problem, None if mark is None else mark.line + 1) from None
     except yaml.YAMLError as error:
-        raise YamlError(path, getattr(error, "reason", str(error))) from None
+        raise YamlError(where, getattr(error, "reason", str(error))) from None
 
 
 def read_mapping(path: Path) -> dict[Any, Any]:
@@ -64,19 +96,92 @@ def mapping(what: str, content: Any) -> dict[Any, Any]:
     return content
 
 
-def _check_keys(path: Path, node: yaml.Node | None, prefix: str, seen: set[yaml.Node]) -> None:
-    """Refuses a mapping, at any depth, with a key twice: the safe loader would take the last one in silence."""
+def _check_events(where: str, text: str) -> None:
+    """Refuses what would cost more than its text: deep nesting, aliases that multiply or hold themselves, tags."""
+    sizes = _Sizes()
+    for event in yaml.parse(text, Loader=_LOADER):
+        problem = sizes.add(event)
+        if problem:
+            mark = event.start_mark
+            raise YamlError(where, problem, None if mark is None else mark.line + 1)
+
+
+class _Sizes:
+    """Counts the values of a stream of events, with all aliases written out, without writing them out."""
+
+    def __init__(self) -> None:
+        self.nodes = 0
+        self.open: list[tuple[str | None, int]] = []  # anchor of each collection that is open, and nodes before it
+        self.anchors: dict[str, int | None] = {}  # size of what an anchor names; None while it is open
+
+    def add(self, event: yaml.Event) -> str:
+        """Counts an event. Returns: what is wrong with it; empty if nothing is."""
+        if isinstance(event, yaml.AliasEvent):
+            size = self.anchors.get(event.anchor or "", 1)  # the composer refuses an anchor that is not known
+            if size is None:
+                return f"alias {shown(event.anchor)} must not stand within what it names"
+            self.nodes += size
+        elif isinstance(event, yaml.ScalarEvent | yaml.CollectionStartEvent):
+            self.nodes += 1
+            if event.tag is not None and event.tag != f"{_TAG}str":
+                return f"values must be written without a tag; got {shown(event.tag)}"
+            self._begin(event)
+        elif isinstance(event, yaml.CollectionEndEvent):
+            anchor, before = self.open.pop()
+            if anchor:
+                self.anchors[anchor] = self.nodes - before
+        if len(self.open) > MAX_DEPTH:
+            return f"values must be nested at most {MAX_DEPTH} deep"
+        return f"it must hold at most {MAX_NODES} values, aliases written out" if self.nodes > MAX_NODES else ""
+
+    def _begin(self, event: yaml.ScalarEvent | yaml.CollectionStartEvent) -> None:
+        """Notes the anchor of a value that begins."""
+        collection = isinstance(event, yaml.CollectionStartEvent)
+        if collection:
+            self.open.append((event.anchor, self.nodes - 1))
+        if event.anchor:
+            self.anchors[event.anchor] = None if collection else 1
+
+
+def _check_values(where: str, loader: Any, node: yaml.Node | None, prefix: str, seen: set[yaml.Node]) -> None:
+    """Refuses at any depth a value that its form promises and that cannot be made, and a key that stands twice.
+
+    The safe loader would take the last one of two equal keys in silence.
+    """
     if node is None or node in seen:  # an alias leads to a node again
         return
     seen.add(node)
-    if isinstance(node, yaml.SequenceNode):
+    if isinstance(node, yaml.ScalarNode):
+        _check_scalar(where, loader, node)
+    elif isinstance(node, yaml.SequenceNode):
         for item in node.value:
-            _check_keys(path, item, prefix, seen)
+            _check_values(where, loader, item, prefix, seen)
     elif isinstance(node, yaml.MappingNode):
-        lines: dict[str, int] = {}
+        lines: dict[Hashable, int] = {}
         for key, value in node.value:
-            name = f"{prefix}{key.value}"
-            if name in lines:
-                raise YamlError(path, f"{key.value!r} stands twice", lines[name], name)
-            lines[name] = key.start_mark.line + 1
-            _check_keys(path, value, f"{name}.", seen)
+            line = key.start_mark.line + 1
+            if not isinstance(key, yaml.ScalarNode):
+                raise YamlError(where, "a key must be a word", line)
+            plain = _check_scalar(where, loader, key)
+            if plain in lines:
+                raise YamlError(where, f"{shown(key.value)} stands twice", lines[plain], f"{prefix}{key.value}")
+            lines[plain] = line
+            _check_values(where, loader, value, f"{prefix}{key.value}.", seen)
+
+
+def _check_scalar(where: str, loader: Any, node: yaml.ScalarNode) -> Hashable:
+    """What a scalar stands for. Raises: YamlError: a number or a date that is none, or beyond what machines hold."""
+    line = node.start_mark.line + 1
+    if node.tag in _NUMBERS and len(node.value) > MAX_DIGITS:
+        raise YamlError(where, f"a number must have at most {MAX_DIGITS} digits; got {len(node.value)}", line)
+    if node.tag == f"{_TAG}merge":
+        return str(node.value)
+    try:
+        plain: Hashable = loader.construct_object(node)
+    except (ValueError, OverflowError) as error:  # a 30th of February
+        raise YamlError(where, f"{shown(node.value)} cannot be read; {error}", line) from None
+    if isinstance(plain, int) and abs(plain) > 2**63 - 1:
+        raise YamlError(where, f"whole numbers must lie within +-2^63; got {shown(node.value)}", line)
+    if isinstance(plain, float) and math.isinf(plain) and "inf" not in node.value.lower():
+        raise YamlError(where, f"{shown(node.value)} is larger than any number of double precision", line)
+    return plain

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Final
 
-from ballfg.checks import check_number
+from ballfg.checks import check_number, listed, shown
 from ballfg.dynamics import KNOWN_BALLS, AnalyticModel, Surfaces, known_ball, model_from_dict, nominal_model
 from ballfg.dynamics.model import THIN_SHELL
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH, TABLE_WIDTH
@@ -94,13 +94,15 @@ def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:
     Raises: ValueError, TypeError: a missing or unknown key, or a value out of its bounds.
     """
     if not isinstance(content, Mapping):
-        raise ValueError(f"a ball must be a mapping with radius, mass, flight and bounce; got {content!r}. Rewrite it.")
+        raise ValueError(
+            f"a ball must be a mapping with radius, mass, flight and bounce; got {shown(content)}. Rewrite it."
+        )
     for key in content:
         if key not in _FILE_KEYS:
-            raise ValueError(f"keys must be among {', '.join(_FILE_KEYS)}; got '{key}'. Rename or delete it.")
+            raise ValueError(f"keys must be among {', '.join(_FILE_KEYS)}; got {shown(key)}. Rename or delete it.")
     for key in ("radius", "mass", "flight", "bounce"):
         if key not in content:
-            raise ValueError(f"key '{key}' is required; got {', '.join(map(str, content))}. Add it.")
+            raise ValueError(f"key '{key}' is required; got {listed(content)}. Add it.")
     ball = Ball(content["radius"], content["mass"])
     model = model_from_dict(
         {"flight": content["flight"], "bounce": content["bounce"]},
@@ -110,7 +112,7 @@ def ball_from_mapping(content: Any, default_name: str = "ball") -> BallKind:
     )
     surface = content.get("surface", "table")
     if surface not in ("table", "court"):
-        raise ValueError(f"surface must be 'table' or 'court'; got {surface!r}. Choose one of them.")
+        raise ValueError(f"surface must be 'table' or 'court'; got {shown(surface)}. Choose one of them.")
     launcher = TABLE_LAUNCHER if surface == "table" else TENNIS_LAUNCHER
     return BallKind(
         str(content.get("name", default_name)),

@@ -1,6 +1,5 @@
 """What a dataset says about itself: `dataset.yaml`, checked."""
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -8,7 +7,7 @@ from typing import Any
 
 import yaml
 
-from ballfg.checks import check_number, check_text, did_you_mean, nearest, type_name
+from ballfg.checks import MAX_LISTED, check_number, check_text, did_you_mean, listed, nearest, shown, type_name
 from ballfg.files.strict_yaml import YamlError, read_yaml
 from ballfg.tracks.noise import TrackNoise
 
@@ -18,10 +17,12 @@ _OPTIONAL = ("rate", "position_noise", "spin_noise", "source", "licence")
 _KNOWN = (*_REQUIRED, *_OPTIONAL, "noise", "labels", "import")
 
 # The largest values that can be meant in SI units; above them the unit is almost surely another one.
-_MAX_RADIUS = 0.5  # m
-_MAX_MASS = 2.0  # kg
+_RADII = (1e-4, 0.5)  # m
+_MASSES = (1e-6, 2.0)  # kg
 MAX_HEIGHT = 50.0  # m
 _MAX_POSITION_NOISE = 1.0  # m
+_MAX_SPIN_NOISE = 5000.0  # rad/s
+_MIN_NOISE = 1e-9  # m or rad/s; weights of less leave no digits for the motion
 _MAX_TABLE_PLACE = 1000.0  # m from the origin, as for positions
 _TABLE_SIZES = (0.1, 50.0)  # m, least and most from one end to the other; a tennis court is 24 m long
 
@@ -40,10 +41,11 @@ class Ball:
     """kg"""
 
     def __post_init__(self) -> None:
-        radius = check_number("ball.radius", self.radius, "m", above=0.0, limit=_MAX_RADIUS, instead="mm")
-        mass = check_number("ball.mass", self.mass, "kg", above=0.0, limit=_MAX_MASS, instead="g")
-        object.__setattr__(self, "radius", radius)
-        object.__setattr__(self, "mass", mass)
+        for key, unit, (least, limit), instead in (("radius", "m", _RADII, "mm"), ("mass", "kg", _MASSES, "g")):
+            value = check_number(
+                f"ball.{key}", getattr(self, key), unit, above=0.0, least=least, limit=limit, instead=instead
+            )
+            object.__setattr__(self, key, value)
 
 
 TABLE_TENNIS = Ball(radius=0.02, mass=0.0027)
@@ -104,14 +106,15 @@ class DatasetInfo:
             raise TypeError(f"ball must be a Ball; got {type(self.ball).__name__}. Pass Ball(radius, mass).")
         height = check_number("frame.table_height", self.table_height, "m", limit=MAX_HEIGHT, instead="mm")
         object.__setattr__(self, "table_height", height)
-        for key, unit, limit, instead in (
-            ("rate", "Hz", math.inf, ""),
-            ("position_noise", "m", _MAX_POSITION_NOISE, "mm"),
-            ("spin_noise", "rad/s", math.inf, ""),
+        for key, unit, least, limit, instead in (
+            ("rate", "Hz", 1e-3, 1e7, "mHz"),
+            ("position_noise", "m", _MIN_NOISE, _MAX_POSITION_NOISE, "mm"),
+            ("spin_noise", "rad/s", _MIN_NOISE, _MAX_SPIN_NOISE, "deg/s"),
         ):
             value = getattr(self, key)
             if value is not None:
-                object.__setattr__(self, key, check_number(key, value, unit, above=0.0, limit=limit, instead=instead))
+                checked = check_number(key, value, unit, above=0.0, least=least, limit=limit, instead=instead)
+                object.__setattr__(self, key, checked)
         if self.table_extent is not None:
             object.__setattr__(self, "table_extent", _checked_extent(self.table_extent))
 
@@ -128,7 +131,7 @@ class DatasetInfo:
         ball = _section(content, "ball", {"radius": "...", "mass": "..."})
         if frame["up"] != "z":
             raise ValueError(
-                f"frame.up must be 'z', the only up axis that is supported; got {frame['up']!r}. "
+                f"frame.up must be 'z', the only up axis that is supported; got {shown(frame['up'])}. "
                 "Rotate the positions so that z points up."
             )
         _need(content, "name", "")
@@ -181,8 +184,12 @@ def read_info(path: Path) -> tuple[DatasetInfo, list[str]]:
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path}: {error}") from None
     absent = [key for key in _OPTIONAL if key not in content]
-    hints = {key: did_you_mean(key, absent) for key in content if key not in _KNOWN}
-    return info, [f"{INFO_FILE}: field {key!r} ignored{'.' + hint if hint else ''}" for key, hint in hints.items()]
+    unknown = [key for key in content if key not in _KNOWN]
+    hints = {key: did_you_mean(key, absent) for key in unknown[:MAX_LISTED]}
+    notes = [f"{INFO_FILE}: field {shown(key)} ignored{'.' + hint if hint else ''}" for key, hint in hints.items()]
+    if len(unknown) > MAX_LISTED:
+        notes.append(f"{INFO_FILE}: {len(unknown) - MAX_LISTED} more fields ignored")
+    return info, notes
 
 
 def write_info(path: Path, info: DatasetInfo) -> None:
@@ -197,7 +204,7 @@ def _section(content: Mapping[str, Any], key: str, fields: Mapping[str, str], pr
     section = content[key]
     if not isinstance(section, dict):
         raise ValueError(
-            f"{prefix}{key} must be a mapping with {' and '.join(fields)}; got {section!r}. "
+            f"{prefix}{key} must be a mapping with {' and '.join(fields)}; got {shown(section)}. "
             f"Write {key}: {{{', '.join(f'{name}: {text}' for name, text in fields.items())}}}."
         )
     for name in fields:
@@ -213,7 +220,8 @@ def _stated_extent(frame: Mapping[str, Any]) -> tuple[Any, ...] | None:
     for axis in "xy":
         if not isinstance(table[axis], list) or len(table[axis]) != 2:
             raise ValueError(
-                f"frame.table.{axis} must be two numbers in m, the table's ends along {axis}; got {table[axis]!r}. "
+                f"frame.table.{axis} must be two numbers in m, the table's ends along {axis}; got "
+                f"{shown(table[axis])}. "
                 f"Write {axis}: [low, high]."
             )
     return (*table["x"], *table["y"])
@@ -221,7 +229,9 @@ def _stated_extent(frame: Mapping[str, Any]) -> tuple[Any, ...] | None:
 
 def _checked_extent(extent: Any) -> tuple[float, ...]:
     if not isinstance(extent, tuple | list) or len(extent) != 4:
-        raise TypeError(f"table_extent must be (x_low, x_high, y_low, y_high) in m; got {extent!r}. Give four numbers.")
+        raise TypeError(
+            f"table_extent must be (x_low, x_high, y_low, y_high) in m; got {shown(extent)}. Give four numbers."
+        )
     ends: list[float] = []
     for axis, pair in (("x", extent[:2]), ("y", extent[2:])):
         label = f"frame.table.{axis}"
@@ -240,7 +250,6 @@ def _checked_extent(extent: Any) -> tuple[float, ...]:
 def _need(content: Mapping[str, Any], key: str, prefix: str) -> None:
     if content.get(key) is not None:
         return
-    present = [str(name) for name in content]
-    found = nearest(key, [name for name in present if name not in _KNOWN])
+    found = nearest(key, (str(name) for name in content if name not in _KNOWN))
     remedy = f"Add it, or rename {found!r}." if found else "Add it."
-    raise ValueError(f"{prefix}{key} is required; got {', '.join(present) or 'nothing'}. {remedy}")
+    raise ValueError(f"{prefix}{key} is required; got {listed(content)}. {remedy}")

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
-from ballfg.checks import check_number, did_you_mean, type_name
+from ballfg.checks import check_number, did_you_mean, shown, type_name
 
 LARGEST: Final[Mapping[str, float]] = {
     "position": 1.0,
@@ -21,6 +22,8 @@ LARGEST: Final[Mapping[str, float]] = {
     "contact_spin": 5000.0,
 }
 """What a number may be at most; more is in another unit."""
+SMALLEST: Final = 1e-9
+"""What a number that may not be zero is at least; weights of less leave no digits for the motion."""
 UNITS: Final[Mapping[str, str]] = {
     "position": "m",
     "memory": "m",
@@ -116,13 +119,15 @@ class TrackNoise:
 
 
 def _checked(name: str, value: Any) -> Any:
-    above = -1e-300 if name in MAY_BE_ZERO else 0.0
+    above, least = (-1e-300, -math.inf) if name in MAY_BE_ZERO else (0.0, SMALLEST)
 
     def number(what: str, one: Any) -> float:
-        return check_number(what, one, UNITS[name], above=above, limit=LARGEST[name], instead=f"m{UNITS[name]}")
+        return check_number(
+            what, one, UNITS[name], above=above, least=least, limit=LARGEST[name], instead=f"m{UNITS[name]}"
+        )
 
     if name not in PER_AXIS:
         return number(f"noise.{name}", value)
     if not isinstance(value, list | tuple) or len(value) != 3:
-        raise ValueError(f"noise.{name} must be three numbers in m, along x, y and z; got {value!r}.")
+        raise ValueError(f"noise.{name} must be three numbers in m, along x, y and z; got {shown(value)}.")
     return tuple(number(f"noise.{name}[{axis}]", one) for axis, one in enumerate(value))

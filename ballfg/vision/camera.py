@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array, Mask
+from ballfg.checks import shown
 
 DISTORTIONS: Final = (0, 4, 5, 8, 12, 14)
 """Lengths of distortion vectors in OpenCV: none; k1 k2 p1 p2; k3; k4 k5 k6; thin prism s1-s4; tilt tau_x tau_y."""
@@ -56,18 +57,18 @@ class Camera:
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str):
-            raise TypeError(f"a camera's name must be text; got {self.name!r}. Put it in quotes.")
+            raise TypeError(f"a camera's name must be text; got {shown(self.name)}. Put it in quotes.")
         if not self.name.strip() or not self.name.isprintable():
-            raise ValueError(f"a camera's name must be printable text; got {self.name!r}. Rename it.")
+            raise ValueError(f"a camera's name must be printable text; got {shown(self.name)}. Rename it.")
         width, height = (int(side) for side in self.size)
         if not (width > 0 and height > 0 and (width, height) == tuple(self.size)):
-            raise ValueError(f"camera {self.name!r}: size must be width and height in pixels; got {self.size}")
+            raise ValueError(f"camera {shown(self.name)}: size must be width and height in pixels; got {self.size}")
         object.__setattr__(self, "size", (width, height))
         count = np.asarray(self.distortion).size
         if count not in DISTORTIONS:
             lengths = ", ".join(map(str, DISTORTIONS))
             raise ValueError(
-                f"camera {self.name!r}: distortion must have one of {lengths} coefficients; got {count}. "
+                f"camera {shown(self.name)}: distortion must have one of {lengths} coefficients; got {count}. "
                 "Give them in OpenCV's order k1, k2, p1, p2, k3, ..."
             )
         for field, shape in {"matrix": (3, 3), "rvec": (3,), "tvec": (3,), "distortion": (count,)}.items():
@@ -75,22 +76,24 @@ class Camera:
         k = self.matrix
         if not (k[0, 0] > 0 and k[1, 1] > 0 and k[1, 0] == 0 and (k[2] == (0, 0, 1)).all() and k[0, 1] == 0):
             raise ValueError(
-                f"camera {self.name!r}: matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; "
+                f"camera {shown(self.name)}: matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; "
                 f"got {k.tolist()}"
             )
         if not np.isfinite(self.time_offset):
-            raise ValueError(f"camera {self.name!r}: time_offset must be finite, in s; got {self.time_offset}")
+            raise ValueError(f"camera {shown(self.name)}: time_offset must be finite, in s; got {self.time_offset}")
         object.__setattr__(self, "time_offset", float(self.time_offset))
 
     def _checked(self, field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
         try:
             array = np.array(value, dtype=np.float64)
         except (TypeError, ValueError):
-            raise ValueError(f"camera {self.name!r}: {field} must be numbers of shape {shape}; got {value!r}") from None
+            raise ValueError(
+                f"camera {shown(self.name)}: {field} must be numbers of shape {shape}; got {shown(value)}"
+            ) from None
         if array.size != np.prod(shape, dtype=int):
-            raise ValueError(f"camera {self.name!r}: {field} must have shape {shape}; got {array.shape}")
+            raise ValueError(f"camera {shown(self.name)}: {field} must have shape {shape}; got {array.shape}")
         if not np.isfinite(array).all():
-            raise ValueError(f"camera {self.name!r}: {field} must be finite; got {array.tolist()}")
+            raise ValueError(f"camera {shown(self.name)}: {field} must be finite; got {array.tolist()}")
         array = array.reshape(shape)
         array.setflags(write=False)
         return array

@@ -1,7 +1,7 @@
 """Cameras in files: `cameras.yaml`, and the files that OpenCV's FileStorage writes."""
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from numbers import Integral
 from os import PathLike
 from pathlib import Path
@@ -11,7 +11,8 @@ import cv2
 import numpy as np
 import yaml
 
-from ballfg.checks import check_keys, did_you_mean, is_number
+from ballfg.checks import check_keys, did_you_mean, is_number, listed, shown
+from ballfg.files.file_storage import ENDINGS, Tree, number, numbers, read_storage
 from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.files.whole_file import whole_file, write_text
 from ballfg.vision.camera import Camera
@@ -31,7 +32,6 @@ _NODES: Final = {
     "tvec": ("tvec",),
 }
 """Our name of an array -> OpenCV's names of its node, the one that is written first; others are read."""
-_ENDINGS: Final = (".xml", ".json", ".yml", ".yaml")
 
 
 def read_cameras(path: str | PathLike[str], *, posed: bool = True) -> list[Camera]:
@@ -50,7 +50,7 @@ def read_cameras(path: str | PathLike[str], *, posed: bool = True) -> list[Camer
         raise FileNotFoundError(f"{path}: must be a file with cameras; there is none. Correct the path.")
     try:
         if _is_storage(path):
-            cameras = _read_storage(path)
+            cameras = _from_storage(path)
         else:
             content = read_mapping(path)
             check_keys(str(path), content, ("cameras",), ("cameras",))
@@ -88,8 +88,8 @@ def write_opencv(path: str | PathLike[str], cameras: Iterable[Camera], *, posed:
         FileNotFoundError: the folder does not exist.
     """
     path = Path(path)
-    if path.suffix.lower() not in _ENDINGS:
-        raise ValueError(f"path must end in {', '.join(_ENDINGS)}; got {path}. Choose the format by the ending.")
+    if path.suffix.lower() not in ENDINGS:
+        raise ValueError(f"path must end in {', '.join(ENDINGS)}; got {path}. Choose the format by the ending.")
     cameras = _check_names(cameras)
     for camera in cameras:
         plain = camera.name.replace("_", "a").replace("-", "0")
@@ -120,7 +120,7 @@ def _is_storage(path: Path) -> bool:
         return file.read(8).removeprefix(b"\xef\xbb\xbf").startswith(b"%YAML")
 
 
-def _read_storage(path: Path) -> dict[str, dict[str, Any]]:
+def _from_storage(path: Path) -> dict[str, dict[str, Any]]:
     """Name of each camera -> its fields as in `cameras.yaml`; nodes that say nothing about a camera are left aside.
 
     A file with `camera_matrix` at its top holds one camera, named as the file; otherwise every map with that node is
@@ -128,24 +128,14 @@ def _read_storage(path: Path) -> dict[str, dict[str, Any]]:
 
     Raises: ValueError: not readable, or without cameras; the message names file, camera and node.
     """
-    try:
-        storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
-    except (cv2.error, SystemError):  # the binding raises the latter where the constructor throws
-        raise ValueError(f"{path}: must be a file of OpenCV's FileStorage; it cannot be parsed. Correct it.") from None
-    try:
-        root = storage.root()
-        keys = _keys(root)
-        if _MATRIX in keys:
-            return {path.stem: _fields(root, str(path))}
-        found = {key: root.getNode(key) for key in keys}
-        cameras = {key: node for key, node in found.items() if _MATRIX in _keys(node)}
-        if not cameras:
-            got = ", ".join(keys) or "nothing"
-            hint = did_you_mean(_MATRIX, keys).replace("Did you mean", "Rename")
-            raise ValueError(f"{path}: node {_MATRIX!r} is required; got {got}.{hint} Add it.")
-        return {key: _fields(node, f"{path}: camera {key!r}") for key, node in cameras.items()}
-    finally:
-        storage.release()
+    root = read_storage(path)
+    if _MATRIX in root:
+        return {path.stem: _fields(root, str(path))}
+    cameras = {key: node for key, node in root.items() if isinstance(node, dict) and _MATRIX in node}
+    if not cameras:
+        hint = did_you_mean(_MATRIX, root).replace("Did you mean", "Rename")
+        raise ValueError(f"{path}: node {_MATRIX!r} is required; got {listed(root)}.{hint} Add it.")
+    return {key: _fields(node, f"{path}: camera {shown(key)}") for key, node in cameras.items()}
 
 
 def _check_names(cameras: Iterable[Camera]) -> Sequence[Camera]:
@@ -155,26 +145,30 @@ def _check_names(cameras: Iterable[Camera]) -> Sequence[Camera]:
         raise ValueError("cameras must hold at least one camera; got none. Pass the cameras to write.")
     name, count = Counter(camera.name for camera in cameras).most_common(1)[0]
     if count > 1:
-        raise ValueError(f"cameras must have names of their own; got {name!r} {count} times. Rename them.")
+        raise ValueError(f"cameras must have names of their own; got {shown(name)} {count} times. Rename them.")
     return cameras
 
 
 def _camera(name: str, content: Any, posed: bool) -> Camera:
     """A camera from its fields. Raises: ValueError, TypeError: names camera and field."""
-    where = f"camera {name!r}"
+    where = f"camera {shown(name)}"
     fields = mapping(where, content)
     check_keys(where, fields, FIELDS, LENS)
     missing = [field for field in POSE if fields.get(field) is None]
     if missing and (posed or len(missing) == 1):
         raise ValueError(
-            f"{where}: field {missing[0]!r} is required; got {', '.join(fields)}. "
+            f"{where}: field {missing[0]!r} is required; got {listed(fields)}. "
             "Add it, or let 'ballfg calibrate-cameras --intrinsics FILE --table TABLE' find where the camera stands."
         )
     size, offset = fields["size"], fields.get("time_offset", 0.0)
     if not (isinstance(size, list | tuple) and len(size) == 2 and all(_is_whole(side) for side in size)):
-        raise ValueError(f"{where}: size must be width and height in pixels, as [1280, 720]; got {size!r}. Correct it.")
+        raise ValueError(
+            f"{where}: size must be width and height in pixels, as [1280, 720]; got {shown(size)}. Correct it."
+        )
     if not is_number(offset):
-        raise ValueError(f"{where}: time_offset must be a number in s; got {offset!r}. Write it like 0.004 or 4.0e-3.")
+        raise ValueError(
+            f"{where}: time_offset must be a number in s; got {shown(offset)}. Write it like 0.004 or 4.0e-3."
+        )
     return Camera(
         name=name,
         size=(size[0], size[1]),
@@ -190,49 +184,26 @@ def _is_whole(value: object) -> bool:
     return is_number(value) and isinstance(value, Integral)
 
 
-def _fields(node: cv2.FileNode, where: str) -> dict[str, Any]:
+def _fields(node: Mapping[str, Tree], where: str) -> dict[str, Any]:
     fields: dict[str, Any] = {"size": _size(node, where)}
     for field, names in _NODES.items():
-        present = [name for name in names if name in _keys(node)]
+        present = [name for name in names if name in node]
         if present:
-            fields[field] = _array(node.getNode(present[0]), f"{where}: node {present[0]!r}")
-    if "time_offset" in _keys(node):
-        offset = node.getNode("time_offset")
-        if not (offset.isReal() or offset.isInt()):
-            raise ValueError(f"{where}: node 'time_offset' must be a number in s. Correct it.")
-        fields["time_offset"] = offset.real()
+            fields[field] = numbers(node[present[0]], f"{where}: node {present[0]!r}")
+    if "time_offset" in node:
+        fields["time_offset"] = number(node["time_offset"], f"{where}: node 'time_offset'")
     return fields
 
 
-def _size(node: cv2.FileNode, where: str) -> list[int]:
-    keys = _keys(node)
-    if "image_size" in keys:
-        numbers = np.ravel(_array(node.getNode("image_size"), f"{where}: node 'image_size'"))
-    elif "image_width" in keys and "image_height" in keys:
-        numbers = np.array([node.getNode(name).real() for name in ("image_width", "image_height")])
+def _size(node: Mapping[str, Tree], where: str) -> list[int]:
+    if "image_size" in node:
+        sides = np.ravel(numbers(node["image_size"], f"{where}: node 'image_size'"))
+    elif "image_width" in node and "image_height" in node:
+        sides = np.array([number(node[name], f"{where}: node {name!r}") for name in ("image_width", "image_height")])
     else:
+        raise ValueError(f"{where}: nodes 'image_width' and 'image_height' are required; got {listed(node)}. Add them.")
+    if len(sides) != 2 or not np.isfinite(sides).all() or (sides != np.trunc(sides)).any():
         raise ValueError(
-            f"{where}: nodes 'image_width' and 'image_height' are required; got {', '.join(keys)}. Add them."
+            f"{where}: the image's size must be two whole numbers; got {shown(sides.tolist())}. Correct it."
         )
-    if len(numbers) != 2 or (numbers != np.trunc(numbers)).any():
-        raise ValueError(f"{where}: the image's size must be two whole numbers; got {numbers.tolist()}. Correct it.")
-    return [int(number) for number in numbers]
-
-
-def _array(node: cv2.FileNode, where: str) -> list[float] | list[list[float]]:
-    """The numbers of a matrix or a sequence, flat unless it is a matrix of several rows and columns."""
-    if node.isSeq():
-        items = [node.at(i) for i in range(node.size())]
-        if all(item.isReal() or item.isInt() for item in items):
-            return [item.real() for item in items]
-    elif node.isMap():
-        matrix = node.mat()
-        if matrix is None:  # how an empty matrix comes back
-            return []
-        flat = matrix.ndim < 2 or 1 in matrix.shape[:2]
-        return list(map(float, matrix.ravel())) if flat else matrix.astype(float).tolist()
-    raise ValueError(f"{where} must be a matrix or a list of numbers. Correct it.")
-
-
-def _keys(node: cv2.FileNode) -> tuple[str, ...]:
-    return tuple(node.keys()) if node.isMap() else ()
+    return [int(side) for side in sides]

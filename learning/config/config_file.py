@@ -5,11 +5,10 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-import yaml
 from pydantic import BaseModel, ValidationError
 
-from ballfg.checks import nearest
-from ballfg.files.strict_yaml import YamlError, read_yaml
+from ballfg.checks import nearest, shown
+from ballfg.files.strict_yaml import YamlError, parse_yaml, read_yaml
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.config.training import TrainConfig
 
@@ -68,7 +67,7 @@ def _load(path: Path) -> dict[str, Any]:
     if content is None:
         return {}
     if not isinstance(content, dict):
-        raise ValueError(f"{path}: a config maps keys to values; got {content!r}. Write for instance 'seed: 0'.")
+        raise ValueError(f"{path}: a config maps keys to values; got {shown(content)}. Write for instance 'seed: 0'.")
     return {str(key): value for key, value in content.items()}
 
 
@@ -97,9 +96,9 @@ def _parse(override: str, text: str) -> Any:
     except json.JSONDecodeError:
         pass
     try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError:
-        raise ValueError(f"override '{override}': the value is not readable as YAML. Quote it.") from None
+        return parse_yaml(text, f"override {shown(override)}")
+    except YamlError as error:
+        raise ValueError(f"{error}. Quote the value.") from None
 
 
 def _explained(error: ValidationError, config: type[Config]) -> str:
@@ -113,13 +112,13 @@ def _explained(error: ValidationError, config: type[Config]) -> str:
         return f"'{key}' {first['ctx']['error']}" if key else str(first["ctx"]["error"])
     if first["type"] == "model_type":
         known = ", ".join(_fields_at(config, location))
-        return f"'{key}' must be a section with keys; got {first['input']!r}. Its keys: {known}."
+        return f"'{key}' must be a section with keys; got {shown(first['input'])}. Its keys: {known}."
     got = first["input"]
     if first["type"] == "too_short":
-        return f"'{key}' must hold at least one; got {got!r}. Leave it out or fill it."
+        return f"'{key}' must hold at least one; got {shown(got)}. Leave it out or fill it."
     rule = first["msg"].removeprefix("Input ").removeprefix("should ").replace("a valid tuple", "a list")
     hint = " YAML reads 1e-3 as text; write 1.0e-3." if _is_number(got) else " docs/train.md lists the keys."
-    return f"'{key}' must {rule}; got {got!r}.{hint}"
+    return f"'{key}' must {rule}; got {shown(got)}.{hint}"
 
 
 def _unknown(location: list[str], config: type[Config]) -> str:

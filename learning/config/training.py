@@ -5,6 +5,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
+from ballfg.checks import shown
 from ballfg.learning.registry import TRAINEES
 
 Positive = Annotated[float, Field(gt=0.0)]
@@ -90,7 +91,9 @@ class ObserveConfig(Section):
         if isinstance(content, int | float) and not isinstance(content, bool):
             return {"samples": None, "seconds": content}
         if not isinstance(content, dict | cls):
-            raise ValueError(f"must be seconds, or a section with samples or seconds; got {content!r}. Write 0.25.")
+            raise ValueError(
+                f"must be seconds, or a section with samples or seconds; got {shown(content)}. Write 0.25."
+            )
         if isinstance(content, dict) and content.get("seconds") is not None and "samples" not in content:
             return content | {"samples": None}
         return content
@@ -209,7 +212,7 @@ def _known(kind: Any) -> Any:
         return kind
     *names, last = (f"'{name}'" for name in TRAINEES)
     listed = f"{', '.join(names)} or {last}"
-    raise ValueError(f"must be {listed}; got {kind!r}. To calibrate coefficients write 'kind: calibrate'.")
+    raise ValueError(f"must be {listed}; got {shown(kind)}. To calibrate coefficients write 'kind: calibrate'.")
 
 
 class TrainConfig(Section):

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from time import process_time
 
 import pytest
 
+from ballfg.checks import check_keys, shown
 from ballfg.files.strict_yaml import YamlError, read_mapping, read_yaml
 
 
@@ -32,10 +34,21 @@ def test_what_is_read(tmp_path: Path) -> None:
         ("a: 1\nb: 2\na: 3", "'a' stands twice", 1, "a"),
         ("a:\n  b: {c: 1, c: 2}", "'c' stands twice", 2, "a.b.c"),
         ("- {c: 1}\n- {d: 1, d: 2}", "'d' stands twice", 2, "d"),
-        ("a: [1,\nb: 2", "while parsing a flow sequence, expected ',' or ']', but got '<stream end>'", 2, None),
-        ("a: !!python/object:os.system x", "could not determine a constructor for the tag", 1, None),
-        ("a: x\x01", "special characters are not allowed", None, None),
+        ("a: [1,\nb: 2", "while parsing a flow sequence, did not find expected ',' or ']'", 3, None),
+        ("a: !!python/object:os.system x", "values must be written without a tag; got", 1, None),
+        ("a: x\x01", "control characters are not allowed", None, None),
         (b"a: caf\xe9\n", "it must be UTF-8 text; invalid continuation byte", None, None),
+        ("a: !!int ''", "values must be written without a tag", 1, None),
+        ("- " + "[" * 3000, "values must be nested at most 40 deep", 1, None),
+        ("a: &a [*a]", "alias 'a' must not stand within what it names", 1, None),
+        ("a: *b", "found undefined alias", 1, None),
+        ("a: " + "9" * 400, "a number must have at most 100 digits; got 400", 1, None),
+        ("a: " + "9" * 30, "whole numbers must lie within +-2^63", 1, None),
+        ("a: 1.0e+400", "'1.0e+400' is larger than any number of double precision", 1, None),
+        ("a: 1\nb: 2026-02-30", "'2026-02-30' cannot be read; day is out of range for month", 2, None),
+        ("1: 1\n0x1: 2", "'0x1' stands twice", 1, "0x1"),
+        ("? [a, b]\n: 1", "a key must be a word", 1, None),
+        ("a: [" + "1, " * 300_000 + "]", "it must hold at most 250000 values, aliases written out", 1, None),
         ("a: 1\n---\nb: 2", "expected a single document in the stream, but found another document", 2, None),
     ],
 )
@@ -50,6 +63,30 @@ def test_what_is_refused(
     assert (error.line, error.repeated) == (line, repeated)
     place = "" if line is None else f" in its line {line}"
     assert str(error) == f"{path}: not readable as YAML ({error.problem}{place})"
+
+
+def test_aliases_that_multiply_are_refused_before_they_do(tmp_path: Path) -> None:
+    lines = ["a0: &a0 [x, x, x, x, x, x, x, x, x]"]
+    lines += [f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 9)}]" for i in range(1, 9)]
+    path = written(tmp_path, "\n".join(lines))
+    assert path.stat().st_size < 500
+    started = process_time()
+    with pytest.raises(YamlError, match="it must hold at most 250000 values, aliases written out in its line 6"):
+        read_yaml(path)
+    assert process_time() - started < 1.0  # written out they take minutes and gigabytes
+
+
+def test_what_is_long_is_named_by_its_beginning(tmp_path: Path) -> None:
+    content = "\n".join(f"k{i}: {{a: 1}}" for i in range(20_000))
+    with pytest.raises(ValueError, match=r"got k0, .*, k11 and 19988 more\. Add it\.") as caught:
+        check_keys("x", read_yaml(written(tmp_path, content)), [f"k{i}" for i in range(20_000)], ["wanted"])
+    assert len(str(caught.value)) < 200
+    assert (
+        shown({"a": [[1] * 1000] * 1000})
+        == "{'a': [[1, 1, 1, 1, 1, 1, 1, 1, ...], [1, 1, 1, 1, 1, 1, 1, 1, ...], [1, 1, 1..."
+    )
+    assert shown("x" * 1000)[:20] == "'" + "x" * 19
+    assert shown(b"short") == "b'short'"
 
 
 def test_a_mapping_is_needed(tmp_path: Path) -> None:

@@ -115,9 +115,9 @@ def test_unknown_fields_are_noted_with_the_nearest_name(make_folder):
         ("- a\n- b\n", "must hold fields such as 'name: my_shots'; got list."),
         ("name: [a\nframe: 1\n", ", line 2: must be valid YAML;"),
         ("name: a\n\tball: 1\n", ", line 2: must be valid YAML;"),
-        ("a: !!python/object:os.system x\n", "must be valid YAML; could not determine a constructor"),
+        ("a: !!python/object:os.system x\n", "must be valid YAML; values must be written without a tag"),
         (b"name: caf\xe9\n", "must be UTF-8 text;"),
-        ("name: a\x01b\n", "must be valid YAML; special characters are not allowed"),
+        ("name: a\x01b\n", "must be valid YAML; control characters are not allowed"),
     ],
 )
 def test_a_bad_yaml_is_named(make_folder, text, message):

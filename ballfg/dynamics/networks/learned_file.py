@@ -16,6 +16,7 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from torch import Tensor
 
+from ballfg.checks import shown
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.networks.architecture import Architecture
@@ -158,7 +159,7 @@ def _read_config(path: Path) -> _Config:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"]) or "content"
-        raise ValueError(f"{path}: {where}: {first['msg']}; got {first['input']!r}.") from None
+        raise ValueError(f"{path}: {where}: {first['msg']}; got {shown(first['input'])}.") from None
 
 
 def _empty_model(config: _Config, analytic: AnalyticModel, folder: Path) -> BallModel:

@@ -10,7 +10,7 @@ from typing import Any, Final
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.checks import check_keys, did_you_mean, is_number
+from ballfg.checks import check_keys, did_you_mean, is_number, shown
 from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.tracks.info import MAX_HEIGHT
 
@@ -89,9 +89,9 @@ def read_table(path: str | PathLike[str]) -> TableFile:
     known = table_points(height)
     own = mapping(f"{path}: points", content["points"]) if "points" in content else {}
     for name, place in own.items():
-        known[name] = _numbers(f"{path}: point {name!r}", place, 3, "its x, y, z in m")
+        known[name] = _numbers(f"{path}: point {shown(name)}", place, 3, "its x, y, z in m")
     cameras = {
-        name: _marked(f"{path}: camera {name!r}", seen, known, sigma)
+        name: _marked(f"{path}: camera {shown(name)}", seen, known, sigma)
         for name, seen in mapping(f"{path}: cameras", content["cameras"]).items()
     }
     return TableFile(height, cameras)
@@ -103,7 +103,7 @@ def _marked(where: str, content: Any, known: Mapping[str, Array], sigma: float) 
         if name not in known:
             hint = did_you_mean(str(name), known)
             raise ValueError(
-                f"{where}: points must be among {', '.join(known)}; got {name!r}.{hint} Put others in points."
+                f"{where}: points must be among {', '.join(known)}; got {shown(name)}.{hint} Put others in points."
             )
     pixels = [_numbers(f"{where}: {name}", pixel, 2, "where it is seen, in px") for name, pixel in seen.items()]
     return Marked(tuple(seen), np.stack([known[name] for name in seen]), np.stack(pixels), sigma)
@@ -111,11 +111,11 @@ def _marked(where: str, content: Any, known: Mapping[str, Array], sigma: float) 
 
 def _numbers(where: str, value: Any, count: int, what: str) -> Array:
     if not isinstance(value, list) or len(value) != count:
-        raise ValueError(f"{where} must be {count} numbers, {what}; got {value!r}. Correct it.")
+        raise ValueError(f"{where} must be {count} numbers, {what}; got {shown(value)}. Correct it.")
     return np.array([_number(where, number) for number in value])
 
 
 def _number(where: str, value: Any) -> float:
     if not is_number(value) or not np.isfinite(value):
-        raise ValueError(f"{where} must be a finite number; got {value!r}. Correct it.")
+        raise ValueError(f"{where} must be a finite number; got {shown(value)}. Correct it.")
     return float(value)
