@@ -72,9 +72,7 @@ def test_twice_the_prior_spread_covers_what_sources_say(name: str) -> None:
 @pytest.mark.parametrize("name", [name for name in COEFFICIENTS if name != "tennis"])
 def test_the_page_of_physics_states_the_numbers_of_the_files(name: str) -> None:
     (row,) = re.findall(rf"^\| {name}[ ,].*%.*$", PHYSICS, re.MULTILINE)
-    _, size, drag, lift, restitution, friction, spreads, court = row.strip("| ").split(" | ") + [""] * (
-        row[-3:] == "| |"
-    )
+    _, size, drag, lift, restitution, friction, spreads, court = (cell.strip() for cell in row.strip("|").split("|"))
     known, (expected_drag, expected_lift) = KNOWN_BALLS[name], COEFFICIENTS[name]
     millimetres, grams = (float(number) for number in re.findall(r"[\d.]+", size))
     assert (millimetres, grams) == pytest.approx((1e3 * known.ball.radius, 1e3 * known.ball.mass), rel=1e-3)
