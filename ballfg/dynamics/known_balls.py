@@ -28,7 +28,7 @@ class KnownBall:
         source: of radius and mass.
         spreads: prior standard deviations as shares of the values, by effect; the effect's own where it is not named.
         inertia_factor: moment of inertia over m R^2, dimensionless.
-        court: (length, width) m of table, court or pitch by the rules; None where they have no rectangle.
+        court: (length, width) m of table, court or pitch; None where the rules have no rectangle.
     """
 
     ball: Ball
@@ -40,35 +40,40 @@ class KnownBall:
 
 KNOWN_BALLS: Final[Mapping[str, KnownBall]] = {
     "table_tennis": KnownBall(TABLE_TENNIS, "ITTF Laws of Table Tennis 2.3", court=(2.74, 1.525)),
-    "tennis": KnownBall(TENNIS, "ITF Rules of Tennis, App. I", {"drag": 0.3, "magnus": 0.3}, court=(23.77, 10.97)),
+    "tennis": KnownBall(
+        TENNIS,
+        "ITF Rules of Tennis, App. I",
+        {"drag": 0.3, "magnus": 0.3, "restitution": 0.06, "friction": 0.15},  # courts differ more than balls do
+        court=(23.77, 10.97),
+    ),
     "basketball": KnownBall(
         Ball(0.121, 0.6),  # circumference 750 to 770 mm, 580 to 620 g
         "FIBA Basketball Equipment 2020, size 7",
-        {"drag": 0.3, "magnus": 0.5, "restitution": 0.04, "friction": 0.3},
+        {"drag": 0.3, "magnus": 0.5, "restitution": 0.05, "friction": 0.3},
         court=(28.0, 15.0),
     ),
     "volleyball": KnownBall(
         Ball(0.105, 0.27),  # circumference 650 to 670 mm, 260 to 280 g
-        "FIVB Volleyball Rules 2021, rule 3",
-        {"drag": 0.4, "magnus": 0.5, "restitution": 0.08, "friction": 0.3},
+        "FIVB Official Volleyball Rules, rule 3",
+        {"drag": 0.45, "magnus": 0.5, "restitution": 0.08, "friction": 0.3},
         court=(18.0, 9.0),
     ),
     "football": KnownBall(
         Ball(0.1098, 0.43),  # circumference 680 to 700 mm, 410 to 450 g
         "IFAB Laws of the Game, law 2",
-        {"drag": 0.4, "magnus": 0.4, "restitution": 0.12, "friction": 0.4},
-        court=(105.0, 68.0),
+        {"drag": 0.5, "magnus": 0.4, "restitution": 0.15, "friction": 0.4},
+        court=(105.0, 68.0),  # the usual size of a stadium; law 1 leaves a range
     ),
     "baseball": KnownBall(
         Ball(0.0369, 0.1453),  # circumference 9 to 9.25 in, 5 to 5.25 oz
         "MLB Official Baseball Rules 3.01",
-        {"drag": 0.2, "magnus": 0.3, "restitution": 0.2, "friction": 0.4},
+        {"drag": 0.25, "magnus": 0.3, "restitution": 0.2, "friction": 0.4},
         SOLID,
     ),
     "golf": KnownBall(
         Ball(0.021335, 0.04593),  # at least 42.67 mm across, at most 45.93 g
         "R&A and USGA Equipment Rules, part 4",
-        {"drag": 0.2, "magnus": 0.4, "restitution": 0.4, "friction": 0.4},
+        {"drag": 0.3, "magnus": 0.4, "restitution": 0.4, "friction": 0.5},
         SOLID,
     ),
 }
