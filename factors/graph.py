@@ -2,7 +2,7 @@
 
 import copy
 import enum
-from collections.abc import Generator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
@@ -79,6 +79,24 @@ def run(search: Search[R]) -> R:
             question = search.send(question.answer())
     except StopIteration as end:
         return end.value
+
+
+def searched_while(search: Search[R], holds: Callable[[Values], bool]) -> Search[R | None]:
+    """A search that is given up, with None, when it goes on from a point that is not wanted.
+
+    Args: search: to begin.  holds: whether a point is wanted.
+    """
+    answer = None
+    try:
+        while True:
+            question = search.send(answer)
+            if isinstance(question, LinearSolution) and not holds(question.values):
+                search.close()
+                return None
+            answer = yield question
+    except StopIteration as end:
+        result: R = end.value
+        return result
 
 
 class Convergence(enum.Enum):

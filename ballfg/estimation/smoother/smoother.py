@@ -15,6 +15,7 @@ from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Segmentation, physics_of, segment
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
+from ballfg.estimation.smoother.grip import rival_note, with_other_spins
 from ballfg.estimation.smoother.initial import initial_states, move_contacts
 from ballfg.estimation.smoother.near_contact import other_sides
 from ballfg.estimation.smoother.problem import Events, TrackProblem
@@ -169,25 +170,32 @@ class Smoother(Estimator):
     def search(self, problem: TrackProblem, earlier: Earlier | None = None) -> Search[Solution]:
         """`solve`, asking for linearisations, so that several tracks can be solved together."""
         segmentation = problem.segmentation
-        solution = yield from self._settle(problem, segmentation, earlier)
+        solution = yield from self._lowest(problem, segmentation, earlier)
         for _ in range(MAX_UNSEEN_HITS if self.settings.find_events else 0):
             interval = _worst_break(solution)
             if interval is None:
                 break
             segmentation = replace(segmentation, hits=np.union1d(segmentation.hits, [interval]))
-            solution = yield from self._settle(problem, segmentation, earlier)
+            solution = yield from self._lowest(problem, segmentation, earlier)
         found = solution.minimum
         if found.convergence is not Convergence.CONVERGED or found.distance < self.optimizer.tolerance:
             return replace(solution, minimum=found.bare())
         minimum = yield from self.optimizer.search(solution.graph, found)
         return replace(solution, minimum=minimum.bare())
 
+    def _lowest(self, problem: TrackProblem, segmentation: Segmentation, earlier: Earlier | None) -> Search[Solution]:
+        """Minimise; where no label chooses the spin, look for a lower minimum with another one."""
+        solution = yield from self._settle(problem, segmentation, earlier)
+        if earlier is not None or self.settings.spin_label(problem.track) is not None:
+            return solution
+        return (yield from with_other_spins(solution, problem.ball, self._up_to(ROUGH)))
+
     def _settle(self, problem: TrackProblem, segmentation: Segmentation, earlier: Earlier | None) -> Search[Solution]:
         """Minimise, move contacts to where the estimate says they are, and minimise again until they stay.
 
         The minima are rough ones, see `ROUGH`.
         """
-        rough = replace(self.optimizer, tolerance=max(ROUGH, self.optimizer.tolerance))
+        rough = self._up_to(ROUGH)
         track, ball = problem.track, problem.ball
         events = Events(segmentation.contacts, segmentation)
         if earlier is None:
@@ -219,6 +227,10 @@ class Smoother(Estimator):
             )
             events = Events(refined, segmentation)
         return min(seen.values(), key=lambda s: s.minimum.error)
+
+    def _up_to(self, tolerance: float) -> LevenbergMarquardt:
+        """The optimizer for a minimum that need not be known better, in posterior standard deviations."""
+        return replace(self.optimizer, tolerance=max(tolerance, self.optimizer.tolerance))
 
     def result(self, problem: TrackProblem, solution: Solution) -> Estimate:
         """What a solution says about the track."""
@@ -255,7 +267,7 @@ class Smoother(Estimator):
             error=minimum.error,
             iterations=minimum.iterations,
             world=self.world,
-            notes=self.doubts(track),
+            notes=self.doubts(track) + rival_note(solution, own_covariances[0, SPIN, SPIN]),
         )
 
 

@@ -23,6 +23,8 @@ class Solution:
     events: Events
     graph: BallGraph
     minimum: Minimum
+    rival: Array | None = None
+    """(3,) rad/s, first spin of another minimum that is nearly as low, where one was found."""
 
 
 def contacts_at_ends(times: Array, solution: Solution, model: BallModel, surfaces: Surfaces) -> tuple[Contact, ...]:

@@ -1,0 +1,181 @@
+"""A second look at a bounce: friction slides or grips, and the track may have a minimum of each kind.
+
+While the ball slides, friction tells the direction of the slip only; once it grips, friction tells all of the slip. On
+the way from a start on one side the search may settle before it reaches the other. So it begins again on the other
+side and goes on while it stays there; the lower minimum is the answer. A spin label, where there is one, chooses the
+side.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from ballfg.arrays import Array
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.impact import slip_velocity
+from ballfg.estimation.smoother.solution import Solution
+from ballfg.factors.batch import Values
+from ballfg.factors.dynamics import model_width
+from ballfg.factors.graph import Convergence, LevenbergMarquardt, Search, searched_while
+from ballfg.state import SPIN, STATE_DIM, VELOCITY
+
+SLIDES = 0.05
+"""Slope of log(friction) by log(slip): 0 while the ball slides, 1 once it grips, between them a gradual transition."""
+SCALES = 2.0 ** np.arange(-4.0, 5.0)
+"""Multiples of the slip that was found at which the ball may begin to slide."""
+WELL_BEYOND = 1.5
+"""Of the slip at which the ball begins to slide, for a start."""
+NEXT = 1.1
+"""Of a slip at which the ball gripped or nearly so: a minimum where it slides has more."""
+NUDGE = 1.01
+LEAST_SLIP = 1e-3
+"""m/s, below which a slip has no direction."""
+
+
+TIE = 2.0
+"""Of the objective, a log likelihood: a minimum that is higher by less has at least a seventh of the probability."""
+RIVAL_APART = 2.5
+"""Posterior standard deviations of the spin, beyond which another spin is said to explain the track too."""
+
+
+def with_other_spins(solution: Solution, model: BallModel, optimizer: LevenbergMarquardt) -> Search[Solution]:
+    """The lower of a solution and of those with which the ball grips instead of slides at a bounce, or slides.
+
+    Args: solution: so far.  model: of the ball, with the coefficients that are estimated.  optimizer: for the others.
+    """
+    least = optimizer.tolerance
+    for bounce in bounces_of(solution):
+        side = other_side(solution.minimum.values, bounce, model)
+        if side is None:
+            continue
+        minimum = yield from searched_while(optimizer.search(solution.graph, side.values), side.holds)
+        if minimum is None or minimum.convergence is not Convergence.CONVERGED:
+            continue
+        found, lower = solution.minimum, minimum.error < solution.minimum.error - least
+        tie = least < abs(minimum.error - found.error) < TIE
+        rival = (found if lower else minimum).values.states[0, SPIN] if tie else solution.rival
+        solution = replace(solution, minimum=minimum if lower else found, rival=rival)
+    return solution
+
+
+def rival_note(solution: Solution, covariance: Array) -> tuple[str, ...]:
+    """Says that another spin explains the track nearly as well, where the covariance does not include it.
+
+    Args: solution: of the track.  covariance: (3, 3) (rad/s)^2, of its first spin.
+    """
+    if solution.rival is None:
+        return ()
+    spin = solution.minimum.values.states[0, SPIN]
+    apart = solution.rival - spin
+    if apart @ np.linalg.solve(covariance, apart) < RIVAL_APART**2:
+        return ()
+    one, other = ("({:.0f}, {:.0f}, {:.0f})".format(*value) for value in (spin, solution.rival))
+    return (f"two spins explain the track nearly as well: {one} and {other} rad/s at its start; a spin label decides",)
+
+
+@dataclass(frozen=True)
+class Bounce:
+    """One bounce of a track: its interval, and the states whose spin it ties together."""
+
+    interval: int
+    first: int
+    last: int
+
+
+def bounces_of(solution: Solution) -> list[Bounce]:
+    """The bounces of a solution that no hit disturbs, in their order.
+
+    The spin before one holds back to the bounce, hit or start before it, the spin after it to the next of these.
+    """
+    segmentation, count = solution.events.segmentation, len(solution.minimum.values.states)
+    broken = {*segmentation.hits.tolist(), *segmentation.restarts.tolist()}
+    intervals = sorted({contact.interval for contact in solution.events.contacts})
+    for rest in segmentation.rests:
+        broken |= set(range(rest.first, rest.last + 1))
+    cuts = np.array(sorted({-1, count - 1, *broken, *intervals}))
+    return [
+        Bounce(i, int(cuts[cuts < i][-1]) + 1, int(cuts[cuts > i][0]))
+        for i in intervals
+        if i not in broken and i < count - 1
+    ]
+
+
+@dataclass(frozen=True)
+class OtherSide:
+    """Where a search begins on the other side of the slip at which a ball begins to slide.
+
+    Attributes:
+        values: to start from.
+        interval: of the bounce.
+        edge: m/s, the slip at which this side ends.
+        slides: whether the ball slides on this side.
+        radius: m, of the ball.
+    """
+
+    values: Values
+    interval: int
+    edge: float
+    slides: bool
+    radius: float
+
+    def holds(self, values: Values) -> bool:
+        """Whether the ball is still on this side of the edge."""
+        slip = np.linalg.norm(_slip(values.states[self.interval], self.radius))
+        return bool((slip >= self.edge) == self.slides)
+
+
+def other_side(values: Values, bounce: Bounce, model: BallModel) -> OtherSide | None:
+    """The start with another spin at a bounce: rolling where the ball slid, sliding where it gripped.
+
+    Args:
+        values: of a minimum.
+        bounce: whose spin changes, from the first to the last state that belongs to it.
+        model: of the ball, with the coefficients that are estimated.
+    Returns: None where the ball does not slip, or never slides.
+    """
+    before = np.concatenate((values.states[bounce.interval], values.coefficients[: model_width(model)]))
+    slip = _slip(before, model.radius)
+    sliding = _slopes(before, slip, model) < SLIDES
+    if np.linalg.norm(slip) < LEAST_SLIP or not sliding.any():
+        return None
+    edge = float(SCALES[sliding.argmax()])
+    slides = edge > 1.0  # on the other side
+    turned = _with_slip(before, slip, WELL_BEYOND * edge if slides else 0.0, model.radius)
+    old, new = _bounced(np.stack((before, turned)), model)
+    states = values.states.copy()
+    states[bounce.first : bounce.interval + 1, SPIN] += turned[SPIN] - before[SPIN]
+    states[bounce.interval + 1 : bounce.last + 1, SPIN] += new[SPIN] - old[SPIN]
+    speed = float(np.linalg.norm(slip))
+    return OtherSide(
+        replace(values, states=states), bounce.interval, speed * (NEXT if slides else edge), slides, model.radius
+    )
+
+
+def _slopes(before: Array, slip: Array, model: BallModel) -> Array:
+    """Slope of log(friction) by log(slip) at `SCALES` of a slip."""
+    rows = [_with_slip(before, slip, nudge * scale, model.radius) for nudge in (1.0, NUDGE) for scale in SCALES]
+    kicks = _bounced(np.stack(rows), model)[:, VELOCITY][:, :2] - before[VELOCITY][:2]
+    at, beyond = np.maximum(np.linalg.norm(kicks, axis=-1), 1e-12).reshape(2, -1)
+    return np.asarray(np.log(beyond / at) / np.log(NUDGE))
+
+
+def _slip(state: Array, radius: float) -> Array:
+    """(2,) m/s, velocity of the ball's lowest point over a level surface."""
+    velocity, spin = torch.from_numpy(state[VELOCITY]), torch.from_numpy(state[SPIN])
+    return np.asarray(slip_velocity(velocity, spin, radius).numpy())
+
+
+def _with_slip(before: Array, slip: Array, scale: float, radius: float) -> Array:
+    """The state with a multiple of its slip, by another spin."""
+    changed, more = before.copy(), (scale - 1.0) * slip / radius
+    changed[SPIN.start] += more[1]
+    changed[SPIN.start + 1] -= more[0]
+    return changed
+
+
+def _bounced(rows: Array, model: BallModel) -> Array:
+    with torch.no_grad():
+        return np.asarray(model.after_bounce(torch.from_numpy(rows)).numpy()[..., :STATE_DIM])
