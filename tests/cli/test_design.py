@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.simulation import SimulationConfig, write_simulation
+from ballfg.simulation import SimulationConfig, parse_effects, write_simulation
 from tests.commands import status
 
 CANDIDATES = "topspin=-3..5:2,sidespin=-5..5:5,speed=8..14:2"
@@ -44,6 +44,29 @@ def test_pairs_of_a_diagnosis(launched: Path, tmp_path: Path, capsys: pytest.Cap
     words = ["design", launched, "--candidates", CANDIDATES, "--diagnosis", tmp_path, "--shots", 1, "--jobs", 1]
     assert status(*words) == 0
     assert "frame_tilt.x frame_tilt.y from table_tilt.x table_tilt.y" in capsys.readouterr().out
+
+
+def test_without_a_pair_the_dataset_is_diagnosed_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Shots that fall too slowly: a clock that is wrong, or another g. The plan is that of the pair named by hand."""
+    settings, fall = {"sidespin": [0], "speed": [11]}, tuple(parse_effects(["gravity.g=9.6"]))
+    write_simulation(tmp_path / "shots", SimulationConfig(8, 60.0, seed=4, settings=settings, undeclared=fall))
+    words = ["design", tmp_path / "shots", "--candidates", "topspin=-3..5:2", "--shots", 2, "--jobs", 1]
+    assert status(*words, "--out", tmp_path / "diagnosed.csv") == 0
+    said = capsys.readouterr()
+    assert "2 of 5 candidates, for time_scale.s from gravity.g" in said.out
+    assert "diagnosing the dataset" in said.err
+    assert "time_scale added" in said.err
+    assert status(*words, "--between", "time_scale,gravity", "--out", tmp_path / "named.csv") == 0
+    assert (tmp_path / "diagnosed.csv").read_bytes() == (tmp_path / "named.csv").read_bytes()
+
+
+def test_a_diagnosis_without_a_pair_is_refused(
+    launched: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "shots.csv"
+    assert status("design", launched, "--candidates", CANDIDATES, "--out", out, "--jobs", 1) == 2
+    assert "the diagnosis names no pair of effects that it could not tell apart" in capsys.readouterr().err
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(
