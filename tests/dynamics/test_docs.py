@@ -10,6 +10,7 @@ import torch
 import yaml
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, advance, model_from_dict, model_to_dict, nominal_model
+from ballfg.dynamics.motion.integrate import fly
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.simulation import parse_effects
 from tests.places import DOCS
@@ -113,3 +114,49 @@ def test_nominal_values_in_the_physics_page():
     ):
         shown = next(v for k, v in nominal.items() if k.startswith(start))
         assert shown == value, start
+
+
+SLOW_AND_FAST = ((6.0, 50.0), (12.0, 100.0))
+"""m/s and rev/s of topspin, the balls of the table "How much it matters"."""
+
+
+def ends(model, *, seconds=0.5, turn=None):
+    """(2, 3) m: where level shots of the two balls are after half a second, in the frame that is turned by `turn`."""
+    state = torch.zeros(2, 9, dtype=torch.float64)
+    state[:, 3] = torch.tensor([speed for speed, _ in SLOW_AND_FAST])
+    state[:, 7] = 2.0 * torch.pi * torch.tensor([turns for _, turns in SLOW_AND_FAST])
+    turn = torch.eye(3, dtype=torch.float64) if turn is None else turn
+    state = (state.reshape(2, 3, 3) @ turn).reshape(2, 9)
+    with torch.no_grad():
+        return fly(model, state, torch.full((2,), seconds, dtype=torch.float64))[:, :3] @ turn.T
+
+
+def changed(**coefficients):
+    content = model_to_dict(nominal_model())
+    for name, value in coefficients.items():
+        effect, coefficient = name.split("__")
+        content["flight"].setdefault(effect, {})[coefficient] = value
+    return model_from_dict(content)
+
+
+def test_how_much_effects_matter_in_the_physics_page():
+    text = (
+        (DOCS / "physics.md").read_text(encoding="utf-8").partition("## How much it matters")[2].partition("\n## ")[0]
+    )
+    table = dict(re.findall(r"^\| ([^|]+?) \| ([\d /]+?) \|", text, re.MULTILINE))
+    nominal, angle = nominal_model(), torch.tensor(0.5 * torch.pi / 180.0, dtype=torch.float64)
+    flight = model_to_dict(nominal)["flight"]
+    one, zero = torch.ones((), dtype=torch.float64), torch.zeros((), dtype=torch.float64)
+    # about the direction of the shot, so that gravity gains a part across it
+    tilt = torch.stack((one, zero, zero, zero, angle.cos(), -angle.sin(), zero, angle.sin(), angle.cos())).reshape(3, 3)
+    moved = {
+        "Magnus +10 %": ends(changed(magnus__k=1.1 * flight["magnus"]["k"])),
+        "drag +10 %": ends(changed(drag__k=1.1 * flight["drag"]["k"])),
+        "tail wind 0.2 m/s": ends(changed(wind__x=0.2)),
+        "spin decay with a time constant of 5 s": ends(changed(spin_decay__rate=0.2)),
+        "tilt of the frame 0.5°": ends(nominal, turn=tilt),
+    }
+    for row, places in moved.items():
+        millimetres = 1000.0 * (places - ends(nominal)).norm(dim=-1)
+        assert table[row] == " / ".join(f"{value:.0f}" for value in millimetres), row
+    assert table["time offset 1 ms"] == " / ".join(f"{speed:.0f}" for speed, _ in SLOW_AND_FAST)
