@@ -1,12 +1,20 @@
 """How well the model predicts, before and after: errors on held-out tracks, one shot, and where the errors are."""
 
 import math
+from typing import Final
+
+import numpy as np
 
 from ballfg.diagnosis.report import pictures, shots
 from ballfg.diagnosis.report.glossary import term
 from ballfg.diagnosis.report.wording import NONE, change, fixed
 from ballfg.diagnosis.result import Diagnosis, Errors
-from ballfg.pages.html import Html, picture, section, table, tag
+from ballfg.pages.html import Html, items, picture, section, table, tag
+
+BY_CHANCE: Final = 2.0
+"""Standard errors within which a NIS counts as 1."""
+NEAR_FLOOR: Final = 1.2
+"""Ratio to the floor up to which a model can hardly be better."""
 
 
 def errors(diagnosis: Diagnosis) -> Html:
@@ -15,6 +23,7 @@ def errors(diagnosis: Diagnosis) -> Html:
     changed = changed and (bool(diagnosis.findings) or diagnosis.unexplained.fallback is not None)
     numbers = (
         (term("prediction error"), before.prediction_rmse_mm, after.prediction_rmse_mm, " mm", "small"),
+        (term("floor", "error of the median track"), *_medians(before, after), " mm", _goal(diagnosis.floor_mm)),
         (term("apex", "error of the apex"), before.apex_rmse_mm, after.apex_rmse_mm, " mm", "small"),
         (term("NIS"), before.nis, after.nis, "", "1"),
         (term("90 % intervals", "90 % intervals hold"), *_percents(before, after), " %", "90 %"),
@@ -33,8 +42,9 @@ def errors(diagnosis: Diagnosis) -> Html:
     )
     if not changed:
         rows = [(name, _fixed(now, unit), goal) for name, _, now, unit, goal in numbers]
-        return section("How well the model predicts", words, table(("", "value", "should be"), rows))
-    head = ("", "declared model", "corrected model", "change", "should be")
+        shown = table(("", "value", "should be"), rows)
+        return section("How well the model predicts", words, shown, items(meaning(diagnosis)))
+    head = ("", "declared model (before)", "corrected model (after)", "change", "should be")
     lines = [
         (name, _fixed(was, unit), _fixed(now, unit), _changed(was, now, unit), goal)
         for name, was, now, unit, goal in numbers
@@ -42,7 +52,60 @@ def errors(diagnosis: Diagnosis) -> Html:
     caption = "Each line is one of these tracks; diamonds pool them all."
     paired = picture(pictures.errors_by_track(before, after), caption)
     shown = tag("div", tag("div", table(head, lines)), paired, kind="beside")
-    return section("How much predictions gain", words, shown)
+    return section("How much predictions gain", words, shown, items(meaning(diagnosis)))
+
+
+def meaning(diagnosis: Diagnosis) -> list[str]:
+    """What the numbers of the table say: how near the floor the errors are, and whether they are as large as stated."""
+    after, floor = diagnosis.after, diagnosis.floor_mm
+    median = _medians(after, after)[0]
+    said = []
+    if math.isfinite(floor + median):
+        how = (
+            "so that a better model would gain little"
+            if median <= NEAR_FLOOR * floor
+            else f"so that predictions are {median / floor:.1f} times as far off as they could be"
+        )
+        said.append(
+            f"Were the model exact, the median track would be off by about {floor:.1f} mm, by the noise of the "
+            f"measurements and what the observed part leaves open of the release. It is off by {median:.1f} mm, {how}."
+        )
+    if math.isfinite(after.nis) and after.nis > 0.0:
+        said.append(_about_nis(after))
+    return said
+
+
+def _about_nis(errors: Errors) -> str:
+    """What a NIS says of the stated uncertainty, and by how much that is off."""
+    error = f" ± {fixed(errors.nis_error, 2)}" if math.isfinite(errors.nis_error) else ""
+    begin, held = f"A NIS of {fixed(errors.nis, 2)}{error}", ""
+    if math.isfinite(errors.intervals_held):
+        held = f" 90 % intervals hold {100 * errors.intervals_held:.1f} % of the measured coordinates."
+    if math.isfinite(errors.nis_error) and abs(errors.nis - 1.0) <= BY_CHANCE * errors.nis_error:
+        return f"{begin} differs from 1 by no more than chance: predictions state their uncertainty rightly.{held}"
+    if errors.nis < 1.0:
+        share = 100 * (1.0 / math.sqrt(errors.nis) - 1.0)
+        return (
+            f"{begin} is below 1: predictions are better than they claim. The noise behind them is stated too large; "
+            f"their standard deviations are {share:.0f} % larger than the errors.{held}"
+        )
+    share = 100 * (1.0 - 1.0 / math.sqrt(errors.nis))
+    return (
+        f"{begin} is above 1: predictions are worse than they claim. The noise behind them is stated too small; their "
+        f"standard deviations are {share:.0f} % smaller than the errors.{held}"
+    )
+
+
+def _medians(before: Errors, after: Errors) -> tuple[float, float]:
+    """mm, the error of the median track before and after; NaN where none could be judged."""
+    judged = [errors.by_track[np.isfinite(errors.by_track)] for errors in (before, after)]
+    old, new = (float(np.median(tracks)) if len(tracks) else math.nan for tracks in judged)
+    return old, new
+
+
+def _goal(floor: float) -> str:
+    """What the error of the median track should be."""
+    return f"near {floor:.1f} mm" if math.isfinite(floor) else "small"
 
 
 def _percents(before: Errors, after: Errors) -> tuple[float, float]:
@@ -71,9 +134,9 @@ def one_shot(diagnosis: Diagnosis) -> Html:
     off = f"off by {was:.1f} mm before and {now:.1f} mm after" if changed else f"off by {now:.1f} mm"
     ranked = "gain is the median" if changed else "error is the median"
     caption = (
-        f"Track {shot.after.name}, whose {ranked} of all {len(after.paths)} judged tracks: its prediction is {off}."
+        f"Track {shot.after.name}, whose {ranked} of all {len(after.paths)} held-out tracks: its prediction is {off}."
     )
-    words = "Root mean square errors of all judged tracks. Cells without a number hold too few samples."
+    words = "Root mean square errors of all held-out tracks. Cells without a number hold too few samples."
     return section(
         "One shot, and where the errors are",
         tag(

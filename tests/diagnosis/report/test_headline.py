@@ -79,7 +79,8 @@ def test_several_effects_are_counted_and_listed() -> None:
     assert list(further(many)) == [
         "The air moves at 0.2 m/s along x.",
         "Air drag differs between groups of tracks: top 0.100 ± 0.010 1/m, back 0.200 ± 0.010 1/m.",
-        "The time stamps jitter by 0.42 ms from sample to sample.",
+        "Not an effect on the ball but noise of the measurements: the time stamps jitter by 0.42 ms from sample to "
+        "sample.",
         "Something else is missing too, which no known effect explains: in flight, acceleration is off everywhere.",
     ]
     assert next(certainty(many)).startswith("A wind: practically certain. Chance makes a trace so strong with prob")
