@@ -313,8 +313,8 @@ class Diagnosis:
         residuals_after: of the search half with the corrected model.
         excluded: sentences on tracks that were not used.
         remarks: sentences on effects that fit better and are no names, and on fitted values that are not plausible.
-        floor_mm: prediction error of the median held-out track if nothing were wrong with the corrected model: what
-            measurement noise and the unknown release alone leave; NaN where that is not known.
+        floor_mm: prediction error that the held-out tracks would have if nothing were wrong with the corrected model:
+            what measurement noise and the unknown release alone leave; NaN where that is not known.
     """
 
     dataset: str

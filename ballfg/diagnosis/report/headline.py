@@ -159,13 +159,13 @@ def _command(name: str, makes: str, dataset: str, model: str, origin: Origin, mo
 
 
 def _least(candidate: Candidate) -> Iterator[str]:
-    """The size from which on an effect would have been noticed, of a vector along its worst axis."""
-    sizes = {name: size for name, size in candidate.seen_from.items() if candidate.estimate[name].unit}
+    """The size from which on an effect would have been noticed, of a vector whatever its direction along the axes."""
+    sizes = candidate.seen_from
     vector = {name: size for name, size in sizes.items() if name in ("x", "y", "z")}
     if vector:
         worst = max(vector, key=vector.__getitem__)
         said = sized(vector[worst], candidate.estimate[worst].unit)
-        yield f"{plain_name(candidate.name)} from {said} on along {worst}, along other axes from less on"
+        yield f"{plain_name(candidate.name)} from {said} on along any axis"
     else:
         sizes_said = (sized(size, candidate.estimate[name].unit) for name, size in sizes.items())
         yield f"{plain_name(candidate.name)} from {' and '.join(sizes_said)} on"

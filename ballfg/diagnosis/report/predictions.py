@@ -3,13 +3,11 @@
 import math
 from typing import Final
 
-import numpy as np
-
 from ballfg.diagnosis.report import pictures, shots
 from ballfg.diagnosis.report.glossary import term
 from ballfg.diagnosis.report.wording import NONE, change, fixed
 from ballfg.diagnosis.result import Diagnosis, Errors
-from ballfg.pages.html import Html, items, picture, section, table, tag
+from ballfg.pages.html import Html, items, picture, section, table, tag, text
 
 BY_CHANCE: Final = 2.0
 """Standard errors within which a NIS counts as 1."""
@@ -22,8 +20,13 @@ def errors(diagnosis: Diagnosis) -> Html:
     before, after, changed = diagnosis.before, diagnosis.after, diagnosis.after is not diagnosis.before
     changed = changed and (bool(diagnosis.findings) or diagnosis.unexplained.fallback is not None)
     numbers = (
-        (term("prediction error"), before.prediction_rmse_mm, after.prediction_rmse_mm, " mm", "small"),
-        (term("floor", "error of the median track"), *_medians(before, after), " mm", _goal(diagnosis.floor_mm)),
+        (
+            term("prediction error"),
+            before.prediction_rmse_mm,
+            after.prediction_rmse_mm,
+            " mm",
+            _goal(diagnosis.floor_mm),
+        ),
         (term("apex", "error of the apex"), before.apex_rmse_mm, after.apex_rmse_mm, " mm", "small"),
         (term("NIS"), before.nis, after.nis, "", "1"),
         (term("90 % intervals", "90 % intervals hold"), *_percents(before, after), " %", "90 %"),
@@ -55,23 +58,23 @@ def errors(diagnosis: Diagnosis) -> Html:
     return section("How much predictions gain", words, shown, items(meaning(diagnosis)))
 
 
-def meaning(diagnosis: Diagnosis) -> list[str]:
+def meaning(diagnosis: Diagnosis) -> list[Html]:
     """What the numbers of the table say: how near the floor the errors are, and whether they are as large as stated."""
     after, floor = diagnosis.after, diagnosis.floor_mm
-    median = _medians(after, after)[0]
-    said = []
-    if math.isfinite(floor + median):
+    error, said = after.prediction_rmse_mm, list[Html]()
+    if math.isfinite(floor + error):
         how = (
             "so that a better model would gain little"
-            if median <= NEAR_FLOOR * floor
-            else f"so that predictions are {median / floor:.1f} times as far off as they could be"
+            if error <= NEAR_FLOOR * floor
+            else f"so that predictions are {error / floor:.1f} times as far off as they could be"
         )
-        said.append(
-            f"Were the model exact, the median track would be off by about {floor:.1f} mm, by the noise of the "
-            f"measurements and what the observed part leaves open of the release. It is off by {median:.1f} mm, {how}."
+        least = (
+            f" is about {floor:.1f} mm: so much the noise of the measurements and what the observed part leaves open "
+            f"of the release cost even an exact model. The error is {error:.1f} mm, {how}."
         )
+        said.append(tag("span", "The ", term("floor"), least))
     if math.isfinite(after.nis) and after.nis > 0.0:
-        said.append(_about_nis(after))
+        said.append(text(_about_nis(after)))
     return said
 
 
@@ -96,15 +99,8 @@ def _about_nis(errors: Errors) -> str:
     )
 
 
-def _medians(before: Errors, after: Errors) -> tuple[float, float]:
-    """mm, the error of the median track before and after; NaN where none could be judged."""
-    judged = [errors.by_track[np.isfinite(errors.by_track)] for errors in (before, after)]
-    old, new = (float(np.median(tracks)) if len(tracks) else math.nan for tracks in judged)
-    return old, new
-
-
 def _goal(floor: float) -> str:
-    """What the error of the median track should be."""
+    """What the prediction error should be."""
     return f"near {floor:.1f} mm" if math.isfinite(floor) else "small"
 
 
