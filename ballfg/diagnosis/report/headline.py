@@ -9,8 +9,8 @@ from typing import Final
 
 from ballfg.diagnosis.remains.patterns import EVERYWHERE
 from ballfg.diagnosis.report.origin import Origin
-from ballfg.diagnosis.report.plain_effects import in_plain_words, plain_name
-from ballfg.diagnosis.report.wording import NONE, fixed, probability, sized
+from ballfg.diagnosis.report.plain_effects import BY_GROUP, DRIFT, in_plain_words, plain_name
+from ballfg.diagnosis.report.wording import NONE, fixed, joined, number, probability, sized
 from ballfg.diagnosis.result import Candidate, Diagnosis, Finding, Outcome, Verdict
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.noise.tracker import NUMBERS
@@ -26,7 +26,7 @@ PLACES: Final = {
 """Begin of a test's words, and the same in a sentence."""
 SURE: Final = ((1e-6, "practically certain"), (1e-3, "very likely"), (0.05, "likely"))
 """Words for the probability that a finding is none; the larger one of both halves of the tracks counts."""
-MAIN: Final = ("wind", "gravity", "time_scale", "drag_speed", "frame_tilt", "scale")
+MAIN: Final = ("wind", "drag_speed", "time_scale", "scale", "frame_tilt")
 """Effects whose least size is told in the first lines of a report that finds nothing."""
 COUNTS: Final = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine")
 
@@ -40,11 +40,14 @@ def answer(diagnosis: Diagnosis) -> str:
 def not_shown(diagnosis: Diagnosis) -> list[Candidate]:
     """Effects that the last round tested and nothing asks for, with the least size that would have been noticed.
 
-    None where a pattern is left: it may hide them.
+    None where a pattern is left: it may hide them. Those that differ between tracks are left out: there is a size for
+    each group of tracks and for each place of a change.
     """
     if diagnosis.verdict is Verdict.UNEXPLAINED or not diagnosis.rounds:
         return []
-    quiet = (c for c in diagnosis.rounds[-1] if c.outcome is Outcome.NOT_NEEDED)
+    quiet = (
+        c for c in diagnosis.rounds[-1] if c.outcome is Outcome.NOT_NEEDED and not c.name.endswith((BY_GROUP, DRIFT))
+    )
     return [c for c in quiet if c.seen_from and all(map(math.isfinite, c.seen_from.values()))]
 
 
@@ -101,10 +104,11 @@ def certainty(diagnosis: Diagnosis) -> Iterator[str]:
             f"{len(last) - unseen} effects were tested, one by one, and none of them stands out from chance. "
             f"The predictions of {diagnosis.tracks_judged_on} tracks were compared with what was measured."
         )
-        if least := [said for c in not_shown(diagnosis) if c.name in MAIN for said in _least(c)]:
-            yield f"In 9 of 10 recordings like this one, these would have been noticed: {'; '.join(least)}."
+        quiet = {c.name: c for c in not_shown(diagnosis)}
+        if least := joined(tuple(_least(quiet[name]) for name in MAIN if name in quiet)):
+            yield f"These would have been noticed in 9 of 10 recordings like this one, from such a size on: {least}."
     if unseen:
-        yield f"These tracks say nothing about {unseen} more effects, which may be there or not."
+        yield f"These tracks say nothing about {unseen} more effect{'s' * (unseen > 1)}, which may be there or not."
     if diagnosis.verdict is Verdict.UNEXPLAINED and diagnosis.unexplained.tests:
         least = min(test.p_value for test in diagnosis.unexplained.tests)
         word = next((word for limit, word in SURE if least < limit), "possible")
@@ -142,13 +146,23 @@ def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
             if decide:
                 yield f"To find out whether it is {plain_name(name)}: {decide}", ""
     if diagnosis.verdict is Verdict.UNEXPLAINED:
-        place = where(diagnosis.unexplained.where)
-        vary = "at other speeds, spins and places than these" if EVERYWHERE in place else "in which it varies more"
+        left = diagnosis.unexplained.where
         yield (
-            f"Look for a cause of what is left ({place}): record tracks {vary}. If you have a suspicion, write it as "
-            "an effect of your own and diagnose again:",
+            f"Look for a cause of what is left ({where(left)}): {_to_look_at(left)}. If you have a suspicion, write it "
+            "as an effect of your own and diagnose again:",
             f"ballfg diagnose {datasets}{given} --effects-file my_effects.py --out {again}",
         )
+
+
+def _to_look_at(pattern: str) -> str:
+    """What tells the cause of a pattern, by the kind of the test that found it."""
+    if pattern.startswith("label: "):
+        return "measure the spin of these tracks once more, and check the axes and the unit of the labels"
+    if pattern.startswith("time: "):
+        return "look for what delays or smooths the positions between the camera and the file"
+    if EVERYWHERE in pattern:
+        return "record tracks at other speeds, spins and places than these"
+    return "record tracks in which it varies more"
 
 
 def _command(name: str, makes: str, dataset: str, model: str, origin: Origin, more: str = "") -> str:
@@ -158,17 +172,12 @@ def _command(name: str, makes: str, dataset: str, model: str, origin: Origin, mo
     return f"ballfg {name} {shlex.quote(dataset)} --model {known}{more} --out {shlex.quote(out)}"
 
 
-def _least(candidate: Candidate) -> Iterator[str]:
+def _least(candidate: Candidate) -> str:
     """The size from which on an effect would have been noticed, of a vector whatever its direction along the axes."""
-    sizes = candidate.seen_from
-    vector = {name: size for name, size in sizes.items() if name in ("x", "y", "z")}
-    if vector:
-        worst = max(vector, key=vector.__getitem__)
-        said = sized(vector[worst], candidate.estimate[worst].unit)
-        yield f"{plain_name(candidate.name)} from {said} on along any axis"
-    else:
-        sizes_said = (sized(size, candidate.estimate[name].unit) for name, size in sizes.items())
-        yield f"{plain_name(candidate.name)} from {' and '.join(sizes_said)} on"
+    worst = max(candidate.seen_from, key=candidate.seen_from.__getitem__)
+    size, unit = candidate.seen_from[worst], candidate.estimate[worst].unit
+    said = f"{number(100 * size, 2)} %" if unit == "1" else sized(size, unit)
+    return f"{plain_name(candidate.name)} ({said}{' along any axis' if len(candidate.seen_from) > 1 else ''})"
 
 
 def where(words: str) -> str:

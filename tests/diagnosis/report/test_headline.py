@@ -65,6 +65,8 @@ def test_nothing_found_says_so_and_what_that_rests_on() -> None:
     sure = list(certainty(replace(silent(), rounds=(hidden,))))
     assert sure[0].startswith(f"{tested - 2} effects")
     assert sure[1] == "These tracks say nothing about 2 more effects, which may be there or not."
+    one = tuple(replace(c, outcome=Outcome.INVISIBLE) if i < 1 else c for i, c in enumerate(silent().rounds[-1]))
+    assert "nothing about 1 more effect, which" in list(certainty(replace(silent(), rounds=(one,))))[-1]
     assert [c for _, c in advice(silent(), replace(ORIGIN, model="m.yaml"))][1] == (
         "ballfg diagnose 'my shots' --model m.yaml --out out_again"
     )
@@ -237,6 +239,7 @@ def with_sizes(made: Diagnosis) -> Diagnosis:
         replace(rounds()[0][3], outcome=Outcome.NOT_NEEDED, seen_from={"share": 0.0011}),
         replace(rounds()[0][4], outcome=Outcome.NOT_NEEDED, seen_from={"x": math.inf}),
         replace(rounds()[0][5], outcome=Outcome.WEAKER, seen_from={"slope": 0.2}),
+        replace(rounds()[0][0], name="wind_drift", outcome=Outcome.NOT_NEEDED, seen_from={"x": 0.2}),
     )
     return replace(made, rounds=(last,))
 
@@ -245,8 +248,8 @@ def with_sizes(made: Diagnosis) -> Diagnosis:
 def test_a_silence_says_how_small_an_effect_it_would_have_noticed() -> None:
     sure = list(certainty(with_sizes(silent())))
     assert sure[1] == (
-        "In 9 of 10 recordings like this one, these would have been noticed: a wind from 0.11 m/s on along any "
-        "axis; a clock that runs wrong from 0.0011 on."
+        "These would have been noticed in 9 of 10 recordings like this one, from such a size on: a wind (0.11 m/s "
+        "along any axis) and a clock that runs wrong (0.11 %)."
     )
     shown = HtmlPage(page(with_sizes(silent()))).text
     listed = shown[shown.index("How small an effect would have been noticed") :]
@@ -255,6 +258,7 @@ def test_a_silence_says_how_small_an_effect_it_would_have_noticed() -> None:
     assert "time_scaleshare 0.0011" in listed
     assert "frame_tilt" not in listed
     assert "magnus_saturation" not in listed
+    assert "wind_drift" not in listed
     assert "How small an effect" not in page(with_sizes(unexplained()))
 
 
@@ -274,6 +278,9 @@ def test_of_several_datasets_each_gets_its_own_model_and_file() -> None:
     )
     *_, (words, _) = advice(replace(unexplained(), unexplained=left), both)
     assert "record tracks at other speeds, spins and places than these" in words
+    left = replace(left, where="label: 9 of 60 spin labels contradict their flights")
+    *_, (words, _) = advice(replace(unexplained(), unexplained=left), both)
+    assert "check the axes and the unit of the labels" in words
 
 
 def test_noise_alone_is_no_effect() -> None:
