@@ -164,7 +164,7 @@ def _write_page(
         if model.is_file()
         else ""
     )
-    origin = {"made on": date()} | ({"command": command} if command else {}) | {"data": ", ".join(data)}
+    origin = {"made on": date()} | ({"command": command} if command else {}) | {"data": ", ".join(data or ())}
     origin["with"] = ", ".join(f"{name} {version}" for name, version in versions(files.PACKAGES).items())
     drawn, learned = curves(record.epochs, record.title), training.task.trainee.learned()
     text = page(record.title, record.epochs, best, drawn, learned, shot, following, origin, untrained)

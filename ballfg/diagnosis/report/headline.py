@@ -105,8 +105,8 @@ def certainty(diagnosis: Diagnosis) -> Iterator[str]:
             f"The predictions of {diagnosis.tracks_judged_on} tracks were compared with what was measured."
         )
         quiet = {c.name: c for c in not_shown(diagnosis)}
-        if least := joined(tuple(_least(quiet[name]) for name in MAIN if name in quiet)):
-            yield f"These would have been noticed in 9 of 10 recordings like this one, from such a size on: {least}."
+        if noticed := joined(tuple(_least(quiet[name]) for name in MAIN if name in quiet)):
+            yield f"These would have been noticed in 9 of 10 recordings like this one, from such a size on: {noticed}."
     if unseen:
         yield f"These tracks say nothing about {unseen} more effect{'s' * (unseen > 1)}, which may be there or not."
     if diagnosis.verdict is Verdict.UNEXPLAINED and diagnosis.unexplained.tests:

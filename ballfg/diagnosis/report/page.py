@@ -109,7 +109,9 @@ def _finding(finding: Finding) -> Html:
                 term("log likelihood"),
                 f" per track; probability of that by chance: {probability(finding.held_out_p)}.",
             ),
-            f"Cannot be told from {joined(others)}." if others else "No other plausible candidate explains as much.",
+            f"Cannot be told from {joined(others)}."
+            if others
+            else "Of the candidates that were not refused no other explains as much.",
         )
     )
     return tag(

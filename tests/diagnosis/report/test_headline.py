@@ -310,3 +310,15 @@ def test_the_caption_of_the_histogram_counts_what_it_leaves_out() -> None:
     assert alone == f"The axis ends at ±6: 7 of {size} residuals lie beyond it and are not shown."
     both = beyond_histogram({"before": left, "after": right})
     assert f"7 of {size} residuals before and 0 of {size} residuals after lie beyond" in both
+
+
+def test_a_gain_that_a_few_tracks_make_is_told_with_the_median_track() -> None:
+    made = found()
+    tracks = made.before.by_track.copy()
+    tracks[tracks.argmax()] = 400.0
+    whole = float(np.sqrt((tracks**2).mean()))
+    skewed = replace(made, before=replace(made.before, by_track=tracks, prediction_rmse_mm=whole))
+    before, after = np.median(tracks), np.median(made.after.by_track)
+    said = f"the median track is off by {before:.1f} mm before and {after:.1f} mm after."
+    assert any(said in line for line in meaning(skewed))
+    assert not any("median track" in line for line in meaning(made))
