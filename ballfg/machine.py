@@ -4,12 +4,17 @@ from __future__ import annotations
 
 import os
 import platform
+import time
 from collections.abc import Iterable
 from importlib import metadata
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     import torch
+
+DATE: Final = "SOURCE_DATE_EPOCH"
+"""Environment variable with a date in seconds since 1970 that stands for now, so that a page can be made again byte
+for byte (reproducible-builds.org)."""
 
 
 def usable_cores() -> int:
@@ -36,3 +41,8 @@ def usable_device(name: str) -> torch.device:
         reason = str(error).splitlines()[0]
         raise ValueError(f"device must be one that torch computes on; got {name!r}: {reason}") from None
     return device
+
+
+def date() -> str:
+    """Today, as 2026-01-31 12:00 UTC."""
+    return time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(float(os.environ.get(DATE, time.time()))))

@@ -4,7 +4,7 @@ import sys
 from collections.abc import Iterable
 from typing import TextIO
 
-from ballfg.benchmarks.conclusions import conclusions, legend, should_be
+from ballfg.benchmarks.conclusions import GIVEN, conclusions, is_given, legend, should_be
 from ballfg.benchmarks.results import CURVE_MARK, Row
 
 
@@ -42,6 +42,8 @@ def _pivot(rows: list[Row]) -> tuple[list[str], list[list[str]]]:
 
 
 def _cell(row: Row) -> str:
+    if is_given(row.case, row.metric):
+        return GIVEN
     text = _number(row.value)
     return text if row.low is None or row.high is None else f"{text} [{_number(row.low)}, {_number(row.high)}]"
 

@@ -5,6 +5,7 @@ Heavy libraries are imported inside functions: `ballfg-train --help` must not wa
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -61,12 +62,20 @@ def train(
 
         run_calibration(settings, folder, resume=resume is not None, jobs=usable_cores(), watch=progress)
     else:
-        status = _train(settings, folder, resume is not None)
+        typed = _typed(config, overrides or (), data or (), out, resume)
+        status = _train(settings, folder, resume is not None, typed)
         if status:
             raise SystemExit(status)
 
 
-def _train(config: TrainConfig, folder: Path, resume: bool) -> int:
+def _typed(config: Path, overrides: Sequence[str], data: Sequence[str], out: str | None, resume: str | None) -> str:
+    """The command line."""
+    words = ["ballfg-train", str(config), *overrides, *(word for folder in data for word in ("--data", folder))]
+    words += [word for option, folder in (("--out", out), ("--resume", resume)) if folder for word in (option, folder)]
+    return shlex.join(words)
+
+
+def _train(config: TrainConfig, folder: Path, resume: bool, typed: str) -> int:
     """Train in this process if a launcher has started it or one is enough, else in new processes.
 
     Returns: the exit status.
@@ -77,25 +86,25 @@ def _train(config: TrainConfig, folder: Path, resume: bool) -> int:
 
     jobs = config.jobs or usable_cores()
     if jobs == 1 or started_by_launcher():
-        return _train_here(config, folder, resume)
+        return _train_here(config, folder, resume, typed)
     check(folder, config, resume=resume)  # refuse a bad folder before the processes start
     announce(f"starting {jobs} processes")
     with idle():  # the first of the processes speaks, and prints the reason of its status
-        return launch(jobs, _train_guarded, config, folder, resume)
+        return launch(jobs, _train_guarded, config, folder, resume, typed)
 
 
-def _train_here(config: TrainConfig, folder: Path, resume: bool) -> int:
+def _train_here(config: TrainConfig, folder: Path, resume: bool, typed: str) -> int:
     from ballfg.learning.run.training import run_training
 
-    return run_training(config, folder, resume=resume, watch=progress)
+    return run_training(config, folder, resume=resume, watch=progress, command=typed)
 
 
-def _train_guarded(config: TrainConfig, folder: Path, resume: bool) -> int:
+def _train_guarded(config: TrainConfig, folder: Path, resume: bool, typed: str) -> int:
     """The work of each process that this command starts. Returns: its exit status."""
 
     def work() -> int:
         with alive("ballfg-train"):
-            return _train_here(config, folder, resume)
+            return _train_here(config, folder, resume, typed)
 
     return guarded(work)
 

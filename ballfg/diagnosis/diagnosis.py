@@ -15,7 +15,7 @@ from ballfg.diagnosis.remains.residuals import residuals_of
 from ballfg.diagnosis.remains.tracker import look_at_tracker
 from ballfg.diagnosis.report.wording import refusal, sentence
 from ballfg.diagnosis.result import Diagnosis, Errors, Fallback, GenericTest, Unexplained, Value, Verdict
-from ballfg.diagnosis.search.evaluation import prediction_errors
+from ballfg.diagnosis.search.evaluation import prediction_errors, prediction_floor
 from ballfg.diagnosis.search.loop import Search, SearchLoop
 from ballfg.diagnosis.search.plausible import implausible
 from ballfg.diagnosis.search.process_noise import Predicting, calibrated_model, noise_about
@@ -76,6 +76,8 @@ def diagnose(
     calibrated = values_of(search.whole, [name for name in search.whole.problem.free if name in declared], declared)
     whole = calibrated_model(search.whole, holdout.launcher.embedding)
     whole.noise = corrected.noise
+    settings = dataset_settings(dataset, corrected)
+    floor = prediction_floor(corrected, holdout.held_out_tracks, holdout.surfaces, settings, jobs)
     return Diagnosis(
         dataset=dataset.info.name,
         verdict=verdict,
@@ -94,6 +96,7 @@ def diagnose(
         residuals_after=residuals if search.fit is search.first else residuals_of(search.fit),
         excluded=holdout.excluded,
         remarks=(*map(refusal, search.refused.values()), *strange(calibrated, model.radius)),
+        floor_mm=floor,
     )
 
 

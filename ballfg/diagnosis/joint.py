@@ -283,6 +283,7 @@ def _pooled(by_room: dict[str, Errors]) -> Errors:
         middle("intervals_held"),
         middle("nis_median"),
         tuple(path for one in every for path in one.paths),
+        float(np.sqrt(np.square([one.nis_error for one in every]).sum()) / len(every)),
     )
 
 

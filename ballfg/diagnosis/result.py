@@ -88,6 +88,8 @@ class Candidate:
         p_value: of its score test, corrected for the number of candidates.
         delta_bic: after a full refit; None where the score did not call for one.
         outcome: of the round.
+        seen_from: coefficient -> size, in its unit, from which on the score test would have noticed it in 9 of 10
+            such recordings, whatever the other coefficients are; empty where nothing shows it.
     """
 
     name: str
@@ -97,6 +99,7 @@ class Candidate:
     p_value: float
     delta_bic: float | None
     outcome: Outcome
+    seen_from: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -149,6 +152,7 @@ class Errors:
         intervals_held: share of measured coordinates inside their central 90 % intervals, 0 to 1.
         nis_median: median over samples of the squared whitened errors of x, y and z added; 2.37 is right.
         paths: the predictions themselves, in the order of `by_track`.
+        nis_error: standard error of `nis`, from the scatter of tracks; NaN for a single one.
     """
 
     prediction_rmse_mm: float
@@ -159,6 +163,7 @@ class Errors:
     intervals_held: float = float("nan")
     nis_median: float = float("nan")
     paths: tuple[PredictedPath, ...] = ()
+    nis_error: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -308,6 +313,8 @@ class Diagnosis:
         residuals_after: of the search half with the corrected model.
         excluded: sentences on tracks that were not used.
         remarks: sentences on effects that fit better and are no names, and on fitted values that are not plausible.
+        floor_mm: prediction error that the held-out tracks would have if nothing were wrong with the corrected model:
+            what measurement noise and the unknown release alone leave; NaN where that is not known.
     """
 
     dataset: str
@@ -327,6 +334,7 @@ class Diagnosis:
     residuals_after: Residuals
     excluded: tuple[str, ...] = field(default=())
     remarks: tuple[str, ...] = field(default=())
+    floor_mm: float = float("nan")
 
     def __repr__(self) -> str:
         effects = ", ".join(finding.name for finding in self.findings) or "none"

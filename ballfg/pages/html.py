@@ -14,8 +14,9 @@ if TYPE_CHECKING:
 
 DPI = 110
 """Dots per inch of pictures, which are then about as wide as a page on a common screen."""
-WIDE = 8.0
-"""Inches. Wider pictures keep their size on a phone and scroll sideways, so that their words can be read."""
+READABLE = 78
+"""Pixels on the screen for each inch of a picture, at least: words of 10 points are then 11 pixels high. A picture that
+finds less room scrolls within its own box."""
 
 
 class Html(str):
@@ -127,6 +128,6 @@ def picture(figure: Figure, caption: str) -> Html:
     memory = io.BytesIO()
     figure.savefig(memory, dpi=DPI, format="png")
     data = base64.b64encode(memory.getvalue()).decode("ascii")
-    image = Html(f'<img alt="{html.escape(caption)}" src="data:image/png;base64,{data}">')
-    wide = "wide" if figure.get_figwidth() > WIDE else ""
-    return tag("figure", tag("div", image, kind="scroll"), tag("figcaption", caption), kind=wide)
+    least = f"--least: {READABLE * figure.get_figwidth():.0f}px"
+    image = Html(f'<img alt="{html.escape(caption)}" style="{least}" src="data:image/png;base64,{data}">')
+    return tag("figure", tag("div", image, kind="scroll"), tag("figcaption", caption))

@@ -2,6 +2,7 @@
 
 import io
 import math
+import shlex
 import sys
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from functools import partial
@@ -20,7 +21,7 @@ from ballfg.learning.run.ranks import TOLD_BY_FIRST, Ranks, join_ranks
 from ballfg.learning.run.record import Record, curves
 from ballfg.learning.run.training_page import beside_untrained, improved, page, verdict
 from ballfg.learning.trainee import PredictedShot, Prepared
-from ballfg.machine import versions
+from ballfg.machine import date, versions
 from ballfg.progress import Watch, unwatched
 
 NOT_BETTER: Final = 1
@@ -38,7 +39,9 @@ def build(config: TrainConfig) -> Prepared:
     return TRAINEES[config.kind].build(config)
 
 
-def run_training(config: TrainConfig, folder: Path, *, resume: bool = False, watch: Watch = unwatched) -> int:
+def run_training(
+    config: TrainConfig, folder: Path, *, resume: bool = False, watch: Watch = unwatched, command: str = ""
+) -> int:
     """Train a model and write the folder of the run.
 
     Every process of a group calls this; the first one writes and prints.
@@ -51,6 +54,7 @@ def run_training(config: TrainConfig, folder: Path, *, resume: bool = False, wat
         folder: to write; that of the earlier run if it is to `resume`.
         resume: continue from the last checkpoint.
         watch: sees the batches pass in the first process, for instance to show progress.
+        command: as it was typed, for the page; empty where it is not known.
     Raises:
         ValueError, FileNotFoundError: bad input, or a training that cannot go on (`TrainingStoppedError`).
         KeyboardInterrupt: after Ctrl-C; the epochs up to the last checkpoint are kept, and the best model so far is
@@ -72,14 +76,14 @@ def run_training(config: TrainConfig, folder: Path, *, resume: bool = False, wat
                 kept = training.checkpoint() if due else None
                 ranks.from_first(partial(_write, record, epoch, kept))
             training.take_best()
-            return ranks.from_first(lambda: _finish(training, record, folder))
+            return ranks.from_first(lambda: _finish(training, record, folder, command))
         except TrainingStoppedError:
             if not ranks.first:
                 raise SystemExit(TOLD_BY_FIRST) from None
             raise
         except KeyboardInterrupt:
             if record is not None:
-                _stop(training, record, folder)
+                _stop(training, record, folder, command)
             raise
         finally:
             if record is not None:
@@ -100,7 +104,7 @@ def _write(record: Record | None, epoch: Epoch, checkpoint: Checkpoint | None) -
         record.write(epoch, checkpoint)
 
 
-def _finish(training: Training, record: Record | None, folder: Path) -> int:
+def _finish(training: Training, record: Record | None, folder: Path, command: str) -> int:
     """Write the model with the best weights and the page, and print whether it helped. Returns: the exit status."""
     model = training.task.trainee.export(folder)
     progress, epochs = training.progress, [] if record is None else record.epochs
@@ -108,7 +112,7 @@ def _finish(training: Training, record: Record | None, folder: Path) -> int:
         return 0
     shot = median_shot(training.task)
     untrained = _untrained(training.task)
-    _write_page(training, record, folder, model, shot, untrained)
+    _write_page(training, record, folder, model, command, shot, untrained)
     better = improved(epochs, progress.best_epoch)
     print(verdict(epochs, progress.best_epoch))
     beside = beside_untrained(epochs, progress.best_epoch, untrained)
@@ -123,7 +127,7 @@ def _finish(training: Training, record: Record | None, folder: Path) -> int:
     return NOT_BETTER if better is False else 0
 
 
-def _stop(training: Training, record: Record, folder: Path) -> None:
+def _stop(training: Training, record: Record, folder: Path, command: str) -> None:
     """Write the best model so far after Ctrl-C, and say what is kept."""
     print(f"{record.kept}; continue with --resume {folder}", file=sys.stderr, flush=True)
     if training.progress is None:
@@ -131,7 +135,7 @@ def _stop(training: Training, record: Record, folder: Path) -> None:
         return
     training.take_best()
     model = training.task.trainee.export(folder)
-    _write_page(training, record, folder, model, None)
+    _write_page(training, record, folder, model, command, None)
     print(f"{model}: the best model so far, of epoch {training.progress.best_epoch}", file=sys.stderr)
 
 
@@ -146,16 +150,24 @@ def _write_page(
     record: Record,
     folder: Path,
     model: Path,
+    command: str,
     shot: PredictedShot | None,
     untrained: float | None = None,
 ) -> None:
     best = 0 if training.progress is None else training.progress.best_epoch
     data = training.task.config.data
     dataset = data[0] if data else "DATASET"
-    command = f"ballfg predict {dataset} --model {model} --observe 0.3 --out predictions.csv" if model.is_file() else ""
-    packages = ", ".join(f"{name} {version}" for name, version in versions(files.PACKAGES).items())
+    following = (
+        shlex.join(
+            ["ballfg", "predict", dataset, "--model", str(model), "--observe", "0.3", "--out", "predictions.csv"]
+        )
+        if model.is_file()
+        else ""
+    )
+    origin = {"made on": date()} | ({"command": command} if command else {}) | {"data": ", ".join(data or ())}
+    origin["with"] = ", ".join(f"{name} {version}" for name, version in versions(files.PACKAGES).items())
     drawn, learned = curves(record.epochs, record.title), training.task.trainee.learned()
-    text = page(record.title, record.epochs, best, drawn, learned, shot, command, packages, untrained)
+    text = page(record.title, record.epochs, best, drawn, learned, shot, following, origin, untrained)
     write_text(folder / files.PAGE, text)
 
 

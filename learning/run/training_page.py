@@ -1,6 +1,6 @@
 """`training.html`: a training as a page for people. Whether it helped comes first, then the grounds."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,7 +17,7 @@ TERMS = {
     "validation": "Tracks that the training never learns from. Their errors show what the model does for new tracks.",
     "RMSE": "Root mean square distance between predicted and measured positions.",
     "loss": "The number that the training makes small. Its scale depends on the config; only its course matters.",
-    "learning rate": "The size of the steps (`optimizer.learning_rate` in the config).",
+    "median": "Of all errors in order of size the one in the middle.",
 }
 """Words of the page with their meanings."""
 
@@ -72,7 +72,7 @@ def page(
     learned: Sequence[Learned],
     shot: PredictedShot | None,
     next_command: str,
-    packages: str,
+    origin: Mapping[str, str],
     untrained: float | None = None,
 ) -> str:
     """The whole page.
@@ -85,7 +85,7 @@ def page(
         learned: coefficients and noise before and after.
         shot: a validation track predicted by the written model; None where there is none.
         next_command: what to type next; empty where no command takes the model.
-        packages: their versions in words.
+        origin: date, versions, command: what the page comes from, by its name.
         untrained: RMSE of the analytic model on the validation tracks, m; None where it is not known.
     """
     first = f"{verdict(epochs, best_epoch)} {beside_untrained(epochs, best_epoch, untrained)}".strip()
@@ -98,10 +98,17 @@ def page(
         ),
         section("What to do next", *_next(improved(epochs, best_epoch), next_command)),
         _numbers(epochs, best_epoch),
-        section("The course of the training", picture(curves, "Loss and errors after each epoch.")),
+        section(
+            "The course of the training",
+            picture(
+                curves,
+                "Loss (a pure number) and root mean square errors (mm) after each epoch. An axis of powers of ten is "
+                "logarithmic.",
+            ),
+        ),
         _shot(shot),
         _learned(learned),
-        section("Where this page comes from", tag("p", f"Made with {packages}. The config is in config.yaml.")),
+        section("Where this page comes from", _origin(origin)),
         section("What the words mean", meanings(TERMS)),
     )
 
@@ -139,15 +146,28 @@ def _numbers(epochs: Sequence[Epoch], best_epoch: int) -> Html:
     return section("How good the model is", table(head, rows))
 
 
+def _origin(origin: Mapping[str, str]) -> Html:
+    """What the page was made from; commands stay as they were typed."""
+    rows = [(name, typed(said) if name == "command" else said) for name, said in origin.items()]
+    return table(("", ""), [*rows, ("config", "config.yaml beside this page, with every default")])
+
+
 def _shot(shot: PredictedShot | None) -> Html:
     if shot is None:
         return Html()
     ahead = shot.times > 0.0
     error = np.linalg.norm(shot.predicted - shot.measured, axis=-1)
     off = 1e3 * float(np.sqrt((error[ahead] ** 2).mean())) if ahead.any() else float("nan")
+    seen = int((~ahead).sum())
+    observed = (
+        f"Crosses mark the {seen} samples that the estimate observed, circles the {int(ahead.sum())} that it had to "
+        "predict; the dashed line stands between them."
+        if seen
+        else f"Circles mark the {len(ahead)} samples that it had to predict; those that it observed are not drawn."
+    )
     caption = (
-        f"Validation track {shot.name}, whose error is the median: after the observed part (left of the dashed line) "
-        f"the prediction is off by {off:.1f} mm (RMSE)."
+        f"Validation track {shot.name}, whose error is the median: the prediction is off by {off:.1f} mm (RMSE). "
+        f"{observed}"
     )
     return section("Predicted against measured", picture(_drawn(shot, error), caption))
 
@@ -156,12 +176,16 @@ def _drawn(shot: PredictedShot, error: Array) -> Figure:
     figure = Figure(figsize=(7.4, 8.0), layout="constrained")
     panels = figure.subplots(4, 1, sharex=True)
     for i, axes in enumerate(panels[:3]):
-        axes.plot(
-            shot.times, shot.measured[:, i], "o", color=MEASURED, markersize=4, fillstyle="none", label="measured"
-        )
+        for part, marker, label in (
+            (shot.times <= 0.0, "x", "measured, observed"),
+            (shot.times > 0.0, "o", "measured"),
+        ):
+            if part.any():
+                where, place = shot.times[part], shot.measured[part, i]
+                axes.plot(where, place, marker, color=MEASURED, markersize=4, fillstyle="none", label=label)
         axes.plot(shot.times, shot.predicted[:, i], "-", color=PREDICTED, label="model")
         axes.set_ylabel(f"{'xyz'[i]}, m")
-    panels[0].legend(fontsize="small")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3, fontsize="small")
     panels[3].plot(shot.times, 1e3 * error, ".-", color=PREDICTED)
     panels[3].set(ylabel="error, mm", xlabel="time since the last observed sample, s", ylim=(0.0, None))
     for axes in panels:
@@ -171,8 +195,11 @@ def _drawn(shot: PredictedShot, error: Array) -> Figure:
 
 
 def _learned(learned: Sequence[Learned]) -> Html:
-    rows = [(one.name, f"{one.before:.4g}", f"{one.after:.4g}", one.unit, one.meaning) for one in learned]
-    return section("What was learned of noise, spin and coefficients", table(("", "before", "after", "unit", ""), rows))
+    rows = [
+        (one.name, f"{one.before:.4g}", f"{one.after:.4g}", one.unit or "a pure number", one.meaning) for one in learned
+    ]
+    head = ("number", "before", "after", "unit", "what it is")
+    return section("What was learned of noise, spin and coefficients", table(head, rows))
 
 
 def _mm(value: float | None) -> str:

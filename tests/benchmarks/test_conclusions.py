@@ -2,6 +2,7 @@
 
 import io
 
+import numpy as np
 import pytest
 
 from ballfg.benchmarks.conclusions import conclusions, legend, should_be, target
@@ -31,6 +32,10 @@ def rows(case: str, *numbers: tuple[str, str, str, float | Figure], n: int = 50)
         ("silence", "noise larger than stated", "1", "0"),
         ("naming, spin labels", "wind", "1", "1"),
         ("fair", "velocity_rmse", "m/s", ""),
+        ("paper", "nees", "1", "6"),
+        ("paper", "nees_velocity", "1", "3"),
+        ("paper", "coverage_90_state", "1", "0.933"),
+        ("paper", "coverage_90_velocity", "1", "0.9"),
         ("time", "one diagnosis, 50 tracks", "s", ""),
     ],
 )
@@ -64,7 +69,25 @@ def test_the_best_method_by_how_much_and_whether_by_chance() -> None:
     assert conclusions("fair", alike) == [
         "position: a, b and c have the smallest error, 0.002 m: all methods are equally good."
     ]
-    assert conclusions("paper", rows("paper", ("a", "spin_rmse", "rad/s", 0.0), ("b", "spin_rmse", "rad/s", 1.0))) == []
+
+
+def test_what_is_given_to_all_methods_is_no_error_of_theirs() -> None:
+    """Nine components of which three are known exactly: the NEES and the coverage of draws, beside the right values."""
+    drawn = np.random.default_rng(5).normal(size=(100_000, 9))
+    drawn[:, 6:] = 0.0
+    assert target("nees", "1", "paper") == pytest.approx((drawn**2).sum(axis=1).mean(), rel=0.01)
+    held = float((abs(drawn) < 1.6449).mean())
+    assert target("coverage_90_state", "1", "paper") == pytest.approx(held, abs=0.002)
+    assert target("coverage_90_state", "%", "paper") == pytest.approx(100 * held, abs=0.2)
+    numbers = (("a", "spin_rmse", "rad/s", 0.0), ("b", "spin_rmse", "rad/s", 1e-6), ("a", "nees", "1", 5.9))
+    stream = io.StringIO()
+    print_table(rows("paper", *numbers), stream)
+    lines = stream.getvalue().splitlines()
+    assert lines[3].split() == ["spin_rmse", "rad/s", "given", "given"]
+    assert "-> stated uncertainty, by nees (should be 6) - right: a (5.9)." in lines
+    assert any("the spin is given, not estimated" in line for line in lines)
+    assert not any(line.startswith("-> spin") for line in lines)
+    assert "given" not in "".join(conclusions("fair", rows("fair", *numbers)))
 
 
 def test_whose_covariances_are_right() -> None:

@@ -65,7 +65,8 @@ def diagnose(
         else:
             diagnosis = find(inputs.dataset, inputs.model, jobs=processes, watch=announce)
     typed = _typed(datasets, model, effects_file, out)
-    origin = Origin(typed, tuple(map(str, datasets)), "" if model is None else str(model), str(out))
+    models = tuple(map(room_file, rooms)) or (MODEL,)
+    origin = Origin(typed, tuple(map(str, datasets)), "" if model is None else str(model), str(out), models)
     write_report(diagnosis, out, rooms, origin)
     print(*_summary(diagnosis), sep="\n")
     if rooms:

@@ -5,8 +5,9 @@ from collections.abc import Iterator, Sequence
 
 from ballfg.diagnosis.report import pictures
 from ballfg.diagnosis.report.glossary import outcome_badge, term
+from ballfg.diagnosis.report.headline import not_shown
 from ballfg.diagnosis.report.plain_effects import plain_name
-from ballfg.diagnosis.report.wording import NONE, capital, listed, number, probability
+from ballfg.diagnosis.report.wording import NONE, capital, listed, number, probability, sized
 from ballfg.diagnosis.result import Candidate, Diagnosis, Outcome
 from ballfg.dynamics import EFFECTS
 from ballfg.pages.html import Html, bar, picture, section, table, tag
@@ -20,7 +21,7 @@ RANKING = (
     term("squared residual", "squared residual it would explain"),
     term("by chance"),
     term("BIC"),
-    "first estimate",
+    term("first estimate"),
     "outcome",
 )
 
@@ -60,6 +61,24 @@ def _lines(row: Sequence[Candidate], most: float) -> Iterator[tuple[str, ...]]:
             NONE if unseen else listed(c.estimate),
             outcome_badge(c.outcome, colour),
         )
+
+
+def noticed_from(diagnosis: Diagnosis) -> Html:
+    """From which size on these tracks would have shown each of the effects that they do not show."""
+    quiet = not_shown(diagnosis)
+    words = (
+        "These effects were looked for and not found. Here is how strong each would have had to be for the test to "
+        "notice it in 9 of 10 recordings like this one, whatever its other coefficients are. Weaker ones may be there."
+    )
+    rows = (
+        (
+            tag("span", tag("b", capital(plain_name(c.name))), " ", tag("code", c.name, kind="quiet")),
+            ", ".join(f"{name} {sized(size, c.estimate[name].unit)}" for name, size in c.seen_from.items()),
+        )
+        for c in quiet
+    )
+    parts = (tag("p", words), table(("effect", "would have been noticed from"), rows)) if quiet else ()
+    return section("How small an effect would have been noticed", *parts)
 
 
 def invisible(diagnosis: Diagnosis) -> Html:

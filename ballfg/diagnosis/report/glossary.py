@@ -18,12 +18,17 @@ TERMS: Final = {
     "log likelihood": "How probable the measurements are under the predictions, as a logarithm per coordinate; larger "
     "is better. It judges the error and the stated uncertainty together.",
     "by chance": "Probability that noise alone gives a trace as strong as this one (p-value), corrected for the number "
-    "of effects tested. Below 0.005 an effect is a candidate, and is added if it passes the other questions too. Very "
+    "of effects tested. Below 0.0025 an effect is a candidate, and is added if it passes the other questions too. Very "
     "small numbers say: certainly not chance.",
     "BIC": "Bayesian information criterion: badness of fit plus a penalty for each further coefficient. An effect pays "
     "for itself where the BIC falls; by 10 is strong evidence.",
     "coefficient": "A number of the model, such as the strength of the drag. After ± stands one standard deviation: "
     "the true value lies within two of them in 95 of 100 cases.",
+    "first estimate": "Coefficients one step from the model of the round. Where the model has the coefficient already, "
+    "as gravity or the drag of a group, it is the change of it.",
+    "floor": "The prediction error of a model that is exact, foretold from its covariance: the noise of the "
+    "measurements and what the observed part leaves open of speed and spin at the release.",
+    "trace": "The pattern in the residuals that an effect would leave.",
     "residual": "Measured minus predicted.",
     "squared residual": "Squared residuals in units of their noise, summed. Under independent errors chance explains "
     "about 1 for each coefficient; errors of one track go together, which the probability beside it allows for.",

@@ -4,12 +4,14 @@ import math
 import re
 import shlex
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Final
 
+from ballfg.diagnosis.remains.patterns import EVERYWHERE
 from ballfg.diagnosis.report.origin import Origin
-from ballfg.diagnosis.report.plain_effects import in_plain_words, plain_name
-from ballfg.diagnosis.report.wording import NONE, fixed, probability
-from ballfg.diagnosis.result import Diagnosis, Finding, Outcome, Verdict
+from ballfg.diagnosis.report.plain_effects import BY_GROUP, DRIFT, in_plain_words, plain_name
+from ballfg.diagnosis.report.wording import NONE, fixed, joined, number, probability, sized
+from ballfg.diagnosis.result import Candidate, Diagnosis, Finding, Outcome, Verdict
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.noise.tracker import NUMBERS
 
@@ -24,7 +26,29 @@ PLACES: Final = {
 """Begin of a test's words, and the same in a sentence."""
 SURE: Final = ((1e-6, "practically certain"), (1e-3, "very likely"), (0.05, "likely"))
 """Words for the probability that a finding is none; the larger one of both halves of the tracks counts."""
+MAIN: Final = ("wind", "drag_speed", "time_scale", "scale", "frame_tilt")
+"""Effects whose least size is told in the first lines of a report that finds nothing."""
 COUNTS: Final = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine")
+
+
+def answer(diagnosis: Diagnosis) -> str:
+    """The verdict in two or three words."""
+    only_noise = diagnosis.findings and all(f.name in NUMBERS for f in diagnosis.findings)
+    return "noise found" if diagnosis.verdict is Verdict.FOUND and only_noise else diagnosis.verdict.value
+
+
+def not_shown(diagnosis: Diagnosis) -> list[Candidate]:
+    """Effects that the last round tested and nothing asks for, with the least size that would have been noticed.
+
+    None where a pattern is left: it may hide them. Those that differ between tracks are left out: there is a size for
+    each group of tracks and for each place of a change.
+    """
+    if diagnosis.verdict is Verdict.UNEXPLAINED or not diagnosis.rounds:
+        return []
+    quiet = (
+        c for c in diagnosis.rounds[-1] if c.outcome is Outcome.NOT_NEEDED and not c.name.endswith((BY_GROUP, DRIFT))
+    )
+    return [c for c in quiet if c.seen_from and all(map(math.isfinite, c.seen_from.values()))]
 
 
 def headline(diagnosis: Diagnosis) -> str:
@@ -52,7 +76,9 @@ def further(diagnosis: Diagnosis) -> Iterator[str]:
     effects = [f for f in diagnosis.findings if f.name not in NUMBERS]
     if len(effects) > 1:
         yield from (in_plain_words(f) for f in effects)
-    yield from (in_plain_words(f) for f in diagnosis.findings if f.name in NUMBERS)
+    for f in (f for f in diagnosis.findings if f.name in NUMBERS):
+        said = in_plain_words(f)
+        yield f"Not an effect on the ball but noise of the measurements: {said[:1].lower()}{said[1:]}"
     if effects and diagnosis.verdict is Verdict.UNEXPLAINED:
         yield f"Something else is missing too, which no known effect explains: {where(diagnosis.unexplained.where)}."
 
@@ -78,8 +104,11 @@ def certainty(diagnosis: Diagnosis) -> Iterator[str]:
             f"{len(last) - unseen} effects were tested, one by one, and none of them stands out from chance. "
             f"The predictions of {diagnosis.tracks_judged_on} tracks were compared with what was measured."
         )
+        quiet = {c.name: c for c in not_shown(diagnosis)}
+        if noticed := joined(tuple(_least(quiet[name]) for name in MAIN if name in quiet)):
+            yield f"These would have been noticed in 9 of 10 recordings like this one, from such a size on: {noticed}."
     if unseen:
-        yield f"These tracks say nothing about {unseen} more effects, which may be there or not."
+        yield f"These tracks say nothing about {unseen} more effect{'s' * (unseen > 1)}, which may be there or not."
     if diagnosis.verdict is Verdict.UNEXPLAINED and diagnosis.unexplained.tests:
         least = min(test.p_value for test in diagnosis.unexplained.tests)
         word = next((word for limit, word in SURE if least < limit), "possible")
@@ -88,27 +117,28 @@ def certainty(diagnosis: Diagnosis) -> Iterator[str]:
 
 def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
     """What to do next: a sentence, and the command to type (empty where there is none)."""
-    dataset, model = shlex.quote(origin.datasets[0]), shlex.quote(f"{origin.out.rstrip('/')}/model.yaml")
+    rooms = list(zip(origin.datasets, origin.models, strict=True))
+    datasets = " ".join(map(shlex.quote, origin.datasets))
+    given = f" --model {shlex.quote(origin.model)}" if origin.model else ""
     again = shlex.quote(f"{origin.out.rstrip('/')}_again")
     changed = bool(diagnosis.findings) or diagnosis.unexplained.fallback is not None
     if changed:
         yield (
             "Estimate the states with the corrected model:",
-            f"ballfg estimate {dataset} --model {model} --out states.csv",
+            "\n".join(_command("estimate", "states", *room, origin) for room in rooms),
         )
         yield (
             "Predict with the corrected model, from the first 0.3 s of each track:",
-            f"ballfg predict {dataset} --model {model} --observe 0.3 --out predictions.csv",
+            "\n".join(_command("predict", "predictions", *room, origin, " --observe 0.3") for room in rooms),
         )
     else:
-        given = f" --model {shlex.quote(origin.model)}" if origin.model else ""
         yield (
             "Keep the model that you have, or take the same one with its coefficients fitted to these tracks:",
-            f"ballfg estimate {dataset} --model {model} --out states.csv",
+            "\n".join(_command("estimate", "states", *room, origin) for room in rooms),
         )
         yield (
             "Once there are more tracks, look again:",
-            f"ballfg diagnose {dataset}{given} --out {again}",
+            f"ballfg diagnose {datasets}{given} --out {again}",
         )
     for finding in diagnosis.findings:
         for name in (finding.name, *finding.indistinguishable_from) if finding.indistinguishable_from else ():
@@ -116,11 +146,38 @@ def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
             if decide:
                 yield f"To find out whether it is {plain_name(name)}: {decide}", ""
     if diagnosis.verdict is Verdict.UNEXPLAINED:
+        left = diagnosis.unexplained.where
         yield (
-            f"Look for a cause of what is left ({where(diagnosis.unexplained.where)}): record tracks in which that "
-            "quantity varies more. If you have a suspicion, write it as an effect of your own and diagnose again:",
-            f"ballfg diagnose {dataset} --effects-file my_effects.py --out {again}",
+            f"Look for a cause of what is left ({where(left)}): {_to_look_at(left)}. If you have a suspicion, write it "
+            "as an effect of your own and diagnose again:",
+            f"ballfg diagnose {datasets}{given} --effects-file my_effects.py --out {again}",
         )
+
+
+def _to_look_at(pattern: str) -> str:
+    """What tells the cause of a pattern, by the kind of the test that found it."""
+    if pattern.startswith("label: "):
+        return "measure the spin of these tracks once more, and check the axes and the unit of the labels"
+    if pattern.startswith("time: "):
+        return "look for what delays or smooths the positions between the camera and the file"
+    if EVERYWHERE in pattern:
+        return "record tracks at other speeds, spins and places than these"
+    return "record tracks in which it varies more"
+
+
+def _command(name: str, makes: str, dataset: str, model: str, origin: Origin, more: str = "") -> str:
+    """A command on one of the datasets with the model of its room; of several each writes a file of its own."""
+    known = shlex.quote(f"{origin.out.rstrip('/')}/{model}")
+    out = f"{makes}.csv" if len(origin.datasets) == 1 else f"{makes}.{Path(model).stem.partition('.')[2]}.csv"
+    return f"ballfg {name} {shlex.quote(dataset)} --model {known}{more} --out {shlex.quote(out)}"
+
+
+def _least(candidate: Candidate) -> str:
+    """The size from which on an effect would have been noticed, of a vector whatever its direction along the axes."""
+    worst = max(candidate.seen_from, key=candidate.seen_from.__getitem__)
+    size, unit = candidate.seen_from[worst], candidate.estimate[worst].unit
+    said = f"{number(100 * size, 2)} %" if unit == "1" else sized(size, unit)
+    return f"{plain_name(candidate.name)} ({said}{' along any axis' if len(candidate.seen_from) > 1 else ''})"
 
 
 def where(words: str) -> str:

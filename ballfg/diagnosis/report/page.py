@@ -7,15 +7,16 @@ from matplotlib.figure import Figure
 
 from ballfg.diagnosis.remains.generic import ALARM
 from ballfg.diagnosis.report import pictures
-from ballfg.diagnosis.report.candidates import invisible, rankings
+from ballfg.diagnosis.report.candidates import invisible, noticed_from, rankings
 from ballfg.diagnosis.report.glossary import glossary, term
-from ballfg.diagnosis.report.headline import advice, certainty, further, headline, where
-from ballfg.diagnosis.report.origin import Origin, date, packages
+from ballfg.diagnosis.report.headline import advice, answer, certainty, further, headline, where
+from ballfg.diagnosis.report.origin import Origin, packages
 from ballfg.diagnosis.report.plain_effects import in_plain_words, plain_name
 from ballfg.diagnosis.report.predictions import errors, one_shot
 from ballfg.diagnosis.report.wording import NONE, capital, fixed, joined, number, plus_minus, probability
 from ballfg.diagnosis.result import Diagnosis, Finding, GenericTest, Residuals, Value, Verdict
 from ballfg.dynamics import EFFECTS
+from ballfg.machine import date
 from ballfg.pages.html import Html, items, picture, section, table, tag, typed
 from ballfg.pages.page import whole_page
 
@@ -25,11 +26,11 @@ BADGES = {Verdict.FOUND: "found", Verdict.NOTHING: "nothing", Verdict.UNEXPLAINE
 
 def page(diagnosis: Diagnosis, origin: Origin | None = None) -> str:
     """The whole page; origin: the command and the files that it comes from, where they are known."""
-    badge = tag("span", diagnosis.verdict.value, kind=f"badge {BADGES[diagnosis.verdict]}")
+    badge = tag("span", answer(diagnosis), kind=f"badge {BADGES[diagnosis.verdict]}")
     question = tag("p", f"{diagnosis.dataset} · what does the model lack? ", badge)
     values = (term("coefficient"), "declared", "fitted" + (" with the added effects" if diagnosis.findings else ""))
     calibrated = table(values, _values(diagnosis.calibrated))
-    noise = table(("position noise along", "stated", "estimated"), _values(diagnosis.noise))
+    noise = table(("position noise along", "stated", "estimated"), _values(_in_mm(diagnosis.noise)))
     return whole_page(
         f"{diagnosis.dataset}: diagnosis",
         tag("header", question, tag("h1", headline(diagnosis)), _in_short(diagnosis)),
@@ -38,10 +39,11 @@ def page(diagnosis: Diagnosis, origin: Origin | None = None) -> str:
         one_shot(diagnosis),
         section("What was added to the model", *(_finding(f) for f in diagnosis.findings)),
         _alike(diagnosis),
-        section("What fits better and is no name", items(diagnosis.remarks) if diagnosis.remarks else ""),
+        section("What else was noticed", items(diagnosis.remarks) if diagnosis.remarks else ""),
         _left_over(diagnosis),
         _residuals(diagnosis),
         rankings(diagnosis),
+        noticed_from(diagnosis),
         invisible(diagnosis),
         section("Coefficients and noise", calibrated, noise),
         _evaluation(diagnosis),
@@ -92,7 +94,12 @@ def _finding(finding: Finding) -> Html:
     others = finding.indistinguishable_from
     evidence = items(
         (
-            f"Probability of so strong a trace by chance, all candidates counted: {probability(finding.p_value)}.",
+            tag(
+                "span",
+                "Probability of so strong a ",
+                term("trace"),
+                f" by chance, all candidates counted: {probability(finding.p_value)}.",
+            ),
             tag("span", "The model's ", term("BIC"), f" {verb} by {abs(finding.delta_bic):.0f} with it, refitted."),
             tag(
                 "span",
@@ -102,7 +109,9 @@ def _finding(finding: Finding) -> Html:
                 term("log likelihood"),
                 f" per track; probability of that by chance: {probability(finding.held_out_p)}.",
             ),
-            f"Cannot be told from {joined(others)}." if others else "No other candidate explains as much.",
+            f"Cannot be told from {joined(others)}."
+            if others
+            else "Of the candidates that were not refused no other explains as much.",
         )
     )
     return tag(
@@ -132,7 +141,8 @@ def _left_over(diagnosis: Diagnosis) -> Html:
     if left.where and math.isfinite(left.share_of_residual):
         share = f"That is {100 * left.share_of_residual:.0f} % of the pattern that was there at the start."
     alarms = [t for t in left.tests if t.p_value < ALARM]
-    quiet = tuple(dict.fromkeys(t.name for t in left.tests if t.p_value >= ALARM))
+    loud = {t.name for t in alarms}
+    quiet = tuple(dict.fromkeys(t.name for t in left.tests if t.name not in loud))
     head = (term("generic test"), term("by chance"), "pattern", "share of it at the start that is left")
     tests = table(head, ((t.name, probability(t.p_value), t.where, _share(t)) for t in alarms))
     silent = f"Tests that find nothing beyond noise: {joined(quiet)}." if quiet else ""
@@ -169,9 +179,13 @@ def _residuals(diagnosis: Diagnosis) -> Html:
         words = "Outgoing minus predicted velocity at each contact; the slip is that of the ball's lowest point."
         drawn.append((pictures.contacts(series, diagnosis.model.radius), words))
     if any(len(r.measurement.times) for r in series.values()):
-        words = f"Measured minus fitted positions in units of their noise, limited to ±{pictures.LARGEST_WHITENED:g}."
+        words = (
+            "Means of measured minus fitted positions, in units of their noise (sigma). A single residual counts as at "
+            f"most ±{pictures.LARGEST_WHITENED:g} in them, so that an outlier hides no pattern."
+        )
         drawn.append((pictures.measurements(series), words))
-        drawn.append((pictures.histogram(series), "Outliers make broad tails; misjudged noise makes a broad middle."))
+        words = "Outliers make broad tails; misjudged noise makes a broad middle. The vertical axis is logarithmic. "
+        drawn.append((pictures.histogram(series), words + pictures.beyond_histogram(series)))
     return section("What the model leaves", *(picture(figure, words) for figure, words in drawn))
 
 
@@ -180,6 +194,12 @@ def _values(values: Mapping[str, Value]) -> Iterator[tuple[str, ...]]:
         unit = "" if value.unit == "1" else f" {value.unit}"
         declared = NONE if value.declared is None else f"{number(value.declared, 4)}{unit}"
         yield tag("code", name), declared, plus_minus(value)
+
+
+def _in_mm(values: Mapping[str, Value]) -> dict[str, Value]:
+    """Lengths in mm, as prediction errors are."""
+    declared = {name: v.declared if v.declared is None else 1e3 * v.declared for name, v in values.items()}
+    return {name: Value(1e3 * v.value, 1e3 * v.sigma, "mm", declared[name]) for name, v in values.items()}
 
 
 def _evaluation(diagnosis: Diagnosis) -> Html:

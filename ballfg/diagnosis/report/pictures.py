@@ -29,6 +29,8 @@ IN_FLIGHT = ("along the flight", "across, to the left", "across, upwards")
 AT_CONTACT = ("along the ground", "to the left", "up")
 LARGEST_WHITENED = 4.0
 """Whitened residuals are limited to it in means, so that one outlier hides no pattern of all the others."""
+HISTOGRAM_END = 6.0
+"""Whitened residuals at which the axis of their histogram ends."""
 SHOWN_SHARE = 0.98
 """Share of the single points that lie within the axes."""
 LEAST_EXPLAINED = 0.3
@@ -123,7 +125,7 @@ def measurements(series: Series) -> Figure:
 def histogram(series: Series) -> Figure:
     """Whitened position residuals of each axis before the normal distribution, on a logarithmic scale."""
     figure, panels = _grid(1, len(series), (max(7.4, 5.0 * len(series)), 3.2))
-    edges = np.linspace(-6.0, 6.0, 49)
+    edges = np.linspace(-HISTOGRAM_END, HISTOGRAM_END, 49)
     middle = 0.5 * (edges[1:] + edges[:-1])
     for axes, (label, residuals) in zip(panels[0], series.items(), strict=True):
         measured = residuals.measurement
@@ -136,6 +138,17 @@ def histogram(series: Series) -> Figure:
         axes.legend(fontsize="small")
     panels[0, 0].set_ylabel("density")
     return figure
+
+
+def beyond_histogram(series: Series) -> str:
+    """How many residuals the histogram does not show, in a sentence: `Of 1200 before, 3 lie beyond ...`."""
+    parts = []
+    for label, residuals in series.items():
+        whitened = residuals.measurement.position / residuals.measurement.sigma
+        beyond = int((np.abs(whitened) > HISTOGRAM_END).sum())
+        named = f" {label}" if len(series) > 1 else ""
+        parts.append(f"{beyond} of {whitened.size} residuals{named}")
+    return f"The axis ends at ±{HISTOGRAM_END:g}: {' and '.join(parts)} lie beyond it and are not shown."
 
 
 def errors_by_track(before: Errors, after: Errors) -> Figure:

@@ -1,12 +1,22 @@
 """How well the model predicts, before and after: errors on held-out tracks, one shot, and where the errors are."""
 
 import math
+from typing import Final
+
+import numpy as np
 
 from ballfg.diagnosis.report import pictures, shots
 from ballfg.diagnosis.report.glossary import term
 from ballfg.diagnosis.report.wording import NONE, change, fixed
 from ballfg.diagnosis.result import Diagnosis, Errors
-from ballfg.pages.html import Html, picture, section, table, tag
+from ballfg.pages.html import Html, items, picture, section, table, tag, text
+
+BY_CHANCE: Final = 2.0
+"""Standard errors within which a NIS counts as 1."""
+SKEWED: Final = 1.5
+"""Ratio of the root mean square to the median track's error beyond which the median is told too."""
+NEAR_FLOOR: Final = 1.2
+"""Ratio to the floor up to which a model can hardly be better."""
 
 
 def errors(diagnosis: Diagnosis) -> Html:
@@ -14,7 +24,13 @@ def errors(diagnosis: Diagnosis) -> Html:
     before, after, changed = diagnosis.before, diagnosis.after, diagnosis.after is not diagnosis.before
     changed = changed and (bool(diagnosis.findings) or diagnosis.unexplained.fallback is not None)
     numbers = (
-        (term("prediction error"), before.prediction_rmse_mm, after.prediction_rmse_mm, " mm", "small"),
+        (
+            term("prediction error"),
+            before.prediction_rmse_mm,
+            after.prediction_rmse_mm,
+            " mm",
+            _goal(diagnosis.floor_mm),
+        ),
         (term("apex", "error of the apex"), before.apex_rmse_mm, after.apex_rmse_mm, " mm", "small"),
         (term("NIS"), before.nis, after.nis, "", "1"),
         (term("90 % intervals", "90 % intervals hold"), *_percents(before, after), " %", "90 %"),
@@ -33,8 +49,9 @@ def errors(diagnosis: Diagnosis) -> Html:
     )
     if not changed:
         rows = [(name, _fixed(now, unit), goal) for name, _, now, unit, goal in numbers]
-        return section("How well the model predicts", words, table(("", "value", "should be"), rows))
-    head = ("", "declared model", "corrected model", "change", "should be")
+        shown = table(("", "value", "should be"), rows)
+        return section("How well the model predicts", words, shown, items(meaning(diagnosis)))
+    head = ("", "declared model (before)", "corrected model (after)", "change", "should be")
     lines = [
         (name, _fixed(was, unit), _fixed(now, unit), _changed(was, now, unit), goal)
         for name, was, now, unit, goal in numbers
@@ -42,7 +59,65 @@ def errors(diagnosis: Diagnosis) -> Html:
     caption = "Each line is one of these tracks; diamonds pool them all."
     paired = picture(pictures.errors_by_track(before, after), caption)
     shown = tag("div", tag("div", table(head, lines)), paired, kind="beside")
-    return section("How much predictions gain", words, shown)
+    return section("How much predictions gain", words, shown, items(meaning(diagnosis)))
+
+
+def meaning(diagnosis: Diagnosis) -> list[Html]:
+    """What the numbers of the table say: how near the floor the errors are, and whether they are as large as stated."""
+    after, floor = diagnosis.after, diagnosis.floor_mm
+    error, said = after.prediction_rmse_mm, list[Html]()
+    if math.isfinite(floor + error):
+        how = (
+            "so that a better model would gain little"
+            if error <= NEAR_FLOOR * floor
+            else f"so that predictions are {error / floor:.1f} times as far off as they could be"
+        )
+        least = (
+            f" is about {floor:.1f} mm: so much the noise of the measurements and what the observed part leaves open "
+            f"of the release cost even an exact model. The error is {error:.1f} mm, {how}."
+        )
+        said.append(tag("span", "The ", term("floor"), least))
+    if few := _few_tracks(diagnosis.before, after):
+        said.append(text(few))
+    if math.isfinite(after.nis) and after.nis > 0.0:
+        said.append(text(_about_nis(after)))
+    return said
+
+
+def _few_tracks(before: Errors, after: Errors) -> str:
+    """The error of the median track, where a few tracks make most of the root mean square; else nothing."""
+    medians = [float(np.nanmedian(e.by_track)) if np.isfinite(e.by_track).any() else math.nan for e in (before, after)]
+    pooled = (before.prediction_rmse_mm, after.prediction_rmse_mm)
+    if not any(whole > SKEWED * median for whole, median in zip(pooled, medians, strict=True)):
+        return ""
+    off = f"{medians[0]:.1f} mm before and {medians[1]:.1f} mm after" if after is not before else f"{medians[1]:.1f} mm"
+    return f"A few tracks make most of the prediction error: the median track is off by {off}."
+
+
+def _about_nis(errors: Errors) -> str:
+    """What a NIS says of the stated uncertainty, and by how much that is off."""
+    error = f" ± {fixed(errors.nis_error, 2)}" if math.isfinite(errors.nis_error) else ""
+    begin, held = f"A NIS of {fixed(errors.nis, 2)}{error}", ""
+    if math.isfinite(errors.intervals_held):
+        held = f" 90 % intervals hold {100 * errors.intervals_held:.1f} % of the measured coordinates."
+    if math.isfinite(errors.nis_error) and abs(errors.nis - 1.0) <= BY_CHANCE * errors.nis_error:
+        return f"{begin} differs from 1 by no more than chance: predictions state their uncertainty rightly.{held}"
+    if errors.nis < 1.0:
+        share = 100 * (1.0 / math.sqrt(errors.nis) - 1.0)
+        return (
+            f"{begin} is below 1: predictions are better than they claim. The noise behind them is stated too large; "
+            f"their standard deviations are {share:.0f} % larger than the errors.{held}"
+        )
+    share = 100 * (1.0 - 1.0 / math.sqrt(errors.nis))
+    return (
+        f"{begin} is above 1: predictions are worse than they claim. The noise behind them is stated too small; their "
+        f"standard deviations are {share:.0f} % smaller than the errors.{held}"
+    )
+
+
+def _goal(floor: float) -> str:
+    """What the prediction error should be."""
+    return f"near {floor:.1f} mm" if math.isfinite(floor) else "small"
 
 
 def _percents(before: Errors, after: Errors) -> tuple[float, float]:
@@ -71,9 +146,9 @@ def one_shot(diagnosis: Diagnosis) -> Html:
     off = f"off by {was:.1f} mm before and {now:.1f} mm after" if changed else f"off by {now:.1f} mm"
     ranked = "gain is the median" if changed else "error is the median"
     caption = (
-        f"Track {shot.after.name}, whose {ranked} of all {len(after.paths)} judged tracks: its prediction is {off}."
+        f"Track {shot.after.name}, whose {ranked} of all {len(after.paths)} held-out tracks: its prediction is {off}."
     )
-    words = "Root mean square errors of all judged tracks. Cells without a number hold too few samples."
+    words = "Root mean square errors of all held-out tracks. Cells without a number hold too few samples."
     return section(
         "One shot, and where the errors are",
         tag(

@@ -92,6 +92,7 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
             "error": {
                 "before": _errors(diagnosis.before),
                 "after": _errors(diagnosis.after),
+                "floor_mm": diagnosis.floor_mm,
                 "tracks_found_on": diagnosis.tracks_found_on,
                 "tracks_judged_on": diagnosis.tracks_judged_on,
             },
@@ -120,6 +121,7 @@ def _candidate(candidate: Candidate) -> dict[str, Any]:
         "p_value": candidate.p_value,
         "delta_bic": candidate.delta_bic,
         "estimate": _values(candidate.estimate),
+        "seen_from": candidate.seen_from,
     }
 
 

@@ -17,6 +17,8 @@ ACROSS, DEEP = 6, 4
 """Cells of the map along the longer and the shorter side of the table."""
 LEAST_SAMPLES: Final = 5
 """Samples in a cell or bin from which on its error is shown."""
+SHEET: Final = 5.2
+"""Inches, width of a picture that stands beside another one: wider ones shrink until nobody can read them."""
 BINS: Final = 8
 """Bins of time."""
 
@@ -52,7 +54,7 @@ def median_shot(before: Errors, after: Errors, changed: bool) -> Shot | None:
 
 def shot_picture(shot: Shot, changed: bool) -> Figure:
     """Side view, top view and error over time of one shot."""
-    figure = Figure(figsize=(7.4, 7.6), layout="constrained")
+    figure = Figure(figsize=(SHEET, 7.2), layout="constrained")
     side, top, error = figure.subplots(3, 1)
     path = shot.after
     begin = path.seen[0] if len(path.seen) else path.measured[0]
@@ -64,7 +66,7 @@ def shot_picture(shot: Shot, changed: bool) -> Figure:
     if changed:
         models = [("predicted before", shot.before, BEFORE), ("predicted after", path, AFTER)]
     for axes, up, label in ((side, np.array([0.0, 0.0, 1.0]), "height"), (top, left, "to the left")):
-        for points, marker, name in ((path.seen, "x", "measured, seen"), (path.measured, "o", "measured, not seen")):
+        for points, marker, name in ((path.seen, "x", "measured, observed"), (path.measured, "o", "measured later")):
             place = (points - origin) @ np.stack((ahead, up), axis=-1)
             axes.plot(*place.T, marker, color=GREY, markersize=4, fillstyle="none", label=name)
         for name, predicted, colour in models:
@@ -73,11 +75,11 @@ def shot_picture(shot: Shot, changed: bool) -> Figure:
         axes.set(xlabel="distance along the shot, m", ylabel=f"{label}, m")
     side.set_title("from the side", size=11)
     top.set_title("from above", size=11)
-    side.legend(fontsize="small", ncols=2)
+    figure.legend(*side.get_legend_handles_labels(), loc="outside upper center", ncols=2, fontsize="small")
     for name, predicted, colour in models:
         error.plot(predicted.times, 1e3 * distances(predicted), ".-", color=colour, label=name)
-    error.set(xlabel="time since the last sample seen, s", ylabel="error, mm", ylim=(0.0, None))
-    error.set_title("distance between predicted and measured position", size=11)
+    error.set(xlabel="time since the last observed sample, s", ylabel="error, mm", ylim=(0.0, None))
+    error.set_title("distance of predicted from measured", size=11)
     for axes in (side, top, error):
         axes.grid(visible=True, alpha=0.25)
     return figure
@@ -86,7 +88,7 @@ def shot_picture(shot: Shot, changed: bool) -> Figure:
 def error_map(before: Errors, after: Errors, changed: bool) -> Figure:
     """Prediction errors by place, seen from above, and by time since the last sample seen."""
     series = [("before", before, BEFORE), ("after", after, AFTER)] if changed else [("", after, AFTER)]
-    figure = Figure(figsize=(7.4, 2.9 + 2.9 * len(series)), layout="constrained")
+    figure = Figure(figsize=(SHEET, 2.6 + 2.6 * len(series)), layout="constrained")
     panels: Sequence[Axes] = figure.subplots(len(series) + 1, 1)
     places = np.concatenate([path.measured for path in after.paths])
     edges = [np.linspace(low, high, 1 + count) for low, high, count in _sides(places)]
@@ -103,11 +105,11 @@ def error_map(before: Errors, after: Errors, changed: bool) -> Figure:
             ink = "white" if cell[i, j] > 0.65 * top else "black"
             axes.text(middles[0][i], middles[1][j], f"{cell[i, j]:.0f}", ha="center", va="center", size=9, color=ink)
         axes.set(xlabel="x, m", ylabel="y, m")
-        axes.set_title(f"prediction error by place, from above, mm{f': {name}' if name else ''}", size=11)
+        axes.set_title(f"error by place, from above, mm{f': {name}' if name else ''}", size=11)
     last = panels[-1]
     for name, errors, colour in series:
         last.plot(*_in_time(errors.paths), "o-", color=colour, label=name)
-    last.set(xlabel="time since the last sample seen, s", ylabel="error, mm", ylim=(0.0, None))
+    last.set(xlabel="time since the last observed sample, s", ylabel="error, mm", ylim=(0.0, None))
     last.set_title("prediction error by time", size=11)
     last.grid(visible=True, alpha=0.25)
     if changed:

@@ -45,6 +45,13 @@ def plus_minus(value: Value) -> str:
     return f"{shown.removeprefix('-') if float(shown) == 0.0 else shown} ± {value.sigma:.{decimals}f}{unit}"
 
 
+def sized(size: float, unit: str) -> str:
+    """A size to two digits with its unit, which `1` leaves out; a dash where it is not finite."""
+    if not math.isfinite(size):
+        return NONE
+    return number(size, 2) if unit == "1" else f"{number(size, 2)} {unit}"
+
+
 def listed(values: Mapping[str, Value]) -> str:
     """For instance `x 0.203 ± 0.012 m/s, y 0.001 ± 0.010 m/s`."""
     return ", ".join(f"{name} {plus_minus(value)}" for name, value in values.items())

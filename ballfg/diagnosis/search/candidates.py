@@ -37,12 +37,14 @@ class Scored:
     """A hypothesis and the outcome of its score test, corrected for the number of hypotheses; None: not visible.
 
     `opposite` is the best shape in which its effect would have the opposite sign: there may be the better minimum.
+    `tested` is the number of hypotheses.
     """
 
     hypothesis: Hypothesis
     score: Score | None
     p_value: float
     opposite: Hypothesis | None = None
+    tested: int = 1
 
     @property
     def explained(self) -> float:
@@ -81,7 +83,7 @@ def score_all(fitted: Fit, candidates: Sequence[Hypothesis]) -> list[Scored]:
     scored = []
     for hypothesis, score in zip(testable, score_tests(*hypothesis_signatures(fitted, testable)), strict=True):
         p_value = 1.0 if score is None else min(1.0, score.p_value * len(testable))
-        scored.append(Scored(hypothesis, score, p_value))
+        scored.append(Scored(hypothesis, score, p_value, tested=len(testable)))
     return sorted(scored, key=lambda s: s.explained, reverse=True)
 
 
@@ -207,7 +209,8 @@ def _by_likelihood(before: Fit, after: Fit, hypothesis: Hypothesis, taken: float
     gain = 2.0 * (before.cost - after.cost) - taken
     estimate = np.array([after.unknowns.values[name] for name in hypothesis.columns])
     p_value = float(stats.chi2.sf(max(gain, 0.0), freedom))
-    score = Score(estimate, np.full(len(estimate), np.nan), gain, p_value, freedom)
+    tracks = len(np.unique(after.problem.stretches.track))
+    score = Score(estimate, np.full(len(estimate), np.nan), gain, p_value, freedom, tracks)
     return Refit(Scored(hypothesis, score, score.p_value), after, delta_bic(before, after) + taken)
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
@@ -16,8 +17,9 @@ from ballfg.diagnosis.search.plausible import SIGMAS
 from ballfg.diagnosis.search.score import score_tests
 from ballfg.diagnosis.search.signatures import Signatures
 from ballfg.dynamics import BallModel, Surfaces
-from ballfg.estimation import Settings, TrackPrediction, make_estimator, predict_tracks
+from ballfg.estimation import Settings, Status, TrackPrediction, make_estimator, predict_tracks
 from ballfg.estimation.noise.forecasts import NINETY
+from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction.apexes import measured_apexes, path_apex
 from ballfg.tracks import Track
 
@@ -30,6 +32,10 @@ SURELY = 1.645
 HARDLY = 1.01
 """Ratio of prediction errors that counts as worse even if the tracks cannot tell. An effect near the detection limit
 moves predictions by less than that, up or down by chance."""
+QUIET: Final = ProcessNoise(acceleration=1e-3, spin=0.05, contact_velocity=1e-3, contact_spin=0.1)
+"""Process noise of a model that is as good as exact: it moves predictions by less than a millimetre."""
+MOST_FORETOLD = 3.0
+"""Ratio to the median of the error foretold for a track beyond which a false hit was found in it."""
 FEW_WORSE = 1.05
 MOST_BETTER = 0.9
 """Where half of the tracks are predicted so much better, the root mean square over all may grow by so much: a few balls
@@ -72,7 +78,40 @@ def prediction_errors(
         float((np.abs(scores) < NINETY).mean()),
         float(np.median((scores**2).sum(axis=-1))),
         tuple(_path(t.track, p) for t, p in pairs),
+        error_of_mean([((p.positions - p.measured) / p.sigmas) ** 2 for _, p in pairs]),
     )
+
+
+def prediction_floor(
+    model: BallModel, tracks: Sequence[EvaluationTrack], surfaces: Surfaces, settings: Settings, jobs: int = 1
+) -> float:
+    """mm, the prediction error that is left where the model is exact: foretold, not measured.
+
+    It is what the covariance states once the process noise is as good as none: the noise of the measurements, and what
+    the observed part leaves open of the release. A model that may not err explains the bends of a few tracks by hits
+    that nobody made, after which nothing is known of the flight; tracks with far more than the median are left out.
+
+    Args: as `prediction_errors`.
+    Returns: NaN if fewer than half of the tracks could be estimated so: the model is not near enough to them.
+    """
+    quiet = replace(settings, process=QUIET, coefficients={})
+    estimator, observed = make_estimator("smoother", model, surfaces, quiet), [t.track for t in tracks]
+    predictions = predict_tracks(estimator, observed, len(observed), lambda t: OBSERVED * t.duration, jobs=jobs)
+    judged = [p for p in predictions if len(p.times) >= LEAST_PREDICTED]
+    squares = [(p.sigmas**2).sum(axis=-1) for p in judged if p.status is Status.OK]
+    if not squares or 2 * len(squares) < len(judged):
+        return float("nan")
+    most = MOST_FORETOLD**2 * float(np.median([s.mean() for s in squares]))
+    return 1e3 * float(np.sqrt(np.concatenate([s for s in squares if s.mean() <= most]).mean()))
+
+
+def error_of_mean(by_track: Sequence[Array]) -> float:
+    """Standard error of the mean over all numbers, those of one track going together; NaN for a single track."""
+    if len(by_track) < 2:
+        return float("nan")
+    sums, counts = np.array([s.sum() for s in by_track]), np.array([s.size for s in by_track])
+    left = sums - counts * sums.sum() / counts.sum()
+    return float(np.sqrt((left**2).sum() * len(by_track) / (len(by_track) - 1)) / counts.sum())
 
 
 def _path(track: Track, prediction: TrackPrediction) -> PredictedPath:

@@ -9,7 +9,7 @@ import numpy as np
 from ballfg.diagnosis.fit.fit import covariance_of, values_of
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.result import Candidate, Finding, Outcome, Value
-from ballfg.diagnosis.search.candidates import Refit, Scored
+from ballfg.diagnosis.search.candidates import ALARM, Refit, Scored
 from ballfg.diagnosis.search.evaluation import HeldOutGain
 from ballfg.diagnosis.search.hypothesis import TWINS, Hypothesis
 from ballfg.diagnosis.search.parsimony import significance
@@ -90,9 +90,10 @@ def _row(scored: Scored, delta_bic: float | None, outcome: Outcome | None) -> Ca
     estimate = {
         c.name: Value(float(v), float(s), c.unit) for c, v, s in zip(listed, score.estimate, score.sigma, strict=True)
     }
+    least = dict(zip(estimate, score.seen_from(ALARM / scored.tested).tolist(), strict=True))
     if outcome is None and delta_bic is not None:
         outcome = Outcome.WEAKER
     if outcome is None:
         hidden = all(s > c.sigma > 0.0 for c, s in zip(listed, score.sigma, strict=True))
         outcome = Outcome.INVISIBLE if hidden else Outcome.NOT_NEEDED
-    return Candidate(hypothesis.name, kind, estimate, score.explained, scored.p_value, delta_bic, outcome)
+    return Candidate(hypothesis.name, kind, estimate, score.explained, scored.p_value, delta_bic, outcome, least)

@@ -14,9 +14,11 @@ multi-stage samples", Survey Methodology 28, the estimator known as CR2.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Final
 
 import numpy as np
-from scipy import stats
+from scipy import optimize, stats
 
 from ballfg.arrays import Array, Index
 from ballfg.diagnosis.search.signatures import Efficient, Signatures, visible_directions
@@ -28,6 +30,12 @@ LEAST_OWN = 1e-6
 rounding in columns that were nearly projected out does not."""
 LEAST_KEPT = 0.05
 """Least share that is left of a track's score: a track that rules a direction alone cannot tell its scatter."""
+
+
+NOTICED: Final = 0.9
+"""Probability with which an effect of the size `seen_from` passes the test."""
+LARGEST: Final = 1e4
+"""Squared size, in units of its covariance, that any test notices."""
 
 
 @dataclass(frozen=True)
@@ -64,6 +72,7 @@ class Score:
         explained: squared whitened residual that the effect would explain: chi-square of `rank` degrees by chance.
         p_value: probability of so much by chance.
         rank: number of directions in which the data show the coefficients.
+        tracks: number of tracks that the scatter comes from.
     """
 
     estimate: Array
@@ -71,6 +80,16 @@ class Score:
     explained: float
     p_value: float
     rank: int
+    tracks: int
+
+    def seen_from(self, alarm: float) -> Array:
+        """(p,) sizes from which on the test would notice each coefficient in 9 of 10 cases, whatever the others are.
+
+        Where the other coefficients are zero, less is enough. Infinite where the data do not show the coefficient.
+
+        Args: alarm: probability of an outcome by chance below which the test notices something.
+        """
+        return self.sigma * least_noticed(self.rank, self.tracks, alarm)
 
 
 def score_tests(signatures: Signatures, candidates: Sequence[Sequence[int]]) -> list[Score | None]:
@@ -82,7 +101,7 @@ def score_tests(signatures: Signatures, candidates: Sequence[Sequence[int]]) -> 
     turns = [_visible(efficient, np.array(chosen)) for chosen in candidates]
     outcomes = iter(pattern_tests(signatures, [turn for turn in turns if turn is not None]))
     return [
-        None if turn is None else _score(next(outcomes), turn[np.array(chosen)])
+        None if turn is None else _score(next(outcomes), turn[np.array(chosen)], signatures.tracks)
         for turn, chosen in zip(turns, candidates, strict=True)
     ]
 
@@ -97,14 +116,14 @@ def _visible(efficient: Efficient, chosen: Index) -> Array | None:
     return turn
 
 
-def _score(pattern: Pattern, turn: Array) -> Score:
+def _score(pattern: Pattern, turn: Array, tracks: int) -> Score:
     """Args: turn: (p, r) the coefficients of a candidate in the directions that were tested."""
     inverse = np.linalg.inv(pattern.information)
     spread = turn @ inverse @ pattern.scatter @ inverse @ turn.T
     # a coefficient without a visible direction has no finite uncertainty
     spread[np.diag_indices_from(spread)] += np.where((turn**2).sum(axis=1) > 0.0, 0.0, np.inf)
     sigma = np.sqrt(np.diagonal(spread))
-    return Score(turn @ pattern.estimate, sigma, pattern.explained, pattern.p_value, pattern.rank)
+    return Score(turn @ pattern.estimate, sigma, pattern.explained, pattern.p_value, pattern.rank, tracks)
 
 
 def pattern_tests(signatures: Signatures, directions: Sequence[Array]) -> list[Pattern]:
@@ -159,6 +178,26 @@ def _p_value(pattern: Pattern, tracks: int, dispersion: float) -> float:
     covariance = tracks * pattern.scatter + PRIOR_TRACKS * dispersion * pattern.information
     pull = pattern.information @ pattern.estimate
     wald = (tracks + PRIOR_TRACKS) * float(pull @ np.linalg.solve(covariance, pull))
-    freedom = tracks + PRIOR_TRACKS - 1.0
-    left = freedom - pattern.rank + 1.0  # Hotelling's: the covariance of several directions is estimated too
+    freedom, left = _freedom(pattern.rank, tracks)
     return float(stats.f.sf(wald * left / (freedom * pattern.rank), pattern.rank, left))
+
+
+def _freedom(rank: int, tracks: int) -> tuple[float, float]:
+    """Degrees of freedom of the scatter, and those left: Hotelling's, for the covariance is estimated too."""
+    freedom = tracks + PRIOR_TRACKS - 1.0
+    return freedom, freedom - rank + 1.0
+
+
+@lru_cache(maxsize=1024)
+def least_noticed(rank: int, tracks: int, alarm: float) -> float:
+    """The size of an effect, in standard deviations, that the test notices in 9 of 10 cases.
+
+    Args: rank: directions tested.  tracks: their number.  alarm: probability by chance below which it is noticed.
+    """
+    _, left = _freedom(rank, tracks)
+    limit = float(stats.f.isf(alarm, rank, left))
+
+    def missing(square: float) -> float:
+        return float(stats.ncf.sf(limit, rank, left, square)) - NOTICED
+
+    return float(np.sqrt(optimize.brentq(missing, 1e-6, LARGEST, rtol=1e-6)))

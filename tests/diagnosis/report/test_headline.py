@@ -11,15 +11,17 @@ import pytest
 
 from ballfg.diagnosis.remains.label_check import LabelCheck
 from ballfg.diagnosis.report.glossary import OUTCOMES, TERMS
-from ballfg.diagnosis.report.headline import advice, certainty, further, headline, where
+from ballfg.diagnosis.report.headline import advice, answer, certainty, further, headline, where
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.page import page
+from ballfg.diagnosis.report.pictures import beyond_histogram
 from ballfg.diagnosis.report.plain_effects import PLAIN, in_plain_words, plain_name
+from ballfg.diagnosis.report.predictions import meaning
 from ballfg.diagnosis.report.shots import distances, error_map, median_shot
 from ballfg.diagnosis.result import Diagnosis, GenericTest, Outcome, Unexplained, Value, Verdict
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.noise.tracker import NUMBERS
-from tests.diagnosis.made_diagnosis import found, silent, unexplained
+from tests.diagnosis.made_diagnosis import found, residuals, rounds, silent, unexplained
 from tests.html_page import HtmlPage
 
 ORIGIN = Origin("ballfg diagnose 'my shots' --out out", ("my shots",), "", "out")
@@ -63,6 +65,8 @@ def test_nothing_found_says_so_and_what_that_rests_on() -> None:
     sure = list(certainty(replace(silent(), rounds=(hidden,))))
     assert sure[0].startswith(f"{tested - 2} effects")
     assert sure[1] == "These tracks say nothing about 2 more effects, which may be there or not."
+    one = tuple(replace(c, outcome=Outcome.INVISIBLE) if i < 1 else c for i, c in enumerate(silent().rounds[-1]))
+    assert "nothing about 1 more effect, which" in list(certainty(replace(silent(), rounds=(one,))))[-1]
     assert [c for _, c in advice(silent(), replace(ORIGIN, model="m.yaml"))][1] == (
         "ballfg diagnose 'my shots' --model m.yaml --out out_again"
     )
@@ -79,7 +83,8 @@ def test_several_effects_are_counted_and_listed() -> None:
     assert list(further(many)) == [
         "The air moves at 0.2 m/s along x.",
         "Air drag differs between groups of tracks: top 0.100 ± 0.010 1/m, back 0.200 ± 0.010 1/m.",
-        "The time stamps jitter by 0.42 ms from sample to sample.",
+        "Not an effect on the ball but noise of the measurements: the time stamps jitter by 0.42 ms from sample to "
+        "sample.",
         "Something else is missing too, which no known effect explains: in flight, acceleration is off everywhere.",
     ]
     assert next(certainty(many)).startswith("A wind: practically certain. Chance makes a trace so strong with prob")
@@ -197,3 +202,123 @@ def test_the_date_of_a_page_can_be_set(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SOURCE_DATE_EPOCH", "86400")
     assert "1970-01-02 00:00 UTC" in page(found())
     assert page(found()) == page(found())
+
+
+@pytest.mark.parametrize(
+    ("nis", "error", "said"),
+    [
+        (0.64, 0.05, "is below 1: predictions are better than they claim. The noise behind them is stated too large; "
+         "their standard deviations are 25 % larger than the errors. 90 % intervals hold 87.0 % of the measured"),
+        (4.0, 0.5, "is above 1: predictions are worse than they claim. The noise behind them is stated too small; "
+         "their standard deviations are 50 % smaller than the errors."),
+        (0.81, 0.12, "A NIS of 0.81 ± 0.12 differs from 1 by no more than chance"),
+        (1.3, math.nan, "A NIS of 1.30 is above 1"),
+    ],
+)  # fmt: skip
+def test_a_nis_is_said_in_words(nis: float, error: float, said: str) -> None:
+    errors = replace(found().after, nis=nis, nis_error=error)
+    assert said in meaning(replace(found(), after=errors))[0]
+
+
+@pytest.mark.usefixtures("blank_pictures")
+def test_an_error_stands_beside_its_floor() -> None:
+    error = found().after.prediction_rmse_mm
+    far = HtmlPage(page(replace(found(), floor_mm=error / 2.0)))
+    assert f"near {error / 2.0:.1f} mm" in far.text
+    assert f"The error is {error:.1f} mm, so that predictions are 2.0 times as far off as they could be." in far.text
+    assert far.explained["floor"] == TERMS["floor"]
+    near = HtmlPage(page(replace(silent(), floor_mm=silent().after.prediction_rmse_mm / 1.1)))
+    assert "so that a better model would gain little" in near.text
+    assert "a better model" not in HtmlPage(page(silent())).text
+
+
+def with_sizes(made: Diagnosis) -> Diagnosis:
+    """The last round with the sizes that it would have noticed."""
+    last = (
+        replace(rounds()[0][0], outcome=Outcome.NOT_NEEDED, seen_from={"x": 0.052, "y": 0.11, "z": 0.03}),
+        replace(rounds()[0][3], outcome=Outcome.NOT_NEEDED, seen_from={"share": 0.0011}),
+        replace(rounds()[0][4], outcome=Outcome.NOT_NEEDED, seen_from={"x": math.inf}),
+        replace(rounds()[0][5], outcome=Outcome.WEAKER, seen_from={"slope": 0.2}),
+        replace(rounds()[0][0], name="wind_drift", outcome=Outcome.NOT_NEEDED, seen_from={"x": 0.2}),
+    )
+    return replace(made, rounds=(last,))
+
+
+@pytest.mark.usefixtures("blank_pictures")
+def test_a_silence_says_how_small_an_effect_it_would_have_noticed() -> None:
+    sure = list(certainty(with_sizes(silent())))
+    assert sure[1] == (
+        "These would have been noticed in 9 of 10 recordings like this one, from such a size on: a wind (0.11 m/s "
+        "along any axis) and a clock that runs wrong (0.11 %)."
+    )
+    shown = HtmlPage(page(with_sizes(silent()))).text
+    listed = shown[shown.index("How small an effect would have been noticed") :]
+    listed = listed[: listed.index("Coefficients and noise")]
+    assert "A wind windx 0.052 m/s, y 0.11 m/s, z 0.03 m/s" in listed
+    assert "time_scaleshare 0.0011" in listed
+    assert "frame_tilt" not in listed
+    assert "magnus_saturation" not in listed
+    assert "wind_drift" not in listed
+    assert "How small an effect" not in page(with_sizes(unexplained()))
+
+
+def test_of_several_datasets_each_gets_its_own_model_and_file() -> None:
+    both = Origin("", ("a b", "c/d"), "m.yaml", "out", ("model.hall_A.yaml", "model.B.yaml"))
+    (_, estimate), (_, predict), *_ = advice(with_wind(x=0.3), both)
+    assert estimate.splitlines() == [
+        "ballfg estimate 'a b' --model out/model.hall_A.yaml --out states.hall_A.csv",
+        "ballfg estimate c/d --model out/model.B.yaml --out states.B.csv",
+    ]
+    assert [line.split()[-1] for line in predict.splitlines()] == ["predictions.hall_A.csv", "predictions.B.csv"]
+    *_, (words, again) = advice(unexplained(), both)
+    assert again == "ballfg diagnose 'a b' c/d --model m.yaml --effects-file my_effects.py --out out_again"
+    assert "record tracks in which it varies more" in words
+    left = replace(
+        unexplained().unexplained, where="flight: acceleration vertically is off everywhere, up to 0.7 m/s^2"
+    )
+    *_, (words, _) = advice(replace(unexplained(), unexplained=left), both)
+    assert "record tracks at other speeds, spins and places than these" in words
+    left = replace(left, where="label: 9 of 60 spin labels contradict their flights")
+    *_, (words, _) = advice(replace(unexplained(), unexplained=left), both)
+    assert "check the axes and the unit of the labels" in words
+
+
+def test_noise_alone_is_no_effect() -> None:
+    jitter = replace(WIND, name="stamp_jitter", parameters={"sigma": Value(0.00042, 1e-5, "s")})
+    assert answer(replace(found(), findings=(jitter,))) == "noise found"
+    assert answer(replace(found(), findings=(WIND, jitter))) == "effect found"
+    assert answer(silent()) == "nothing lacking"
+
+
+@pytest.mark.usefixtures("blank_pictures")
+def test_a_test_that_found_a_pattern_is_not_called_silent() -> None:
+    tests = (GenericTest("flight", "flight: off", 1e-9, 0.5), GenericTest("flight", "", 0.8, 0.0))
+    left = Unexplained("flight: off", 0.5, (*tests, GenericTest("contact", "", 0.7, 0.0)), None)
+    assert "Tests that find nothing beyond noise: contact." in page(replace(unexplained(), unexplained=left))
+
+
+@pytest.mark.usefixtures("blank_pictures")
+def test_position_noise_is_told_in_mm() -> None:
+    assert "x3 mm3.10 ± 0.02 mm" in "".join(HtmlPage(page(found())).words).replace("3.100 ± 0.020", "3.10 ± 0.02")
+
+
+def test_the_caption_of_the_histogram_counts_what_it_leaves_out() -> None:
+    left, right = residuals(0.0, 4), residuals(0.0, 5)
+    left.measurement.position[:7, 1] = 30.0
+    size = left.measurement.position.size
+    alone = beyond_histogram({"the fitted model": left})
+    assert alone == f"The axis ends at ±6: 7 of {size} residuals lie beyond it and are not shown."
+    both = beyond_histogram({"before": left, "after": right})
+    assert f"7 of {size} residuals before and 0 of {size} residuals after lie beyond" in both
+
+
+def test_a_gain_that_a_few_tracks_make_is_told_with_the_median_track() -> None:
+    made = found()
+    tracks = made.before.by_track.copy()
+    tracks[tracks.argmax()] = 400.0
+    whole = float(np.sqrt((tracks**2).mean()))
+    skewed = replace(made, before=replace(made.before, by_track=tracks, prediction_rmse_mm=whole))
+    before, after = np.median(tracks), np.median(made.after.by_track)
+    said = f"the median track is off by {before:.1f} mm before and {after:.1f} mm after."
+    assert any(said in line for line in meaning(skewed))
+    assert not any("median track" in line for line in meaning(made))

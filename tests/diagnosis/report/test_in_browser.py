@@ -5,8 +5,11 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import numpy as np
+
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.page import page
+from ballfg.pages.html import DPI
 from tests.browser import needs_browser, opened
 from tests.diagnosis.made_diagnosis import found
 
@@ -21,9 +24,12 @@ frame.addEventListener("load", () => {
     found.push(root.scrollWidth - root.clientWidth);
   }
   document.body.dataset.found = found.join(" ");
+  const images = [...frame.contentDocument.querySelectorAll("img")];
+  document.body.dataset.images = images.map((i) => (i.clientWidth / i.naturalWidth).toFixed(3)).join(" ");
 });
 """
-"""The width of the window, then by how much the page is wider, as it is and with each explained word chosen."""
+"""The width of the window, then by how much the page is wider, as it is and with each explained word chosen; and the
+width of each picture as shown, over its own."""
 
 
 @needs_browser
@@ -37,3 +43,8 @@ def test_a_report_fits_a_phone_and_has_no_errors(tmp_path: Path) -> None:
     assert width == PHONE
     assert len(wider) > 10
     assert not any(wider)
+    shares = re.search(r'data-images="([^"]*)"', elements)
+    assert shares is not None
+    points = 10.0 / 72.0 * DPI * np.array(shares[1].split(), dtype=float)
+    assert len(points) == 9
+    assert (points >= 10.0).all(), points  # pixels on the phone of words of 10 points

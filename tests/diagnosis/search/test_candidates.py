@@ -131,7 +131,7 @@ def test_turning_the_scene_changes_nothing(windy, windy_fit, scored, make_fit, m
 
 
 def scored_with(name, explained, p_value=0.0):
-    return Scored(hypothesis(name), Score(np.zeros(1), np.ones(1), explained, p_value, 1), p_value)
+    return Scored(hypothesis(name), Score(np.zeros(1), np.ones(1), explained, p_value, 1, 20), p_value)
 
 
 def test_the_shortlist_holds_the_best_shape_of_each_effect():

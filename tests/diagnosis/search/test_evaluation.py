@@ -11,7 +11,15 @@ from ballfg.diagnosis.fit.fit import covariance_of, fit_problem
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.stretches import joined
 from ballfg.diagnosis.search.candidates import refit, score_all
-from ballfg.diagnosis.search.evaluation import held_out_gain, on_all, on_others, prediction_errors
+from ballfg.diagnosis.search.evaluation import (
+    QUIET,
+    error_of_mean,
+    held_out_gain,
+    on_all,
+    on_others,
+    prediction_errors,
+    prediction_floor,
+)
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.settings import Settings
@@ -84,9 +92,9 @@ def test_nothing_to_predict(make_ball, surfaces):
         prediction_errors(make_ball(), [], surfaces, Settings(), 1)
 
 
-def test_errors_of_predictions(make_ball, make_launches, make_shots, surfaces):
-    data = make_shots(make_ball(), make_launches(4, 53), 53, duration=0.5).stretches
-    tracks = [
+def evaluated(data):
+    """Stretches as tracks to judge predictions by."""
+    return [
         EvaluationTrack(
             Track(
                 data.times[i].numpy(), data.positions[i].numpy(), labels=labels_of(data.labels[i].tolist()), name=name
@@ -95,6 +103,35 @@ def test_errors_of_predictions(make_ball, make_launches, make_shots, surfaces):
         )
         for i, name in enumerate(data.names)
     ]
+
+
+def test_the_floor_is_what_an_exact_model_gets(make_ball, make_launches, make_shots, surfaces):
+    """Flights without any process noise, predicted by the model that made them and by a wrong one."""
+    tracks = evaluated(make_shots(make_ball(), make_launches(24, 54), 54, duration=0.5).stretches)
+    settings = Settings(position_noise=(0.003,) * 3, spin_label_noise=4.0)
+    exact = prediction_errors(make_ball(), tracks, surfaces, replace(settings, process=QUIET), 1)
+    floor = prediction_floor(make_ball(), tracks, surfaces, settings)
+    assert floor == pytest.approx(exact.prediction_rmse_mm, rel=0.25)
+    wrong = make_ball(drag={"k": 0.3})
+    assert prediction_floor(wrong, tracks, surfaces, settings) == pytest.approx(floor, rel=0.25)
+    assert prediction_errors(wrong, tracks, surfaces, settings, 1).prediction_rmse_mm > 1.5 * floor
+
+
+def test_the_error_of_a_nis_is_its_scatter_over_repeated_recordings():
+    """Tracks of unlike lengths whose samples err alike: the tracks are what is independent."""
+    rng = np.random.default_rng(6)
+
+    def drawn():
+        return [np.full(n, rng.chisquare(3) / 3) for n in rng.integers(20, 60, 30)]
+
+    means = [float(np.concatenate(drawn()).mean()) for _ in range(400)]
+    stated = [error_of_mean(drawn()) for _ in range(400)]
+    assert np.mean(stated) == pytest.approx(np.std(means), rel=0.1)
+    assert np.isnan(error_of_mean([np.ones(5)]))
+
+
+def test_errors_of_predictions(make_ball, make_launches, make_shots, surfaces):
+    tracks = evaluated(make_shots(make_ball(), make_launches(4, 53), 53, duration=0.5).stretches)
     settings = Settings(position_noise=(0.003,) * 3, spin_label_noise=4.0)
     right = prediction_errors(make_ball(), tracks, surfaces, settings, 1)
     wrong = prediction_errors(make_ball(drag={"k": 0.3}), tracks, surfaces, settings, 1)

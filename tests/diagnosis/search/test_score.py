@@ -108,6 +108,23 @@ def test_power_where_the_ideal_test_has_ninety_percent(count, least):
     assert not stats.binom.cdf((found < 0.05).sum(), REPEATS, least) < SURE, (found < 0.05).mean()
 
 
+@pytest.mark.parametrize(("candidate", "column"), [(0, 0), (2, 4)])
+@pytest.mark.parametrize("alarm", [0.05, 1e-4])
+def test_an_effect_of_the_stated_size_is_noticed_in_nine_of_ten_cases(candidate, column, alarm):
+    """Exactly for a single coefficient; of several at least, for the others need not be free."""
+    rng, count = np.random.default_rng(7), 40
+    tracks = tracks_of(count, rng)
+    place = CANDIDATES[candidate].index(column)
+    quiet = [score_tests(tracks.signatures(rng.normal(size=(count, SAMPLES))), CANDIDATES) for _ in range(20)]
+    size = float(np.mean([one[candidate].seen_from(alarm)[place] for one in quiet]))
+    planted = tracks.columns[..., COMMON + column]
+    drawn = (tracks.signatures(size * planted + rng.normal(size=(count, SAMPLES))) for _ in range(REPEATS))
+    noticed = sum(score_tests(s, CANDIDATES)[candidate].p_value < alarm for s in drawn)
+    assert stats.binom.cdf(noticed, REPEATS, 0.9) > SURE, noticed / REPEATS
+    if candidate == 0:
+        assert stats.binom.sf(noticed - 1, REPEATS, 0.95) > SURE, noticed / REPEATS
+
+
 def test_one_step_finds_a_linear_effect_without_noise():
     rng = np.random.default_rng(1)
     tracks, planted = tracks_of(12, rng), np.array([0.7, -1.1, 0.4])

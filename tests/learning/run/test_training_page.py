@@ -16,7 +16,7 @@ from ballfg.learning.cli import run as command
 from ballfg.learning.config.training import OptimizerConfig, SplitConfig, TrainConfig
 from ballfg.learning.run import record, training
 from ballfg.learning.run.metrics import Epoch, read_metrics
-from ballfg.learning.run.training_page import beside_untrained, improved, page, verdict
+from ballfg.learning.run.training_page import TERMS, beside_untrained, improved, page, verdict
 from ballfg.learning.trainee import Learned, PredictedShot
 from tests.html_page import HtmlPage
 
@@ -47,12 +47,13 @@ def test_whether_it_helped_in_one_sentence() -> None:
 
 def test_a_page_shows_the_numbers_and_a_shot() -> None:
     rows = epochs(0.08, 0.05, 0.06)
-    times = np.linspace(-0.2, 0.4, 13)
+    times = 0.05 * np.arange(-4, 9)
     measured = np.outer(times, (5.0, 0.1, 1.0))
     shot = PredictedShot("ball <7>", times, measured, measured + np.array([0.0, 0.012, 0.0]))
     learned = [Learned("spin", 1.0, 0.37, "rad/s/√s", "random change of the spin in flight")]
     curves = record.curves(rows, "mlp")
-    text = page("mlp: 9 tracks", rows, 1, curves, learned, shot, "ballfg predict D --model m.yaml", "ballfg 1")
+    origin = {"made on": "2026-01-31", "command": "ballfg-train a.yaml -3e-4", "with": "ballfg 1"}
+    text = page("mlp: 9 tracks", rows, 1, curves, learned, shot, "ballfg predict D --model m.yaml", origin)
     words = " ".join(" ".join(HtmlPage(text).words).split())
     for part in (
         "The training helped: on validation",
@@ -61,12 +62,19 @@ def test_a_page_shows_the_numbers_and_a_shot() -> None:
         "0: before the first step 50.0 mm 80.0 mm",
         "Validation track ball <7>, whose error is the median",
         "the prediction is off by 12.0 mm (RMSE)",
+        "Crosses mark the 5 samples that the estimate observed, circles the 8 that it had to predict",
+        "made on 2026-01-31 command ballfg-train a.yaml -3e-4 with ballfg 1",
         "spin 1 0.37 rad/s/√s random change of the spin in flight",
     ):
         assert part in words, part
     assert text.count("data:image/png") == 2
-    bare = page("mlp", rows, 0, curves, [], None, "", "ballfg 1")
+    rest = replace(shot, times=times[5:], measured=measured[5:], predicted=measured[5:])
+    whole = page("mlp", rows, 0, curves, learned, rest, "", origin)
+    assert "Circles mark the 8 samples that it had to predict; those that it observed are not drawn." in whole
+    bare = page("mlp", rows, 0, curves, [], None, "", {"with": "ballfg 1"})
     assert "Lower optimizer.learning_rate" in bare
+    for word in TERMS:  # a word that is explained is used elsewhere on the page
+        assert words[: words.index("What the words mean")].lower().count(word.lower()), word
     assert "nan" not in " ".join(HtmlPage(bare).words)
 
 
