@@ -7,11 +7,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
+import numpy as np
+
 from ballfg.diagnosis.remains.patterns import EVERYWHERE
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.plain_effects import BY_GROUP, DRIFT, in_plain_words, plain_name
 from ballfg.diagnosis.report.wording import NONE, fixed, joined, number, probability, sized
-from ballfg.diagnosis.result import Candidate, Diagnosis, Finding, Outcome, Verdict
+from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Finding, Outcome, Verdict
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.noise.tracker import NUMBERS
 
@@ -26,6 +28,8 @@ PLACES: Final = {
 """Begin of a test's words, and the same in a sentence."""
 SURE: Final = ((1e-6, "practically certain"), (1e-3, "very likely"), (0.05, "likely"))
 """Words for the probability that a finding is none; the larger one of both halves of the tracks counts."""
+SKEWED: Final = 1.5
+"""Ratio of the root mean square to the median track's error beyond which the median is told."""
 MAIN: Final = ("wind", "drag_speed", "time_scale", "scale", "frame_tilt")
 """Effects whose least size is told in the first lines of a report that finds nothing."""
 COUNTS: Final = ("No", "One", "Two", "Three", "Four", "Five", "Six", "Seven", "Eight", "Nine")
@@ -88,9 +92,23 @@ def gain(diagnosis: Diagnosis, what: str) -> str:
     before, after = diagnosis.before.prediction_rmse_mm, diagnosis.after.prediction_rmse_mm
     if not what or not math.isfinite(before + after):
         return f"Predictions are off by {_error(diagnosis)}." if math.isfinite(after) else ""
+    if medians := skewed_medians(diagnosis.before, diagnosis.after):  # one ball that misses the table may weigh most
+        least, most = (f"{median:.1f}" for median in reversed(medians))
+        return f"{what}, half of the tracks are predicted to {least} mm or better; before, to {most} mm."
     if f"{before:.1f}" == f"{after:.1f}":
         return f"{what}, predictions are off by as much as before, {after:.1f} mm."
     return f"{what}, predictions are off by {after:.1f} instead of {before:.1f} mm."
+
+
+def skewed_medians(before: Errors, after: Errors) -> tuple[float, float] | None:
+    """mm, errors of the median track before and after, where a few tracks make most of the root mean square."""
+    medians = tuple(
+        float(np.nanmedian(e.by_track)) if np.isfinite(e.by_track).any() else math.nan for e in (before, after)
+    )
+    pooled = (before.prediction_rmse_mm, after.prediction_rmse_mm)
+    if not any(whole > SKEWED * median for whole, median in zip(pooled, medians, strict=True)):
+        return None
+    return medians[0], medians[1]
 
 
 def certainty(diagnosis: Diagnosis) -> Iterator[str]:

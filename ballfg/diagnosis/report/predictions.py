@@ -3,18 +3,15 @@
 import math
 from typing import Final
 
-import numpy as np
-
 from ballfg.diagnosis.report import pictures, shots
 from ballfg.diagnosis.report.glossary import term
+from ballfg.diagnosis.report.headline import skewed_medians
 from ballfg.diagnosis.report.wording import NONE, change, fixed
 from ballfg.diagnosis.result import Diagnosis, Errors
 from ballfg.pages.html import Html, items, picture, section, table, tag, text
 
 BY_CHANCE: Final = 2.0
 """Standard errors within which a NIS counts as 1."""
-SKEWED: Final = 1.5
-"""Ratio of the root mean square to the median track's error beyond which the median is told too."""
 NEAR_FLOOR: Final = 1.2
 """Ratio to the floor up to which a model can hardly be better."""
 
@@ -86,9 +83,8 @@ def meaning(diagnosis: Diagnosis) -> list[Html]:
 
 def _few_tracks(before: Errors, after: Errors) -> str:
     """The error of the median track, where a few tracks make most of the root mean square; else nothing."""
-    medians = [float(np.nanmedian(e.by_track)) if np.isfinite(e.by_track).any() else math.nan for e in (before, after)]
-    pooled = (before.prediction_rmse_mm, after.prediction_rmse_mm)
-    if not any(whole > SKEWED * median for whole, median in zip(pooled, medians, strict=True)):
+    medians = skewed_medians(before, after)
+    if medians is None:
         return ""
     off = f"{medians[0]:.1f} mm before and {medians[1]:.1f} mm after" if after is not before else f"{medians[1]:.1f} mm"
     return f"A few tracks make most of the prediction error: the median track is off by {off}."

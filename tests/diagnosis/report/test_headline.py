@@ -321,4 +321,6 @@ def test_a_gain_that_a_few_tracks_make_is_told_with_the_median_track() -> None:
     before, after = np.median(tracks), np.median(made.after.by_track)
     said = f"the median track is off by {before:.1f} mm before and {after:.1f} mm after."
     assert any(said in line for line in meaning(skewed))
+    assert f"predicted to {after:.1f} mm or better; before, to {before:.1f} mm." in headline(skewed)
+    assert "instead of" in headline(made)
     assert not any("median track" in line for line in meaning(made))
