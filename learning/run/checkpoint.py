@@ -12,8 +12,9 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from ballfg.dynamics.earlier_names import todays_name
+from ballfg.files.moving import settle
 from ballfg.files.strict_yaml import YamlError, read_yaml
-from ballfg.files.whole_folder import recover, replaced_folder
+from ballfg.files.whole_folder import whole_folder
 
 NAME = "checkpoint"
 STATE = "state.yaml"
@@ -68,7 +69,7 @@ class Checkpoint:
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Replace the checkpoint in the folder of a run. At every moment the old or the new one exists as a whole."""
-    with replaced_folder(folder / NAME) as part:
+    with whole_folder(folder / NAME, earlier=("*",)) as part:
         for name in TENSORS:
             tensors: dict[str, Tensor] = getattr(checkpoint, name)
             owned = {key: tensor.detach().contiguous().clone() for key, tensor in tensors.items()}
@@ -83,7 +84,7 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
     Raises: ValueError: if it is damaged.
     """
     path = folder / NAME
-    recover(path)
+    settle(path)
     if not path.exists():
         return None
     try:

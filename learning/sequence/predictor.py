@@ -14,6 +14,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from ballfg.files.moving import settle
 from ballfg.files.strict_yaml import YamlError, read_yaml
 from ballfg.files.whole_folder import whole_folder
 from ballfg.learning.sequence.architecture import SequenceArchitecture
@@ -109,6 +110,11 @@ class SequencePredictor:
         folder = Path(folder)
         if folder.exists():
             raise ValueError(f"folder must be new; {folder} exists. Choose another name or delete it.")
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        self.replace(folder)
+
+    def replace(self, folder: Path) -> None:
+        """Write as `save`, in the place of an earlier model of that folder; its parent must exist."""
         config = {
             "kind": self.architecture.kind,
             "width": self.architecture.width,
@@ -116,8 +122,7 @@ class SequencePredictor:
             "labels": list(self.launcher.labels),
             "categories": {label: list(values) for label, values in self.launcher.categories.items()},
         }
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with whole_folder(folder) as part:
+        with whole_folder(folder, earlier=(CONFIG, WEIGHTS)) as part:
             text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
             (part / CONFIG).write_text(text, encoding="utf-8")
             save_file({name: value.contiguous() for name, value in self.model.state_dict().items()}, part / WEIGHTS)
@@ -148,6 +153,7 @@ class SequencePredictor:
 
 def _read(folder: Path) -> tuple[FolderConfig, dict[str, Tensor]]:
     """Config and weights of a folder."""
+    settle(folder)
     for name in (CONFIG, WEIGHTS):
         if not (folder / name).is_file():
             raise FileNotFoundError(f"{folder} must hold {CONFIG} and {WEIGHTS}; {name} is missing. Save it again.")
