@@ -1,5 +1,6 @@
 """The checkpoint of a training, from which it continues to the same numbers: a folder of tensors and YAML."""
 
+import hashlib
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,6 +19,8 @@ from ballfg.files.whole_folder import whole_folder
 
 NAME = "checkpoint"
 STATE = "state.yaml"
+DIGESTS = "digests"
+"""In `state.yaml`: the SHA-256 of every file of tensors."""
 TENSORS = ("weights", "optimizer", "memory", "best")
 """One file `<name>.safetensors` each."""
 
@@ -74,7 +77,8 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
             tensors: dict[str, Tensor] = getattr(checkpoint, name)
             owned = {key: tensor.detach().contiguous().clone() for key, tensor in tensors.items()}
             save_file(owned, part / f"{name}.safetensors")
-        text = yaml.safe_dump(checkpoint.progress.model_dump(), sort_keys=False)
+        state = checkpoint.progress.model_dump() | {DIGESTS: _digests(part)}
+        text = yaml.safe_dump(state, sort_keys=False)
         (part / STATE).write_text(text, encoding="utf-8")
 
 
@@ -89,10 +93,20 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
         return None
     try:
         content: Any = read_yaml(path / STATE)
+        digests = content.pop(DIGESTS, None) if isinstance(content, dict) else None
         tensors = {name: load_file(path / f"{name}.safetensors") for name in TENSORS}
-        return Checkpoint(RunProgress.model_validate(content), **tensors)
+        progress = RunProgress.model_validate(content)
+        if digests is not None and digests != _digests(path):  # checkpoints of earlier versions have none
+            raise SafetensorError(f"the tensors are not those that {STATE} states: a file is damaged")
+        return Checkpoint(progress, **tensors)
     except ValidationError as error:
         reason = f"{STATE}: {error.errors()[0]['msg']}"
     except (OSError, YamlError, SafetensorError) as error:
         reason = " ".join(str(error).split())
     raise ValueError(f"{path}: not a whole checkpoint ({reason}). Start a new run.")
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    """The digest of every file of tensors in a folder."""
+    files = {name: folder / f"{name}.safetensors" for name in TENSORS}
+    return {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}

@@ -128,6 +128,21 @@ def test_a_folder_in_one_that_was_killed_is_finished_too(tmp_path: Path, monkeyp
     assert contents(tmp_path) == {"a": "new", "b": "new", "place/x": "new"}
 
 
+def test_a_reader_that_may_not_write_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fill(tmp_path, a="old")
+    killed_between(tmp_path, monkeypatch, 1)
+
+    def refuse(*_: object) -> None:
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("os.open", refuse)
+        with pytest.raises(ValueError, match=r"between two results: .* \(Read-only file system\)\. Give permission"):
+            settle(tmp_path)
+    settle(tmp_path)
+    assert contents(tmp_path) == {"a": "new", "b": "new", "place/x": "new"}
+
+
 def test_what_a_killed_writing_made_is_cleared_by_the_next(tmp_path: Path) -> None:
     fill(tmp_path, d__a="old", **{f"d__{MARK}__{NEW}__half": "half", f".d{MARK}__{NEW}__half": "half"})
     with whole_folder(tmp_path / "d") as stage:

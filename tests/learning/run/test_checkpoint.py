@@ -84,3 +84,13 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path, name: str, content: byt
         (tmp_path / "checkpoint" / name).write_bytes(content)
     with pytest.raises(ValueError, match=r"not a whole checkpoint \(.+\)\. Start a new run\."):
         read_checkpoint(tmp_path)
+
+
+def test_a_flipped_bit_is_found(tmp_path: Path) -> None:
+    write_checkpoint(tmp_path, made(1))
+    weights = tmp_path / "checkpoint" / "weights.safetensors"
+    content = bytearray(weights.read_bytes())
+    content[-8] ^= 1  # the lowest bit of a number
+    weights.write_bytes(content)
+    with pytest.raises(ValueError, match=r"tensors are not those that state\.yaml states: a file is damaged\)"):
+        read_checkpoint(tmp_path)
