@@ -6,7 +6,8 @@ Commands import what they need inside: `ballfg-bench --help` must not wait for t
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -77,12 +78,12 @@ def estimators(
     results = _start("estimators", [] if data is None else [data], quick, seed)
     size = QUICK if quick else FULL
     dataset = None if data is None else _open(data)  # before the folder: a wrong path leaves nothing behind
-    with workers(cluster, address, jobs) as processes:
+    with workers(cluster, address, jobs) as processes, _folder(out) as folder:
         if dataset is None:
-            pictures = run_synthetic(results, _folder(out), size, processes)
+            pictures = run_synthetic(results, folder, size, processes)
         else:
-            pictures = run_dataset(results, dataset, _folder(out), size, processes)
-    _finish(results, out, pictures)
+            pictures = run_dataset(results, dataset, folder, size, processes)
+        _finish(results, out, pictures)
 
 
 @app.command()
@@ -104,9 +105,9 @@ def cameras(
     from ballfg.benchmarks.cameras.suite import FULL, QUICK, run_cameras
 
     results = _start("cameras", [], quick, seed)
-    with workers(cluster, address, jobs) as processes:
-        pictures = run_cameras(results, _folder(out), QUICK if quick else FULL, processes)
-    _finish(results, out, pictures)
+    with workers(cluster, address, jobs) as processes, _folder(out) as folder:
+        pictures = run_cameras(results, folder, QUICK if quick else FULL, processes)
+        _finish(results, out, pictures)
 
 
 @app.command()
@@ -144,9 +145,9 @@ def dynamics(
     other = None if transfer is None else _open(transfer)
     measured = Measured([_open(one) for one in data], other, transfer_tracks) if data else None
     plan = QUICK if quick else FULL
-    with workers(cluster, address, jobs) as processes:
-        pictures = run_dynamics(results, measured, _shared(_folder(out), cluster), plan, processes, method)
-    _finish(results, out, pictures)
+    with workers(cluster, address, jobs) as processes, _folder(out) as folder:
+        pictures = run_dynamics(results, measured, _shared(folder, cluster), plan, processes, method)
+        _finish(results, out, pictures)
 
 
 @app.command()
@@ -175,11 +176,10 @@ def loop(
     for folder in data or []:
         _open(folder)  # a bad one is better known now than hours later
     plan = QUICK if quick else FULL
-    with workers(cluster, address, jobs) as processes:
-        pictures = run_loop(
-            results, [_shared(one, cluster) for one in data or []], _shared(_folder(out), cluster), plan, processes
-        )
-    _finish(results, out, pictures)
+    with workers(cluster, address, jobs) as processes, _folder(out) as place:
+        shared = [_shared(one, cluster) for one in data or []]
+        pictures = run_loop(results, shared, _shared(place, cluster), plan, processes)
+        _finish(results, out, pictures)
 
 
 @app.command()
@@ -224,7 +224,8 @@ def intervals(
         else:
             plan = suite.QUICK if quick else suite.FULL
             suite.run_intervals(results, datasets, plan, processes, tracks, diagnosed)
-    _finish(results, _folder(out), [])
+    with _folder(out) as folder:
+        _finish(results, folder, [])
 
 
 @app.command()
@@ -274,7 +275,8 @@ def speed(
         run_peers(results, interpreters, size)
     else:
         run_speed(results, None if data is None else _open(data), size, there)
-    _finish(results, _folder(out), [])
+    with _folder(out) as folder:
+        _finish(results, folder, [])
     if gate is not None:
         try:
             print("\n" + "\n".join(check_ratios(results.rows, gate)))
@@ -316,11 +318,16 @@ def _open(data: Path) -> Dataset:
     return dataset
 
 
-def _folder(out: Path) -> Path:
+@contextmanager
+def _folder(out: Path) -> Iterator[Path]:
+    """The output folder, made if it does not exist; no other run writes there until the block ends."""
+    from ballfg.files.whole_folder import reserved
+
     if out.exists() and not out.is_dir():
         raise ValueError(f"--out must be a folder; {out} is a file. Choose another name.")
     out.mkdir(parents=True, exist_ok=True)
-    return out
+    with reserved(out, "--out"):
+        yield out
 
 
 def _shared(folder: Path, cluster: str | None) -> Path:

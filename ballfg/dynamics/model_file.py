@@ -15,6 +15,7 @@ from ballfg.dynamics.model import THIN_SHELL, BallModel
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.networks.learned_file import has_learned_part, read_learned, remove_others, write_learned
 from ballfg.dynamics.variation import Variation
+from ballfg.files.moving import settle
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.whole_file import write_text
 from ballfg.tracks import TrackNoise
@@ -46,6 +47,7 @@ def load_model(
             outside its bounds; or if the folder does not hold a learned part of this version.
     """
     path = Path(path)
+    settle(path.parent)
     if not path.is_file():
         raise FileNotFoundError(f"model file {path} does not exist; a model is one YAML file")
     content = read_yaml(path)

@@ -6,6 +6,7 @@ from pathlib import Path
 from ballfg.dynamics import model_to_dict, nominal_model
 from ballfg.estimation.observations.files import read_readings
 from ballfg.estimation.observations.sighted_dataset import SightedDataset, read_sighted
+from ballfg.files.moving import settle
 from ballfg.files.strict_yaml import read_mapping
 from ballfg.tracks import Ball, Dataset, read_dataset
 from ballfg.tracks.dataset import TRACK_FILES
@@ -31,6 +32,7 @@ def read(folder: str | PathLike[str]) -> Dataset | SightedDataset:
         FileNotFoundError: the folder or one of its files is missing.
         ValueError: the content breaks a rule; the message names file, line, column and remedy.
     """
+    settle(Path(folder))
     dataset = with_readings(read_dataset(folder)) if has_positions(folder) else read_sighted(folder)
     dataset.notes = [*dataset.notes, *unused_model(folder, dataset.ball)]
     return dataset

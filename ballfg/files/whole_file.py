@@ -1,28 +1,36 @@
 """Writing a file as a whole: it has its name only when it is complete."""
 
+import errno
 import os
-import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from ballfg.files.held import NEW, beside, clear, held
+
 
 @contextmanager
 def whole_file(path: Path, argument: str = "out") -> Iterator[Path]:
-    """A hidden path beside `path`, with its ending, to write to; it takes the name when the block ends well.
+    """A path in a hidden folder, with the same name, to write to; it takes its place when the block ends well.
 
-    After an exception or Ctrl-C what was there before is untouched.
+    After an exception, Ctrl-C or a kill what was there before is untouched.
 
-    Raises: FileNotFoundError: the folder of the path does not exist. ValueError: the path is a folder.
+    Raises: FileNotFoundError: the folder of the path does not exist. ValueError: the path is a folder, or another
+        process is writing it.
     """
     check_file(path, argument)
-    temporary = path.with_name(f".{path.stem}.{uuid.uuid4().hex[:8]}{path.suffix}")
-    try:
-        yield temporary
-        flush(temporary)
-        os.replace(temporary, path)
-    finally:
-        temporary.unlink(missing_ok=True)
+    target = Path(os.path.realpath(path.parent)) / path.name
+    place = beside(target)
+    with held(place, path, argument):
+        try:
+            (place / NEW).mkdir()
+            temporary = place / NEW / path.name
+            yield temporary
+            flush(temporary)
+            os.replace(temporary, target)
+            flush_folder(target.parent)
+        finally:
+            clear(place)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -38,6 +46,15 @@ def flush(path: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
+
+
+def flush_folder(path: Path) -> None:
+    """Brings the names in a folder to the disk; a filesystem that has no such call (EINVAL) does it in its own way."""
+    try:
+        flush(path)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):
+            raise
 
 
 def check_file(path: Path, argument: str = "out") -> None:

@@ -28,8 +28,8 @@ def write_import(folder: Path, proposal: Proposal, file_format: Literal["csv", "
     Args: folder: new, empty, or with `force` a dataset to replace.  proposal: to write.  file_format: of the tracks.
     Raises: ValueError: a folder with other content. FileNotFoundError: its parent does not exist.
     """
-    check_replaceable(folder, mark=INFO_FILE, what="a dataset", force=force)
     with whole_folder(folder, earlier=(*DATASET_FILES, PAGE)) as stage:
+        check_replaceable(folder, mark=INFO_FILE, what="a dataset", force=force)
         write_dataset(stage, proposal.info, proposal.tracks, file_format)
         (stage / PAGE).write_text(page(proposal), encoding="utf-8")
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,7 +12,7 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.online.state import OnlineState
-from ballfg.files.whole_file import check_file, flush
+from ballfg.files.whole_file import whole_file
 from ballfg.live.outlook import Outlook, unusable
 from ballfg.live.sources.bag import need_rosbags
 from ballfg.live.tracker import BallUpdate
@@ -35,19 +33,14 @@ def bag_writer(out: Path, horizon: float) -> Iterator[BagWriter]:
     Raises: ValueError: the package `rosbags` is missing, or `out` is a folder. FileNotFoundError: no such folder.
     """
     need_rosbags()
-    check_file(out)
     from rosbags.rosbag2 import StoragePlugin, Writer
 
-    folder = Path(tempfile.mkdtemp(prefix=f".{out.stem}.", dir=out.absolute().parent))
-    try:
-        bag = folder / "bag"
+    with whole_file(out) as temporary:
+        bag = temporary.with_name("bag")
         with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
             yield BagWriter(writer, horizon)
         (written,) = bag.glob("*.mcap")
-        flush(written)
-        os.replace(written, out)
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
+        os.replace(written, temporary)
 
 
 class BagWriter:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ballfg.files.moving import settle
 from ballfg.pages.tables import Kind, ResultTable, columns_of, kind_of, read_table
 from ballfg.tracks import Dataset, read_dataset
 
@@ -58,6 +59,7 @@ def recognise(paths: Iterable[Path]) -> Given:
 def _read(path: Path) -> tuple[str, Any]:
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; it could be {COULD_BE}. Check the path.")
+    settle(path if path.is_dir() else path.parent)
     if path.is_dir():
         if (path / "dataset.yaml").is_file():
             return "dataset", read_dataset(path)

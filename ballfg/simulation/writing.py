@@ -50,15 +50,19 @@ def write_simulation(
     """
     path = Path(folder)
     check_format(file_format)
-    check_replaceable(path, mark=TRUTH_FILE, what="a simulated dataset", force=force)
-    earlier = (*DATASET_FILES, *TRUTH_TABLES, f"{Path(MODEL_FILE).stem}.learned-*")
-    with whole_folder(path, earlier=earlier, last=TRUTH_FILE) as stage:
+    with whole_folder(path, earlier=simulation_files(), last=TRUTH_FILE) as stage:
+        check_replaceable(path, mark=TRUTH_FILE, what="a simulated dataset", force=force)
         with TableWriter(stage / f"truth.{file_format}") as truth:
             tracks = _with_truth(watch(simulate(config), config.tracks, "tracks simulated"), truth, config)
             write_dataset(stage, dataset_info(config), tracks, file_format)
         save_model(config.ball.model, stage / MODEL_FILE)
         text = yaml.safe_dump(truth_content(config), sort_keys=False)
         (stage / TRUTH_FILE).write_text(text, encoding="utf-8")
+
+
+def simulation_files() -> tuple[str, ...]:
+    """Names, or patterns of names, that the files of a simulated dataset can have."""
+    return (*DATASET_FILES, *TRUTH_TABLES, f"{Path(MODEL_FILE).stem}.learned-*")
 
 
 def check_format(name: str) -> FileFormat:

@@ -9,6 +9,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Final
 
+from ballfg.files.moving import settle
 from ballfg.tracks.checks import Findings, check_scale, tidy
 from ballfg.tracks.grouping import Index, RowGroup, groups, scan
 from ballfg.tracks.info import INFO_FILE, Ball, DatasetInfo, read_info
@@ -129,6 +130,7 @@ def read_dataset(folder: str | PathLike[str]) -> Dataset:
         ValueError: the content breaks a rule; the message names file, line, column and remedy.
     """
     path = Path(folder)
+    settle(path)
     source = _open_source(path)
     info, notes = read_info(path / INFO_FILE)
     notes += [f"{source.path.name}: column {name!r} ignored" for name in source.ignored]

@@ -15,6 +15,7 @@ from ballfg.benchmarks.dynamics.task import Task
 from ballfg.dynamics import BallModel, load_model
 from ballfg.estimation import Settings
 from ballfg.estimation.configure import launcher_of, learned_process
+from ballfg.files.whole_file import write_text
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.registry import SEQUENCES
 from ballfg.learning.run.metrics import read_metrics
@@ -80,7 +81,7 @@ def _written(job: Job) -> list[Path]:
         job.folder.mkdir(parents=True, exist_ok=True)
         for task, name in zip(learned, names, strict=True):
             task.write(job.folder / name, validate=not job.measured or kind_of(job.method) in SEQUENCES)
-        mark.write_text(digest, encoding="utf-8")
+        write_text(mark, digest)
     elif mark.read_text(encoding="utf-8") != digest:
         raise ValueError(
             f"{job.folder}: must be a training of these tracks by this recipe; it is of others. "

@@ -50,21 +50,22 @@ def run_calibration(config: CalibrationConfig, folder: Path, *, resume: bool, jo
     Args: jobs: number of processes where the config has none.
     Raises: ValueError, FileNotFoundError: bad input. KeyboardInterrupt: after Ctrl-C; finished steps are kept.
     """
-    files.check(folder, config, resume=resume)
-    if config.data is None:
-        raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
-    torch.set_num_threads(1)  # the batches are small: threads cost more than they gain
-    dataset = open_dataset(config.data)
-    problem = pose(dataset, analytic_model(config.model, dataset.info.ball), config, config.jobs or jobs)
-    steps = read_checkpoint(folder, problem) if resume else []
-    files.start(folder, config)
-    print(f"{folder / files.CONFIG}: the config; {len(problem.split.fit)} tracks fit, {len(problem.split.judge)} judge")
-    try:
-        _steps(problem, steps, folder, watch)
-        _finish(problem, steps, folder, watch)
-    except KeyboardInterrupt:
-        print(f"{len(steps)} steps are kept; continue with --resume {folder}", file=sys.stderr)
-        raise
+    with files.running(folder, config, resume=resume):
+        if config.data is None:
+            raise ValueError("a dataset is needed; got none. Give --data FOLDER, or 'data' in the config.")
+        torch.set_num_threads(1)  # the batches are small: threads cost more than they gain
+        dataset = open_dataset(config.data)
+        problem = pose(dataset, analytic_model(config.model, dataset.info.ball), config, config.jobs or jobs)
+        steps = read_checkpoint(folder, problem) if resume else []
+        files.start(folder, config)
+        fit, judge = len(problem.split.fit), len(problem.split.judge)
+        print(f"{folder / files.CONFIG}: the config; {fit} tracks fit, {judge} judge")
+        try:
+            _steps(problem, steps, folder, watch)
+            _finish(problem, steps, folder, watch)
+        except KeyboardInterrupt:
+            print(f"{len(steps)} steps are kept; continue with --resume {folder}", file=sys.stderr)
+            raise
 
 
 def _steps(problem: Problem, steps: list[Step], folder: Path, watch: Watch) -> None:

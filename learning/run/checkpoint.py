@@ -1,5 +1,6 @@
 """The checkpoint of a training, from which it continues to the same numbers: a folder of tensors and YAML."""
 
+import hashlib
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -12,11 +13,14 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from ballfg.dynamics.earlier_names import todays_name
+from ballfg.files.moving import settle
 from ballfg.files.strict_yaml import YamlError, read_yaml
-from ballfg.files.whole_folder import recover, replaced_folder
+from ballfg.files.whole_folder import whole_folder
 
 NAME = "checkpoint"
 STATE = "state.yaml"
+DIGESTS = "digests"
+"""In `state.yaml`: the SHA-256 of every file of tensors."""
 TENSORS = ("weights", "optimizer", "memory", "best")
 """One file `<name>.safetensors` each."""
 
@@ -68,12 +72,13 @@ class Checkpoint:
 
 def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
     """Replace the checkpoint in the folder of a run. At every moment the old or the new one exists as a whole."""
-    with replaced_folder(folder / NAME) as part:
+    with whole_folder(folder / NAME, earlier=("*",)) as part:
         for name in TENSORS:
             tensors: dict[str, Tensor] = getattr(checkpoint, name)
             owned = {key: tensor.detach().contiguous().clone() for key, tensor in tensors.items()}
             save_file(owned, part / f"{name}.safetensors")
-        text = yaml.safe_dump(checkpoint.progress.model_dump(), sort_keys=False)
+        state = checkpoint.progress.model_dump() | {DIGESTS: _digests(part)}
+        text = yaml.safe_dump(state, sort_keys=False)
         (part / STATE).write_text(text, encoding="utf-8")
 
 
@@ -83,15 +88,25 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
     Raises: ValueError: if it is damaged.
     """
     path = folder / NAME
-    recover(path)
+    settle(path)
     if not path.exists():
         return None
     try:
         content: Any = read_yaml(path / STATE)
+        digests = content.pop(DIGESTS, None) if isinstance(content, dict) else None
         tensors = {name: load_file(path / f"{name}.safetensors") for name in TENSORS}
-        return Checkpoint(RunProgress.model_validate(content), **tensors)
+        progress = RunProgress.model_validate(content)
+        if digests is not None and digests != _digests(path):  # checkpoints of earlier versions have none
+            raise SafetensorError(f"the tensors are not those that {STATE} states: a file is damaged")
+        return Checkpoint(progress, **tensors)
     except ValidationError as error:
         reason = f"{STATE}: {error.errors()[0]['msg']}"
     except (OSError, YamlError, SafetensorError) as error:
         reason = " ".join(str(error).split())
     raise ValueError(f"{path}: not a whole checkpoint ({reason}). Start a new run.")
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    """The digest of every file of tensors in a folder."""
+    files = {name: folder / f"{name}.safetensors" for name in TENSORS}
+    return {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files.items()}

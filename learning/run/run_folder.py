@@ -1,13 +1,16 @@
 """The folder of a run: names of its files, checks before a run starts, config and versions."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import yaml
 
+from ballfg.files.moving import settle
 from ballfg.files.whole_file import write_text
+from ballfg.files.whole_folder import reserved
 from ballfg.learning.config.config_file import Config, read_config
 from ballfg.machine import versions
 
@@ -29,6 +32,7 @@ def check(folder: Path, config: Config, *, resume: bool) -> None:
         ValueError: a file, or a folder with an earlier run; to resume, a config that would change the numbers.
         FileNotFoundError: no run to resume.
     """
+    settle(folder)
     if resume:
         _check_resumable(folder, config)
         return
@@ -40,6 +44,25 @@ def check(folder: Path, config: Config, *, resume: bool) -> None:
             f"out must not hold an earlier run; {folder} has {there[0]}. Choose another folder, or continue that run "
             f"with --resume {folder}."
         )
+
+
+@contextmanager
+def running(folder: Path, config: Config, *, resume: bool) -> Iterator[None]:
+    """Check the folder, and keep other runs from it until the block ends. A new folder that stays empty is removed.
+
+    Raises: ValueError: another run is writing there; else as `check`.
+    """
+    check(folder, config, resume=resume)
+    made = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        with reserved(folder):
+            check(folder, config, resume=resume)
+            yield
+    finally:
+        for path in made:
+            if path.is_dir() and not any(path.iterdir()):
+                path.rmdir()
 
 
 def _check_resumable(folder: Path, config: Config) -> None:

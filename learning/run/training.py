@@ -61,8 +61,8 @@ def run_training(
             written.
         SystemExit: in the other processes, where the first one raises.
     """
-    with join_ranks() as ranks:
-        ranks.from_first(lambda: files.check(folder, config, resume=resume))
+    with join_ranks() as ranks, ExitStack() as stack:
+        ranks.from_first(partial(_enter, stack, folder, config, resume))
         trainee, train, validation = ranks.together(lambda: _built(ranks, config))
         # processes on machines of other kinds too begin with the same weights, bit for bit
         trainee.module.load_state_dict(ranks.from_first(trainee.module.state_dict))
@@ -88,6 +88,11 @@ def run_training(
         finally:
             if record is not None:
                 record.close()
+
+
+def _enter(stack: ExitStack, folder: Path, config: TrainConfig, resume: bool) -> None:
+    """Keep other runs from the folder until the stack is closed."""
+    stack.enter_context(files.running(folder, config, resume=resume))
 
 
 def _built(ranks: Ranks, config: TrainConfig) -> Prepared:

@@ -1,9 +1,10 @@
 """A trained sequence model for use: predictions from tracks, and its folder with a config and weights."""
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 import torch
@@ -11,9 +12,10 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
+from ballfg.files.moving import settle
 from ballfg.files.strict_yaml import YamlError, read_yaml
 from ballfg.files.whole_folder import whole_folder
 from ballfg.learning.sequence.architecture import SequenceArchitecture
@@ -41,6 +43,8 @@ class FolderConfig(BaseModel):
     """Labels that are launcher settings."""
     categories: dict[str, Annotated[tuple[str, ...], Field(strict=False)]]
     """Values of those that are text."""
+    digest: str | None = None
+    """SHA-256 of the weights; null in folders of earlier versions."""
 
 
 @dataclass(eq=False)
@@ -109,18 +113,24 @@ class SequencePredictor:
         folder = Path(folder)
         if folder.exists():
             raise ValueError(f"folder must be new; {folder} exists. Choose another name or delete it.")
-        config = {
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        self.replace(folder)
+
+    def replace(self, folder: Path) -> None:
+        """Write as `save`, in the place of an earlier model of that folder; its parent must exist."""
+        config: dict[str, Any] = {
             "kind": self.architecture.kind,
             "width": self.architecture.width,
             "points": self.model.points,
             "labels": list(self.launcher.labels),
             "categories": {label: list(values) for label, values in self.launcher.categories.items()},
         }
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        with whole_folder(folder) as part:
+        weights = save({name: value.contiguous() for name, value in self.model.state_dict().items()})
+        config["digest"] = hashlib.sha256(weights).hexdigest()
+        with whole_folder(folder, earlier=(CONFIG, WEIGHTS)) as part:
             text = yaml.safe_dump(config, sort_keys=False, allow_unicode=True)
             (part / CONFIG).write_text(text, encoding="utf-8")
-            save_file({name: value.contiguous() for name, value in self.model.state_dict().items()}, part / WEIGHTS)
+            (part / WEIGHTS).write_bytes(weights)
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
@@ -142,12 +152,18 @@ class SequencePredictor:
                 f"weights in {folder} must be those of the model in its config; '{wrong[0]}' is "
                 f"{got.get(wrong[0], 'missing')}, not {expected.get(wrong[0], 'part of it')}. Save the model again."
             )
+        if config.digest not in (None, hashlib.sha256((Path(folder) / WEIGHTS).read_bytes()).hexdigest()):
+            raise ValueError(
+                f"{Path(folder) / WEIGHTS}: must be as it was saved, with the digest that {CONFIG} states; it is "
+                "damaged or was changed. Copy it again, or save the model again."
+            )
         model.load_state_dict(weights)
         return cls(architecture, launcher, model)
 
 
 def _read(folder: Path) -> tuple[FolderConfig, dict[str, Tensor]]:
     """Config and weights of a folder."""
+    settle(folder)
     for name in (CONFIG, WEIGHTS):
         if not (folder / name).is_file():
             raise FileNotFoundError(f"{folder} must hold {CONFIG} and {WEIGHTS}; {name} is missing. Save it again.")

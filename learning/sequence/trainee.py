@@ -112,7 +112,7 @@ class SequenceTrainee(Trainee):
     def export(self, folder: Path) -> Path:
         """Write the predictor. Returns: its folder, for `SequencePredictor.load`."""
         path = folder / FOLDER
-        self.predictor().save(path)
+        self.predictor().replace(path)  # that of a run that was stopped while it ended
         return path
 
     def _batch_loss(self, tracks: Sequence[int], losses: Tensor, positions: Tensor, batch: Batch) -> BatchLoss:

@@ -156,7 +156,7 @@ def _placed(camera: Camera, lens: Intrinsics | None, marked: TableFile | None) -
 
 
 def _write(out: Path, found: list[Calibration], shown: Mapping[str, Image], marked: TableFile | None) -> None:
-    from ballfg.files.whole_file import whole_file, write_text
+    from ballfg.files.whole_folder import whole_folder
     from ballfg.vision.calibration.report import calibration_picture, content, summary
     from ballfg.vision.calibration.table_points import TABLE_HEIGHT
     from ballfg.vision.camera_file import write_cameras, write_opencv
@@ -164,11 +164,11 @@ def _write(out: Path, found: list[Calibration], shown: Mapping[str, Image], mark
     figure = calibration_picture(found, shown, TABLE_HEIGHT if marked is None else marked.table_height)
     report, picture = (out.with_name(f"{out.stem}_calibration{ending}") for ending in (".json", ".png"))
     text = json.dumps([content(one) for one in found], indent=2, allow_nan=False, ensure_ascii=False)
-    write_text(report, text + "\n")
-    with whole_file(picture) as temporary:
-        figure.savefig(temporary)
     write = write_cameras if out.suffix.lower() in OURS else write_opencv
-    write(out, [one.camera for one in found], posed=marked is not None)
+    with whole_folder(out.absolute().parent) as stage:  # the three appear together: they tell of the same calibration
+        (stage / report.name).write_text(text + "\n", encoding="utf-8")
+        figure.savefig(stage / picture.name)
+        write(stage / out.name, [one.camera for one in found], posed=marked is not None)
     print(*(line for one in found for line in summary(one)), sep="\n")
     print(f"{out}: {len(found)} camera{'s' if len(found) > 1 else ''}{'' if marked else ', lenses only'}")
     print(f"how well they are known: {report}, {picture}")

@@ -44,30 +44,32 @@ def diagnose(
     from ballfg.diagnosis.report.origin import Origin
     from ballfg.diagnosis.report.report import MODEL, PAGE, REPORT, check_report_folder, room_file, write_report
     from ballfg.dynamics import AnalyticModel
+    from ballfg.files.whole_folder import reserved
 
     if any(out.resolve() == dataset.resolve() for dataset in datasets):
         raise ValueError(f"out must not be the dataset itself; got {out}. Choose another folder.")
     if model is not None and model.resolve() == out.resolve() / MODEL:
         raise ValueError(f"out must not hold the model itself; {model} would be replaced. Choose another folder.")
-    check_report_folder(out, force=force)
-    inputs, *others = [open_inputs(dataset, model, effects_file) for dataset in datasets]
-    if not isinstance(inputs.model, AnalyticModel):
-        raise ValueError(
-            f"--model must be analytic: a diagnosis adds physical effects to it; {model} is a learned one. "
-            "Give the analytic model that you believe in."
-        )
-    rooms: dict[str, AnalyticModel] = {}
-    with workers(cluster, address, jobs) as processes:
-        if others:
-            together = [inputs.dataset, *(other.dataset for other in others)]
-            joint = diagnose_jointly(together, inputs.model, jobs=processes, watch=announce)
-            diagnosis, rooms = joint.whole, joint.rooms
-        else:
-            diagnosis = find(inputs.dataset, inputs.model, jobs=processes, watch=announce)
-    typed = _typed(datasets, model, effects_file, out)
-    models = tuple(map(room_file, rooms)) or (MODEL,)
-    origin = Origin(typed, tuple(map(str, datasets)), "" if model is None else str(model), str(out), models)
-    write_report(diagnosis, out, rooms, origin)
+    with reserved(out):  # until the report is there: a diagnosis takes minutes
+        check_report_folder(out, force=force)
+        inputs, *others = [open_inputs(dataset, model, effects_file) for dataset in datasets]
+        if not isinstance(inputs.model, AnalyticModel):
+            raise ValueError(
+                f"--model must be analytic: a diagnosis adds physical effects to it; {model} is a learned one. "
+                "Give the analytic model that you believe in."
+            )
+        rooms: dict[str, AnalyticModel] = {}
+        with workers(cluster, address, jobs) as processes:
+            if others:
+                together = [inputs.dataset, *(other.dataset for other in others)]
+                joint = diagnose_jointly(together, inputs.model, jobs=processes, watch=announce)
+                diagnosis, rooms = joint.whole, joint.rooms
+            else:
+                diagnosis = find(inputs.dataset, inputs.model, jobs=processes, watch=announce)
+        typed = _typed(datasets, model, effects_file, out)
+        models = tuple(map(room_file, rooms)) or (MODEL,)
+        origin = Origin(typed, tuple(map(str, datasets)), "" if model is None else str(model), str(out), models)
+        write_report(diagnosis, out, rooms, origin)
     print(*_summary(diagnosis), sep="\n")
     if rooms:
         print("", *diagnosis.remarks[: len(rooms) + 2], sep="\n")

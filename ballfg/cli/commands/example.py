@@ -40,21 +40,21 @@ def example(
     Example: ballfg example --out example
     """
     from ballfg import simulation
-    from ballfg.files.whole_file import write_text
-    from ballfg.files.whole_folder import check_folder, check_replaceable
-    from ballfg.simulation.writing import TRUTH_FILE
+    from ballfg.files.whole_folder import check_replaceable, whole_folder
+    from ballfg.simulation.writing import TRUTH_FILE, simulation_files
 
     plain = simulation.SimulationConfig(tracks=tracks, seed=seed)
     windy = replace(plain, seed=seed + 1, undeclared=simulation.parse_effects([WIND]))
     named = ((PLAIN, plain), (WINDY, windy))
-    if out.exists():
-        for name, _ in named:
-            check_replaceable(out / name, mark=TRUTH_FILE, what="a simulated dataset", force=force)
-    check_folder(out)
-    out.mkdir(exist_ok=True)
-    for name, config in named:
-        simulation.write_simulation(out / name, config, force=force, watch=progress)
-    write_text(out / CAPTURE, _capture(replace(plain, tracks=min(tracks, 12), seed=seed + 2)))
+    earlier = [f"{name}/{file}" for name, _ in named for file in simulation_files()]
+    with whole_folder(out, earlier=earlier, merged=(PLAIN, WINDY)) as stage:
+        if out.exists():
+            for name, _ in named:
+                check_replaceable(out / name, mark=TRUTH_FILE, what="a simulated dataset", force=force)
+        for name, config in named:
+            simulation.write_simulation(stage / name, config, watch=progress)
+        capture = _capture(replace(plain, tracks=min(tracks, 12), seed=seed + 2))
+        (stage / CAPTURE).write_text(capture, encoding="utf-8")
     print(f"{out / PLAIN}: {tracks} simulated table-tennis shots with bounces, truth.csv beside them")
     print(f"{out / WINDY}: {tracks} more, with an effect that their model.yaml does not declare")
     print(f"{out / CAPTURE}: a recording as another program writes it: one file, mm and ms, y up, decimal commas")

@@ -69,7 +69,7 @@ def track(
     # FFmpeg and OpenCV print what they think of a file, unless they are told not to before OpenCV is loaded.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    from ballfg.files.whole_folder import staging
+    from ballfg.files.whole_folder import reserved
     from ballfg.simulation.balls import ball_kind
     from ballfg.tracks import DatasetInfo
     from ballfg.vision.camera_file import read_cameras
@@ -79,32 +79,33 @@ def track(
 
     kind = ball_kind(ball)
     height = kind.surfaces.table_height if table_height is None else table_height
-    check_result_folder(out, [cameras, *(Path(text) for text in recordings)], force=force)
-    with staging(out):  # what cannot be written to is better known before the search
-        pass
-    files = " ".join(Path(text).name for text in recordings)
-    info = DatasetInfo(name or out.resolve().name, height, kind.ball, source=f"ballfg track {files}")
-    rig = others(read_cameras(cameras), without or ())
-    streams: Streams | None = None
-    if len(recordings) == 1 and recordings[0].lower().endswith(".csv"):
-        _refuse(stamps=stamps, colour=colour, detector=detector)
-        tracking = _from_table(Path(recordings[0]), rig, without or ())
-    else:
-        tracking, streams = _from_videos(recordings, rig, stamps or (), colour, detector, jobs, without or ())
-    if time_offsets and tracking.balls:
-        tracking = _on_one_clock(tracking, kind.model, replace(kind.surfaces, table_height=height))
-    print_notes(blind_cameras(tracking))
-    if (doubt := disagreement(tracking)) is not None:
-        print_notes([doubt])
-    info = replace(info, rate=tracking.rate)
-    written = write_tracking(
-        out, tracking, info, table=kind.surfaces.extent, streams=streams, overlay=overlay, watch=progress
-    )
-    if not tracking.balls:
-        raise ValueError(f"{no_ball(tracking)} {out} holds an empty dataset; look at {', '.join(written[4:])} there.")
-    points = sum(len(ball.times) for ball in tracking.balls)
-    print(f"{out}: {len(tracking.balls)} tracks of {points} points; wrote {', '.join(written)}")
-    print(*summary(tracking), sep="\n")
+    with reserved(out):  # what cannot be written to is better known before the search
+        check_result_folder(out, [cameras, *(Path(text) for text in recordings)], force=force)
+        files = " ".join(Path(text).name for text in recordings)
+        info = DatasetInfo(name or out.resolve().name, height, kind.ball, source=f"ballfg track {files}")
+        rig = others(read_cameras(cameras), without or ())
+        streams: Streams | None = None
+        if len(recordings) == 1 and recordings[0].lower().endswith(".csv"):
+            _refuse(stamps=stamps, colour=colour, detector=detector)
+            tracking = _from_table(Path(recordings[0]), rig, without or ())
+        else:
+            tracking, streams = _from_videos(recordings, rig, stamps or (), colour, detector, jobs, without or ())
+        if time_offsets and tracking.balls:
+            tracking = _on_one_clock(tracking, kind.model, replace(kind.surfaces, table_height=height))
+        print_notes(blind_cameras(tracking))
+        if (doubt := disagreement(tracking)) is not None:
+            print_notes([doubt])
+        info = replace(info, rate=tracking.rate)
+        written = write_tracking(
+            out, tracking, info, table=kind.surfaces.extent, streams=streams, overlay=overlay, watch=progress
+        )
+        if not tracking.balls:
+            raise ValueError(
+                f"{no_ball(tracking)} {out} holds an empty dataset; look at {', '.join(written[4:])} there."
+            )
+        points = sum(len(ball.times) for ball in tracking.balls)
+        print(f"{out}: {len(tracking.balls)} tracks of {points} points; wrote {', '.join(written)}")
+        print(*summary(tracking), sep="\n")
 
 
 def _refuse(**options: object) -> None:

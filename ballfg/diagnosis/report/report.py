@@ -1,10 +1,11 @@
 """A diagnosis as files: `report.json` for programs, `report.html` for people, `model.yaml` for other commands."""
 
+import glob
 import json
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,7 +19,8 @@ from ballfg.dynamics import BallModel, save_model
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 
 REPORT: Final = "report.json"
-"""Written last, so that the other files are complete where it exists."""
+PROGRAM: Final = "ballfg diagnose"
+"""Stands in `report.json` under `program`: other commands write files of that name too."""
 PAGE: Final = "report.html"
 MODEL: Final = "model.yaml"
 
@@ -36,8 +38,8 @@ def write_report(
 ) -> None:
     """Write `report.json`, `report.html` and `model.yaml` into a folder.
 
-    The files are made in a folder beside it and moved at the end. A new folder thus appears at once; an earlier report
-    is replaced file by file. Other files of the folder stay.
+    They appear together. An earlier report is replaced: its files are those that its `report.json` lists. Other files
+    of the folder stay.
 
     Args:
         diagnosis: to report.
@@ -45,20 +47,22 @@ def write_report(
         rooms: models of single rooms, by name, written beside it.
         origin: the command and the files that the diagnosis comes from, for the page.
     Raises:
-        ValueError: if `out` is a file or holds other things than a report.
+        ValueError: if `out` is a file, holds other things than a report, or a file that another program wrote and that
+            would be replaced.
         FileNotFoundError: if its parent does not exist.
     """
-    check_report_folder(Path(out))
     folder = Path(out).resolve()
-    stem = Path(MODEL).stem
-    with whole_folder(
-        folder, earlier=(f"{stem}.learned-*", f"{stem}.*.learned-*", f"{stem}.*.yaml"), last=REPORT
-    ) as made:
+    check_report_folder(folder)
+    earlier = earlier_files(folder / REPORT) or ()
+    with whole_folder(folder, earlier=[glob.escape(name) for name in earlier], last=REPORT) as made:
         save_model(diagnosis.model, made / MODEL)
         for name, model in (rooms or {}).items():
             save_model(model, made / room_file(name))
         (made / PAGE).write_text(page(diagnosis, origin), encoding="utf-8")
-        text = json.dumps(content(diagnosis), indent=2, allow_nan=False, ensure_ascii=False)
+        files = sorted({REPORT, *(entry.name for entry in made.iterdir())})
+        _check_own(folder, files)
+        marked = content(diagnosis) | {"program": PROGRAM, "files": files}
+        text = json.dumps(marked, indent=2, allow_nan=False, ensure_ascii=False)
         (made / REPORT).write_text(text + "\n", encoding="utf-8")
 
 
@@ -70,7 +74,36 @@ def check_report_folder(folder: Path, *, force: bool = True) -> None:
         ValueError: if it is a file or a folder with other content than an earlier report, or with one and no force.
         FileNotFoundError: if its parent does not exist.
     """
-    check_replaceable(folder, mark=REPORT, what="an earlier report", force=force)
+    check_replaceable(
+        folder,
+        mark=REPORT,
+        what="an earlier report",
+        force=force,
+        is_mark=lambda path: earlier_files(path) is not None,
+    )
+    _check_own(folder, (REPORT, PAGE, MODEL))
+
+
+def earlier_files(path: Path) -> list[str] | None:
+    """Names of the files that an earlier diagnosis wrote; None where `report.json` is missing or of no diagnosis."""
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError, ValueError):
+        return None
+    if not isinstance(found, dict) or found.get("program") != PROGRAM or not isinstance(found.get("files"), list):
+        return None
+    return [str(name) for name in found["files"]]
+
+
+def _check_own(folder: Path, names: Iterable[str]) -> None:
+    """Refuses to replace a file that no diagnosis wrote. Raises: ValueError."""
+    own = earlier_files(folder / REPORT) or ()
+    for name in names:
+        if name not in own and (folder / name).exists():
+            raise ValueError(
+                f"out must not hold files of other programs that would be replaced; {folder / name} is none of the "
+                "earlier report. Move it away, or choose another folder."
+            )
 
 
 def content(diagnosis: Diagnosis) -> dict[str, Any]:

@@ -140,13 +140,13 @@ def _note_path(about: str) -> Path:
 @lru_cache(maxsize=1)
 def cache_folder() -> Path:
     """The folder of compiled functions: `BALLFG_CACHE`, else the user's cache, else a temporary one."""
-    base = os.environ.get("BALLFG_CACHE") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    folder = Path(base) / "ballfg"
     try:
+        base = os.environ.get("BALLFG_CACHE") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        folder = Path(base) / "ballfg"
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-    except OSError:
+    except (OSError, RuntimeError):  # RuntimeError: the user has no home
         folder = Path(tempfile.mkdtemp(prefix="ballfg-"))
     return folder
 

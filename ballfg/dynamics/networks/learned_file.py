@@ -5,6 +5,7 @@ saving again never changes one that a file names.
 """
 
 import hashlib
+import re
 import shutil
 from pathlib import Path
 from typing import Annotated, Any
@@ -76,7 +77,7 @@ def write_learned(model: BallModel, parent: Path, stem: str) -> str:
     """
     config = yaml.safe_dump(_config(model).model_dump(mode="json"), sort_keys=False, allow_unicode=True).encode()
     weights = safetensors.torch.save({name: t.detach().contiguous() for name, t in _tensors(model).items()})
-    folder = parent / f"{stem}.learned-{hashlib.sha256(config + weights).hexdigest()[:12]}"
+    folder = parent / f"{stem}.learned-{_digest(config, weights)}"
     if not folder.exists():
         with whole_folder(folder) as part:
             (part / CONFIG).write_bytes(config)
@@ -97,7 +98,8 @@ def read_learned(folder: Path, analytic: AnalyticModel) -> BallModel:
     Args: folder: written by `write_learned`.  analytic: model of the effects; the base of a residual architecture.
     Raises:
         FileNotFoundError: if the folder or one of its files is missing.
-        ValueError: if a file is damaged, the config unknown, or weights have other names, shapes or types.
+        ValueError: if a file is damaged or is not the one that was saved, the config unknown, or weights have other
+            names, shapes or types.
     """
     for path in (folder / CONFIG, folder / WEIGHTS):
         if not path.is_file():
@@ -109,7 +111,24 @@ def read_learned(folder: Path, analytic: AnalyticModel) -> BallModel:
     with torch.no_grad():
         for name, tensor in expected.items():
             tensor.copy_(tensors[name])
+    _check_digest(folder)  # last: what is wrong with a file says more than that it was changed
     return model
+
+
+def _digest(config: bytes, weights: bytes) -> str:
+    return hashlib.sha256(config + weights).hexdigest()[:12]
+
+
+def _check_digest(folder: Path) -> None:
+    """Refuses files that are not those that were saved. A folder that somebody has named otherwise has no digest."""
+    named = re.search(r"\.learned-([0-9a-f]{12})$", folder.name)
+    found = _digest((folder / CONFIG).read_bytes(), (folder / WEIGHTS).read_bytes())
+    if named is not None and named[1] != found:
+        raise ValueError(
+            f"{folder}: {CONFIG} and {WEIGHTS} must be as they were saved, with the digest {named[1]} that the name of "
+            f"the folder states; theirs is {found}: a file is damaged or was changed. Copy the folder again, or train "
+            "again."
+        )
 
 
 def _config(model: BallModel) -> _Config:

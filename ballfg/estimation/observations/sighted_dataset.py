@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from ballfg.estimation.observations.sightings import NeverSeenByTwoError, sighted_track
+from ballfg.files.moving import settle
 from ballfg.tracks.dataset import TrackFolder
 from ballfg.tracks.detections_file import DETECTIONS_FILE, read_sightings
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, read_info
@@ -89,6 +90,7 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
         ValueError: the content breaks a rule, or there is no ball in it; the message names file, line and remedy.
     """
     path = Path(folder)
+    settle(path)
     for name in (INFO_FILE, CAMERAS_FILE, DETECTIONS_FILE):
         if not (path / name).is_file():
             raise FileNotFoundError(

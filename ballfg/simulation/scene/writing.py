@@ -67,6 +67,7 @@ def write_scene(
     scene = path / SCENE_FILE
     earlier = [glob.escape(name) for name in read_yaml(scene)["files"]] if scene.is_file() else []
     with whole_folder(path, earlier=earlier, last=SCENE_FILE) as stage:
+        check_scene_folder(path, force=force)
         every_image = itertools.chain.from_iterable(map(recording.images, range(len(recording.cameras))))
         drawn = watch(every_image, recording.image_count, "frames drawn")
         for number, camera in enumerate(recording.cameras):

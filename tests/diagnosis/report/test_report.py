@@ -156,6 +156,9 @@ def with_learned_fallback() -> Diagnosis:
     return replace(unexplained(), model=learned, unexplained=replace(left, fallback=fallback))
 
 
+EARLIER = '{"program": "ballfg diagnose", "files": ["report.json"]}'
+
+
 @pytest.mark.parametrize("there", [False, True])
 def test_a_failure_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, there: bool) -> None:
     out = tmp_path / "diagnosis"
@@ -165,12 +168,12 @@ def test_a_failure_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.Mon
 
     if there:
         out.mkdir()
-        (out / "report.json").write_text("earlier")
+        (out / "report.json").write_text(EARLIER)
     monkeypatch.setattr(report, "page", fail)
     with pytest.raises(KeyboardInterrupt):
         write_report(silent(), out)
     left = {str(path.relative_to(tmp_path)): path.read_text() for path in tmp_path.rglob("*") if path.is_file()}
-    assert left == ({"diagnosis/report.json": "earlier"} if there else {})
+    assert left == ({"diagnosis/report.json": EARLIER} if there else {})
 
 
 @pytest.mark.usefixtures("no_page")
@@ -185,6 +188,24 @@ def test_folders_that_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match=r"out must be in an existing folder; .*nowhere is none"):
         write_report(silent(), tmp_path / "nowhere" / "diagnosis")
     assert (tmp_path / "work" / "model.yaml").read_text() == "mine"
+
+
+@pytest.mark.usefixtures("no_page")
+def test_files_of_other_programs_are_not_replaced(tmp_path: Path) -> None:
+    run = tmp_path / "calibration"  # a calibration writes a report.json and a model.yaml too
+    run.mkdir()
+    (run / "report.json").write_text('{"verdict": "better"}')
+    (run / "model.yaml").write_text("calibrated")
+    with pytest.raises(ValueError, match=r"hold an earlier report; .*calibration holds other files"):
+        write_report(silent(), run)
+    assert (run / "model.yaml").read_text() == "calibrated"
+    out = tmp_path / "diagnosis"
+    write_report(silent(), out)
+    (out / "model.level.yaml").write_text("mine")
+    with pytest.raises(ValueError, match=r"model\.level\.yaml is none of the earlier report\. Move it away"):
+        write_report(silent(), out, {"level": nominal_model()})
+    write_report(silent(), out)
+    assert (out / "model.level.yaml").read_text() == "mine"
 
 
 @pytest.mark.usefixtures("no_page")

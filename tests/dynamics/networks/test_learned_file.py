@@ -169,6 +169,17 @@ def test_missing_parts(saved):
         load_model(path)
 
 
+@pytest.mark.parametrize("name", ["config.yaml", "weights.safetensors"])
+def test_a_flipped_bit_is_found(saved, name):
+    path, folder = saved
+    content = bytearray((folder / name).read_bytes())
+    place = content.index(b"0.") + 2 if name == "config.yaml" else len(content) - 8  # lowest digits of a number
+    content[place] ^= 1
+    (folder / name).write_bytes(content)
+    with pytest.raises(ValueError, match=r"must be as they were saved, .* [0-9a-f]{12} .* Copy the folder again"):
+        load_model(path)
+
+
 def change_config(folder, keys, value):
     content = yaml.safe_load((folder / "config.yaml").read_text(encoding="utf-8"))
     at = content

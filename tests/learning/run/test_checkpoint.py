@@ -38,8 +38,10 @@ def test_a_checkpoint_reads_back_bit_for_bit_and_the_next_takes_its_place(tmp_pa
     assert os.listdir(tmp_path) == ["checkpoint"]
 
 
-@pytest.mark.parametrize("call", [1, 2])
-def test_a_crash_leaves_the_old_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: int) -> None:
+@pytest.mark.parametrize("call", [1, 2, 3])
+def test_a_crash_leaves_the_old_or_the_new_checkpoint(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: int
+) -> None:
     write_checkpoint(tmp_path, made(1))
     real, calls = os.replace, []
 
@@ -53,7 +55,7 @@ def test_a_crash_leaves_the_old_checkpoint(tmp_path: Path, monkeypatch: pytest.M
         patch.setattr("os.replace", replace)
         with pytest.raises(OSError, match="the power went"):
             write_checkpoint(tmp_path, made(2))
-    assert same(read_checkpoint(tmp_path), made(1))
+    assert same(read_checkpoint(tmp_path), made(1 if call == 1 else 2))  # the first call puts the plan in its place
     write_checkpoint(tmp_path, made(3))
     assert same(read_checkpoint(tmp_path), made(3))
     assert os.listdir(tmp_path) == ["checkpoint"]
@@ -81,4 +83,14 @@ def test_a_damaged_checkpoint_is_refused(tmp_path: Path, name: str, content: byt
     else:
         (tmp_path / "checkpoint" / name).write_bytes(content)
     with pytest.raises(ValueError, match=r"not a whole checkpoint \(.+\)\. Start a new run\."):
+        read_checkpoint(tmp_path)
+
+
+def test_a_flipped_bit_is_found(tmp_path: Path) -> None:
+    write_checkpoint(tmp_path, made(1))
+    weights = tmp_path / "checkpoint" / "weights.safetensors"
+    content = bytearray(weights.read_bytes())
+    content[-8] ^= 1  # the lowest bit of a number
+    weights.write_bytes(content)
+    with pytest.raises(ValueError, match=r"tensors are not those that state\.yaml states: a file is damaged\)"):
         read_checkpoint(tmp_path)

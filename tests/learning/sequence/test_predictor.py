@@ -106,6 +106,9 @@ def test_missing_and_damaged_files_are_named(tracks: list[Track], tmp_path: Path
     save_file(tensors | {"extra": torch.zeros(1)}, weights)
     with pytest.raises(ValueError, match=r"'extra' is .*, not part of it"):
         SequencePredictor.load(folder)
+    save_file(tensors | {"bridge.bias": tensors["bridge.bias"] + 1e-9}, weights)
+    with pytest.raises(ValueError, match=r"must be as it was saved, with the digest that config.yaml states"):
+        SequencePredictor.load(folder)
     weights.write_bytes(b"not numbers")
     with pytest.raises(ValueError, match=r"weights.safetensors: not readable as safetensors"):
         SequencePredictor.load(folder)
