@@ -414,10 +414,14 @@ def test_numbers_out_of_this_world_are_refused(flight):
 
 
 def test_a_filter_that_overflows_fails_with_a_status(flight):
-    """A label of that spin leaves no number in the first step."""
+    """A drag of that size leaves no number after the second sample."""
     _, track = flight
-    result = run(replace(track, labels=dict.fromkeys(SPIN_LABELS, 1e200)))
+    model = nominal_model()
+    with torch.no_grad():
+        dict(model.named_parameters())["flight.drag.k"].fill_(1e200)
+    result = ExtendedKalmanFilter(model, TABLE, PLAIN).estimate(track)
     assert result.status is Status.FAILED
+    assert (np.linalg.eigvalsh(result.covariances)[:, 0] > 0).all()
     np.testing.assert_array_equal(result.states[:, POSITION], track.positions)
 
 
