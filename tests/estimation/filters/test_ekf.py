@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -24,7 +22,7 @@ from ballfg.estimation.settings import Settings
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.state import POSITION, STATE_DIM, VELOCITY
-from ballfg.tracks import SPIN_LABELS, Track, read_dataset
+from ballfg.tracks import Track, read_dataset
 from tests.places import DATA
 
 LOW = Surfaces(table_height=-100.0)
