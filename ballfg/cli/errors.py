@@ -20,7 +20,8 @@ def guarded(command: Callable[[], object]) -> int:
     """Runs a command and turns what a user can mend into one line `ballfg: error: ...` and an exit status.
 
     Args: command: takes no arguments; may raise.
-    Returns: 0, 2 for bad input, 3 where some tracks could not be estimated, 130 after Ctrl-C, or the status that the command returned.
+    Returns: 0, 2 for bad input, 3 where some tracks could not be estimated, 130 after Ctrl-C, or the status that the
+        command returned.
     """
     try:
         result = command()

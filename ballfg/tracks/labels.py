@@ -102,9 +102,9 @@ def _column(path: Path, name: str, cells: list[str], lines: list[int]) -> list[L
                 f"{path}, line {line}, column {name!r}: must be a number; got {cell!r}. "
                 "Correct it, or leave the cell empty if it is unknown."
             )
-    values = [float(cell) if cell.strip() else None for cell in cells]
+    values: list[Label | None] = [float(cell) if cell.strip() else None for cell in cells]
     for value, line in zip(values, lines, strict=True):
-        if name in SPIN_LABELS and value is not None and abs(value) > FASTEST_SPIN:
+        if name in SPIN_LABELS and isinstance(value, float) and abs(value) > FASTEST_SPIN:
             raise ValueError(
                 f"{path}, line {line}, column {name!r}: must be within {FASTEST_SPIN:g} rad/s, as the spin of every "
                 f"ball; got {value:g}. Correct it, or leave the cell empty if it is unknown."
