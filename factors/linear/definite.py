@@ -7,6 +7,7 @@ that is so already stays as it is.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 
@@ -28,7 +29,7 @@ def definite(covariance: Array) -> Array:
     return np.stack([_shrunk(one) for one in flat]).reshape(symmetric.shape)
 
 
-def variances_positive(covariance: Array) -> Array:
+def variances_positive(covariance: Array) -> NDArray[np.bool_]:
     """(...) bool: whether a covariance (..., d, d) has finite numbers and positive variances."""
     finite = np.isfinite(covariance).all(axis=(-1, -2))
     with np.errstate(invalid="ignore"):
