@@ -23,7 +23,7 @@ class BallGraph:
     batches: tuple[FactorBatch, ...]
 
     def linearize(self, values: Values) -> list[Rows]:
-        """All factors at a point, one call for each batch; not finite where a trial step left all that a ball can do."""
+        """All factors at a point, one call a batch; not finite where a trial step left all that a ball can do."""
         with np.errstate(over="ignore", invalid="ignore"):
             return [batch.linearize(values) for batch in self.batches if len(batch)]
 
