@@ -88,8 +88,9 @@ class Rows:
     loss: Loss
 
     def error(self) -> float:
-        """Sum of the losses."""
-        return float(self.loss.value(np.linalg.norm(self.residual, axis=-1)).sum())
+        """Sum of the losses; infinite where a residual is too large to be squared, as a trial step may make it."""
+        with np.errstate(over="ignore"):
+            return float(self.loss.value(np.linalg.norm(self.residual, axis=-1)).sum())
 
 
 @dataclass(frozen=True)

@@ -23,8 +23,9 @@ class BallGraph:
     batches: tuple[FactorBatch, ...]
 
     def linearize(self, values: Values) -> list[Rows]:
-        """All factors at a point, one call for each batch."""
-        return [batch.linearize(values) for batch in self.batches if len(batch)]
+        """All factors at a point, one call a batch; not finite where a trial step left all that a ball can do."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return [batch.linearize(values) for batch in self.batches if len(batch)]
 
     def error(self, values: Values) -> float:
         """The objective: sum of all losses; half the squared whitened residuals where none is robust."""

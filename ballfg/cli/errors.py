@@ -8,6 +8,8 @@ import typer
 
 BAD_INPUT = 2
 """Exit status for input that cannot be used."""
+NOT_ESTIMATED = 3
+"""Exit status where everything was written, but some tracks could not be estimated."""
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells have it."""
 
@@ -21,7 +23,8 @@ def guarded(command: Callable[[], object]) -> int:
     """Runs a command and turns what a user can mend into one line `ballfg: error: ...` and an exit status.
 
     Args: command: takes no arguments; may raise.
-    Returns: 0, 2 for bad input, 130 after Ctrl-C, or the status that the command returned.
+    Returns: 0, 2 for bad input, 3 where some tracks could not be estimated, 130 after Ctrl-C, or the status that the
+        command returned.
     """
     try:
         result = command()

@@ -14,17 +14,20 @@ from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
 
 import typer
 
+from ballfg.cli.errors import NOT_ESTIMATED
 from ballfg.machine import usable_cores
 from ballfg.progress import progress
 
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel
     from ballfg.dynamics.surfaces import Surfaces
-    from ballfg.estimation import Estimator
+    from ballfg.estimation import Estimator, Status
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.tracks import Dataset
 
 
+MOST_FAILURES = 10
+"""Tracks that could not be estimated which are named, before the others are counted."""
 MOST_DOUBTS = 3
 """Tracks whose doubts are printed, before the others are counted."""
 
@@ -242,18 +245,24 @@ class Outcome:
     statuses: Counter[str] = field(default_factory=Counter)
     doubts: list[str] = field(default_factory=list)
     doubtful: int = 0
+    failed: dict[str, str] = field(default_factory=dict)
+    failures: int = 0
     outside: int = 0
     far: int = 0
     shares: float = 0.0
 
-    def add(self, name: str, status: str, notes: Iterable[str], outside: float | None) -> None:
+    def add(self, name: str, status: Status, notes: Iterable[str], outside: float | None) -> None:
         """Counts a track.
 
         Args:
             name: of the track.  status: how it ended.  notes: doubts about its frame.
             outside: share of it outside of a network's training data, 0 to 1; None without a network.
         """
-        self.statuses[status] += 1
+        self.statuses[status.value] += 1
+        if status.failed:
+            self.failures += 1
+            if self.failures <= MOST_FAILURES:
+                self.failed[name] = status.value
         for note in notes:
             self.doubtful += 1
             if self.doubtful <= MOST_DOUBTS:
@@ -268,6 +277,21 @@ class Outcome:
         print_notes(self.doubts)
         if self.doubtful > MOST_DOUBTS:
             print_notes([f"the same doubts about {self.doubtful - MOST_DOUBTS} more tracks"])
+
+    def end(self) -> None:
+        """Ends a command whose output is written whole: with a table of the tracks that could not be estimated.
+
+        Raises: typer.Exit: with the status `NOT_ESTIMATED`, if there are any.
+        """
+        if not self.failures:
+            return
+        print(f"ballfg: {self.failures} of {self.statuses.total()} tracks could not be estimated:", file=sys.stderr)
+        width = max(map(len, self.failed))
+        for name, why in self.failed.items():
+            print(f"  {name.ljust(width)}  {why.split(';')[0].split('. ')[0]}", file=sys.stderr)
+        if self.failures > len(self.failed):
+            print(f"  and {self.failures - len(self.failed)} more", file=sys.stderr)
+        raise typer.Exit(NOT_ESTIMATED)
 
     def print_outside(self) -> None:
         """Prints how much of the tracks lies outside of a network's training data; nothing without a network."""

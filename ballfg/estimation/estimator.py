@@ -92,7 +92,7 @@ class Estimator(ABC):
                 f"track must be a Track; got {type(track).__name__}. Make one with Track(times, positions): (n,) s and "
                 "(n, 3) m."
             )
-        if len(track) >= LEAST_CHECKED:
+        if len(track) >= LEAST_CHECKED and not track.part:
             check_scale(f"track {track.name!r}", track.times, track.positions, track.sigmas, None)
         return track.observed(*given(factors))
 

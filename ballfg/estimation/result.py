@@ -37,6 +37,16 @@ class Status(enum.Enum):
         "the objective is not finite at the start; the states are the measured positions and the priors. Check the "
         "table height: the ball seems to be far below a surface that it bounces on"
     )
+    IMPLAUSIBLE = (
+        "no ball moves as the estimate does: some of its states were faster than 200 m/s, spun faster than 2000 rad/s, "
+        "or were no numbers; in their place stand the measured positions and the priors. Check the unit of the stamps, "
+        "and look at the track for jumps"
+    )
+
+    @property
+    def failed(self) -> bool:
+        """Whether states are not estimated: they are measured positions and priors, with wide covariances."""
+        return self in (Status.FAILED, Status.IMPLAUSIBLE)
 
 
 @dataclass(frozen=True)

@@ -90,6 +90,7 @@ class Settings:
         for name in ("position_scale", "spin_prior", "spin_label_noise", "velocity_prior"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
                 raise ValueError(f"{name} must be positive and finite; got {getattr(self, name)}")
+        self._check_widths()
         if np.shape(self.memory) != (3,) or not (np.isfinite(self.memory).all() and min(self.memory) >= 0.0):
             raise ValueError(f"memory must be three numbers in m, zero or more; got {self.memory}. Give one per axis.")
         if not (np.isfinite(self.memory_time) and self.memory_time > 0.0):
@@ -102,6 +103,14 @@ class Settings:
         for name, sigma in self.time_offsets.items():
             if not (np.isfinite(sigma) and sigma > 0):
                 raise ValueError(f"time_offsets['{name}'] must be a positive standard deviation in s; got {sigma}")
+
+    def _check_widths(self) -> None:
+        for name in ("spin_prior", "spin_label_noise", "velocity_prior"):
+            if getattr(self, name) > WIDEST_PRIOR:
+                raise ValueError(
+                    f"{name} must be at most {WIDEST_PRIOR:g}, in m/s or rad/s; got {getattr(self, name):g}. "
+                    f"{WIDEST_PRIOR:g} says nothing of a ball already."
+                )
 
     @classmethod
     def for_measured(cls, model: BallModel, **changes: Any) -> Settings:
@@ -143,8 +152,16 @@ class Settings:
         return None if self.launcher is None else self.launcher.label(track)
 
 
+WIDEST_PRIOR = 1e5
+"""m/s or rad/s, widest spread of an unknown velocity or spin."""
+
 LEAST_BIAS = 1e-6
 """m. Errors of this size are none; the linear algebra needs a number above zero."""
+
+LEAST_NOISE = 1e-6
+"""m. Nothing measures a ball to a micrometre; double precision does not hold less beside a velocity that is free."""
+MOST_NOISE = 1e4
+"""m. A sample of this noise says nothing of a ball, and of a larger one no more than that."""
 
 MEASURED = ProcessNoise(contact_tangential=0.2, contact_spin=10.0)
 """Process noise on measured tracks: what friction does in a bounce is known to some 0.2 m/s only. Friction and
@@ -159,10 +176,10 @@ def spin_start(label: SpinLabel | None, settings: Settings) -> tuple[Array, floa
 def sample_sigmas(settings: Settings, count: int, own: Array | None) -> Array:
     """(n, 3) m, the caller's to change: a track's own sigmas where it has them, else the settings', both scaled.
 
-    They are those of the white part of a position's error.
+    They are those of the white part of a position's error, within `LEAST_NOISE` and `MOST_NOISE`.
     """
     sigmas = np.broadcast_to(np.array(settings.position_noise), (count, 3)) if own is None else own
-    return settings.position_scale * sigmas
+    return np.clip(settings.position_scale * sigmas, LEAST_NOISE, MOST_NOISE)
 
 
 def stamp_covariance(settings: Settings, velocity: Array) -> Array:

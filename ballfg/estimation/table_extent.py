@@ -97,8 +97,9 @@ def _bounces(times: Array, positions: Array, contact: float, radius: float) -> A
     i = np.arange(2 * reach, len(times) - 1 - 2 * reach)
     start, fall, _ = _arcs(times, positions, (i - 2 * reach, i - reach, i), i)
     end, rise, _ = _arcs(times, positions, (i + 1, i + 1 + reach, i + 1 + 2 * reach), i)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        after = ((start - end)[:, Z] / (rise - fall)[:, Z])[:, None]  # s until both arcs are at one height
+    turn = (rise - fall)[:, Z]
+    ahead = np.divide((start - end)[:, Z], turn, out=np.full(len(i), -1.0), where=turn > 0.0)
+    after = ahead[:, None]  # s until both arcs are at one height; less than zero where the ball does not turn upwards
     place = start + after * fall - after**2 / 2 * _UPWARD_GRAVITY
     fall, rise = fall - after * _UPWARD_GRAVITY, rise - after * _UPWARD_GRAVITY
     least = math.sqrt(2 * STANDARD_GRAVITY * radius)  # m/s, of a ball that rises by a radius

@@ -142,6 +142,8 @@ def _block(
     tracks: Sequence[Track],
 ) -> list[TrackPrediction]:
     """Predictions of a block; without the model where it is that of all, which need not travel with every track."""
+    for track in tracks:
+        estimator.prepared(track)  # what is no track in m and s shows in the whole
     parts = [track.until(float(track.times[0]) + observe(track) + _tolerance(track)) for track in tracks]
     estimates = estimate_together(estimator, parts, device)
     found = list(_predict_block(estimator, propagator, estimates, list(tracks), horizon))

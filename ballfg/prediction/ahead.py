@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.factors.linear.definite import definite
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.crossing import Crossing, apex, next_contact, plane_crossing
 from ballfg.prediction.propagate import Propagator
@@ -119,7 +120,7 @@ def look_ahead(start: BallState, horizon: float, step: float = 0.01) -> Ahead:
     count = max(int(np.ceil(horizon / step - 1e-9)), 1)
     times = start.time + np.minimum(step * np.arange(1, count + 1), horizon)
     path = propagator.rollout(belief, times)
-    return Ahead(start, horizon, times, path.states[0], path.covariances[0])
+    return Ahead(start, horizon, times, path.states[0], definite(path.covariances[0]))
 
 
 def carried_by(start: BallState) -> tuple[Propagator, Belief]:

@@ -6,7 +6,7 @@ from pathlib import Path
 from ballfg.checks import did_you_mean
 from ballfg.tracks import csv_files
 from ballfg.tracks.rows import KEY
-from ballfg.tracks.track import SPIN_LABELS, Label
+from ballfg.tracks.track import FASTEST_SPIN, SPIN_LABELS, Label
 
 LABELS_FILE = "labels.csv"
 NUMERIC_LABELS = (*SPIN_LABELS, "topspin", "sidespin", "speed")
@@ -102,4 +102,11 @@ def _column(path: Path, name: str, cells: list[str], lines: list[int]) -> list[L
                 f"{path}, line {line}, column {name!r}: must be a number; got {cell!r}. "
                 "Correct it, or leave the cell empty if it is unknown."
             )
-    return [float(cell) if cell.strip() else None for cell in cells]
+    values: list[Label | None] = [float(cell) if cell.strip() else None for cell in cells]
+    for value, line in zip(values, lines, strict=True):
+        if name in SPIN_LABELS and isinstance(value, float) and abs(value) > FASTEST_SPIN:
+            raise ValueError(
+                f"{path}, line {line}, column {name!r}: must be within {FASTEST_SPIN:g} rad/s, as the spin of every "
+                f"ball; got {value:g}. Correct it, or leave the cell empty if it is unknown."
+            )
+    return values

@@ -14,6 +14,11 @@ from ballfg.checks import check_array
 
 SPIN_LABELS = ("spin_x", "spin_y", "spin_z")
 
+FASTEST_BALL = 200.0
+"""m/s. No ball is faster; a shuttlecock of 157 m/s is the record of all sports."""
+FASTEST_SPIN = 2000.0
+"""rad/s. No ball spins faster; a golf ball off a wedge reaches 1,200."""
+
 Label = float | str
 
 
@@ -61,6 +66,9 @@ class Track:
 
     rough: bool = False
     """Whether the positions were made from the observations. Events are found in them; they measure nothing anew."""
+
+    part: bool = False
+    """Whether it is a part of a longer track. Its scale was checked with the whole; a few samples do not tell it."""
 
     dataset: Any = None
     """The dataset that the track was read from: tells its ball, table and noise. It does not travel to processes."""
@@ -154,6 +162,7 @@ class Track:
             sigmas=sigmas,
             labels=labels,
             observations=tuple(observation.taken(inside) for observation in self.observations),
+            part=self.part or not inside.all(),
         )
 
     def until(self, end: float) -> Track:
@@ -204,6 +213,11 @@ def _checked_labels(track: str, labels: Mapping[str, Label]) -> dict[str, Label]
         if isinstance(value, str) and key not in SPIN_LABELS:
             checked[key] = value
         elif isinstance(value, int | float | np.integer | np.floating) and np.isfinite(value):
+            if key in SPIN_LABELS and abs(value) > FASTEST_SPIN:
+                raise ValueError(
+                    f"track {track!r}: label {key!r} must be within {FASTEST_SPIN:g} rad/s, as the spin of every ball; "
+                    f"got {value:g}. Correct it, or leave it out if it is unknown."
+                )
             checked[key] = float(value)
         else:
             rule = "a finite number" if key in SPIN_LABELS else "a finite number or text"

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ballfg.estimation.observations.innovation import LEAST_INFORMATION, leave_position_out, whiten_innovation
+from ballfg.estimation.observations.innovation import LEAST_INFORMATION, leave_position_out
 from ballfg.estimation.result import Estimate, Status
 from ballfg.factors.batch import Values
+from ballfg.factors.linear.definite import whitened as whitened_by
 from ballfg.factors.loss import Loss
 from ballfg.factors.position import PositionFactors
 
@@ -34,7 +35,7 @@ def test_whitened_innovations_have_unit_covariance() -> None:
     rng = np.random.default_rng(0)
     covariance = np.tile(spd(rng, 1, 3), (20_000, 1, 1))
     innovation = rng.multivariate_normal(np.zeros(3), covariance[0], 20_000)
-    whitened = whiten_innovation(innovation, covariance)
+    whitened = whitened_by(innovation, covariance)
     distance = np.einsum("ni,nij,nj->n", innovation, np.linalg.inv(covariance), innovation)
     np.testing.assert_allclose((whitened**2).sum(axis=1), distance, rtol=1e-9)
     np.testing.assert_allclose(np.cov(whitened.T), np.eye(3), atol=0.03)
@@ -56,7 +57,7 @@ def test_leave_one_out_takes_the_sample_back_out(loss) -> None:
     rows = kind.linearize(Values(states, np.zeros(0)))
     core = np.linalg.norm(rows.residual, axis=1) < 2.0  # where Huber's loss is the squared one
     assert core.sum() >= 2
-    expected = whiten_innovation(z - mean, C + R)
+    expected = whitened_by(z - mean, C + R)
     np.testing.assert_allclose(
         leave_position_out(states, covariances, z, R, rows)[core], expected[core], rtol=1e-4, atol=1e-5
     )

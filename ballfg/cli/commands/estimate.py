@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from ballfg.dynamics import BallModel
-    from ballfg.estimation import Estimate
+    from ballfg.estimation import Estimate, Status
 
 
 def estimate(
@@ -52,6 +52,9 @@ def estimate(
     table are then true times, with the cameras' time offsets subtracted. The other methods use roughly triangulated
     positions. A network that knows where it was trained adds the column outside: 0 there, 1 far from it.
 
+    A track that no motion explains has its measured positions with wide sigmas. Where there are such tracks, the table
+    is written whole, they are listed, and the exit status is 3.
+
     Example: ballfg estimate data/aimy --method smoother --out states.csv
     """
     from ballfg.estimation import has_positions
@@ -76,6 +79,7 @@ def estimate(
     print(f"{out}: {rows} states of {count} tracks by {method}; {hits} hits found")
     outcome.print()
     outcome.print_outside()
+    outcome.end()
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,7 @@ class _Estimated:
 
     name: str
     columns: dict[str, str | np.ndarray]
-    status: str
+    status: Status
     notes: tuple[str, ...]
     outside: float | None
     rows: int
@@ -97,7 +101,7 @@ def _estimated(model: BallModel, result: Estimate) -> _Estimated:
     share = outside_of(model, result.states)
     columns = _columns(result) | ({} if share is None else {"outside": share})
     outside = None if share is None else float(share.mean())
-    ended = result.status.value, result.notes, outside, len(result.times), len(result.hits)
+    ended = result.status, result.notes, outside, len(result.times), len(result.hits)
     return _Estimated(result.name, columns, *ended)
 
 

@@ -46,6 +46,9 @@ def predict(
     These are the positions that will be measured: measurement effects of the model file are included. A network that
     knows where it was trained adds the column outside: 0 there, 1 far from it.
 
+    Where the observed part of a track could not be estimated, its prediction is wide; such tracks are listed, and the
+    exit status is 3.
+
     Example: ballfg predict data/ballgun --observe 0.25 --out predictions.csv
     """
     from ballfg.estimation import check_observe, predict_tracks
@@ -81,6 +84,7 @@ def predict(
         if save_conformal is not None:
             scales.save(save_conformal)
             print(f"{save_conformal}: the scales, for --conformal")
+    outcome.tracks.end()
 
 
 def _conformal_scales(
@@ -167,7 +171,7 @@ class _Outcome:
         self.held += int((finite & (errors <= HALF_WIDTH * result.sigmas)).sum())
         self.held_by_own += int((finite & (errors <= HALF_WIDTH * own_sigmas)).sum())
         outside = None if result.outside is None or not len(result.outside) else float(result.outside.mean())
-        self.tracks.add(result.name, result.status.value, result.estimate.notes, outside)
+        self.tracks.add(result.name, result.status, result.estimate.notes, outside)
 
     def print(self, observe: float) -> None:
         """Prints how the tracks ended and how far off their predictions are."""

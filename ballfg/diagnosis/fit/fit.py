@@ -35,6 +35,8 @@ TOLERANCE = 1e-5
 FIRST_DAMPING, LARGEST_DAMPING = 1e-4, 1e6
 NORMAL_MEDIAN = 0.6745
 """Median of the absolute value of a standard normal number."""
+LEAST_SPREAD = 1e-3
+"""Share of the stated noise below which an axis shows none at all."""
 LEAST_SPIN_SCATTER = 1.0
 """rad/s. Unlabelled spins are taken to scatter at least so much."""
 
@@ -200,10 +202,13 @@ def _settled(result: Fit) -> Noise:
     """Noise from the residuals: their median absolute deviation, with the degrees of freedom that states took.
 
     One scale for all axes: what a model lacks often acts along one of them. With a scale for each, that axis would
-    count as noisy and hide it.
+    count as noisy and hide it. Axes without any noise were not measured (a ball that is dropped along x = y = 0): they
+    do not count.
     """
-    position = result.noise.position * _spread(result, result.whitened[result.problem.stretches.used.numpy()])
-    return replace(result.noise, position=position, spin=_spin_scatter(result))
+    whitened = result.whitened[result.problem.stretches.used.numpy()]
+    measured = [axis for axis in range(3) if _spread(result, whitened[:, axis]) > LEAST_SPREAD]
+    position = result.noise.position * _spread(result, whitened[:, measured] if measured else whitened)
+    return replace(result.noise, position=np.maximum(position, LEAST_SPREAD), spin=_spin_scatter(result))
 
 
 def noise_by_axis(result: Fit) -> Array:

@@ -13,6 +13,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from scipy import stats
 
 from ballfg.arrays import Array, Index
+from ballfg.estimation.measurement.position_noise import FLOOR
 from ballfg.tracks import Track
 
 REGULAR: Final = 0.02
@@ -181,7 +182,8 @@ def _quadratics(times: Array, positions: Array) -> tuple[Array, Array]:
     basis /= (scale := np.abs(basis).max(axis=1, keepdims=True))
     found = np.linalg.solve(basis.swapaxes(-1, -2) @ basis, basis.swapaxes(-1, -2) @ positions)
     left = positions - basis @ found
-    return found / scale.swapaxes(-1, -2), (left**2).sum(axis=(1, 2)) / (3.0 * (times.shape[1] - 3))
+    variance = (left**2).sum(axis=(1, 2)) / (3.0 * (times.shape[1] - 3))
+    return found / scale.swapaxes(-1, -2), np.maximum(variance, TINY**2)
 
 
 def _pieces(times: Array, positions: Array) -> tuple[Array, Array]:
@@ -193,11 +195,14 @@ def _pieces(times: Array, positions: Array) -> tuple[Array, Array]:
 
 
 def _across(track: Track) -> float:
-    """m^2, variance of a coordinate across the motion, which wrong stamps do not change: about planar parabolas."""
+    """m^2, variance of a coordinate across the motion, which wrong stamps do not change: about planar parabolas.
+
+    A ball that falls straight down with x = y = 0, as one axis of a computed track does, has none: at least `FLOOR`.
+    """
     windows = sliding_window_view(track.positions, WINDOW, axis=0)[:: WINDOW // 4].swapaxes(-1, -2)
     ways = windows - windows.mean(axis=1, keepdims=True)
     spread = np.linalg.eigvalsh(ways.swapaxes(-1, -2) @ ways)  # smallest: out of the plane of the motion
-    return float(np.median(spread[:, 0])) / (WINDOW - 3)
+    return max(float(np.median(spread[:, 0])) / (WINDOW - 3), FLOOR**2)
 
 
 def _log_gravity(track: Track, gravity: float, drag: float) -> float:

@@ -114,6 +114,8 @@ def _cut(smoother: Smoother, launcher: Launcher, track: Track) -> list[Stretches
     problem = smoother.problem(track)
     sigma, solution = problem.sigma, smoother.solve(problem)
     estimate, segmentation = smoother.result(problem, solution), solution.events.segmentation
+    if estimate.status.failed:
+        return []
     rests = [rest.first for rest in segmentation.rests]
     stretches = []
     for first, last in segmentation.segments:

@@ -122,7 +122,7 @@ def _score(pattern: Pattern, turn: Array, tracks: int) -> Score:
     spread = turn @ inverse @ pattern.scatter @ inverse @ turn.T
     # a coefficient without a visible direction has no finite uncertainty
     spread[np.diag_indices_from(spread)] += np.where((turn**2).sum(axis=1) > 0.0, 0.0, np.inf)
-    sigma = np.sqrt(np.diagonal(spread))
+    sigma = np.sqrt(np.maximum(np.diagonal(spread), 0.0))
     return Score(turn @ pattern.estimate, sigma, pattern.explained, pattern.p_value, pattern.rank, tracks)
 
 

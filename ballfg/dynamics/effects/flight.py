@@ -16,6 +16,8 @@ PLACES: Final = (4, 2, 2)
 """Centres of gust regions that are tried along x, y and z."""
 REGION_SHARE: Final = 0.25
 """Size of a region that is tried, as a share of the longest extent of the data."""
+SMALLEST_REGION: Final = 0.01
+"""m. A ball that stays where it is has no extent."""
 LARGEST_REGION: Final = 50.0
 """m. Of a region that is tried, at most."""
 _DOWN = torch.tensor((0.0, 0.0, -1.0), dtype=torch.float64)
@@ -215,7 +217,7 @@ class GustRegion(FlightEffect):
             [low + span * (i + 0.5) / count for i in range(count)]
             for low, span, count in zip(scene.low, extent, PLACES, strict=True)
         ]
-        size = min(REGION_SHARE * max(extent), LARGEST_REGION)
+        size = min(max(REGION_SHARE * max(extent), SMALLEST_REGION), LARGEST_REGION)
         return [{"center_x": x, "center_y": y, "center_z": z, "size": size} for x, y, z in itertools.product(*axes)]
 
     def air_velocity(self, flight: Flight) -> Tensor:

@@ -14,6 +14,7 @@ from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.innovation import FilterInnovation
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.dynamics import model_width
+from ballfg.factors.linear.definite import whitened
 from ballfg.state import STANDARD_GRAVITY, STATE_DIM, VELOCITY, Z
 
 GATE_CHANCE = 1e-6
@@ -77,13 +78,12 @@ class BallFilter(FilterpyEKF):
 
     def innovation(self, measured: Array) -> Array:
         """(3,) whitened: measured minus predicted position over the root of its covariance H P H^T + R."""
-        root = np.linalg.cholesky(self.H @ self.P @ self.H.T + self.R)
-        return np.asarray(np.linalg.solve(root, measured - self.H @ self.x))
+        return whitened(measured - self.H @ self.x, self.H @ self.P @ self.H.T + self.R)
 
     @staticmethod
-    def passes(whitened: Array) -> bool:
+    def passes(innovation: Array) -> bool:
         """Whether a whitened innovation (dim,) is within the gate."""
-        return bool(whitened @ whitened <= chdtri(len(whitened), GATE_CHANCE))
+        return bool(innovation @ innovation <= chdtri(len(innovation), GATE_CHANCE))
 
     def correct(self, measured: Array) -> None:
         """The update of filterpy with a measured position."""

@@ -6,7 +6,6 @@ docs/estimators_ekf.md has the equations, what the filter does at contacts, hits
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -21,12 +20,14 @@ from ballfg.estimation.filters.rts import FilterRecord, fly_back, rts_smooth
 from ballfg.estimation.filters.sliding_window import SlidingWindow, first_pair
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
 from ballfg.estimation.observations.observation import Context, refuse_unknowns
+from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact, Quality
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, stamp_covariance, total_sigmas
-from ballfg.estimation.smoother.near_contact import other_sides
+from ballfg.estimation.smoother.near_contact import with_other_sides
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.factors.batch import FactorBatch
+from ballfg.factors.linear.definite import raised
 from ballfg.factors.tracker import bias_step
 from ballfg.state import POSITION, STATE_DIM, VELOCITY, Z
 from ballfg.tracks import Ball, Track
@@ -40,6 +41,10 @@ HIT_POSITION = 1.0
 """m, standard deviation of the position after a hit: it starts anew at the measurement."""
 LEAST_USED = 0.5
 """Share of samples that must have passed the gate for the filter to have followed the ball."""
+LEAST_SHARE = 1e-3
+"""Of the noise of one sample over the root of their number, or of a prior: what is known better is rounding."""
+LEAST_MOTION = 1e-6
+"""m/s and rad/s, the same of velocity and spin."""
 NEAR_SURFACE = 0.05
 """m. Samples this close to a surface need not lie on one parabola with others: there may be a bounce."""
 
@@ -99,18 +104,23 @@ class ExtendedKalmanFilter(Estimator):
         whitened = record.innovations(run.H, mean, covariance, track.positions) if self.smooth else record.whitened
         return self._result(track, run, mean, covariance, whitened)
 
-    def _result(self, track: Track, run: _Run, mean: Array, covariance: Array, whitened: Array) -> Estimate:
+    def _result(
+        self,
+        track: Track,
+        run: _Run,
+        mean: Array,
+        covariance: Array,
+        whitened: Array,
+        status: Status | None = None,
+    ) -> Estimate:
         states, own = mean[:, :STATE_DIM], slice(STATE_DIM, STATE_DIM + len(run.means))
         contacts = tuple(contact for i in sorted(run.record.contacts) for contact in run.record.contacts[i])
-        of_states = covariance[:, :STATE_DIM, :STATE_DIM]
-        others = other_sides(track.times, states, of_states, contacts, self.model, self.surfaces)
-        return Estimate(
+        estimate = Estimate(
             name=track.name,
             times=track.times,
             states=states,
-            covariances=of_states + others,
-            other_sides=others,
-            status=_status(run.record.used),
+            covariances=covariance[:, :STATE_DIM, :STATE_DIM],
+            status=status or _status(run.record.used),
             innovations={"position": whitened, **run.innovations},
             world=self.world,
             notes=self.doubts(track),
@@ -122,13 +132,15 @@ class ExtendedKalmanFilter(Estimator):
             hits=np.array(run.record.hits, dtype=np.int64),
             quality=run.record.quality,
         )
+        estimate = plausible(estimate, track, run.sigma, self.settings)
+        return with_other_sides(estimate, self.model, self.surfaces)
 
     def _failed(self, track: Track, run: _Run) -> Estimate:
         """Measured positions and priors."""
         pairs = [run.prior(i) for i in range(len(track))]
         mean, covariance = (np.stack(part) for part in zip(*pairs, strict=True))
-        result = self._result(track, run, mean, covariance, np.full((len(track), 3), np.nan))
-        return replace(result, status=Status.FAILED)
+        nothing = np.full((len(track), 3), np.nan)
+        return self._result(track, run, mean, covariance, nothing, Status.FAILED)
 
 
 def _status(used: NDArray[np.bool_]) -> Status:
@@ -159,9 +171,10 @@ class _Run:
         self.beside = [(one, one.batch(context)) for one in beside]
         self.innovations = {one.name: np.full((len(batch), batch.dim), np.nan) for one, batch in self.beside}
         self.record = FilterRecord.empty(len(track), self.H.shape[1])
+        self.record.least = self._least()
         for k in range(len(track)):
             self.record.measurement_noise[k] = self._measurement_noise(k, self.velocities[k])
-        with np.errstate(over="ignore", invalid="ignore"):  # ends in Status.FAILED
+        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # ends in Status.FAILED
             self._filter()
 
     def finite(self) -> bool:
@@ -186,6 +199,13 @@ class _Run:
             covariance[POSITION, POSITION] += lasting
             covariance[POSITION, -3:] = covariance[-3:, POSITION] = -lasting
         return mean, covariance
+
+    def _least(self) -> Array:
+        """(d,) standard deviations below which no number can be known, whatever rounding says of it."""
+        position = LEAST_SHARE * float(self.sigma.min()) / np.sqrt(len(self.track))
+        coefficients = LEAST_SHARE * np.array(list(self.settings.coefficients.values()))
+        own = np.concatenate((np.full(3, position), np.full(6, LEAST_MOTION), coefficients))
+        return np.concatenate((own, LEAST_SHARE * self.bias_sigmas))
 
     def _measurement_noise(self, k: int, velocity: Array) -> Array:
         """(3, 3) m^2, of a sample's white error and of the error of its stamp at a velocity (3,) m/s."""
@@ -271,6 +291,8 @@ class _Run:
         motion = ball.move(point, times[k] - times[k - 1], float(self.fading[0][k - 1]))
         ball.Q = self._noise(k, motion)
         ball.predict()
+        if np.isfinite(ball.P).all():
+            ball.P = raised(ball.P, record.least)
         velocity = self.velocities[k] if ball.velocity_is_wide else ball.x[VELOCITY]
         ball.R = record.measurement_noise[k] = self._measurement_noise(k, velocity)
         record.contacts.pop(k - 1, None)
@@ -322,5 +344,5 @@ class _Run:
 
     def _store(self, ball: BallFilter, k: int, used: bool) -> None:
         self.record.mean[k] = ball.x
-        self.record.covariance[k] = ball.P = (ball.P + ball.P.T) / 2
+        self.record.covariance[k] = ball.P = raised(ball.P, self.record.least)
         self.record.quality[k] = Quality.GOOD if used else Quality.OUTLIER

@@ -18,6 +18,7 @@ from ballfg.dynamics.motion.integrate import fly_jacobian
 from ballfg.estimation.observations.innovation import leave_position_out
 from ballfg.estimation.segmentation import Contact, Quality
 from ballfg.factors.batch import Rows
+from ballfg.factors.linear.definite import raised
 from ballfg.factors.loss import Loss
 from ballfg.state import STATE_DIM
 
@@ -37,6 +38,7 @@ class FilterRecord:
         quality: (n,) `Quality`.
         contacts: for each interval that has any.
         hits: intervals.
+        least: (d,) standard deviations that rounding takes none of them below.
     """
 
     prior_mean: Array
@@ -51,6 +53,7 @@ class FilterRecord:
     start: int = 0
     contacts: dict[int, tuple[Contact, ...]] = field(default_factory=dict)
     hits: list[int] = field(default_factory=list)
+    least: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def empty(cls, n: int, d: int) -> FilterRecord:
@@ -108,7 +111,7 @@ def rts_smooth(record: FilterRecord) -> tuple[Array, Array]:
         mean[k] = record.mean[k] + C @ (mean[k + 1] - record.prior_mean[k + 1])
         rest = identity - C @ F
         smoothed = rest @ P @ rest.T + C @ (covariance[k + 1] + record.noise[k + 1]) @ C.T
-        covariance[k] = (smoothed + smoothed.T) / 2
+        covariance[k] = raised(smoothed, record.least)
     return mean, covariance
 
 
@@ -151,3 +154,6 @@ def fly_back(
         mean[k, :width], mean[k, width:] = after[0].numpy(), fading[0][k] * mean[k + 1, width:]
         covariance[k] = F @ widened @ F.T
         covariance[k, width:, width:] += np.diag(fading[1][k] ** 2)
+        if not (np.isfinite(mean[k]).all() and np.isfinite(covariance[k]).all()):  # drag, back in time, is a push
+            mean[: k + 1], covariance[: k + 1] = np.nan, np.nan
+            return

@@ -17,6 +17,7 @@ from ballfg.dynamics.motion.integrate import rate_jacobian
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
+from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.settings import sample_sigmas, spin_start, total_sigmas
 from ballfg.factors.batch import FactorBatch
@@ -70,7 +71,7 @@ class SlidingWindow(Estimator):
         covariances[:, VELOCITY, VELOCITY] += _bounce_covariance(track, first, bounced)
         covariances[0, VELOCITY] = covariances[0, :, VELOCITY] = 0.0
         covariances[0, VELOCITY, VELOCITY] = self.settings.velocity_prior**2 * np.eye(3)
-        return Estimate(
+        estimate = Estimate(
             name=track.name,
             times=track.times,
             states=states,
@@ -81,6 +82,7 @@ class SlidingWindow(Estimator):
             notes=self.doubts(track),
             cross_covariances=np.zeros((n, STATE_DIM, 0)),
         )
+        return plausible(estimate, track, sigma, self.settings)
 
     def _spin_covariance(self, track: Track, bounced: NDArray[np.bool_]) -> Array:
         """(n, 3, 3): prior or label, the random walk since, and an unknown change once the ball may have bounced."""

@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ballfg.arrays import Array
 from ballfg.state import STANDARD_GRAVITY, Z
+from ballfg.tracks.track import FASTEST_BALL
 
 WINDOW = 5
 """Samples in a window."""
@@ -21,7 +22,7 @@ def window_velocities(times: Array, positions: Array, breaks: ArrayLike = ()) ->
         times: (n,) s, increasing.
         positions: (n, 3) m.
         breaks: intervals (between samples i and i+1) in which a contact or a hit broke the motion.
-    Returns: (n, 3) m/s, always finite; zero for a track of one sample.
+    Returns: (n, 3) m/s, always finite, at most `FASTEST_BALL`; zero for a track of one sample.
     """
     n = len(times)
     if n == 1:
@@ -42,7 +43,8 @@ def window_velocities(times: Array, positions: Array, breaks: ArrayLike = ()) ->
     velocities = np.einsum("nk,nkd->nd", centred, p) / np.where(alone, 1.0, scatter)[:, None]
     if alone.any():
         velocities[alone] = _neighbour_slopes(times, positions)[alone]
-    return np.asarray(velocities)
+    speed = np.linalg.norm(velocities, axis=1, keepdims=True)
+    return np.asarray(velocities * (FASTEST_BALL / np.maximum(speed, FASTEST_BALL)))
 
 
 def _segment_bounds(n: int, breaks: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

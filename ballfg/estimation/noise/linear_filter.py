@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ballfg.estimation.noise.linear_tracks import LinearTracks
+from ballfg.estimation.settings import LEAST_NOISE
 from ballfg.state import POSITION, STATE_DIM
 
 BIAS_DIM: Final = 3
@@ -97,7 +98,8 @@ class LinearFilter:
         """(t, n, 3, 3) m^2, of the part of a measured position that is new in each sample."""
         way = self.tracks.velocities
         along = noise.stamp_jitter[:, None, None, None] * way[..., :, None] * way[..., None, :]
-        return along + torch.diag_embed((noise.position[:, None, :] * self.tracks.white).square())
+        white = (noise.position[:, None, :] * self.tracks.white).clamp_min(LEAST_NOISE)  # an axis may show none
+        return along + torch.diag_embed(white.square())
 
     def losses(self, noise: Noise) -> Tensor:
         """(t,) negative logarithms of the marginal likelihood of each track."""

@@ -186,6 +186,8 @@ def _score(tracks: LinearFilter, fit: MarginalFit, name: str, time: float) -> Ar
 def _p_value(score: Array, freedom: float) -> float:
     """One-sided; freedom: share of the scatter that is left after other numbers took theirs."""
     spread = np.sqrt(len(score) * score.var(ddof=1) / max(freedom, 0.1))
+    if not spread > 0.0:  # tracks that are all the same tell nothing of chance
+        return 1.0
     from scipy import stats  # it takes half a second to import
 
     return float(stats.t.sf(score.sum() / spread, len(score) - 1))

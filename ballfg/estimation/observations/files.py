@@ -103,5 +103,10 @@ def _read(path: Path, sort: type[Observation], known: set[str], notes: list[str]
                     f"{path}, line {line}, column {header[place]!r}: must be {rule}; got {cells[place]!r}. "
                     "Correct it, or delete the line."
                 )
+            if header[place] in sort.columns and abs(float(cells[place])) > sort.largest:
+                raise ValueError(
+                    f"{path}, line {line}, column {header[place]!r}: must be within {sort.largest:g}, as of every "
+                    f"ball; got {cells[place]}. Correct it, or delete the line."
+                )
         rows[cells[key]].append([float(cells[place]) for place in places])
     return {name: np.array(numbers) for name, numbers in rows.items()}

@@ -7,6 +7,7 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.factors.batch import FactorBatch, Rows
 from ballfg.factors.linear.covariance import Covariances
+from ballfg.factors.linear.definite import whitened
 from ballfg.factors.linear.step import weighted
 from ballfg.state import POSITION, STATE_DIM
 
@@ -51,15 +52,9 @@ class FilterInnovation:
             H[:, own] = blocks[1][0]
         unit = np.eye(factor.dim)
         spread = H @ covariance @ H.T
-        whitened = np.linalg.solve(np.linalg.cholesky(spread + unit), -residual)
-        (weight,) = factor.loss.weight(np.array([np.linalg.norm(whitened)]))
-        return cls(residual, H, unit / weight, spread, np.asarray(whitened))
-
-
-def whiten_innovation(innovation: Array, covariance: Array) -> Array:
-    """(n, r) innovations divided by the root of their covariances (n, r, r)."""
-    root = np.linalg.cholesky(covariance)
-    return np.asarray(np.linalg.solve(root, innovation[..., None])[..., 0])
+        innovation = whitened(-residual, spread + unit)
+        (weight,) = factor.loss.weight(np.array([np.linalg.norm(innovation)]))
+        return cls(residual, H, unit / weight, spread, innovation)
 
 
 def leave_position_out(states: Array, covariances: Array, measured: Array, noise: Array, samples: Rows) -> Array:
@@ -80,14 +75,23 @@ def leave_position_out(states: Array, covariances: Array, measured: Array, noise
     jacobian = jacobian[..., POSITION]
     pull = (jacobian.swapaxes(-1, -2) @ residual[..., None])[..., 0]
     information = np.linalg.inv(covariances[:, POSITION, POSITION])
-    axes = np.arange(3)
-    others = information - jacobian.swapaxes(-1, -2) @ jacobian
+    scale = 1.0 / np.sqrt(np.diagonal(information, axis1=-2, axis2=-1))
+    both = scale[:, :, None] * scale[:, None, :]
+    others = (information - jacobian.swapaxes(-1, -2) @ jacobian) * both
     # a sample that alone decides its position leaves nothing: bound C, the whitened distance goes to zero
-    others[:, axes, axes] += LEAST_INFORMATION * information[:, axes, axes]
-    covariance = np.linalg.inv(others)
+    covariance = _inverse_of_rest(others) * both
     distance = measured - states[:, POSITION] - (covariance @ pull[..., None])[..., 0]
-    covariance += noise
-    return whiten_innovation(distance, np.asarray(covariance, dtype=np.float64))
+    return whitened(distance, np.asarray(covariance + noise, dtype=np.float64))
+
+
+def _inverse_of_rest(information: Array) -> Array:
+    """(n, r, r) inverse of what is left of an information near one after a share was taken out of it.
+
+    Nothing less than zero can be left; where all of it goes, a difference of two nearly equal matrices may be so.
+    """
+    values, vectors = np.linalg.eigh(0.5 * (information + information.swapaxes(-1, -2)))
+    inverse = 1.0 / (np.maximum(values, 0.0) + LEAST_INFORMATION)
+    return np.asarray((vectors * inverse[..., None, :]) @ vectors.swapaxes(-1, -2))
 
 
 def leave_one_out(rows: Rows, covariances: Covariances) -> Array:
@@ -112,8 +116,8 @@ def leave_one_out(rows: Rows, covariances: Covariances) -> Array:
         joint = np.block([[joint, cross], [cross.swapaxes(-1, -2), both]])
     gain = joint @ pulled.swapaxes(-1, -2)
     # a measurement that alone decides what it shows leaves nothing: bound C, the whitened distance goes to zero
-    left = np.linalg.inv((1.0 + LEAST_INFORMATION) * unit - pulled @ gain)
+    left = _inverse_of_rest(unit - pulled @ gain)
     others = joint + gain @ left @ gain.swapaxes(-1, -2)
     pull = pulled.swapaxes(-1, -2) @ residual[..., None]
     distance = -rows.residual - (plain @ others @ pull)[..., 0]
-    return whiten_innovation(distance, unit + plain @ others @ plain.swapaxes(-1, -2))
+    return whitened(distance, unit + plain @ others @ plain.swapaxes(-1, -2))

@@ -75,12 +75,14 @@ class Observation(ABC):
         locates: whether it measures where the ball is. The positions of such a track were made from it.
         file: name of its table in the folder of a dataset; None where it has no table of its own.
         columns: of that table, beside `trajectory`, `t` (s) and `sigma`.
+        largest: size, in the units of the columns, that no value of a ball exceeds; larger ones are refused.
     """
 
     name: ClassVar[str]
     locates: ClassVar[bool] = False
     file: ClassVar[str | None] = None
     columns: ClassVar[tuple[str, ...]] = ()
+    largest: ClassVar[float] = np.inf
     state: Index
 
     def __len__(self) -> int:

@@ -20,6 +20,7 @@ from ballfg.factors.batch import FactorBatch
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, VELOCITY
 from ballfg.tracks import Track
+from ballfg.tracks.track import FASTEST_BALL, FASTEST_SPIN
 
 FARTHEST: Final = 0.05
 """s. A reading that lies farther from every sample is refused: over so long the ball may bounce."""
@@ -63,6 +64,11 @@ class Reading(Observation):
         self.delay: Array = np.zeros(m) if delay is None else np.asarray(delay, dtype=np.float64).reshape(m)
         if not np.isfinite(self.values).all() or not np.isfinite(self.delay).all():
             raise ValueError(f"values of '{self.name}' must be finite; leave out readings that are not")
+        if (np.abs(self.values) > self.largest).any():
+            raise ValueError(
+                f"values of '{self.name}' must be within {self.largest:g}, as of every ball; got "
+                f"{np.abs(self.values).max():g}. Correct them, or leave them out."
+            )
         if not (np.isfinite(self.sigma).all() and (self.sigma > 0.0).all()):
             raise ValueError(f"sigma of '{self.name}' must be positive and finite; leave out readings without a sigma")
         if (np.diff(self.state) < 0).any():
@@ -135,6 +141,7 @@ class RadarSpeed(Reading):
     name: ClassVar[str] = "speed"
     file: ClassVar[str | None] = "speeds.csv"
     columns: ClassVar[tuple[str, ...]] = ("speed",)
+    largest: ClassVar[float] = FASTEST_BALL
 
     def predicted(self, state: Tensor) -> Tensor:
         """(..., 1) m/s, length of the velocity."""
@@ -156,6 +163,7 @@ class SpinReading(Reading):
     file: ClassVar[str | None] = "spins.csv"
     columns: ClassVar[tuple[str, ...]] = ("wx", "wy", "wz")
     loss: ClassVar[Loss] = Loss("cauchy", 3.0)
+    largest: ClassVar[float] = FASTEST_SPIN
 
     def predicted(self, state: Tensor) -> Tensor:
         """(..., 3) rad/s."""

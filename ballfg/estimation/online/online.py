@@ -24,13 +24,16 @@ from ballfg.estimation.online.warm_up import warmed_up
 from ballfg.estimation.online.windows.chain import ChainWindow
 from ballfg.estimation.online.windows.stream_window import StreamWindow
 from ballfg.estimation.online.windows.window import IsamWindow
+from ballfg.estimation.plausible import plausible, possible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import physics_of
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
 from ballfg.estimation.smoother.motion import FLIGHT, Motion, motions_of
-from ballfg.estimation.smoother.problem import trackwise_model
+from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import FactorBatch
+from ballfg.factors.linear.definite import definite, variances_positive
+from ballfg.state import STATE_DIM
 from ballfg.tracks import Ball, Track
 from ballfg.vision.camera import Camera
 
@@ -147,10 +150,10 @@ class Online(Estimator):
         Raises: ValueError: if the time does not increase, or a number is not finite.
         """
         own = None if sigma is None else np.asarray(sigma, dtype=np.float64)[None]
+        if own is not None and not (np.isfinite(own) & (own > 0.0)).all():
+            raise ValueError(f"sigma must be positive and finite, in m; got {sigma!r}. Leave it out if it is unknown.")
         spread = sample_sigmas(self.settings, 1, own)[0]
         point = np.array(position, dtype=np.float64)
-        if not (np.isfinite(spread) & (spread > 0.0)).all():
-            raise ValueError(f"sigma must be positive and finite, in m; got {sigma!r}. Leave it out if it is unknown.")
         if self._samples and not self._samples[-1].measured:
             raise ValueError("push must not follow push_sighting in one stream; call reset in between.")
         sample = Sample(float(time), point, spread)
@@ -338,10 +341,16 @@ class Online(Estimator):
         self, window: StreamWindow, sample: Sample, update: Update, revised: int, rebuilt: bool, status: Status
     ) -> OnlineState:
         mean, joint = window.newest_belief
+        if possible(mean[:STATE_DIM]) and variances_positive(joint):
+            joint = definite(joint)
+        else:
+            lost = unknown(sample, self.settings, window.p)
+            mean, joint = np.concatenate((lost.state, coefficient_means(self.model, self.settings))), lost.joint
+            status = status if status.failed else Status.IMPLAUSIBLE
         return OnlineState(
             time=sample.time,
             mean=mean,
-            joint=joint.copy(),
+            joint=joint,
             coefficient_names=tuple(self.settings.coefficients),
             world=self.world,
             name="stream",
@@ -385,8 +394,9 @@ class Online(Estimator):
         result = final_estimate(smoother, self.window, track, found, self._frozen)
         self.reset()
         lost = any(state.status is Status.FAILED for state in states)
-        status = Status.NOT_CONVERGED if lost else result.status
-        return replace(result, innovations=innovations, status=status)
+        status = Status.NOT_CONVERGED if lost and not result.status.failed else result.status
+        result = replace(result, innovations=innovations, status=status)
+        return plausible(result, track, sigma, self.settings) if first else result
 
     def _measurements(self, track: Track) -> dict[str, list[tuple[int, Measurement]]]:
         """What was measured beside positions, by name of the observation: each with the number of its sample."""

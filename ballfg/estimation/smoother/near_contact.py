@@ -1,5 +1,7 @@
 """Stamps so close to a contact that the sample may lie on either side of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 from scipy.special import ndtr
@@ -8,6 +10,8 @@ from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import fly
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.plausible import possible
+from ballfg.estimation.result import Estimate
 from ballfg.estimation.segmentation import Contact
 from ballfg.state import VZ, Z
 
@@ -15,6 +19,17 @@ FAR = 4.0
 """Standard deviations of a contact's time beyond which a stamp is taken to lie on one side of it."""
 LEAST_SPEED = 1e-3
 """m/s, least vertical speed in the uncertainty of a contact's time."""
+
+
+def with_other_sides(estimate: Estimate, model: BallModel, surfaces: Surfaces) -> Estimate:
+    """The estimate, its covariances with the chance that a ball is on the other side of a near contact.
+
+    Args: estimate: without it.  model: the ball.  surfaces: what it may bounce on.
+    """
+    if estimate.status.failed:  # its states do not know of contacts
+        return replace(estimate, other_sides=np.zeros_like(estimate.covariances))
+    others = other_sides(estimate.times, estimate.states, estimate.covariances, estimate.contacts, model, surfaces)
+    return replace(estimate, covariances=estimate.covariances + others, other_sides=others)
 
 
 def other_sides(
@@ -47,8 +62,9 @@ def other_sides(
             sigma = float(np.sqrt(covariances[k, Z, Z])) / max(abs(float(states[k, VZ])), LEAST_SPEED)
             margin = (contact.time - times[k]) * np.sign(beyond - k) / sigma
             if margin < FAR:
-                jump = _carried(model, states[beyond], times[k] - times[beyond]) - states[k]
-                lacking[k] += _mixture(margin, jump)
+                other = _carried(model, states[beyond], times[k] - times[beyond])
+                if possible(other):  # back over a long gap, drag would have been push
+                    lacking[k] += _mixture(margin, other - states[k])
     last = torch.from_numpy(states[-1])
     height = float(surfaces.height_below(last))
     margin = (
@@ -58,7 +74,9 @@ def other_sides(
     )
     if margin < FAR and last[VZ] < 0.0:
         with torch.no_grad():
-            lacking[-1] += _mixture(margin, model.after_bounce(last).numpy() - states[-1])
+            other = model.after_bounce(last).numpy()
+        if possible(other):
+            lacking[-1] += _mixture(margin, other - states[-1])
     return lacking
 
 

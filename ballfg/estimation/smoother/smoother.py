@@ -12,12 +12,13 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import window_velocities
+from ballfg.estimation.plausible import measured_only, plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Segmentation, physics_of, segment
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
 from ballfg.estimation.smoother.grip import rival_note, with_other_spins
 from ballfg.estimation.smoother.initial import initial_states, move_contacts
-from ballfg.estimation.smoother.near_contact import other_sides
+from ballfg.estimation.smoother.near_contact import with_other_sides
 from ballfg.estimation.smoother.problem import Events, TrackProblem
 from ballfg.estimation.smoother.restart import label_let_go, minimise_with_restart
 from ballfg.estimation.smoother.solution import (
@@ -31,9 +32,10 @@ from ballfg.factors.batch import FactorBatch, Values
 from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum, Search, run
 from ballfg.factors.linear.covariance import Covariances, marginal_covariances
+from ballfg.factors.linear.definite import definite, variances_positive
 from ballfg.factors.prior import PriorFactors
 from ballfg.factors.tracker import BiasStartFactors
-from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+from ballfg.state import STATE_DIM
 from ballfg.tracks import Ball, Track
 
 ROUGH = 1e-2
@@ -46,9 +48,6 @@ MAX_UNSEEN_HITS = 8
 """How many hits the estimate may add to those that the segmentation found; measured logs needed three at most."""
 BROKEN = 8.0
 """Norm of a whitened dynamics residual (9 dimensions) beyond which its interval hides a hit; chance: one in 1e9."""
-
-LEAST_POSITION_SIGMA = 0.05
-"""m. A position in a track that no graph explains is not trusted better than that."""
 
 OFFSET_ROUNDS = 6
 """How often stamps may be moved by the time offsets that were estimated; 4 ms need three."""
@@ -121,7 +120,7 @@ class Smoother(Estimator):
         for _ in range(OFFSET_ROUNDS):
             problem = smoother.problem(track)
             estimate = smoother.result(problem, (yield from smoother.search(problem)))
-            if not moving or estimate.status is Status.FAILED:
+            if not moving or estimate.status.failed:
                 return estimate
             retimed = [later for one in problem.observations if (later := one.retimed(track, estimate)) is not None]
             if not retimed and smoother is self:
@@ -238,20 +237,14 @@ class Smoother(Estimator):
         track, values = problem.track, solution.minimum.values
         n, p = len(track), len(values.coefficients)
         contacts = timed_contacts(track.times, solution)
-        if minimum.step is None:
-            known = None
-            covariances = _prior_covariances(problem)
-        else:
-            known = covariances = marginal_covariances(minimum.step.root)
+        known = None if minimum.step is None else _definite_covariances(marginal_covariances(minimum.step.root))
+        covariances = _prior_covariances(problem) if known is None else known
         own, rest = slice(0, problem.width), slice(problem.width, p)
-        own_covariances = covariances.states[:, :STATE_DIM, :STATE_DIM]
-        others = other_sides(track.times, values.states, own_covariances, contacts, self.model, self.surfaces)
-        return Estimate(
+        estimate = Estimate(
             name=track.name,
             times=track.times,
             states=values.states,
-            covariances=own_covariances + others,
-            other_sides=others,
+            covariances=covariances.states[:, :STATE_DIM, :STATE_DIM],
             status=_status(minimum, n),
             innovations=problem.innovations(values, known),
             coefficient_names=tuple(self.settings.coefficients),
@@ -269,6 +262,8 @@ class Smoother(Estimator):
             world=self.world,
             notes=self.doubts(track) + rival_note(solution, own_covariances[0, SPIN, SPIN]),
         )
+        estimate = plausible(estimate, track, problem.sigma, self.settings)
+        return with_other_sides(estimate, self.model, self.surfaces)
 
 
 def _worst_break(solution: Solution) -> int | None:
@@ -294,9 +289,13 @@ def _status(minimum: Minimum, samples: int) -> Status:
 
 def _prior_covariances(problem: TrackProblem) -> Covariances:
     """What is known of each state by itself, where the graph could not be solved."""
-    n, settings, coefficients = len(problem.track), problem.settings, problem.coefficient_sigmas
-    spread = np.empty((n, STATE_DIM))
-    spread[:, POSITION] = np.maximum(problem.sigma, LEAST_POSITION_SIGMA)
-    spread[:, VELOCITY], spread[:, SPIN] = settings.velocity_prior, settings.spin_prior
-    states = spread[..., None] ** 2 * np.eye(STATE_DIM)
-    return Covariances(states, np.diag(coefficients**2), np.zeros((n, STATE_DIM, len(coefficients))))
+    coefficients = problem.coefficient_sigmas
+    _, states = measured_only(problem.track.positions, problem.sigma, problem.settings)
+    return Covariances(states, np.diag(coefficients**2), np.zeros((len(states), STATE_DIM, len(coefficients))))
+
+
+def _definite_covariances(found: Covariances) -> Covariances | None:
+    """The covariances, safe from rounding; None where a track leaves something undetermined, to double precision."""
+    if not variances_positive(found.states).all() or not np.isfinite(found.cross).all():
+        return None
+    return replace(found, states=definite(found.states))

@@ -7,6 +7,7 @@ from ballfg.estimation.online.sample import Sample
 from ballfg.estimation.online.tracker import carried_with_bias
 from ballfg.estimation.online.windows.interval import Interval
 from ballfg.estimation.settings import Settings, stamp_covariance
+from ballfg.factors.linear.definite import whitened as whitened_by
 from ballfg.factors.tracker import BIAS_DIM
 from ballfg.state import POSITION, STATE_DIM, VELOCITY
 
@@ -69,7 +70,7 @@ class WindowFilter:
         noise = np.diag(sample.sigma**2) + stamp_covariance(self.settings, sample.velocity)
         rows = self._measured_part(covariance)
         spread = self._measured_part(rows.T)
-        whitened = np.asarray(np.linalg.solve(np.linalg.cholesky(spread + noise), innovation))
+        whitened = whitened_by(innovation, spread + noise)
         if self.settings.loss.name != "squared":
             noise = noise / self.settings.loss.weight(np.array([np.linalg.norm(whitened)]))
         gain = np.linalg.solve(spread + noise, rows)

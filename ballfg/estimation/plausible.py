@@ -1,0 +1,95 @@
+"""What no ball does: estimates that are no numbers, or out of this world, and what stands in their place."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.arrays import Array
+from ballfg.estimation.result import Estimate, Status
+from ballfg.estimation.settings import Settings
+from ballfg.factors.linear.definite import compatible, definite, variances_positive
+from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+from ballfg.tracks import Track
+from ballfg.tracks.checks import MAX_COORDINATE
+from ballfg.tracks.track import FASTEST_BALL, FASTEST_SPIN
+
+LEAST_POSITION_SIGMA = 0.05
+"""m. A position in a track that no graph explains is not trusted better than that."""
+
+
+def plausible(estimate: Estimate, track: Track, sigma: Array, settings: Settings) -> Estimate:
+    """The estimate, its covariances positive definite, with states that no ball has replaced by what was measured.
+
+    Args:
+        estimate: of the track.
+        track: gives the positions.
+        sigma: (n, 3) m, of the positions.
+        settings: give the priors.
+    Returns: the same estimate where nothing is wrong with it, else one whose status says so.
+    """
+    wrong = ~(possible(estimate.states) & variances_positive(estimate.covariances))
+    lost = not _known(estimate)
+    covariances = estimate.covariances
+    if wrong.any():
+        states, priors = measured_only(track.positions, sigma, settings)
+        covariances = np.where(wrong[:, None, None], priors, covariances)
+        estimate = replace(
+            estimate,
+            states=np.where(wrong[:, None], states, estimate.states),
+            other_sides=np.where(wrong[: len(estimate.other_sides), None, None], 0.0, estimate.other_sides),
+            status=Status.FAILED if estimate.status is Status.FAILED else Status.IMPLAUSIBLE,
+        )
+    if lost:
+        coefficients = np.array(list(settings.coefficients.values()))
+        estimate = replace(
+            estimate,
+            coefficients=np.where(np.isfinite(estimate.coefficients), estimate.coefficients, 0.0),
+            coefficient_covariance=np.diag(coefficients**2),
+            status=Status.FAILED if estimate.status is Status.FAILED else Status.IMPLAUSIBLE,
+        )
+    covariances, shared = definite(covariances), estimate.coefficient_covariance
+    shared = definite(shared) if shared.size else shared
+    cross = np.where((wrong | lost)[:, None, None], 0.0, estimate.cross_covariances)
+    return replace(
+        estimate,
+        covariances=covariances,
+        coefficient_covariance=shared,
+        cross_covariances=compatible(cross, covariances, shared),
+    )
+
+
+def possible(states: Array) -> NDArray[np.bool_]:
+    """(...) bool: whether states (..., 9) are numbers and those of a ball.
+
+    A track lies within `MAX_COORDINATE` m; no ball is faster than `FASTEST_BALL` m/s or spins faster than
+    `FASTEST_SPIN` rad/s.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        speed, spin = (np.linalg.norm(states[..., part], axis=-1) for part in (VELOCITY, SPIN))
+        near = np.abs(states[..., POSITION]).max(axis=-1) <= 2.0 * MAX_COORDINATE
+        return np.asarray(near & (speed <= FASTEST_BALL) & (spin <= FASTEST_SPIN))
+
+
+def measured_only(positions: Array, sigma: Array, settings: Settings) -> tuple[Array, Array]:
+    """What a position says without any motion: states (n, 9) of balls without velocity, covariances (n, 9, 9).
+
+    Args: positions: (n, 3) m.  sigma: (n, 3) m, of theirs.  settings: give the spreads of velocity and spin.
+    """
+    states, spread = np.zeros((len(positions), STATE_DIM)), np.empty((len(positions), STATE_DIM))
+    states[:, POSITION] = positions
+    spread[:, POSITION] = np.maximum(sigma, LEAST_POSITION_SIGMA)
+    spread[:, VELOCITY], spread[:, SPIN] = settings.velocity_prior, settings.spin_prior
+    return states, spread[..., None] ** 2 * np.eye(STATE_DIM)
+
+
+def _known(estimate: Estimate) -> bool:
+    """Whether the coefficients are numbers with a covariance."""
+    own = estimate.coefficient_covariance
+    return bool(
+        np.isfinite(estimate.coefficients).all()
+        and variances_positive(own).all()
+        and np.isfinite(estimate.cross_covariances).all()
+    )
