@@ -1,12 +1,13 @@
 """Covariances of states and coefficients from the triangles that eliminations leave behind."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ballfg.arrays import Array, Index
 from ballfg.factors.batch import COEFFICIENTS
+from ballfg.factors.linear.definite import definite, variances_positive
 from ballfg.factors.linear.elimination import covariances_of
 from ballfg.factors.linear.step import Root
 
@@ -24,6 +25,12 @@ class Covariances:
     states: Array
     coefficients: Array
     cross: Array
+
+    def definite(self) -> "Covariances | None":
+        """These, safe from rounding; None where a track leaves something undetermined, to double precision."""
+        if not variances_positive(self.states).all() or not np.isfinite(self.cross).all():
+            return None
+        return replace(self, states=definite(self.states))
 
 
 @dataclass(frozen=True)

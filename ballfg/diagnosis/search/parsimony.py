@@ -22,6 +22,8 @@ from ballfg.diagnosis.search.score import Score, score_tests
 from ballfg.diagnosis.search.signatures import Signatures
 from ballfg.diagnosis.search.state import without_named
 
+LEAST_FREEDOM: Final = 2
+"""Degrees of freedom that a half with hardly more tracks than unknowns is taken to have."""
 CHANCE: Final = 2.0 * float(stats.norm.sf(SIGMAS))
 """The probability that goes with `SIGMAS`: a group of several coefficients is held to the same one."""
 
@@ -117,7 +119,11 @@ def halves_differ(fit: Fit, hypothesis: Hypothesis, held_out: Stretches) -> bool
     if one is None or two is None:
         return False
     # in the directions that tracks show: nothing tells the same time offset of all axes, which differs by chance
-    sigma, difference = np.hypot(one.sigma, two.sigma), two.estimate - one.estimate
-    freedom = sum(len(np.unique(half.problem.stretches.track)) - 1 for half in (fit, other))
+    difference = two.estimate - one.estimate
+    tracks = np.array([len(np.unique(half.problem.stretches.track)) for half in (fit, other)])
+    # the scatter of tracks about common unknowns that were fitted to the same tracks is too small by these unknowns
+    left = np.maximum(tracks - len(values), LEAST_FREEDOM)
+    sigma = np.hypot(*(half.sigma * np.sqrt(n / m) for half, n, m in zip((one, two), tracks, left, strict=True)))
+    freedom = int(left.sum())
     p_values = 2.0 * stats.t.sf(np.abs(difference) / sigma, freedom)
     return bool(p_values.min() * len(p_values) < CHANCE)

@@ -64,13 +64,13 @@ def with_other_spins(solution: Solution, model: BallModel, optimizer: LevenbergM
 def rival_note(solution: Solution, covariance: Array) -> tuple[str, ...]:
     """Says that another spin explains the track nearly as well, where the covariance does not include it.
 
-    Args: solution: of the track.  covariance: (3, 3) (rad/s)^2, of its first spin.
+    Args: solution: of the track.  covariance: (9, 9), of its first state.
     """
     if solution.rival is None:
         return ()
     spin = solution.minimum.values.states[0, SPIN]
     apart = solution.rival - spin
-    if apart @ np.linalg.solve(covariance, apart) < RIVAL_APART**2:
+    if apart @ np.linalg.solve(covariance[SPIN, SPIN], apart) < RIVAL_APART**2:
         return ()
     one, other = ("({:.0f}, {:.0f}, {:.0f})".format(*value) for value in (spin, solution.rival))
     return (f"two spins explain the track nearly as well: {one} and {other} rad/s at its start; a spin label decides",)

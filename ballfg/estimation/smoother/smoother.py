@@ -32,7 +32,6 @@ from ballfg.factors.batch import FactorBatch, Values
 from ballfg.factors.dynamics import DynamicsFactors
 from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum, Search, run
 from ballfg.factors.linear.covariance import Covariances, marginal_covariances
-from ballfg.factors.linear.definite import definite, variances_positive
 from ballfg.factors.prior import PriorFactors
 from ballfg.factors.tracker import BiasStartFactors
 from ballfg.state import STATE_DIM
@@ -237,7 +236,7 @@ class Smoother(Estimator):
         track, values = problem.track, solution.minimum.values
         n, p = len(track), len(values.coefficients)
         contacts = timed_contacts(track.times, solution)
-        known = None if minimum.step is None else _definite_covariances(marginal_covariances(minimum.step.root))
+        known = None if minimum.step is None else marginal_covariances(minimum.step.root).definite()
         covariances = _prior_covariances(problem) if known is None else known
         own, rest = slice(0, problem.width), slice(problem.width, p)
         estimate = Estimate(
@@ -260,9 +259,10 @@ class Smoother(Estimator):
             error=minimum.error,
             iterations=minimum.iterations,
             world=self.world,
-            notes=self.doubts(track) + rival_note(solution, own_covariances[0, SPIN, SPIN]),
+            notes=self.doubts(track),
         )
         estimate = plausible(estimate, track, problem.sigma, self.settings)
+        estimate = replace(estimate, notes=estimate.notes + rival_note(solution, estimate.covariances[0]))
         return with_other_sides(estimate, self.model, self.surfaces)
 
 
@@ -292,10 +292,3 @@ def _prior_covariances(problem: TrackProblem) -> Covariances:
     coefficients = problem.coefficient_sigmas
     _, states = measured_only(problem.track.positions, problem.sigma, problem.settings)
     return Covariances(states, np.diag(coefficients**2), np.zeros((len(states), STATE_DIM, len(coefficients))))
-
-
-def _definite_covariances(found: Covariances) -> Covariances | None:
-    """The covariances, safe from rounding; None where a track leaves something undetermined, to double precision."""
-    if not variances_positive(found.states).all() or not np.isfinite(found.cross).all():
-        return None
-    return replace(found, states=definite(found.states))
