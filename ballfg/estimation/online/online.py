@@ -187,6 +187,7 @@ class Online(Estimator):
             state = self._observe(sample)
         return state
 
+    @np.errstate(over="ignore", invalid="ignore")  # samples that no ball flew end in a status, not in warnings
     def _observe(self, sample: Sample) -> OnlineState:
         """Take in a sample."""
         self._tell_whole_error(sample)
@@ -220,6 +221,7 @@ class Online(Estimator):
             sample.velocity = window_velocities(times, positions)[-1]
         sample.whole = total_sigmas(self.settings, sample.stated, sample.velocity)
 
+    @np.errstate(over="ignore", invalid="ignore")
     def _join(self, sighting: Measurement) -> OnlineState:
         """Take in one more sighting of the newest sample."""
         assert self.window is not None

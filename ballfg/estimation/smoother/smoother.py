@@ -271,7 +271,8 @@ def _worst_break(solution: Solution) -> int | None:
     worst, where = BROKEN, None
     for batch, rows in zip((b for b in solution.graph.batches if len(b)), solution.minimum.linearized, strict=True):
         if isinstance(batch, DynamicsFactors):
-            norm = np.linalg.norm(rows.residual, axis=-1)
+            with np.errstate(over="ignore"):  # broken without measure
+                norm = np.linalg.norm(rows.residual, axis=-1)
             norm[np.isin(batch.variables[:, 0], solution.events.segmentation.hits)] = 0.0
             if not norm.max() <= worst:
                 worst, where = norm.max(), int(batch.variables[norm.argmax(), 0])
