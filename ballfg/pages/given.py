@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from ballfg.files.moving import settle
 from ballfg.pages.tables import Kind, ResultTable, columns_of, kind_of, read_table
-from ballfg.tracks import Dataset, read_dataset
+from ballfg.tracks import Ball, DatasetInfo, Track, read_dataset
 
 REPORT = "report.json"
 """The file of a diagnosis folder that programs read."""
@@ -18,6 +18,33 @@ COULD_BE = (
     "a dataset (a folder with dataset.yaml), states of `ballfg estimate`, predictions of `ballfg predict` "
     "(.csv or .parquet), or a diagnosis of `ballfg diagnose` (its folder or report.json)"
 )
+
+
+class Folder(Protocol):
+    """A dataset to show: measured tracks, or tracks as cameras saw them."""
+
+    path: Path
+    info: DatasetInfo
+    notes: list[str]
+
+    @property
+    def ball(self) -> Ball:
+        """Radius m and mass kg."""
+
+    @property
+    def names(self) -> list[str]:
+        """Of the tracks, in their order."""
+
+    @property
+    def rough(self) -> bool:
+        """Whether the positions were made from what cameras saw."""
+
+    @property
+    def has_sigmas(self) -> bool:
+        """Whether the samples bring standard deviations."""
+
+    def __iter__(self) -> Iterator[Track]:
+        """The tracks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,16 +57,16 @@ class Given:
         diagnosis: content of `report.json`.
     """
 
-    dataset: Dataset | None = None
+    dataset: Folder | None = None
     states: ResultTable | None = None
     predictions: ResultTable | None = None
     diagnosis: Mapping[str, Any] | None = None
 
 
-def recognise(paths: Iterable[Path]) -> Given:
+def recognise(paths: Iterable[Path], opened: Callable[[Path], Folder] = read_dataset) -> Given:
     """Reads each path as what it is.
 
-    Args: paths: one of each kind at most, in any order.
+    Args: paths: one of each kind at most, in any order.  opened: reads a dataset.
     Raises:
         FileNotFoundError: a path that is not there.
         ValueError: a path that is nothing of the kind, two of one kind, or a file that breaks its format.
@@ -47,7 +74,7 @@ def recognise(paths: Iterable[Path]) -> Given:
     found: dict[str, Any] = {}
     places: dict[str, Path] = {}
     for path in paths:
-        kind, content = _read(path)
+        kind, content = _read(path, opened)
         if kind in found:
             raise ValueError(f"one {kind} can be shown at a time; got {places[kind]} and {path}. Leave one out.")
         found[kind], places[kind] = content, path
@@ -56,13 +83,13 @@ def recognise(paths: Iterable[Path]) -> Given:
     return Given(**found)
 
 
-def _read(path: Path) -> tuple[str, Any]:
+def _read(path: Path, opened: Callable[[Path], Folder]) -> tuple[str, Any]:
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; it could be {COULD_BE}. Check the path.")
     settle(path if path.is_dir() else path.parent)
     if path.is_dir():
         if (path / "dataset.yaml").is_file():
-            return "dataset", read_dataset(path)
+            return "dataset", opened(path)
         if (path / REPORT).is_file():
             return "diagnosis", _diagnosis(path / REPORT)
         raise ValueError(f"{path} must be {COULD_BE}; it holds neither dataset.yaml nor {REPORT}. Check the path.")

@@ -167,6 +167,11 @@ def _with_noise(given: Given, shots: list[Shot]) -> tuple[list[Shot], str]:
     """The shots with the standard deviations of their samples, and a sentence on where they are from."""
     assert given.dataset is not None
     info = given.dataset.info
+    if given.dataset.rough:
+        return (
+            shots,
+            "The samples were triangulated from what the cameras saw; estimates use the pixels themselves.",
+        )
     if given.dataset.has_sigmas:
         return shots, "The standard deviations of the samples are those of the dataset's table."
     words = "The standard deviations of the samples are those of dataset.yaml"

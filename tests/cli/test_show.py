@@ -7,7 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from ballfg.tracks.detections_file import write_sightings
+from ballfg.tracks.info import TABLE_TENNIS, DatasetInfo, write_info
+from ballfg.vision.camera_file import write_cameras
 from tests.commands import status
+from tests.estimation.observations.sighted_rig import RIG, TABLE, scene, world
 from tests.pages.made import Fall, Made, make
 
 
@@ -64,3 +68,18 @@ def test_a_recording_holds_every_shot(made: Made, tmp_path: Path, capsys: pytest
     assert status("show", made.dataset, made.states, "--rerun", tmp_path / "log.rrd") == 0
     assert f"{tmp_path / 'log.rrd'}: 2 shots" in capsys.readouterr().out
     assert (tmp_path / "log.rrd").stat().st_size > 1000
+
+
+def test_what_cameras_saw_is_shown_without_a_table_of_tracks(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = tmp_path / "seen"
+    folder.mkdir()
+    write_info(folder / "dataset.yaml", DatasetInfo("seen", TABLE, TABLE_TENNIS))
+    write_cameras(folder / "cameras.yaml", RIG)
+    write_sightings(folder / "detections.csv", [("one", scene(0, world(), duration=0.3).sightings)])
+    states, page = folder / "states.csv", tmp_path / "page.html"
+    assert status("estimate", folder, "--out", states, "--jobs", 1) == 0
+    assert status("show", folder, states, "--out", page) == 0
+    assert "1 of 1 shots" in capsys.readouterr().out
+    assert "triangulated from what the cameras saw" in page.read_text(encoding="utf-8")

@@ -11,7 +11,9 @@ import typer
 from ballfg.files.whole_file import check_file, whole_file, write_text
 
 if TYPE_CHECKING:
+    from ballfg.estimation.observations.sighted_dataset import SightedDataset
     from ballfg.pages import Shown
+    from ballfg.tracks import Dataset
 
 
 def show(
@@ -41,7 +43,7 @@ def show(
     from ballfg.pages import collect, recognise, show_page
 
     _check_outputs(out, png, rerun)
-    what, names = recognise(given), track or []
+    what, names = recognise(given, _dataset), track or []
     for note in what.dataset.notes if what.dataset is not None else ():
         print(f"note: {note}", file=sys.stderr)
     if rerun is not None:
@@ -56,6 +58,19 @@ def show(
     if out is not None:
         write_text(out, show_page(shown))
         print(f"{out}: {len(shown.shots)} of {shown.count} shots")
+
+
+def _dataset(folder: Path) -> Dataset | SightedDataset:
+    """The tracks of a folder; roughly triangulated ones where there are only detections."""
+    from ballfg.tracks import read_dataset
+    from ballfg.tracks.dataset import TRACK_FILES
+    from ballfg.tracks.detections_file import DETECTIONS_FILE
+
+    if any((folder / name).is_file() for name in TRACK_FILES) or not (folder / DETECTIONS_FILE).is_file():
+        return read_dataset(folder)  # without torch, which takes seconds to load
+    from ballfg.estimation import read_sighted
+
+    return read_sighted(folder)
 
 
 def _check_outputs(out: Path | None, png: Path | None, rerun: Path | None) -> None:

@@ -31,6 +31,9 @@ class SightedDataset(TrackFolder):
     rough: Final = True
     """The positions of the tracks are made from the sightings."""
 
+    has_sigmas: Final = False
+    """Nobody states how far these positions are off."""
+
     def __init__(
         self,
         path: Path,
