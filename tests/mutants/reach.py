@@ -100,10 +100,13 @@ class Recording:
     def reaching(self, name: str, first: int, last: int) -> dict[str, float]:
         """Seconds of the tests that reach some lines of a file.
 
-        Lines that a module runs as it is imported, and machine code, belong to no test: then those that use the name
-        which these lines define, or else all that reach their file.
+        Lines that a module runs as it is imported, and machine code, belong to no test: then those that reach the
+        function whose default stands there, or that use the name which these lines define, or else all that reach
+        their file.
         """
         tests = self._on(name, range(first, last + 1))
+        if not tests:
+            tests = self._on(name, self.known.headed(name, first))
         if not tests:
             tests = self._using(name, self.known.defined(name, first), set())
         if not tests:
@@ -155,6 +158,13 @@ class Names:
                     return getattr(node.target, "id", None)
                 return getattr(node, "name", None)
         return None
+
+    def headed(self, name: str, line: int) -> range:
+        """The lines of the function in whose head a line stands; none where it stands in no head."""
+        for node in ast.walk(self.trees[name]):
+            if isinstance(node, ast.FunctionDef) and node.lineno <= line < node.body[0].lineno:
+                return range(node.body[0].lineno, (node.end_lineno or node.body[0].lineno) + 1)
+        return range(0)
 
     def uses(self, name: str, defined: str) -> list[tuple[str, int]]:
         """Files and lines that use a name, in its own module and in those that import it from there."""
