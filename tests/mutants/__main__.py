@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import argparse
 import csv
+import json
 import queue
 import random
+import threading
 import time
 from collections import Counter
 from collections.abc import Sequence
@@ -22,7 +24,7 @@ from typing import Final
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.whole_file import whole_file
 from tests.mutants.mutations import Mutation, by_line, mutations_of
-from tests.mutants.reach import Recording, record, recorded_tests
+from tests.mutants.reach import Recording, digest, record, recorded_tests
 from tests.mutants.sources import has_machine_code, room_of, source_files
 from tests.mutants.trial import Outcome, Workshop
 from tests.places import ROOT
@@ -100,26 +102,53 @@ def judged() -> dict[tuple[str, str, str], str]:
     return {(e["file"], e["line"], e["becomes"]): e["reason"] for e in read_yaml(JUDGED) or []}
 
 
+class Killed:
+    """The changes that a test noticed, kept as they are found: none needs to be tried twice on the same file.
+
+    Args: path: of the file that keeps them.  begin: with none.
+    """
+
+    def __init__(self, path: Path, *, begin: bool) -> None:
+        self.path = path
+        if begin:
+            path.unlink(missing_ok=True)
+        lines = path.read_text(encoding="utf-8").splitlines() if path.exists() else []
+        self.by = {tuple(json.loads(line)[:-1]): json.loads(line)[-1] for line in lines}
+
+    def add(self, verdict: Verdict) -> None:
+        """Keep one."""
+        with self.path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps([*self.key(verdict.mutation), verdict.by]) + "\n")
+
+    @staticmethod
+    def key(mutation: Mutation) -> tuple[str, str, int, str]:
+        """A change of a file as it is now."""
+        return mutation.file, digest(mutation.file), mutation.start, mutation.after
+
+
 def run_all(
-    mutations: Sequence[Mutation], recording: Recording, folder: Path, jobs: int, budget: float
+    mutations: Sequence[Mutation], recording: Recording, folder: Path, killed: Killed, jobs: int, budget: float
 ) -> list[Verdict]:
     """Try all, some at the same time, and say how it goes."""
     compiled = {name for name in source_files() if has_machine_code((ROOT / name).read_text(encoding="utf-8"))}
-    known, killers, verdicts, begin = judged(), set[str](), list[Verdict](), time.monotonic()
+    known, verdicts, reading, begin = judged(), list[Verdict](), threading.Lock(), time.monotonic()
     with ExitStack() as stack:
         free: queue.SimpleQueue[Workshop] = queue.SimpleQueue()
         for _ in range(jobs):
             free.put(stack.enter_context(Workshop(folder / "machine_code")))
 
         def attempt(mutation: Mutation) -> Verdict:
-            last = mutation.line + mutation.before.count("\n")
-            tests = recording.reaching(mutation.file, mutation.line, last)
+            if (by := killed.by.get(Killed.key(mutation))) is not None:
+                return Verdict(mutation, "killed", by, 0.0)
+            with reading:
+                last = mutation.line + mutation.before.count("\n")
+                tests = recording.reaching(mutation.file, mutation.line, last)
+                frozen = recording.known.frozen_in_machine_code(mutation.file, mutation.line, compiled)
             chosen = ordered(tests, mutation.file, budget)
             if not chosen:
                 return Verdict(mutation, "unreached", "", 0.0)
             workshop = free.get()
             try:
-                frozen = recording.known.frozen_in_machine_code(mutation.file, mutation.line, compiled)
                 outcome = workshop.attempt(mutation, chosen, sum(tests[t] for t in chosen), compile_anew=frozen)
             finally:
                 free.put(workshop)
@@ -129,12 +158,13 @@ def run_all(
         for done, future in enumerate(as_completed([pool.submit(attempt, m) for m in mutations]), 1):
             verdict = future.result()
             verdicts.append(verdict)
+            if verdict.word == "killed" and Killed.key(verdict.mutation) not in killed.by:
+                killed.add(verdict)
             left = (time.monotonic() - begin) / done * (len(mutations) - done) / 60.0
             print(f"{done} of {len(mutations)}: {_line(verdict)}; {left:.0f} min left", flush=True)
         killers = {v.by for v in verdicts if v.by in recording.seconds}
-        failing = set(
-            free.get().failing(sorted(killers), sum(recording.seconds[t] for t in killers)) if killers else ()
-        )
+        again = sum(recording.seconds[test] for test in killers)
+        failing = set(free.get().failing(sorted(killers), again)) if killers else set()
     return sorted(
         (Verdict(v.mutation, "doubtful", v.by, v.seconds) if v.by in failing else v for v in verdicts),
         key=lambda v: (v.mutation.file, v.mutation.line),
@@ -198,6 +228,7 @@ def main() -> None:
         "--folder", type=Path, default=ROOT / "build" / "mutants", help="of the recording and the table"
     )
     parser.add_argument("--refresh", action="store_true", help="record which test reaches which line anew")
+    parser.add_argument("--keep", action="store_true", help="do not try again what a test noticed in the last run")
     options = parser.parse_args()
     mutations = sample(options.count, options.seed, options.rooms)
     recording = options.folder / "recording"
@@ -206,7 +237,8 @@ def main() -> None:
         record(recording, options.tests, options.jobs)
     recorded = Recording(recording)
     print(f"{len(recorded.seconds)} tests; {len(recorded.failed)} that fail or are skipped judge nothing", flush=True)
-    verdicts = run_all(mutations, recorded, options.folder, options.jobs, options.budget)
+    killed = Killed(options.folder / "killed.jsonl", begin=not options.keep)
+    verdicts = run_all(mutations, recorded, options.folder, killed, options.jobs, options.budget)
     print(report(verdicts, options.folder / "results.csv"))
 
 
