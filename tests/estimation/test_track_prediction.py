@@ -161,6 +161,16 @@ def test_coefficients_are_held_within_their_bounds(tracks):
     torch.testing.assert_close(belief.covariance, Belief.of(nominal_model(), [estimate.last]).covariance)
 
 
+def test_a_coefficient_that_another_s_bound_pulls_out_is_held_too(tracks):
+    """A restitution above one is held at one; drag goes down with it, and would become negative."""
+    settings = replace(SETTINGS, coefficients=COEFFICIENTS)
+    estimate = estimator("smoother", settings).estimate(tracks[0])
+    together = np.array([[0.03**2, 0.9 * 0.03 * 0.02], [0.9 * 0.03 * 0.02, 0.02**2]])
+    beyond = replace(estimate, coefficients=np.array([0.01, 1.05]), coefficient_covariance=together)
+    belief = Belief.of(nominal_model(), [beyond.last])
+    np.testing.assert_allclose(belief.mean[0, 9:], [0.0, 1.0], atol=1e-15)
+
+
 def test_beliefs_refuse_what_does_not_fit(tracks):
     settings = replace(SETTINGS, coefficients=COEFFICIENTS)
     windowed, smoothed = (estimator(m, settings).estimate(tracks[0]) for m in ("sliding-window", "smoother"))

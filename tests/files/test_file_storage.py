@@ -148,3 +148,21 @@ def test_damage_ends_in_a_message(tmp_path: Path, ending: str) -> None:
         path.write_bytes(damaged)
         refused += refusal(path).startswith(str(path))
     assert 30 < refused < 290
+
+
+@pytest.mark.parametrize("tag", ["a", "_"], ids=["names", "list"])
+def test_forty_nodes_deep_is_the_deepest(tmp_path: Path, tag: str) -> None:
+    """A list in a list counts as a name in a name does."""
+
+    def nested(depth: int) -> Path:
+        path = tmp_path / f"{depth}.xml"
+        inner = f"<{tag}>" * (depth - 1) + "1" + f"</{tag}>" * (depth - 1)
+        path.write_text(f"<opencv_storage><x>{inner}</x></opencv_storage>")
+        return path
+
+    found = read_storage(nested(40))["x"]
+    for _ in range(39):
+        found = found[0] if tag == "_" else found[tag]  # type: ignore[index, call-overload]
+    assert found == "1"
+    with pytest.raises(ValueError, match="nested at most 40 deep"):
+        read_storage(nested(41))

@@ -8,7 +8,7 @@ from time import process_time
 import pytest
 
 from ballfg.checks import check_keys, shown
-from ballfg.files.strict_yaml import YamlError, read_mapping, read_yaml
+from ballfg.files.strict_yaml import YamlError, parse_yaml, read_mapping, read_yaml
 
 
 def written(folder: Path, content: str | bytes) -> Path:
@@ -74,6 +74,14 @@ def test_aliases_that_multiply_are_refused_before_they_do(tmp_path: Path) -> Non
     with pytest.raises(YamlError, match="it must hold at most 250000 values, aliases written out in its line 6"):
         read_yaml(path)
     assert process_time() - started < 1.0  # written out they take minutes and gigabytes
+
+
+def test_an_alias_counts_as_what_it_names() -> None:
+    """A list of 1000 words is 1001 values; it stands there 249 times, the outer list is one, and 750 words are left."""
+    lines = [f"- &a [{', '.join('x' * 1000)}]", *["- *a"] * 248, *["- x"] * 750]
+    assert len(parse_yaml("\n".join(lines), "here")) == len(lines)
+    with pytest.raises(YamlError, match="it must hold at most 250000 values, aliases written out in its line 1000"):
+        parse_yaml("\n".join([*lines, "- x"]), "here")
 
 
 def test_what_is_long_is_named_by_its_beginning(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -41,14 +43,16 @@ def test_a_path_ahead(estimate: bf.Estimate) -> None:
 
 
 def test_one_of_several_balls(estimate: bf.Estimate) -> None:
-    from ballfg.prediction import Propagator
+    from ballfg.prediction import Belief, Propagator
     from ballfg.prediction.ahead import carried_by
 
     propagator, belief = carried_by(estimate.last)
     assert isinstance(propagator, Propagator)
-    several = propagator.rollout(belief, estimate.last.time + np.array([[0.1, 0.2, 0.3]]))
-    sigmas = np.sqrt(np.diagonal(several.covariances[0], axis1=1, axis2=2))
-    check(several.plot(0), "prediction", several.times[0], several.states[0, :, :3], sigmas)
+    later = replace(belief, mean=belief.mean + 0.1)
+    several = propagator.rollout(Belief.joined([belief, later]), estimate.last.time + np.array([[0.1, 0.2, 0.3]] * 2))
+    for ball, figure in ((0, several.plot()), (1, several.plot(1))):
+        sigmas = np.sqrt(np.diagonal(several.covariances[ball], axis1=1, axis2=2))
+        check(figure, "prediction", several.times[ball], several.states[ball, :, :3], sigmas)
 
 
 def test_a_prediction_against_what_was_measured(small: Made) -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ballfg.dynamics import Surfaces
-from ballfg.dynamics.motion.rollout import advance, rollout
+from ballfg.dynamics.motion.rollout import LONGEST_MOTION, advance, rollout
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import Belief, Propagator
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
@@ -218,3 +218,19 @@ def test_wrong_times(model, beliefs, table):
             table.rollout(belief, times.double())
     with pytest.raises(ValueError, match="not negative"):
         table.forward(belief, torch.tensor([-0.1]).double())
+
+
+def test_after_the_longest_motion_a_ball_lies_and_its_doubt_grows(model, beliefs):
+    """Nothing moves then, and the noise of the time that is left is added once, as in flight."""
+    noise = ProcessNoise(acceleration=0.01, spin=0.5)
+    propagator = Propagator(Surfaces(0.0, -0.76), noise)
+    belief = beliefs(model, [0, 0, CENTRE, 0.3, 0.0, 0, 0.0, 15.0, 0.0])
+    times = torch.tensor([LONGEST_MOTION, LONGEST_MOTION + 30.0], dtype=torch.float64)
+    last, later = (propagator.forward(belief, time[None]) for time in times)
+    assert float(later.time) == pytest.approx(LONGEST_MOTION + 30.0)
+    torch.testing.assert_close(later.mean, last.mean)
+    gained = (later.covariance - last.covariance)[0, :9, :9].numpy()
+    t, q, w = 30.0, 0.01**2, 0.5**2
+    expected = np.diag(np.repeat([q * t**3 / 3, q * t, w * t], 3))
+    expected[:3, 3:6] = expected[3:6, :3] = q * t**2 / 2 * np.eye(3)
+    np.testing.assert_allclose(gained, expected, rtol=1e-9, atol=1e-9 * float(last.covariance.max()))

@@ -28,3 +28,20 @@ def test_reversed_axis_is_seen_beside_a_bounce(contact):
     times, positions = bouncing(contact, end=0.6)
     (doubt,) = doubts_about(times, positions * [1.0, 1.0, -1.0], (0.0,), RADIUS)
     assert "z seems to point down" in doubt
+
+
+@pytest.mark.parametrize("contact", [0.2, 0.3, 0.4])
+def test_a_bounce_where_no_surface_is_declared(contact):
+    times, positions = bouncing(contact, end=0.6)
+    (doubt,) = doubts_about(times, positions + np.array([0.0, 0.0, 0.5]), (0.0, -0.76), RADIUS)
+    assert "bounces at z = 0.5" in doubt
+    assert "(they are at 0 and -0.76 m)" in doubt
+
+
+@pytest.mark.parametrize("way", [1.0, -1.0], ids=["lifted", "put down"])
+def test_a_ball_that_lies_and_is_lifted_has_not_bounced(way):
+    """It must come down to its lowest place and rise from there."""
+    times = np.arange(0.0, 0.4, 0.007)
+    height = 0.5 + 3.0 * np.maximum(way * (times - 0.2), 0.0)
+    positions = np.stack([0.5 * times, np.zeros_like(times), height], axis=-1)
+    assert doubts_about(times, positions, (0.0,), RADIUS) == ()

@@ -37,6 +37,26 @@ def test_model_file_keeps_it(tmp_path):
     assert loaded.measures_plainly  # the noise is no effect
 
 
+LIMITS = {
+    "memory_time": 10.0,
+    "stamp_jitter": 1.0,
+    "spin_label": 5000.0,
+    "spin_prior": 5000.0,
+    "acceleration": 100.0,
+    "contact_velocity": 50.0,
+    "contact_tangential": 50.0,
+    "contact_spin": 5000.0,
+}
+
+
+@pytest.mark.parametrize("name", LIMITS)
+def test_more_than_any_ball_has_is_in_another_unit(name):
+    """In ms, in degrees, in mm/s it would be: what is refused is a thousandth more than what is taken."""
+    assert getattr(TrackNoise.from_mapping({name: LIMITS[name]}), name) == LIMITS[name]
+    with pytest.raises(ValueError, match=f"noise.{name} must be in .* at most {LIMITS[name]:g}"):
+        TrackNoise.from_mapping({name: 1.001 * LIMITS[name]})
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
     [

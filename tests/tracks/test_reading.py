@@ -137,6 +137,16 @@ def test_near_rows_at_one_stamp_are_averaged_with_a_note(make_folder):
     assert np.allclose(dataset.track("a").positions[1], [1.01, 0, 0.01], atol=1e-15)
 
 
+@pytest.mark.parametrize("apart", [0.099, 0.101])
+def test_rows_at_one_stamp_are_one_ball_within_a_tenth_of_a_metre(make_folder, apart):
+    folder = make_folder(HEAD + f"a,0,0,0,0\na,0.01,1,0,0\na,0.01,{1 + apart},0,0\na,0.02,2,0,0\n")
+    if apart < 0.1:
+        assert np.allclose(read_dataset(folder).track("a").positions[1], [1.0 + apart / 2, 0, 0])
+    else:
+        with pytest.raises(ValueError, match=r"one position for each time; got two, 0\.101 m apart"):
+            read_dataset(folder)
+
+
 def test_near_rows_with_sigmas_are_weighted(make_folder):
     rows = "a,0,0,0,0,.01,.01,.01\na,0,0.05,0,0,.02,.02,.02\na,1,0,0,0,.01,.01,.01\n"
     track = read_dataset(make_folder(SIGMA_HEAD + rows)).track("a")

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ballfg.diagnosis.remains.generic import ALARM, generic_tests
-from ballfg.diagnosis.remains.whiteness import whiteness
+from ballfg.diagnosis.remains.whiteness import _summed, whiteness
 from ballfg.tracks import TrackNoise
 from tests.diagnosis.conftest import POSITION_NOISE
 
@@ -30,6 +30,25 @@ def wandering(stretches, seed):
 @pytest.fixture(scope="module")
 def lasting(make_ball, make_launches, make_shots, make_fit):
     return make_fit(make_ball(), wandering(make_shots(make_ball(), make_launches(12, 81), 81).stretches, 3))
+
+
+def test_the_moments_of_the_statistic_are_those_of_its_quadratic_form():
+    """U = r'(W + c) r of r = M e: its mean, variance and third cumulant as traces of whole matrices."""
+    rng = np.random.default_rng(3)
+    n, k, d = 2, 7, 8
+    taken = np.stack([np.linalg.qr(rng.standard_normal((3 * k, d)))[0] for _ in range(n)])
+    apart = np.arange(k)[:, None] - np.arange(k)
+    kernel = np.tile(np.exp(-0.5 * (apart / 2.0) ** 2) - np.eye(k), (n, 1, 1))
+    lone = np.zeros((n, k, 3))
+    lone[:, 2] = 0.7  # no pair of samples differs from another one, so that the noise counts as even
+    total, variance, third = _summed(lone, taken.reshape(n, k, 3, d), np.ones((n, k), dtype=bool), kernel)
+    moments = np.zeros(3)
+    for rows in taken:
+        M, W = np.eye(3 * k) - rows @ rows.T, np.kron(kernel[0], np.eye(3))
+        c = -np.trace(M @ W) / np.trace(M)
+        A = M @ (W + c * np.eye(3 * k))
+        moments += [c * np.trace(M), 2.0 * np.trace(A @ A), 8.0 * np.trace(A @ A @ A)]
+    np.testing.assert_allclose([total, variance, third], moments, rtol=1e-9)
 
 
 def test_a_memory_is_an_alarm_until_it_is_known(lasting):

@@ -10,6 +10,7 @@ import pytest
 from ballfg.diagnosis.fit.fit import covariance_of, fit_problem
 from ballfg.diagnosis.fit.holdout import EvaluationTrack
 from ballfg.diagnosis.fit.stretches import joined
+from ballfg.diagnosis.search import evaluation
 from ballfg.diagnosis.search.candidates import refit, score_all
 from ballfg.diagnosis.search.evaluation import (
     QUIET,
@@ -21,6 +22,7 @@ from ballfg.diagnosis.search.evaluation import (
     prediction_floor,
 )
 from ballfg.diagnosis.search.hypothesis import Hypothesis
+from ballfg.diagnosis.search.score import score_tests
 from ballfg.dynamics import EFFECTS
 from ballfg.estimation.settings import Settings
 from ballfg.tracks import Track
@@ -47,6 +49,24 @@ def test_the_true_effect_helps_on_other_tracks(windy_fit, with_wind, others):
     found = held_out_gain(windy_fit, with_wind, others[0])
     assert found.gain > 5.0
     assert found.p_value < 0.05
+
+
+def test_only_a_change_for_the_better_counts(windy_fit, with_wind, others, monkeypatch):
+    """The product of change and residual has a sign: half of the two-sided probability of its score."""
+    scores = []
+
+    def heard(*given):
+        (score,) = score_tests(*given)
+        scores.append(score)
+        return [score]
+
+    monkeypatch.setattr(evaluation, "score_tests", heard)
+    found = held_out_gain(windy_fit, with_wind, others[0])
+    assert scores[0].rank == 1
+    assert found.p_value == pytest.approx(scores[0].p_value / 2.0, rel=1e-12)
+    back = held_out_gain(with_wind, windy_fit, others[0])
+    assert back.gain < 0.0
+    assert back.p_value == 1.0
 
 
 def test_an_idle_effect_does_not(calm_fit, others):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from ballfg.diagnosis.search.score import score_tests
+from ballfg.diagnosis.search.score import PRIOR_TRACKS, Pattern, _p_value, score_tests
 from ballfg.diagnosis.search.signatures import Signatures
 
 SAMPLES, COMMON, COLUMNS, REPEATS = 40, 6, 6, 120
@@ -123,6 +123,20 @@ def test_an_effect_of_the_stated_size_is_noticed_in_nine_of_ten_cases(candidate,
     assert stats.binom.cdf(noticed, REPEATS, 0.9) > SURE, noticed / REPEATS
     if candidate == 0:
         assert stats.binom.sf(noticed - 1, REPEATS, 0.95) > SURE, noticed / REPEATS
+
+
+@pytest.mark.parametrize("tracks", [4, 12])
+def test_several_directions_are_judged_by_hotelling_s_distribution(tracks):
+    """Against drawn covariances of as many degrees of freedom: chi-square would give a tenth of these p-values."""
+    rng, draws = np.random.default_rng(8), 60_000
+    freedom = tracks + round(PRIOR_TRACKS) - 1
+    rows = rng.standard_normal((draws, freedom, 3))
+    drawn, scatter = rng.standard_normal((draws, 3)), rows.swapaxes(1, 2) @ rows / freedom
+    squares = np.einsum("ni,ni->n", drawn, np.linalg.solve(scatter, drawn[..., None])[..., 0])
+    for size in (2.0, 3.0, 4.0):
+        found = _p_value(Pattern(3, np.array([size, 0.0, 0.0]), np.eye(3), np.eye(3), 1.0), tracks, 1.0)
+        share = float((squares > size**2).mean())
+        assert found == pytest.approx(share, abs=4.0 * np.sqrt(share / draws)), size
 
 
 def test_one_step_finds_a_linear_effect_without_noise():

@@ -136,6 +136,25 @@ def test_a_falling_ball_always_leaves_upwards(kind, states):
         assert bool((up <= (HIGHEST_RESTITUTION + 1e-12) * -state[:, 5]).all())
 
 
+@pytest.mark.parametrize("residual", [False, True])
+def test_a_network_may_choose_any_restitution_up_to_the_highest(residual, every_effect, states):
+    """From none at all over the first guess to `HIGHEST_RESTITUTION` times it, with one output."""
+    base = every_effect if residual else None
+    model, state = build(Architecture.of("mlp", residual=residual), radius=0.02, base=base), states(5)
+    state[:, 5] = -1.0 - state[:, 5].abs()
+    guess, ratios = model.after_bounce(state)[:, 5].detach(), []
+    for output in (-40.0, -0.5, 0.0, 0.5, 40.0):
+        torch.nn.init.zeros_(model.contact.network.last.bias)
+        with torch.no_grad():
+            model.contact.network.last.bias[0] = output
+            ratios.append(float((model.after_bounce(state)[:, 5] / guess).mean()))
+    highest = HIGHEST_RESTITUTION / (1.0 if residual else START_RESTITUTION)
+    assert ratios[0] == pytest.approx(0.0, abs=1e-12)
+    assert ratios[2] == 1.0
+    assert ratios[4] == pytest.approx(highest, rel=1e-12)
+    assert ratios == sorted(ratios)
+
+
 @pytest.mark.parametrize("kind", SYMMETRIC)
 def test_far_from_all_training_features_stay_bounded(kind, states):
     """Ten times the speed and spin: coefficients, hence drag per speed, are of the size they are at usual speeds."""

@@ -14,6 +14,7 @@ from ballfg.dynamics.effects.flight import Gravity
 from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.filters.ball_filter import BallFilter
 from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
 from ballfg.estimation.filters.sliding_window import SlidingWindow
 from ballfg.estimation.result import Estimate, Status
@@ -313,6 +314,33 @@ def test_planted_hit_is_found_in_its_interval(rng, smooth):
     assert nees(result, truth, VELOCITY)[[23, 35, 54]].max() < chi2.ppf(0.999, 3)
     alone = run(before, smooth=smooth)
     assert np.abs(result.states[:24] - alone.states[:24]).max() < (2.0 if smooth else 1e-9)
+
+
+def test_a_position_after_a_hit_starts_anew_at_its_measurement(rng):
+    """However weak hits are said to be, where the ball was before tells nothing of where it is now."""
+    first, before = simulate(nominal_model(), PLAIN, SERVE, np.arange(25) * 0.01, rng)
+    struck = first[-1].copy()
+    struck[3:6] = [-9.0, 1.0, 2.0]
+    _, after = simulate(nominal_model(), PLAIN, struck, np.arange(11) * 0.01, rng)
+    positions = np.concatenate((before.positions, after.positions[1:]))
+    track = Track(np.arange(35) * 0.01, positions, labels=before.labels, name="struck")
+    weak = replace(PLAIN, process=replace(PLAIN.process, hit_velocity=0.5))
+    result = ExtendedKalmanFilter(nominal_model(), TABLE, weak).estimate(track)
+    assert result.hits[0] == 24
+    np.testing.assert_allclose(result.states[25, :3], positions[25], atol=1e-5)  # 14 cm off the prediction
+    np.testing.assert_allclose(result.sigmas[25, :3], 0.002, rtol=1e-4)
+
+
+@pytest.mark.parametrize("dt", [0.01, 0.2])
+def test_a_wide_velocity_is_linearised_at_the_one_that_the_next_sample_tells(dt):
+    """Drag-free flight from the first sample to the next one, gravity included; the mean itself stays."""
+    start = np.concatenate((SERVE[:3], np.zeros(6)))
+    spread = np.diag(np.repeat([1e-4, 20.0, 100.0], 3) ** 2)
+    ball = BallFilter(AnalyticModel([Gravity()]), LOW, start, spread, np.eye(3, 9))
+    fallen = SERVE[POSITION] + SERVE[VELOCITY] * dt - [0.0, 0.0, 9.81 * dt**2 / 2]
+    point = ball.linearisation_point(fallen, dt, 1e-8 * np.eye(3))
+    np.testing.assert_allclose(point[VELOCITY], SERVE[VELOCITY], atol=0.01)
+    np.testing.assert_array_equal(ball.x, start)
 
 
 def test_gap_of_a_fifth_of_a_second(flight):

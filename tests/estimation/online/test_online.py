@@ -13,12 +13,14 @@ from ballfg.dynamics import BallModel, Surfaces, nominal_model, rollout
 from ballfg.estimation.online.events import contact_step
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.online.windows import stream_window
+from ballfg.estimation.online.windows.interval import IntervalMaker
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.motion import FLIGHT, Motion
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.bridge import STATE_KEY, Bridge
 from ballfg.factors.loss import Loss
+from ballfg.factors.noise import ProcessNoise
 from ballfg.tracks import Track
 
 SIGMA = 0.002
@@ -116,6 +118,20 @@ def test_network_dynamics():
     assert max(s.calls for s in states) == 1
     error = (states[-1].state - truth[-1]) / np.sqrt(np.diag(states[-1].covariance))
     assert np.abs(error).max() < 4.0
+
+
+@pytest.mark.parametrize("dt", [1e-4, 0.01, 0.3])
+def test_the_quick_interval_has_the_noise_of_free_flight(dt):
+    """By its closed form, q^2 [[dt^3/3, dt^2/2], [dt^2/2, dt]], which it does not compute from."""
+    noise = ProcessNoise(acceleration=0.7, spin=3.0)
+    made = IntervalMaker(nominal_model(), noise).make(4, FLIGHT, dt)
+    expected = np.zeros((9, 9))
+    expected[:3, :3], expected[3:6, 3:6] = 0.49 * dt**3 / 3 * np.eye(3), 0.49 * dt * np.eye(3)
+    expected[:3, 3:6] = expected[3:6, :3] = 0.49 * dt**2 / 2 * np.eye(3)
+    expected[6:, 6:] = 9.0 * dt * np.eye(3)
+    np.testing.assert_allclose(made.covariance, expected, rtol=1e-12)
+    root = made.batch.whitening[0]
+    np.testing.assert_allclose(root @ expected @ root.T, np.eye(9), atol=1e-9)
 
 
 def test_answers_are_batched_and_updates_local():

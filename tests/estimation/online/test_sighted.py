@@ -15,6 +15,7 @@ from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.factors.noise import ProcessNoise
 from tests.estimation.observations.sighted_rig import RIG, Scene, World, scene, track_of, world
 
 SAME = 1e-4
@@ -50,7 +51,17 @@ def test_final_estimate_is_the_smoothers(ball: World, seed: int, phases: tuple[f
     assert (np.abs(online.states - smoothed.states) / smoothed.sigmas).max() < tolerance
     assert online.error == pytest.approx(smoothed.error, rel=1e-5)
     assert online.whitened.shape == (len(track.observations[0]), 2)
-    assert np.nanmedian(online.nis) == pytest.approx(1.39, abs=0.5)  # the median of chi-square with 2 degrees
+
+
+def test_innovations_are_as_large_as_stated(ball: World) -> None:
+    """Chi-square of 2 degrees: mean 2, median 2 ln 2. Both of n numbers scatter by 2 / sqrt(n): three times that."""
+    exact = Settings(process=ProcessNoise(acceleration=0.01, spin=0.1, contact_velocity=0.01, contact_spin=0.1))
+    tracks = [track_of(scene(seed, ball, duration=0.35)) for seed in (3, 4, 5)]
+    nis = np.concatenate([Online(ball.model, ball.surfaces, exact, lag=200).estimate(t).nis for t in tracks])
+    nis = nis[np.isfinite(nis)]
+    assert len(nis) > 350
+    assert nis.mean() == pytest.approx(2.0, abs=6.0 / np.sqrt(len(nis)))
+    assert np.median(nis) == pytest.approx(2.0 * np.log(2.0), abs=6.0 / np.sqrt(len(nis)))
 
 
 def test_states_on_the_way(ball: World) -> None:

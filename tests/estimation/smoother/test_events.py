@@ -191,6 +191,23 @@ def test_a_hit_that_the_segmentation_missed_is_marked(settings) -> None:
     assert off[:, :6].max() < 4.5
 
 
+def test_a_known_hit_that_is_harder_than_stated_does_not_hide_another() -> None:
+    """The first breaks its own factor more than the second does, which alone is still to be found."""
+    nowhere = Surfaces(-20.0)
+    first = truth(SERVE, TIMES[:21], nowhere)
+    second = truth([*first[-1, :3], -8.0, 1.0, 3.0, *first[-1, 6:]], TIMES[20:51], nowhere)
+    third = truth([*second[-1, :3], -4.0, -1.0, 3.0, *second[-1, 6:]], TIMES[50:], nowhere)
+    states = np.concatenate((first, second[1:], third[1:]))
+    weak = replace(EXACT, process=replace(EXACT.process, hit_velocity=0.3))
+    track = Track(TIMES, measured(states), name="t")
+    smoother = Smoother(MODEL, nowhere, weak)
+    one = replace(smoother.segment(track), hits=np.array([20]))
+    hits = smoother.solve(smoother.problem(track, one)).events.segmentation.hits
+    assert hits[0] == 20
+    assert len(hits) == 2
+    assert 49 <= hits[1] <= 51
+
+
 @pytest.mark.parametrize(
     "bad",
     [[0], [1], [2], [-1], [40], [10, 40, 41, 60], [0, 25, 50, 75]],

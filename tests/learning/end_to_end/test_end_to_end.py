@@ -138,6 +138,11 @@ def test_unusable_samples_and_the_horizon() -> None:
     growing = trainee(LossConfig(horizon_start=0.05, horizon_epochs=4), noise=False)
     counted = [growing.loss((0, 1, 2), epoch).points for epoch in (0, 2, 4, 9)]
     assert counted[0] < counted[1] < counted[2] == counted[3] == growing.judge((0, 1, 2)).points
+    half = 0  # after two of four epochs: half way from the first horizon to what is left after the observed samples
+    for shot in growing.shots:
+        times, since = shot.track.times, float(shot.track.times[shot.observed - 1])
+        half += int((times <= since + (0.05 + float(times[-1]) - since) / 2 + 1e-9).sum())
+    assert counted[1] == half
 
 
 def test_the_shot_shown_has_the_error_that_is_judged() -> None:

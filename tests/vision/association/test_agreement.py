@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ballfg.vision.association.agreement import check_agreement
+from ballfg.vision.association.agreement import CameraAgreement, _culprit, check_agreement
 from ballfg.vision.association.associate import associate
 from ballfg.vision.camera import Camera
 from tests.vision.filming import World, film, rig, shots, turned
@@ -49,6 +49,14 @@ def test_two_wrong_cameras_are_not_blamed_on_one() -> None:
     found = check_agreement(associate(FILMS, cameras), cameras)
     assert found.culprit is None
     assert "no single one explains it" in found.sentence
+
+
+@pytest.mark.parametrize(("explained", "culprit"), [(0.78, None), (0.82, "left"), (0.95, "left")])
+def test_a_culprit_explains_four_fifths(explained: float, culprit: str | None) -> None:
+    """One that leaves a fifth of the disagreement may be wrong beside another camera, however clearly it leads."""
+    shares = {"left": explained, "right": 0.01, "far": 0.02}
+    by_camera = {name: CameraAgreement(5.0, share, 0.5, 0.0, 1.0) for name, share in shares.items()}
+    assert _culprit(by_camera, 30.0) == culprit
 
 
 def test_two_cameras_cannot_say() -> None:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from ballfg.vision.association.triangulate import Triangulated, triangulate
+from ballfg.vision.association.triangulate import Triangulated, _proposal, _views, triangulate
 from ballfg.vision.camera import Camera
 from tests.vision.filming import looking, rig
 
@@ -58,13 +58,18 @@ def test_covariance_of_two_cameras_at_a_right_angle() -> None:
     np.testing.assert_allclose(made.covariances[0], np.diag([one, one, one / 2]), rtol=1e-6, atol=1e-18)
 
 
+def side_by_side(base: float = 0.1, depth: float = 3.0) -> list[Camera]:
+    return [
+        looking(name, (x, -depth, 0.0), (0.0, 0.0, 0.0), distortion=[])
+        for name, x in (("a", -base / 2), ("b", base / 2))
+    ]
+
+
 def test_covariance_is_deep_along_the_viewing_direction() -> None:
     """Two cameras a base b apart: the mean of two angles gives the place across, s z / sqrt(2), their difference the
     depth, s z^2 sqrt(2) / b; the ratio is 2 z / b."""
     base, depth = 0.3, 3.0
-    cameras = [
-        looking(name, (x, -depth, 0.0), (0.0, 0.0, 0.0), distortion=[]) for name, x in (("a", -0.15), ("b", 0.15))
-    ]
+    cameras = side_by_side(base, depth)
     made = triangulate(cameras, *seen(cameras, np.zeros((1, 3)), noise=0.0))
     sigma = np.sqrt(np.diagonal(made.covariances[0]))
     assert sigma[1] / sigma[0] == pytest.approx(2.0 * depth / base, rel=0.01)
@@ -97,6 +102,19 @@ def test_a_wrong_candidate_does_not_move_the_point() -> None:
     assert made.used[found].sum(axis=1).min() == 2
     assert np.linalg.norm(made.points - points, axis=1)[found].max() < 0.01
     assert nees(made, points)[found].mean() == pytest.approx(3.0, abs=0.3)
+
+
+def test_a_third_view_is_gated_by_the_point_s_own_uncertainty_too() -> None:
+    """Two cameras side by side hardly tell the depth, which is what the third one sees: it is off by 8 px."""
+    cameras, points = [*side_by_side(), looking("c", (3.0, 0.0, 0.0), (0.0, 0.0, 0.0), distortion=[])], places(300)
+    points = 0.2 * (points - points.mean(axis=0))
+    pixels, covariances = seen(cameras, points)
+    proposed, agree, _ = _proposal(_views(cameras, pixels, covariances), 0, 1)
+    off = np.linalg.norm(cameras[2].project(proposed) - pixels[:, 2], axis=1)
+    assert np.median(off) > 5.0  # 17 sigma of the third view alone
+    assert agree.all()  # the test refuses one right candidate in a million
+    pixels[:, 2, 1] += 20.0  # across what the depth leaves open
+    assert not _proposal(_views(cameras, pixels, covariances), 0, 1)[1][:, 2].any()
 
 
 def test_views_may_be_missing() -> None:

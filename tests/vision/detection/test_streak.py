@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ballfg.vision.detection.streak import Look, Patch, fit_streak, start, swept
+from ballfg.vision.detection.streak import Look, Patch, _linearised, fit_streak, start, swept
 from tests.vision.drawn import coverage
 
 VALUES = np.array([20.3, 18.8, 4.0, -3.0, 6.5, 60.0, 0.85, 0.2, -0.1])
@@ -50,6 +50,23 @@ def test_derivatives_agree_with_differences(row: int) -> None:
     )
     high, low = swept(x, y, VALUES + step)[0], swept(x, y, VALUES - step)[0]
     np.testing.assert_allclose(swept(x, y, VALUES)[1][row], (high - low) / 0.04, atol=1e-3)
+
+
+def test_without_contrast_the_expectations_alone_tell_the_step() -> None:
+    """Downhill in half^2 / (2 L^2) + (mean - look)' I (mean - look) / 2, which is what is left of the objective."""
+    x, y = grid(40)
+    empty = np.zeros_like(x)
+    values, look = VALUES.copy(), Look(np.array([0.6, 0.05, 0.1]), np.diag([4.0, 9.0, 25.0]) + 0.5)
+    values[5] = 1e-4
+    normal, gradient, residual = _linearised(Patch(x, y, empty, empty, 0.0, 1.0), values, look)
+    assert np.abs(residual).max() < 1e-3
+    expected = np.zeros(9)
+    expected[2:4] = -values[2:4] / 15.0**2
+    expected[6:] = look.information @ (look.mean - values[6:])
+    rest = [2, 3, 6, 7, 8]
+    np.testing.assert_allclose(gradient[rest], expected[rest], rtol=1e-4)
+    np.testing.assert_allclose(normal[6:, 6:], look.information, rtol=1e-4)
+    np.testing.assert_allclose(normal[2:4, 2:4], np.eye(2) / 15.0**2, atol=1e-6)
 
 
 @pytest.mark.parametrize("streak", [0.0, 3.0, 10.0, 25.0])
