@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from ballfg.arrays import Array, Index
-from ballfg.checks import check_keys
+from ballfg.checks import check_keys, one_line, short_text, shown
 from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.files.whole_file import write_text
 
@@ -181,7 +181,7 @@ def load_conformal(path: str | Path) -> ConformalScales:
     check_keys(str(path), content, known, known)
     if (content["level"], content["bin"]) != (LEVEL, BIN):
         raise ValueError(
-            f"{path}: level and bin must be {LEVEL:g} and {BIN:g} s; got {content['level']} and {content['bin']}. "
+            f"{path}: level and bin must be {LEVEL:g} and {BIN:g} s; got {shown(content['level'])} and {shown(content['bin'])}. "
             "Calibrate again."
         )
     try:
@@ -190,7 +190,9 @@ def load_conformal(path: str | Path) -> ConformalScales:
         observe = float(content["observe"])
         statuses = {str(text): int(number) for text, number in content["statuses"].items()}
     except (TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"{path}: must be as it was written; {error}. Calibrate again.") from error
+        raise ValueError(
+            f"{path}: must be as it was written; {short_text(one_line(error))}. Calibrate again."
+        ) from error
     for key, table in tables.items():
         if tracks.ndim != 1 or table.shape != (len(tracks), 3):
             raise ValueError(

@@ -13,6 +13,8 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
 from ballfg.arrays import Array
+from ballfg.checks import one_line
+from ballfg.files.damaged import check_unpacked, library_reads
 from ballfg.state import SIGMA_NAMES, STATE_NAMES
 
 KEYS = ("trajectory", "t")
@@ -59,10 +61,10 @@ def columns_of(path: Path) -> list[str]:
     Raises: ValueError: the file cannot be read as the table that its ending promises.
     """
     if path.suffix.lower() == ".parquet":
-        try:
-            return list(pq.read_schema(path).names)
-        except pa.ArrowInvalid as error:
-            raise ValueError(f"{path} must be a Parquet table; got {_line(error)}. Write it again.") from None
+        with library_reads(path, "Parquet", "Write it again."):
+            about = pq.read_metadata(path)
+            check_unpacked(path, 8 * about.num_rows * about.num_columns)
+            return list(about.schema.to_arrow_schema().names)
     try:
         with path.open(encoding="utf-8") as lines:
             return [name.strip().strip('"') for name in lines.readline().rstrip("\r\n").split(",")]
@@ -85,8 +87,8 @@ def read_table(path: Path, kind: Kind) -> ResultTable:
                 column_types=types, include_columns=names, strings_can_be_null=False, null_values=["", "nan", "NaN"]
             )
             found = pa_csv.read_csv(path, convert_options=options)
-    except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-        raise ValueError(f"{path} must hold a number in each cell; {_line(error)}. Correct it.") from None
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(f"{path} must hold a number in each cell; {one_line(error)[:160]}. Correct it.") from None
     values = np.column_stack([found[name].to_numpy().astype(np.float64) for name in names[1:]])
     if not len(values):
         raise ValueError(f"{path} must have rows; it has a header only. Give a table with results.")
@@ -102,7 +104,3 @@ def read_table(path: Path, kind: Kind) -> ResultTable:
     ends = np.cumsum(counts).tolist()
     rows = map(slice, [0, *ends], ends)
     return ResultTable(path, kind, dict(zip(keys.dictionary.to_pylist(), rows, strict=True)), values[order])
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split()).rstrip(".")
