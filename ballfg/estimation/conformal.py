@@ -180,16 +180,14 @@ def load_conformal(path: str | Path) -> ConformalScales:
     known = (*_FIELDS, "level", "bin")
     check_keys(str(path), content, known, known)
     if (content["level"], content["bin"]) != (LEVEL, BIN):
-        raise ValueError(
-            f"{path}: level and bin must be {LEVEL:g} and {BIN:g} s; got {shown(content['level'])} and {shown(content['bin'])}. "
-            "Calibrate again."
-        )
+        got = f"{shown(content['level'])} and {shown(content['bin'])}"
+        raise ValueError(f"{path}: level and bin must be {LEVEL:g} and {BIN:g} s; got {got}. Calibrate again.")
     try:
         tracks = np.array(content["tracks"], dtype=np.int64)
         tables = {key: np.array(content[key], dtype=np.float64) for key in _ARRAYS[1:]}
         observe = float(content["observe"])
         statuses = {str(text): int(number) for text, number in content["statuses"].items()}
-    except (TypeError, ValueError, AttributeError) as error:
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
         raise ValueError(
             f"{path}: must be as it was written; {short_text(one_line(error))}. Calibrate again."
         ) from error

@@ -18,6 +18,8 @@ from ballfg.files.damaged import check_unpacked, library_reads
 from ballfg.state import SIGMA_NAMES, STATE_NAMES
 
 KEYS = ("trajectory", "t")
+LARGEST = 1e12
+"""Of all numbers of a table, in SI units; beyond it sums and squares leave what a page can hold."""
 
 
 class Kind(enum.Enum):
@@ -96,6 +98,13 @@ def read_table(path: Path, kind: Kind) -> ResultTable:
         row = int(np.flatnonzero(~np.isfinite(values[:, 0]))[0])
         raise ValueError(
             f"{path}: t must be a finite number of seconds; row {row + 1} has {values[row, 0]}. Correct it."
+        )
+    far = np.argwhere(np.isfinite(values) & (np.abs(values) > LARGEST))
+    if len(far):
+        row, column = far[0].tolist()
+        raise ValueError(
+            f"{path}: {names[1 + column]} must be at most {LARGEST:g} in SI units; row {row + 1} has "
+            f"{values[row, column]:g}. Correct it."
         )
     keys = found["trajectory"].combine_chunks().dictionary_encode()
     codes = keys.indices.to_numpy().astype(np.int64)
