@@ -5,10 +5,14 @@ VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 SOURCES := ballfg factors learning benchmarks tests
+TOOLS  := build/tools/bin/pip-audit
+OLDEST := tests/factors tests/files tests/importing/test_forms.py tests/live/test_bag.py tests/dynamics/test_model_file.py \
+	tests/dynamics/networks/test_learned_file.py tests/estimation/smoother tests/prediction tests/pages tests/tracks \
+	tests/vision/test_camera_file.py tests/cli/test_estimate.py tests/cli/test_show.py tests/simulation tests/test_front.py
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: bench test check check-speed docs package readme format clean
+.PHONY: bench test check check-speed check-deps check-oldest docs package sbom readme format clean
 
 bench: $(READY)  ## the estimator comparison: table, results/results.json, pictures; measured tracks too where they are
 	$(BIN)/ballfg-bench estimators --out results
@@ -41,6 +45,27 @@ package: $(READY)  ## wheel and sdist in dist/, tried in a bare environment away
 	build/bare/bin/python -m pip install --quiet -c constraints.txt dist/*.whl
 	cd build/bare && rm -rf tried && mkdir tried && cd tried && ../bin/ballfg example --tracks 6 \
 	&& ../bin/ballfg estimate example/shots --out states.csv && ../bin/ballfg info
+	$(MAKE) sbom
+
+sbom: $(TOOLS)  ## what the wheel brings along, as CycloneDX JSON beside it; after `make package`
+	build/tools/bin/cyclonedx-py environment --pyproject pyproject.toml --mc-type library --output-reproducible \
+		--of JSON -o dist/ballfg.cdx.json build/bare/bin/python
+
+check-deps: $(READY) $(TOOLS)  ## known vulnerabilities (needs a network, and says so without one) and licences; STRICT=1
+	$(BIN)/python -m tests.dependencies.audit $(TOOLS) $(if $(STRICT),--strict)
+	$(BIN)/python -m tests.dependencies.licences
+
+check-oldest:  ## the oldest versions that pyproject.toml allows, in an environment of their own: tests of reading to predicting
+	rm -rf build/oldest && $(PYTHON) -m venv build/oldest
+	build/oldest/bin/python -m pip install --quiet --upgrade pip "setuptools>=77" wheel
+	build/oldest/bin/python -m pip install --quiet --no-build-isolation -c constraints-oldest.txt \
+		-e ".[diffusion,ros,excel,hdf5,dask]" "pytest>=8" "hypothesis>=6"
+	build/oldest/bin/python -m pytest -W default -W ignore::DeprecationWarning $(OLDEST)
+
+$(TOOLS): constraints.txt
+	$(PYTHON) -m venv build/tools
+	build/tools/bin/python -m pip install --quiet -c constraints.txt pip-audit cyclonedx-bom
+	touch $@
 
 format: $(READY)
 	$(BIN)/ruff format $(SOURCES)

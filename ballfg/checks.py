@@ -61,8 +61,10 @@ def short_text(text: str) -> str:
 
 
 def listed(names: Collection[object]) -> str:
-    """Names in a message: the first ones, and how many more there are."""
-    first = [short_text(str(name)) for name in itertools.islice(names, MAX_LISTED)]
+    """Names in a message: the first ones, and how many more there are; line feeds and their like as in Python."""
+    first = [
+        short_text(str(name) if str(name).isprintable() else repr(name)) for name in itertools.islice(names, MAX_LISTED)
+    ]
     more = len(names) - len(first)
     return (", ".join(first) or "nothing") + (f" and {more} more" if more else "")
 

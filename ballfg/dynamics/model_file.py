@@ -23,6 +23,8 @@ from ballfg.tracks import TrackNoise
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
 VARIATIONS: Final = "variations"
 SECTIONS = (*KINDS, VARIATIONS, "learned")
+LONGEST_NAME: Final = 255
+"""Characters of a folder's name."""
 NOISE: Final = "noise"
 """Entry of the section `measurement` that is no effect: how far tracks scatter about the model."""
 
@@ -54,7 +56,7 @@ def load_model(
     learned = content.get("learned") if isinstance(content, Mapping) else None
     if learned is None:
         return model_from_dict(content, radius=radius, inertia_factor=inertia_factor, where=str(path))
-    if not isinstance(learned, str) or not learned:
+    if not isinstance(learned, str) or not 0 < len(learned) <= LONGEST_NAME:
         raise ValueError(f"{path}: section 'learned' must be null or the name of a folder; got {shown(learned)}")
     analytic = model_from_dict(
         {**content, "learned": None}, radius=radius, inertia_factor=inertia_factor, where=str(path)

@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from ballfg.arrays import Array, Index
-from ballfg.checks import check_keys
+from ballfg.checks import check_keys, one_line, short_text, shown
 from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.files.whole_file import write_text
 
@@ -180,17 +180,17 @@ def load_conformal(path: str | Path) -> ConformalScales:
     known = (*_FIELDS, "level", "bin")
     check_keys(str(path), content, known, known)
     if (content["level"], content["bin"]) != (LEVEL, BIN):
-        raise ValueError(
-            f"{path}: level and bin must be {LEVEL:g} and {BIN:g} s; got {content['level']} and {content['bin']}. "
-            "Calibrate again."
-        )
+        got = f"{shown(content['level'])} and {shown(content['bin'])}"
+        raise ValueError(f"{path}: level and bin must be {LEVEL:g} and {BIN:g} s; got {got}. Calibrate again.")
     try:
         tracks = np.array(content["tracks"], dtype=np.int64)
         tables = {key: np.array(content[key], dtype=np.float64) for key in _ARRAYS[1:]}
         observe = float(content["observe"])
         statuses = {str(text): int(number) for text, number in content["statuses"].items()}
-    except (TypeError, ValueError, AttributeError) as error:
-        raise ValueError(f"{path}: must be as it was written; {error}. Calibrate again.") from error
+    except (TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise ValueError(
+            f"{path}: must be as it was written; {short_text(one_line(error))}. Calibrate again."
+        ) from error
     for key, table in tables.items():
         if tracks.ndim != 1 or table.shape != (len(tracks), 3):
             raise ValueError(

@@ -195,6 +195,8 @@ def _one_clock(table: RawTable, names: list[str]) -> bool:
         a, b = (np.asarray(one - one[0], dtype=np.float64) for one in (first, other))
         slope = float(a @ b) / max(float(a @ a), 1e-300)
         power = np.log10(abs(slope)) if slope else np.inf
+        if not np.isfinite(power):
+            return False
         if abs(power - round(power)) > 1e-3 or np.abs(b - slope * a).max() > 1e-3 * max(np.abs(b).max(), 1e-300):
             return False
     return True

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ballfg.checks import short_text
 from ballfg.importing.ball_and_table import ball_of, table_of
 from ballfg.importing.choices import Choices, Guess, UndecidedError
 from ballfg.importing.columns import Roles
@@ -38,6 +39,17 @@ def propose(data: Any, choices: Choices) -> Proposal:
     Raises: UndecidedError: a guess that is not safe. FileNotFoundError: no such file. ValueError: unreadable input.
     """
     tables = tables_of(data, choices.topic, choices.key)
+    try:
+        return _proposed(tables, choices)
+    except UndecidedError:
+        raise
+    except ValueError as error:
+        where = short_text(", ".join(dict.fromkeys(table.source for table in tables)))
+        raise error if where in str(error) else ValueError(f"{where}: {error}") from None
+
+
+def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
+    """What tables were understood to be."""
     chosen, roles, beside = understood(tables, choices)
     counts = Counts()
     shots = shots_of(chosen, roles, choices, counts)

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
+from ballfg.checks import listed
 from ballfg.importing.choices import Choices, UndecidedError
 from ballfg.importing.columns import Roles
 from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
@@ -17,6 +18,8 @@ from ballfg.tracks.track import Label
 
 _DISORDER: Final = 3.0
 """Median steps: a stamp that is earlier by less came late; by more, a new shot begins."""
+_LARGEST: Final = 1e15
+"""In the source's units; a larger number is no place, whatever the unit, and counts as missing."""
 _ALONE: Final = 5.0
 """A row of zeros is a missing sample if it lies this many median distances from its neighbours."""
 GAP: Final = 0.5
@@ -72,13 +75,16 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
 
     Raises: UndecidedError: no time and no rate. ValueError: a time that is text, or no row with a position.
     """
+    lacking = [name for name in _needed(roles) if name not in table.columns]
+    if lacking:
+        raise ValueError(f"{table.where} must have the columns of the other tables; {listed(lacking)} missing. Add it.")
     stamps = _stamps(table, roles, choices, counts)
     positions = np.stack([numbers(table.columns[name]) for name in roles.places], axis=1)
     sigmas = None
-    held = ~missing(stamps) & np.isfinite(positions).all(axis=1)
+    held = ~missing(stamps) & (np.abs(positions) <= _LARGEST).all(axis=1)
     if roles.sigmas is not None:
         sigmas = np.stack([numbers(table.columns[name]) for name in roles.sigmas], axis=1)
-        held &= np.isfinite(sigmas).all(axis=1) & (sigmas > 0).all(axis=1)
+        held &= ((sigmas > 0) & (sigmas <= _LARGEST)).all(axis=1)
     counts.missing += int((~held).sum())
     rows = np.flatnonzero(held)
     if not len(rows):
@@ -219,12 +225,24 @@ def _labels(
     """Columns that are constant in every shot."""
     found: dict[str, list[Label | None]] = {}
     for name in names:
-        column = table.columns[name]
-        if all((column[part] == column[part[0]]).all() for part in parts) and name.isprintable():
+        column = table.columns.get(name)
+        if column is None:  # the first table has it, this one does not
+            counts.ignored.add(name)
+        elif all((column[part] == column[part[0]]).all() for part in parts) and _may_be_label(name):
             found[name] = [_label(column, int(part[0])) for part in parts]
         elif not _empty(column):
             counts.ignored.add(name)
     return found
+
+
+def _needed(roles: Roles) -> tuple[str, ...]:
+    """The columns that every table of a source must have."""
+    alone = (name for name in (roles.frame, roles.trajectory) if name is not None)
+    return (*roles.time, *roles.places, *alone, *(roles.sigmas or ()))
+
+
+def _may_be_label(name: str) -> bool:
+    return bool(name.strip()) and name.isprintable() and name != "trajectory"
 
 
 def _label(column: Column, row: int) -> Label | None:

@@ -18,6 +18,8 @@ NO_STAMP: Final = np.iinfo(np.int64).min
 _CLOCK: Final = re.compile(r"^(\d{1,2}):(\d{2}):(\d{2}(?:[.,]\d+)?)$")
 _FINE: Final = re.compile(r"^(.*:\d{2})[.,](\d+)(.*)$")
 _DIVISORS: Final = {"s": 1.0, "ms": 1e3, "us": 1e6, "ns": 1e9}
+_LATEST: Final = 1e19
+"""No stamp is later: 300 years in ns."""
 _FAR: Final = 1e6
 """s: stamps later than this are counted from the first one, so that a float keeps their microseconds."""
 
@@ -46,7 +48,7 @@ def joined(seconds: Column, nanoseconds: Column) -> Stamps:
 
 def missing(stamps: Stamps) -> NDArray[np.bool_]:
     """(n,) which stamps are missing."""
-    return stamps == NO_STAMP if stamps.dtype.kind == "i" else ~np.isfinite(stamps)
+    return stamps == NO_STAMP if stamps.dtype.kind == "i" else ~(np.abs(stamps) <= _LATEST)
 
 
 def origin_of(stamps: Stamps, unit: str) -> int | float:

@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from ballfg.checks import listed, short_text, shown
 from ballfg.files.moving import settle
 from ballfg.pages.tables import Kind, ResultTable, columns_of, kind_of, read_table
 from ballfg.tracks import Ball, DatasetInfo, Track, read_dataset
@@ -101,17 +104,74 @@ def _read(path: Path, opened: Callable[[Path], Folder]) -> tuple[str, Any]:
     own = path.absolute().parent / "dataset.yaml"
     kind = None if own.is_file() and path.stem == "tracks" else kind_of(columns)
     if kind is None:
-        shown = ", ".join(columns[:8]) + (", ..." if len(columns) > 8 else "")
         hint = f"Give its folder, {path.parent}." if own.is_file() else "Check the path."
-        raise ValueError(f"{path} must be {COULD_BE}; its columns are {shown}. {hint}")
+        raise ValueError(f"{path} must be {COULD_BE}; its columns are {listed(columns)}. {hint}")
     return ("states" if kind is Kind.STATES else "predictions"), read_table(path, kind)
 
 
 def _diagnosis(path: Path) -> Mapping[str, Any]:
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError:
+    except (ValueError, RecursionError):
         raise ValueError(f"{path} must be the {REPORT} of a diagnosis; it is no JSON. Diagnose again.") from None
     if not isinstance(content, dict) or not {"verdict", "sentence", "error", "calibrated", "rounds"} <= content.keys():
         raise ValueError(f"{path} must be the {REPORT} of a diagnosis; its fields are others. Give {COULD_BE}.")
+    try:
+        _Report.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = short_text(".".join(str(part) for part in first["loc"]))
+        raise ValueError(
+            f"{path} must be the {REPORT} of a diagnosis; {where}: {first['msg']}, got {shown(first['input'])}. "
+            "Diagnose again."
+        ) from None
     return content
+
+
+class _Part(BaseModel):
+    """A part of a report; fields that no page shows are left alone."""
+
+    model_config = ConfigDict(strict=True, frozen=True, allow_inf_nan=False)
+
+
+class _Errors(_Part):
+    prediction_rmse_mm: float | None = None
+    apex_rmse_mm: float | None = None
+    nis: float | None = None
+    intervals_held: float | None = None
+    by_track_mm: list[float | None] = []
+
+
+class _BeforeAfter(_Part):
+    before: _Errors
+    after: _Errors
+
+
+class _Value(_Part):
+    declared: float | None = None
+    value: float | None
+    sigma: float | None
+    unit: str
+
+
+class _Effect(_Part):
+    name: str
+    sentence: str
+
+
+class _Candidate(_Part):
+    name: str
+    explained: float | None = None
+    standing: str
+
+
+class _Report(_Part):
+    """What pages show of a report."""
+
+    verdict: str
+    sentence: str
+    error: _BeforeAfter
+    calibrated: dict[str, _Value]
+    rounds: list[list[_Candidate]]
+    effects: list[_Effect] = []
+    dataset: str = ""

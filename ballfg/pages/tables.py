@@ -13,9 +13,13 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 
 from ballfg.arrays import Array
+from ballfg.checks import one_line
+from ballfg.files.damaged import check_unpacked, library_reads
 from ballfg.state import SIGMA_NAMES, STATE_NAMES
 
 KEYS = ("trajectory", "t")
+LARGEST = 1e12
+"""Of all numbers of a table, in SI units; beyond it sums and squares leave what a page can hold."""
 
 
 class Kind(enum.Enum):
@@ -59,10 +63,10 @@ def columns_of(path: Path) -> list[str]:
     Raises: ValueError: the file cannot be read as the table that its ending promises.
     """
     if path.suffix.lower() == ".parquet":
-        try:
-            return list(pq.read_schema(path).names)
-        except pa.ArrowInvalid as error:
-            raise ValueError(f"{path} must be a Parquet table; got {_line(error)}. Write it again.") from None
+        with library_reads(path, "Parquet", "Write it again."):
+            about = pq.read_metadata(path)
+            check_unpacked(path, 8 * about.num_rows * about.num_columns)
+            return list(about.schema.to_arrow_schema().names)
     try:
         with path.open(encoding="utf-8") as lines:
             return [name.strip().strip('"') for name in lines.readline().rstrip("\r\n").split(",")]
@@ -85,8 +89,8 @@ def read_table(path: Path, kind: Kind) -> ResultTable:
                 column_types=types, include_columns=names, strings_can_be_null=False, null_values=["", "nan", "NaN"]
             )
             found = pa_csv.read_csv(path, convert_options=options)
-    except (pa.ArrowInvalid, pa.ArrowNotImplementedError) as error:
-        raise ValueError(f"{path} must hold a number in each cell; {_line(error)}. Correct it.") from None
+    except (pa.ArrowException, OSError) as error:
+        raise ValueError(f"{path} must hold a number in each cell; {one_line(error)[:160]}. Correct it.") from None
     values = np.column_stack([found[name].to_numpy().astype(np.float64) for name in names[1:]])
     if not len(values):
         raise ValueError(f"{path} must have rows; it has a header only. Give a table with results.")
@@ -95,6 +99,13 @@ def read_table(path: Path, kind: Kind) -> ResultTable:
         raise ValueError(
             f"{path}: t must be a finite number of seconds; row {row + 1} has {values[row, 0]}. Correct it."
         )
+    far = np.argwhere(np.isfinite(values) & (np.abs(values) > LARGEST))
+    if len(far):
+        row, column = far[0].tolist()
+        raise ValueError(
+            f"{path}: {names[1 + column]} must be at most {LARGEST:g} in SI units; row {row + 1} has "
+            f"{values[row, column]:g}. Correct it."
+        )
     keys = found["trajectory"].combine_chunks().dictionary_encode()
     codes = keys.indices.to_numpy().astype(np.int64)
     order = np.lexsort((values[:, 0], codes))
@@ -102,7 +113,3 @@ def read_table(path: Path, kind: Kind) -> ResultTable:
     ends = np.cumsum(counts).tolist()
     rows = map(slice, [0, *ends], ends)
     return ResultTable(path, kind, dict(zip(keys.dictionary.to_pylist(), rows, strict=True)), values[order])
-
-
-def _line(error: Exception) -> str:
-    return " ".join(str(error).split()).rstrip(".")

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ballfg.arrays import Array
+from ballfg.checks import shown
 from ballfg.state import STANDARD_GRAVITY, Z
 from ballfg.tracks.grouping import RowGroup
 
@@ -116,7 +117,7 @@ def tidy(group: RowGroup, where: Where, findings: Findings | None = None) -> Arr
         values = _one_per_stamp(RowGroup(group.name, rows, values), where, findings)
     if len(values) < 2:
         raise ValueError(
-            f"{where(int(rows[0]))}: trajectory {group.name!r} must have at least two samples at different times; "
+            f"{where(int(rows[0]))}: trajectory {shown(group.name)} must have at least two samples at different times; "
             "got one. Delete it."
         )
     return values
@@ -214,11 +215,11 @@ def _one_per_stamp(group: RowGroup, where: Where, findings: Findings) -> Array:
         if distances[farthest] > MERGE_DISTANCE:
             first, second = int(group.rows[starts[i]]), int(group.rows[starts[i] + farthest])
             raise ValueError(
-                f"{where(first, second)}: trajectory {group.name!r} must have one position for each time; got two, "
-                f"{distances[farthest]:.3g} m apart, at t={same[0, 0]}. Delete one, or give the two balls two names."
+                f"{where(first, second)}: trajectory {shown(group.name)} must have one position for each time; got "
+                f"two, {distances[farthest]:.3g} m apart, at t={same[0, 0]}. Delete one, or give two balls two names."
             )
         kept[i] = fuse(distinct)
-        findings.merged.append(f"{group.name!r} at t={same[0, 0]}")
+        findings.merged.append(f"{shown(group.name)} at t={same[0, 0]}")
         findings.merged_distance = max(findings.merged_distance, float(distances[farthest]))
     return kept
 

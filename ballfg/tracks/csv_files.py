@@ -13,7 +13,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 
-from ballfg.checks import did_you_mean, one_line
+from ballfg.checks import did_you_mean, one_line, shown
 
 _NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
 _NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|infinity)\s*", re.IGNORECASE)
@@ -47,7 +47,7 @@ def check_header(path: Path, header: Sequence[str], required: Sequence[str], kno
     Raises: ValueError: naming the column.
     """
     text = ",".join(header)
-    shown = repr(text if len(text) <= 120 else text[:117] + "...")
+    got = repr(text if len(text) <= 120 else text[:117] + "...")
     for name in required:
         if name not in header:
             expected = f"expected {','.join(required)}, " if len(required) > 1 else ""
@@ -55,11 +55,11 @@ def check_header(path: Path, header: Sequence[str], required: Sequence[str], kno
             if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
                 hint += " Cells must be separated by commas."
             raise ValueError(
-                f"{path}: column {name!r} is missing; {expected}got {shown}. Add or rename the column.{hint}"
+                f"{path}: column {name!r} is missing; {expected}got {got}. Add or rename the column.{hint}"
             )
     for name in known:
         if list(header).count(name) > 1:
-            raise ValueError(f"{path}: column {name!r} must appear once; got {shown}. Rename one of them.")
+            raise ValueError(f"{path}: column {name!r} must appear once; got {got}. Rename one of them.")
 
 
 def convert_options(texts: Sequence[str], numbers: Sequence[str]) -> pa_csv.ConvertOptions:
@@ -143,8 +143,10 @@ def row_problem(header: list[str], numeric: Sequence[str], cells: list[str]) -> 
     for name in numeric:
         cell = cells[header.index(name)]
         if not _NUMBER.fullmatch(cell) and not _NOT_FINITE.fullmatch(cell):
-            got = f"got {cell!r}" if cell.strip() else "got an empty cell"
-            return f", column {name!r}: must be a number with a decimal point; {got}. Correct it or delete the line."
+            got = f"got {shown(cell)}" if cell.strip() else "got an empty cell"
+            return (
+                f", column {shown(name)}: must be a number with a decimal point; {got}. Correct it or delete the line."
+            )
     return None
 
 

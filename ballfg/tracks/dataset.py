@@ -9,6 +9,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Final
 
+from ballfg.checks import shown
 from ballfg.files.moving import settle
 from ballfg.tracks.checks import Findings, check_scale, tidy
 from ballfg.tracks.grouping import Index, RowGroup, groups, scan
@@ -133,7 +134,7 @@ def read_dataset(folder: str | PathLike[str]) -> Dataset:
     settle(path)
     source = _open_source(path)
     info, notes = read_info(path / INFO_FILE)
-    notes += [f"{source.path.name}: column {name!r} ignored" for name in source.ignored]
+    notes += [f"{source.path.name}: column {shown(name)} ignored" for name in source.ignored]
     index = scan(source)
     labels = LabelTable({}, {})
     if (path / LABELS_FILE).is_file():
@@ -182,6 +183,6 @@ def check_group(source: RowSource, group: RowGroup, info: DatasetInfo, findings:
     values = tidy(group, source.where, findings)
     sigmas = values[:, 4:] if values.shape[1] > 4 else None
     try:
-        check_scale(f"trajectory {group.name!r}", values[:, 0], values[:, 1:4], sigmas, info.rate)
+        check_scale(f"trajectory {shown(group.name)}", values[:, 0], values[:, 1:4], sigmas, info.rate)
     except ValueError as error:
         raise ValueError(f"{source.where(int(group.rows[0]))}: {error}") from None

@@ -12,7 +12,7 @@ import pyarrow.csv as pa_csv
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import did_you_mean
+from ballfg.checks import did_you_mean, shown
 from ballfg.tracks import csv_files
 from ballfg.tracks.checks import check_step
 from ballfg.tracks.rows import KEY
@@ -32,8 +32,16 @@ UNSTATED: Final = {"sigma_u": 0.5, "sigma_v": 0.5, "rho_uv": 0.0}
 """px. Half a pixel: what a detector reaches that looks for the middle of a patch."""
 LEAST_SIGMA: Final = 1e-4
 """px. No camera tells a ball's centre better; a graph with far surer pixels cannot be solved in double precision."""
-_SIGMA: Final[Rule] = (f"{LEAST_SIGMA:g} px or more", lambda x: x >= LEAST_SIGMA)
+MOST_PIXELS: Final = 1e6
+"""px. No image is wider; larger numbers leave double precision when they are squared."""
+_SIGMA: Final[Rule] = (
+    f"{LEAST_SIGMA:g} to {MOST_PIXELS:.0f} px",
+    lambda x: (x >= LEAST_SIGMA) & (x <= MOST_PIXELS),
+)
+_PIXEL: Final[Rule] = (f"finite, at most {MOST_PIXELS:.0f} px", lambda x: np.abs(x) <= MOST_PIXELS)
 RULES: Final[Mapping[str, Rule]] = {
+    "u": _PIXEL,
+    "v": _PIXEL,
     "sigma_u": _SIGMA,
     "sigma_v": _SIGMA,
     "rho_uv": ("between -1 and 1", lambda x: np.abs(x) < 1.0),
@@ -74,7 +82,7 @@ def read_sightings(
     """
     path = Path(path)
     header, table, nameless = _read(path, list(time_offsets))
-    notes = [f"{path.name}: column {name!r} ignored" for name in header if name not in (*REQUIRED, *OPTIONAL)]
+    notes = [f"{path.name}: column {shown(name)} ignored" for name in header if name not in (*REQUIRED, *OPTIONAL)]
     if nameless:
         notes.append(f"{path.name}: {nameless} rows without a trajectory left out")
     rows, doubles = _chosen(table)
@@ -195,7 +203,7 @@ def check_cameras(
     if strange.any():
         got = str(names[int(np.argmax(strange))])
         raise ValueError(
-            f"{_place(path, lines[strange], CAMERA)} must be a camera: {', '.join(cameras)}; got {got!r}. "
+            f"{_place(path, lines[strange], CAMERA)} must be a camera: {', '.join(cameras)}; got {shown(got)}. "
             f"Rename it, add it to the cameras' file, or delete its rows.{did_you_mean(got, cameras)}"
         )
 

@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from pathlib import Path
 
-from ballfg.checks import did_you_mean
+from ballfg.checks import did_you_mean, shown
 from ballfg.tracks import csv_files
 from ballfg.tracks.rows import KEY
 from ballfg.tracks.track import FASTEST_SPIN, SPIN_LABELS, Label
@@ -50,9 +50,8 @@ def read_labels(path: Path, trajectories: Collection[str]) -> LabelTable:
     header = csv_files.read_header(path)
     csv_files.check_header(path, header, (KEY,), (KEY,))
     if not all(name.strip() and name.isprintable() for name in header):
-        raise ValueError(
-            f"{path}: each column must have a printable name; got {','.join(header)!r}. Name it or delete it."
-        )
+        got = shown(",".join(header))
+        raise ValueError(f"{path}: each column must have a printable name; got {got}. Name it or delete it.")
     csv_files.check_header(path, header, (), header)
     rows, lines, cells = _read_rows(path, header, set(trajectories))
     columns = {
@@ -76,12 +75,12 @@ def _read_rows(
         name = row[key]
         if name in rows:
             raise ValueError(
-                f"{path}, line {line}: trajectory {name!r} must have one row; line {lines[rows[name]]} is another. "
-                "Delete one of them."
+                f"{path}, line {line}: trajectory {shown(name)} must have one row; line {lines[rows[name]]} is another."
+                " Delete one of them."
             )
         if name not in trajectories:
             raise ValueError(
-                f"{path}, line {line}: trajectory {name!r} must have a track; there is none of that name. "
+                f"{path}, line {line}: trajectory {shown(name)} must have a track; there is none of that name. "
                 f"Names are compared as text, zeros included.{did_you_mean(name, trajectories)}"
             )
         rows[name] = len(cells)
@@ -99,7 +98,7 @@ def _column(path: Path, name: str, cells: list[str], lines: list[int]) -> list[L
             if name not in NUMERIC_LABELS:
                 return text
             raise ValueError(
-                f"{path}, line {line}, column {name!r}: must be a number; got {cell!r}. "
+                f"{path}, line {line}, column {shown(name)}: must be a number; got {shown(cell)}. "
                 "Correct it, or leave the cell empty if it is unknown."
             )
     values: list[Label | None] = [float(cell) if cell.strip() else None for cell in cells]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.checks import one_line
+from ballfg.files.damaged import check_unpacked
 from ballfg.tracks import csv_files
 
 KEY = "trajectory"
@@ -107,9 +108,11 @@ class ParquetRows(RowSource):
 
     def __init__(self, path: Path) -> None:
         try:
-            schema = pq.read_schema(path)
+            about = pq.read_metadata(path)
+            schema = about.schema.to_arrow_schema()
         except (pa.ArrowException, OSError) as error:
             raise ValueError(f"{path}: must be a Parquet file; {one_line(error)}. Write it again.") from None
+        check_unpacked(path, 8 * about.num_rows * about.num_columns)
         super().__init__(path, schema.names)
         for name in self.columns:
             kind = schema.field(name).type

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import check_array
+from ballfg.checks import check_array, shown
 
 SPIN_LABELS = ("spin_x", "spin_y", "spin_z")
 
@@ -78,14 +78,14 @@ class Track:
         times = _finite(self.name, "times", self.times)
         if times.ndim != 1 or len(times) == 0:
             raise ValueError(
-                f"track {self.name!r}: times must have shape (n,) with n >= 1; got {times.shape}. "
+                f"track {shown(self.name)}: times must have shape (n,) with n >= 1; got {times.shape}. "
                 "Pass one stamp per sample."
             )
         wrong = np.flatnonzero(np.diff(times) <= 0)
         if wrong.size:
             i = int(wrong[0]) + 1
             raise ValueError(
-                f"track {self.name!r}: times must be strictly increasing; times[{i}]={times[i]} <= "
+                f"track {shown(self.name)}: times must be strictly increasing; times[{i}]={times[i]} <= "
                 f"times[{i - 1}]={times[i - 1]}. Sort or drop duplicates."
             )
         positions = _finite(self.name, "positions", self.positions, (len(times), 3))
@@ -95,7 +95,7 @@ class Track:
             if (sigmas <= 0).any():
                 i, axis = (int(k) for k in np.argwhere(sigmas <= 0)[0])
                 raise ValueError(
-                    f"track {self.name!r}: sigmas must be positive; sigmas[{i}, {axis}]={sigmas[i, axis]}. "
+                    f"track {shown(self.name)}: sigmas must be positive; sigmas[{i}, {axis}]={sigmas[i, axis]}. "
                     "Give a standard deviation in m, or no sigmas at all."
                 )
         labels = _checked_labels(self.name, self.labels)
@@ -148,8 +148,8 @@ class Track:
         inside = (self.times >= start) & (self.times <= end)
         if not inside.any():
             raise ValueError(
-                f"track {self.name!r}: between(start, end) must hold a sample; got [{start:g}, {end:g}] s while the "
-                f"track covers [{self.times[0]:g}, {self.times[-1]:g}] s. Widen the interval."
+                f"track {shown(self.name)}: between(start, end) must hold a sample; got [{start:g}, {end:g}] s while "
+                f"the track covers [{self.times[0]:g}, {self.times[-1]:g}] s. Widen the interval."
             )
         labels = dict(self.labels)
         if not inside[0]:
@@ -177,28 +177,30 @@ def _check_observations(track: str, observations: tuple[Measurements, ...], roug
     names = [observation.name for observation in observations]
     if len(set(names)) < len(names):
         raise ValueError(
-            f"track {track!r}: observations must have different names; got {names}. Join those of one name."
+            f"track {shown(track)}: observations must have different names; got {names}. Join those of one name."
         )
     if rough and not names:
-        raise ValueError(f"track {track!r}: rough positions must come with the observations that they were made from.")
+        raise ValueError(
+            f"track {shown(track)}: rough positions must come with the observations that they were made from."
+        )
 
 
 def _check_name(name: object) -> None:
     if not isinstance(name, str):
-        raise TypeError(f"track name must be a str; got {type(name).__name__} {name!r}. Pass str({name!r}).")
+        raise TypeError(f"track name must be a str; got {type(name).__name__} {shown(name)}. Pass str({shown(name)}).")
     if not name or not name.isprintable():
         raise ValueError(
-            f"track name must be printable text of one line, not empty; got {name!r}. Rename the trajectory."
+            f"track name must be printable text of one line, not empty; got {shown(name)}. Rename the trajectory."
         )
 
 
 def _finite(track: str, argument: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
-    array = check_array(f"track {track!r}: {argument}", value, shape, "Pass one row per sample.")
+    array = check_array(f"track {shown(track)}: {argument}", value, shape, "Pass one row per sample.")
     if not np.isfinite(array).all():
         index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
         place = ", ".join(map(str, index))
         raise ValueError(
-            f"track {track!r}: {argument} must be finite; {argument}[{place}]={array[index]}. Drop that sample."
+            f"track {shown(track)}: {argument} must be finite; {argument}[{place}]={array[index]}. Drop that sample."
         )
     return array
 
@@ -208,7 +210,8 @@ def _checked_labels(track: str, labels: Mapping[str, Label]) -> dict[str, Label]
     for key, value in labels.items():
         if not isinstance(key, str) or not key.strip() or not key.isprintable() or key == "trajectory":
             raise ValueError(
-                f"track {track!r}: label names must be printable text other than 'trajectory'; got {key!r}. Rename it."
+                f"track {shown(track)}: label names must be printable text other than 'trajectory'; got {shown(key)}. "
+                "Rename it."
             )
         if isinstance(value, str) and key not in SPIN_LABELS:
             checked[key] = value
@@ -222,6 +225,7 @@ def _checked_labels(track: str, labels: Mapping[str, Label]) -> dict[str, Label]
         else:
             rule = "a finite number" if key in SPIN_LABELS else "a finite number or text"
             raise ValueError(
-                f"track {track!r}: label {key!r} must be {rule}; got {value!r}. Leave the label out if it is unknown."
+                f"track {shown(track)}: label {shown(key)} must be {rule}; got {shown(value)}. "
+                "Leave the label out if it is unknown."
             )
     return checked

@@ -8,13 +8,14 @@ from typing import Any, Self
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor
 
+from ballfg.checks import one_line
 from ballfg.dynamics.earlier_names import todays_name
 from ballfg.files.moving import settle
-from ballfg.files.strict_yaml import YamlError, read_yaml
+from ballfg.files.strict_yaml import read_yaml
+from ballfg.files.weights import read_tensors
 from ballfg.files.whole_folder import whole_folder
 
 NAME = "checkpoint"
@@ -94,15 +95,15 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
     try:
         content: Any = read_yaml(path / STATE)
         digests = content.pop(DIGESTS, None) if isinstance(content, dict) else None
-        tensors = {name: load_file(path / f"{name}.safetensors") for name in TENSORS}
+        tensors = {name: read_tensors(path / f"{name}.safetensors") for name in TENSORS}
         progress = RunProgress.model_validate(content)
         if digests is not None and digests != _digests(path):  # checkpoints of earlier versions have none
-            raise SafetensorError(f"the tensors are not those that {STATE} states: a file is damaged")
+            raise ValueError(f"the tensors are not those that {STATE} states: a file is damaged")
         return Checkpoint(progress, **tensors)
     except ValidationError as error:
         reason = f"{STATE}: {error.errors()[0]['msg']}"
-    except (OSError, YamlError, SafetensorError) as error:
-        reason = " ".join(str(error).split())
+    except (OSError, ValueError) as error:
+        reason = one_line(error)
     raise ValueError(f"{path}: not a whole checkpoint ({reason}). Start a new run.")
 
 

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from ballfg.checks import one_line, short_text
 from ballfg.files.whole_file import write_text
 
 
@@ -60,7 +61,7 @@ def read_metrics(path: Path) -> list[Epoch]:
             rows = [{name: _number(name, text) for name, text in row.items()} for row in csv.DictReader(file)]
         return [Epoch(**row) for row in rows]
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: not a table of epochs ({error}). Start a new run.") from None
+        raise ValueError(f"{path}: not a table of epochs ({short_text(one_line(error))}). Start a new run.") from None
 
 
 def epoch_line(epoch: Epoch, last: int, seconds_left: float) -> str:

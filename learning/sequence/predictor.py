@@ -11,12 +11,13 @@ import torch
 import yaml
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
-from safetensors import SafetensorError
-from safetensors.torch import load_file, save
+from safetensors.torch import save
 from torch import Tensor
 
+from ballfg.checks import short_text, shown
 from ballfg.files.moving import settle
-from ballfg.files.strict_yaml import YamlError, read_yaml
+from ballfg.files.strict_yaml import read_yaml
+from ballfg.files.weights import read_tensors
 from ballfg.files.whole_folder import whole_folder
 from ballfg.learning.sequence.architecture import SequenceArchitecture
 from ballfg.learning.sequence.data import LauncherSettings, collate, example
@@ -169,10 +170,11 @@ def _read(folder: Path) -> tuple[FolderConfig, dict[str, Tensor]]:
             raise FileNotFoundError(f"{folder} must hold {CONFIG} and {WEIGHTS}; {name} is missing. Save it again.")
     try:
         config = FolderConfig.model_validate(read_yaml(folder / CONFIG))
-    except (YamlError, ValidationError) as error:
-        raise ValueError(f"{folder / CONFIG}: not the config of a sequence model ({error}). Save it again.") from None
-    try:
-        weights = load_file(folder / WEIGHTS)
-    except SafetensorError as error:
-        raise ValueError(f"{folder / WEIGHTS}: not readable as safetensors ({error}). Save the model again.") from None
-    return config, weights
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"]) or "content"
+        raise ValueError(
+            f"{folder / CONFIG}: not the config of a sequence model ({short_text(where)}: {first['msg']}; got "
+            f"{shown(first['input'])}). Save it again."
+        ) from None
+    return config, read_tensors(folder / WEIGHTS)

@@ -53,7 +53,7 @@ def test_what_cannot_be_shown_says_what_could_be(made: Made, tmp_path: Path) -> 
         ("notes.txt", "must be a dataset .*ending is '.txt'"),
         ("other.json", "its fields are others"),
         ("broken.json", "is no JSON"),
-        ("broken.parquet", "must be a Parquet table"),
+        ("broken.parquet", "must be a whole Parquet file"),
         ("other.csv", "must be a dataset .*columns are a, b"),
         ("", "holds neither dataset.yaml nor report.json"),
     ):

@@ -109,14 +109,14 @@ def test_best_candidate_counts_and_the_rest_is_told(tmp_path: Path) -> None:
         ("trajectory,t,camera,u,v,u\na,0,left,1,2,3\n", "column 'u' must appear once"),
         ("trajectory,t,camera,u,v\na,0,left,1,2\na,1,left,x,2\n", "line 3, column 'u': must be a number"),
         ("trajectory,t,camera,u,v\na,0,left,1,2\na,1,left,1\n", "line 3: must have 5 cells"),
-        ("trajectory,t,camera,u,v\na,0,left,nan,2\n", "line 2, column 'u': must be finite; got nan"),
+        ("trajectory,t,camera,u,v\na,0,left,nan,2\n", "line 2, column 'u': must be finite, at most 1000000 px; got"),
         (
             "trajectory,t,camera,u,v\na,0,lefd,1,2\n",
             "line 2, column 'camera': must be a camera: left, right; got 'lefd'",
         ),
         (
             "trajectory,t,camera,u,v,sigma_u\na,0,left,1,2,0\n",
-            "line 2, column 'sigma_u': must be 0.0001 px or more; got 0",
+            "line 2, column 'sigma_u': must be 0.0001 to 1000000 px; got 0",
         ),
         ("trajectory,t,camera,u,v,rho_uv\na,0,left,1,2,1\n", "column 'rho_uv': must be between -1 and 1"),
         (

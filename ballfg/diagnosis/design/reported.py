@@ -4,6 +4,7 @@ import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+from ballfg.checks import one_line, short_text
 from ballfg.diagnosis.report.report import REPORT
 from ballfg.diagnosis.result import Diagnosis
 from ballfg.diagnosis.search.hypothesis import TWINS
@@ -31,8 +32,9 @@ def reported_pairs(folder: Path) -> list[tuple[str, str]]:
     try:
         effects = json.loads(path.read_text(encoding="utf-8"))["effects"]
         found = {str(e["name"]): [str(name) for name in e["indistinguishable_from"]] for e in effects}
-    except (ValueError, KeyError, TypeError) as error:
-        raise ValueError(f"{path} is not the report of a diagnosis ({error!r}). Run ballfg diagnose again.") from None
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        said = short_text(one_line(error))
+        raise ValueError(f"{path} is not the report of a diagnosis ({said}). Run ballfg diagnose again.") from None
     return _pairs(found, str(path))
 
 

@@ -10,7 +10,6 @@ import shutil
 from pathlib import Path
 from typing import Annotated, Any
 
-import safetensors
 import safetensors.torch
 import torch
 import yaml
@@ -26,6 +25,7 @@ from ballfg.dynamics.networks.learned import LearnedModel, build
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.dynamics.trained import Trained
 from ballfg.files.strict_yaml import read_yaml
+from ballfg.files.weights import read_tensors
 from ballfg.files.whole_folder import whole_folder
 from ballfg.tracks import TrackNoise
 
@@ -218,14 +218,11 @@ def _trained(config: _TrainedConfig, folder: Path) -> Trained:
 
 
 def _read_weights(path: Path, expected: dict[str, Tensor]) -> dict[str, Tensor]:
-    try:
-        tensors = safetensors.torch.load_file(path)
-    except safetensors.SafetensorError as error:
-        raise ValueError(f"{path}: not readable as safetensors ({error}).") from error
+    tensors = read_tensors(path)
     for name in sorted(set(expected) | set(tensors)):
         if name not in tensors or name not in expected:
             has = "is missing" if name not in tensors else "is not of this model"
-            raise ValueError(f"{path}: tensor '{name}' {has}; {CONFIG} and {WEIGHTS} do not belong together.")
+            raise ValueError(f"{path}: tensor {shown(name)} {has}; {CONFIG} and {WEIGHTS} do not belong together.")
         tensor, wanted = tensors[name], expected[name]
         if tensor.shape != wanted.shape or tensor.dtype != wanted.dtype:
             raise ValueError(

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.checks import shown
 from ballfg.estimation.observations.observation import Observation
 from ballfg.estimation.observations.registry import OBSERVATIONS
 from ballfg.tracks import TableWriter, Track, csv_files
@@ -77,13 +78,14 @@ def _read(path: Path, sort: type[Observation], known: set[str], notes: list[str]
     """Rows of each trajectory of one table."""
     header = csv_files.read_header(path)
     wanted = ("t", *sort.columns, "sigma")
+    given = shown(",".join(header))
     for name in (KEY, *wanted):
         if header.count(name) != 1:
             raise ValueError(
-                f"{path}: must have the columns {', '.join((KEY, *wanted))}, each once; got {','.join(header)!r}. "
+                f"{path}: must have the columns {', '.join((KEY, *wanted))}, each once; got {given}. "
                 f"Add or rename {name!r}."
             )
-    notes += [f"{path.name}: column {name!r} ignored" for name in header if name not in (KEY, *wanted)]
+    notes += [f"{path.name}: column {shown(name)} ignored" for name in header if name not in (KEY, *wanted)]
     places, key = [header.index(name) for name in wanted], header.index(KEY)
     rows: defaultdict[str, list[list[float]]] = defaultdict(list)
     for line, cells in csv_files.records(path):
@@ -93,14 +95,14 @@ def _read(path: Path, sort: type[Observation], known: set[str], notes: list[str]
             )
         if cells[key] not in known:
             raise ValueError(
-                f"{path}, line {line}: trajectory {cells[key]!r} must have a track; there is none of that name. "
+                f"{path}, line {line}: trajectory {shown(cells[key])} must have a track; there is none of that name. "
                 "Names are compared as text, zeros included."
             )
         for place in places:
             if not csv_files.is_number(cells[place]) or (header[place] == "sigma" and not float(cells[place]) > 0.0):
                 rule = "a positive number" if header[place] == "sigma" else "a number"
                 raise ValueError(
-                    f"{path}, line {line}, column {header[place]!r}: must be {rule}; got {cells[place]!r}. "
+                    f"{path}, line {line}, column {header[place]!r}: must be {rule}; got {shown(cells[place])}. "
                     "Correct it, or delete the line."
                 )
             if header[place] in sort.columns and abs(float(cells[place])) > sort.largest:

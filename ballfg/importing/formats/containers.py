@@ -1,14 +1,22 @@
-"""Files that hold tables of numbers as such: Parquet, Excel, npz, HDF5, MATLAB, ROS bags."""
+"""Files that hold tables of numbers as such: Parquet, Excel, npz, HDF5, ROS bags."""
 
+import math
 import zipfile
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import IO, Any, Final
 
 import numpy as np
 
+from ballfg.checks import listed
+from ballfg.files.damaged import check_unpacked, library_reads
 from ballfg.importing.formats.nested import nested_tables
 from ballfg.importing.formats.raw import RawTable, table_of
 from ballfg.importing.formats.text_files import text_table
+
+MAX_DEPTH: Final = 40
+"""Groups within groups."""
+_PLAIN: Final = "Save plain arrays of numbers with numpy.savez."
 
 
 def read_parquet(path: Path) -> list[RawTable]:
@@ -16,28 +24,31 @@ def read_parquet(path: Path) -> list[RawTable]:
     import pyarrow as pa
     import pyarrow.parquet as pq
 
-    try:
-        table = pq.read_table(path)
-    except (pa.ArrowException, OSError) as error:
-        raise _unreadable(path, "Parquet", error) from None
-    columns: dict[str, Any] = {}
-    for field in table.flatten().schema:
-        column = table.flatten().column(field.name)
-        if pa.types.is_list(field.type) or pa.types.is_fixed_size_list(field.type):
-            columns[field.name] = column.to_pylist()
-        elif pa.types.is_timestamp(field.type):
-            columns[field.name] = column.cast(pa.timestamp("ns", field.type.tz)).to_numpy().astype("datetime64[ns]")
-        elif pa.types.is_integer(field.type) and column.null_count == 0:
-            columns[field.name] = column.to_numpy()
-        elif pa.types.is_integer(field.type) or pa.types.is_floating(field.type):
-            columns[field.name] = column.cast(pa.float64()).to_numpy()
-        else:
-            columns[field.name] = column.to_pylist()
+    with library_reads(path, "Parquet"):
+        about = pq.read_metadata(path)
+    check_unpacked(path, 8 * about.num_rows * about.num_columns)
+    with library_reads(path, "Parquet"):
+        columns = _columns(pa, pq.read_table(path).flatten())
     rows: list[dict[str, Any]] = []
     if any(isinstance(values, list) and values and isinstance(values[0], list) for values in columns.values()):
         rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         return nested_tables(rows, path.stem, str(path))
     return [table_of(path.stem, columns, str(path))]
+
+
+def _columns(pa: Any, table: Any) -> dict[str, Any]:
+    """The columns of an Arrow table by name: arrays of numbers and dates, lists of all else."""
+    columns: dict[str, Any] = {}
+    for field, column in zip(table.schema, table.columns, strict=True):
+        if pa.types.is_timestamp(field.type):
+            columns[field.name] = column.cast(pa.timestamp("ns", field.type.tz)).to_numpy().astype("datetime64[ns]")
+        elif pa.types.is_integer(field.type) and column.null_count == 0:
+            columns[field.name] = column.to_numpy()
+        elif pa.types.is_integer(field.type) or pa.types.is_floating(field.type):
+            columns[field.name] = column.cast(pa.float64(), safe=False).to_numpy()
+        else:
+            columns[field.name] = column.to_pylist()
+    return columns
 
 
 def read_excel(path: Path) -> list[RawTable]:
@@ -53,47 +64,57 @@ def read_excel(path: Path) -> list[RawTable]:
 
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path} must be an Excel file (.xlsx); it is none. Save it again as .xlsx or CSV.")
-    book = openpyxl.load_workbook(io.BytesIO(path.read_bytes()), read_only=True, data_only=True)
+    with library_reads(path, "Excel"), zipfile.ZipFile(path) as archive:
+        size = sum(member.file_size for member in archive.infolist())
+    check_unpacked(path, size)
+    sheets: dict[str, str] = {}
+    with library_reads(path, "Excel"):
+        book = openpyxl.load_workbook(io.BytesIO(path.read_bytes()), read_only=True, data_only=True)
+        for sheet in book.worksheets:
+            sheet.reset_dimensions()  # rows end at their last cell, whatever size the sheet says it has
+            rows = [row for row in map(_cells, sheet.iter_rows(values_only=True)) if any(row)]
+            width = max(map(len, rows), default=0)
+            check_unpacked(path, sum(len(cell) for row in rows for cell in row) + width * len(rows))
+            text = io.StringIO()
+            csv.writer(text).writerows(row + [""] * (width - len(row)) for row in rows)
+            sheets[sheet.title] = text.getvalue()
+        book.close()
     found: list[RawTable] = []
-    for sheet in book.worksheets:
-        rows = [
-            [
-                ""
-                if cell is None
-                else cell.isoformat()
-                if hasattr(cell, "isoformat")
-                else repr(cell)
-                if isinstance(cell, float)
-                else str(cell)
-                for cell in row
-            ]
-            for row in sheet.iter_rows(values_only=True)
-        ]
-        rows = [row for row in rows if any(row)]
-        if not rows:
-            continue
-        text = io.StringIO()
-        csv.writer(text).writerows(rows)
+    for title, written in sheets.items():
         try:
-            found.append(text_table(text.getvalue(), sheet.title, str(path)))
+            found += [text_table(written, title, str(path))] if written else []
         except ValueError:  # a sheet of text beside the data is no table
             continue
-    book.close()
     if not found:
-        raise ValueError(f"{path} must have a sheet with rows of numbers; got {', '.join(book.sheetnames)}. Add one.")
+        raise ValueError(f"{path} must have a sheet with rows of numbers; got {listed(sheets)}. Add one.")
     return found
+
+
+def _cells(row: Iterable[Any]) -> list[str]:
+    """The cells of a row as text."""
+    return [
+        ""
+        if cell is None
+        else cell.isoformat()
+        if hasattr(cell, "isoformat")
+        else repr(cell)
+        if isinstance(cell, float)
+        else str(cell)
+        for cell in row
+    ]
 
 
 def read_npz(path: Path) -> list[RawTable]:
     """The tables of an npz or npy file. Raises: ValueError: not one, or it holds Python objects."""
-    try:
+    with library_reads(path, "npz or npy", _PLAIN):
+        size = _array_bytes(path)
+    check_unpacked(path, size)
+    with library_reads(path, "npz or npy", _PLAIN):
         loaded = np.load(path, allow_pickle=False)
         content: Any = loaded if isinstance(loaded, np.ndarray) else {key: loaded[key] for key in loaded.files}
-    except (ValueError, OSError, EOFError, zipfile.BadZipFile):
-        raise ValueError(
-            f"{path} must be a whole npz or npy file of plain arrays; it is another file, cut off, or holds Python "
-            "objects. Save arrays of numbers with numpy.savez."
-        ) from None
+        for array in [content] if isinstance(content, np.ndarray) else content.values():
+            if array.dtype.kind in "UV":
+                array.tolist()  # refuses code points that no text has
     return nested_tables(content, path.stem, str(path))
 
 
@@ -103,24 +124,8 @@ def read_hdf5(path: Path) -> list[RawTable]:
     Raises: ValueError: no h5py, or not an HDF5 file.
     """
     h5py = _h5py(path)
-    try:
-        with h5py.File(path, "r") as file:
-            content = _group(h5py, file)
-    except OSError as error:
-        raise _unreadable(path, "HDF5", error) from None
-    return nested_tables(content, path.stem, str(path))
-
-
-def read_matlab(path: Path) -> list[RawTable]:
-    """The tables of a MATLAB file of any version. Raises: ValueError: not one, or version 7.3 without h5py."""
-    import scipy.io
-
-    try:
-        content = scipy.io.loadmat(path, simplify_cells=True)
-    except NotImplementedError:  # version 7.3 is HDF5
-        return read_hdf5(path)
-    except (ValueError, TypeError, OSError) as error:
-        raise _unreadable(path, "MATLAB", error) from None
+    with library_reads(path, "HDF5"), h5py.File(path, "r") as file:
+        content = _Group(h5py, path).content(file, 0)
     return nested_tables(content, path.stem, str(path))
 
 
@@ -155,20 +160,51 @@ def _h5py(path: Path) -> Any:
     return h5py
 
 
-def _group(h5py: Any, group: Any) -> dict[str, Any]:
-    content: dict[str, Any] = {}
-    for key, value in group.attrs.items():
-        if isinstance(value, str | int | float | np.integer | np.floating):
-            content[key] = value
-    for key, value in group.items():
-        if isinstance(value, h5py.Group):
-            if not key.startswith("#"):  # MATLAB keeps the parts of cells there
-                content[key] = _group(h5py, value)
-        elif value.shape is not None:
-            content[key] = value[()]
-    return content
+class _Group:
+    """Reads the groups of an HDF5 file within bounds: links may lead round in circles, empty data be of any size."""
+
+    def __init__(self, h5py: Any, path: Path) -> None:
+        self._h5py, self._path = h5py, path
+        self._size = 0
+
+    def content(self, group: Any, depth: int) -> dict[str, Any]:
+        """Arrays and numbers of a group, by name."""
+        content: dict[str, Any] = {}
+        for key, value in group.attrs.items():
+            if isinstance(value, str | int | float | np.integer | np.floating):
+                content[key] = value
+        if depth > MAX_DEPTH:
+            raise ValueError(f"{self._path}: groups must be nested at most {MAX_DEPTH} deep. Write it flatter.")
+        for key in group:
+            value = group.get(key)  # None where a link leads nowhere
+            if isinstance(value, self._h5py.Group):
+                if not key.startswith("#"):  # MATLAB keeps the parts of cells there
+                    content[key] = self.content(value, depth + 1)
+            elif isinstance(value, self._h5py.Dataset) and value.shape is not None:
+                self._size += value.size * value.dtype.itemsize
+                check_unpacked(self._path, self._size)
+                content[key] = value[()]
+        return content
 
 
-def _unreadable(path: Path, kind: str, error: Exception) -> ValueError:
-    said = " ".join(str(error).split())[:120]
-    return ValueError(f"{path} must be a whole {kind} file; {said}. Copy or export it again.")
+def _array_bytes(path: Path) -> int:
+    """Bytes that the arrays of an npz or npy file take, as their headers and the archive say."""
+    if not zipfile.is_zipfile(path):
+        with path.open("rb") as file:
+            return _header_bytes(file)
+    size = 0
+    with zipfile.ZipFile(path) as archive:
+        for member in archive.infolist():
+            size += member.file_size
+            if member.filename.endswith(".npy"):
+                with archive.open(member) as file:
+                    size = max(size, _header_bytes(file))
+    return size
+
+
+def _header_bytes(file: IO[bytes]) -> int:
+    """Bytes that the array of an npy file takes, by its header."""
+    version = np.lib.format.read_magic(file)
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, kind = header(file)
+    return math.prod(shape) * max(kind.itemsize, 1)

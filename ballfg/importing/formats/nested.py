@@ -17,8 +17,12 @@ def nested_tables(content: Any, name: str, source: str) -> list[RawTable]:
     """All tables in nested dicts, lists and arrays. A scalar beside a table becomes a constant column of it.
 
     Args: content: to search.  name: of the whole.  source: the file, for messages.
+    Raises: ValueError: lists within lists beyond some hundred levels.
     """
-    return _tables(content, name, source, {})
+    try:
+        return _tables(content, name, source, {})
+    except RecursionError:
+        raise ValueError(f"{source} must be nested less deep; it has hundreds of levels. Write tables.") from None
 
 
 def _tables(content: Any, name: str, source: str, known: Mapping[str, Any]) -> list[RawTable]:

@@ -7,7 +7,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
-from ballfg.importing.formats.containers import read_bag, read_excel, read_hdf5, read_matlab, read_npz, read_parquet
+from ballfg.importing.formats.containers import read_bag, read_excel, read_hdf5, read_npz, read_parquet
+from ballfg.importing.formats.matlab import read_matlab
 from ballfg.importing.formats.nested import nested_tables
 from ballfg.importing.formats.raw import RawTable
 from ballfg.importing.formats.text_files import decoded, read_text_table
@@ -107,7 +108,7 @@ def _of_file(path: Path, topic: str | None) -> list[RawTable]:
 def _json(path: Path, text: str) -> list[RawTable]:
     """The tables of a JSON file, or of one with a JSON value on each line."""
     try:
-        content = json.loads(text)
+        content = _loaded(text)
     except json.JSONDecodeError as error:
         lines = [line for line in text.splitlines() if line.strip()]
         if not _whole_line(lines[0]):
@@ -121,9 +122,21 @@ def _json(path: Path, text: str) -> list[RawTable]:
     return nested_tables(content, path.stem, str(path))
 
 
+def _loaded(text: str) -> Any:
+    """The content of JSON. Raises: JSONDecodeError: it is none, or beyond what can be read."""
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        raise
+    except RecursionError:
+        raise json.JSONDecodeError("values are nested too deep", text, 0) from None
+    except ValueError:  # whole numbers beyond 4300 digits
+        raise json.JSONDecodeError("a number has too many digits", text, 0) from None
+
+
 def _whole_line(line: str) -> bool:
     try:
-        json.loads(line)
+        _loaded(line)
     except json.JSONDecodeError:
         return False
     return True
@@ -133,7 +146,7 @@ def _json_lines(path: Path, lines: Sequence[str]) -> list[Any]:
     values: list[Any] = []
     for number, line in enumerate(lines, 1):
         try:
-            values.append(json.loads(line))
+            values.append(_loaded(line))
         except json.JSONDecodeError as error:
             raise ValueError(
                 f"{path}, line {number}: must be valid JSON; {error.msg} at column {error.colno}. Correct or delete "

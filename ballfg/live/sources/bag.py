@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ballfg.checks import listed
+from ballfg.files.damaged import library_reads
 from ballfg.live.sources.lines import Sample
 
 Point = Any
@@ -57,24 +59,21 @@ def _opened(bag: Path) -> Any:
 
 def _topic(bag: Path, topic: str | None) -> str:
     """The topic to read. Raises: ValueError: there is none such."""
-    try:
-        with _opened(bag) as reader:
-            kinds = {connection.topic: str(connection.msgtype) for connection in reader.connections}
-    except Exception as error:
-        raise ValueError(f"bag must be readable; {bag}: {' '.join(str(error).split())}. Check the file.") from None
+    with library_reads(bag, "bag"), _opened(bag) as reader:
+        kinds = {connection.topic: str(connection.msgtype) for connection in reader.connections}
     good = [name for name, kind in kinds.items() if kind in READERS]
-    shown = ", ".join(f"{name} ({kind})" for name, kind in kinds.items()) or "none"
+    held = listed([f"{name} ({kind})" for name, kind in kinds.items()])
     if topic is None and len(good) == 1:
         return good[0]
     if topic is None or topic not in good:
         known = ", ".join(kind.rpartition("/")[2] for kind in READERS)
         got = f"{topic!r}" if topic is not None else "none"
-        raise ValueError(f"topic must be one of {known}; got {got}. The bag has: {shown}. Choose with --topic.")
+        raise ValueError(f"topic must be one of {known}; got {got}. {bag} has: {held}. Choose with --topic.")
     return topic
 
 
 def _samples(bag: Path, topic: str) -> Iterator[Sample]:
-    with _opened(bag) as reader:
+    with library_reads(bag, "bag"), _opened(bag) as reader:
         connections = [c for c in reader.connections if c.topic == topic]
         for connection, _, data in reader.messages(connections=connections):
             message = reader.deserialize(data, connection.msgtype)

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array, Mask
+from ballfg.checks import shown
 from ballfg.files.moving import settle
 from ballfg.tracks import detections_file
 from ballfg.tracks.checks import check_step
@@ -56,7 +57,7 @@ def read_detections(
         )
     values |= {name: np.full(len(names), value) for name, value in _UNSTATED.items() if name not in values}
     known = (*REQUIRED, *detections_file.OPTIONAL, *UNUSED)
-    notes = [f"{path.name}: column {name!r} ignored" for name in header if name not in known]
+    notes = [f"{path.name}: column {shown(name)} ignored" for name in header if name not in known]
     number = np.unique(names, return_inverse=True)[1]
     kept = np.sort(np.unique(np.column_stack((number, *values.values())), axis=0, return_index=True)[1])
     if len(kept) < len(names):

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.checks import listed, shown
 from ballfg.tracks import csv_files
 from ballfg.tracks.checks import check_step
 from ballfg.vision.arrays import Image
@@ -183,17 +184,17 @@ def read_stamps(path: Path) -> Array:
         raise FileNotFoundError(f"file of stamps {path} does not exist. Check the path.")
     names = [name.strip() for name in csv_files.read_header(path)]
     if "t" not in names:
-        raise ValueError(f"{path} must have a column t (s); got {', '.join(names)}. Name it in line 1.")
+        raise ValueError(f"{path} must have a column t (s); got {listed(names)}. Name it in line 1.")
     stamps: list[float] = []
     for line, cells in csv_files.records(path):
         where = f"{path}, line {line}"
         row = dict(zip(names, (cell.strip() for cell in cells), strict=False))
         if "frame" in names and row.get("frame") != str(len(stamps)):
             raise ValueError(
-                f"{where}: frame must count from 0; got {row.get('frame')!r} for {len(stamps)}. Sort the rows."
+                f"{where}: frame must count from 0; got {shown(row.get('frame'))} for {len(stamps)}. Sort the rows."
             )
         if not csv_files.is_number(row.get("t", "")):
-            raise ValueError(f"{where}: t must be a finite number of seconds; got {row.get('t')!r}. Correct it.")
+            raise ValueError(f"{where}: t must be a finite number of seconds; got {shown(row.get('t'))}. Correct it.")
         stamps.append(float(row["t"]))
         if len(stamps) > 1 and not stamps[-1] > stamps[-2]:
             raise ValueError(

@@ -110,7 +110,7 @@ def test_missing_and_damaged_files_are_named(tracks: list[Track], tmp_path: Path
     with pytest.raises(ValueError, match=r"must be as it was saved, with the digest that config.yaml states"):
         SequencePredictor.load(folder)
     weights.write_bytes(b"not numbers")
-    with pytest.raises(ValueError, match=r"weights.safetensors: not readable as safetensors"):
+    with pytest.raises(ValueError, match=r"weights.safetensors must be a whole safetensors file"):
         SequencePredictor.load(folder)
 
 

@@ -1,0 +1,99 @@
+"""Damaged files of every kind: read, or refused in one line; and what the fuzzer itself must notice."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ballfg.files.damaged import FREE, check_unpacked, library_reads
+from tests.faults import worker
+from tests.faults.worker import Worker, verdict
+from tests.places import ROOT
+
+SECONDS = 10
+
+
+def test_every_reader_refuses_damaged_files_in_one_line() -> None:
+    """The corpus, every file replaced as a whole, and then some seconds of random damage."""
+    command = [sys.executable, "-m", "tests.faults.fuzz", "--replay", "--seconds", str(SECONDS), "--seed", "1"]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=500)
+    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
+    assert " 0 fault" in done.stdout
+
+
+def _good() -> None:
+    """Nothing happens."""
+
+
+def _says(error: Exception) -> Callable[[], object]:
+    def fail() -> None:
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize(
+    ("read", "outcome", "words"),
+    [
+        (_good, "read", ""),
+        (_says(ValueError("a.csv must be good")), "refused", "a.csv"),
+        (_says(ValueError("must be good")), "fault", "names no file"),
+        (_says(ValueError("a.csv must\nbe good")), "fault", "not one line"),
+        (_says(ValueError("a.csv" + "x" * 3000)), "fault", "3005 characters"),
+        (_says(KeyError("a.csv")), "fault", "KeyError"),
+        (_says(np.linalg.LinAlgError("a.csv")), "fault", "numpy's own"),
+    ],
+)
+def test_verdicts(read: Callable[[], object], outcome: str, words: str) -> None:
+    found = verdict(read, ("a.csv",))
+    assert found[0] == outcome
+    assert words in found[1]
+
+
+def test_hangs_crashes_and_memory_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each in a process that is really ended; the next case finds a new one."""
+    monkeypatch.setattr(worker, "SECONDS", 0.2)
+    monkeypatch.setattr(worker, "WAITING", 1.0)
+
+    def spin() -> None:
+        while True:
+            pass
+
+    cases = {
+        "spin": spin, "sleep": lambda: time.sleep(60.0), "crash": os.abort, "leave": lambda: os._exit(0),
+        "memory": lambda: bytearray(3 << 30), "good": _good,
+    }  # fmt: skip
+    judge = Worker(lambda reader, file: verdict(cases[reader], ()), _good)
+    found = {name: judge(name, "") for name in cases}
+    judge.close()
+    assert found["spin"] == ("fault", "hang: over 0.2 s of the processor")
+    assert found["sleep"] == ("fault", "hang: waits for over 1 s")
+    assert found["crash"] == ("fault", "crash: SIGABRT")
+    assert found["leave"][1].startswith("crash")
+    assert found["memory"][1].startswith("MemoryError")
+    assert found["good"] == ("read", "")
+
+
+def test_what_a_file_unpacks_to_is_bounded(tmp_path: Path) -> None:
+    path = tmp_path / "a.npz"
+    path.write_bytes(bytes(1000))
+    check_unpacked(path, FREE + 100_000)
+    with pytest.raises(ValueError, match=r"a\.npz must unpack to at most 64 MB, .*; it says 80000 MB"):
+        check_unpacked(path, 80_000_000_000)
+
+
+def test_a_librarys_error_becomes_one_line(tmp_path: Path) -> None:
+    with (
+        pytest.raises(ValueError, match=r"a must be a whole Excel file; 'two lines'\. Copy") as caught,
+        library_reads(tmp_path / "a", "Excel"),
+    ):
+        raise KeyError("two lines")
+    assert "\n" not in str(caught.value)
