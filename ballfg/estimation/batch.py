@@ -14,6 +14,7 @@ from ballfg.estimation.result import Estimate
 from ballfg.factors.lockstep import run_together
 from ballfg.machine import usable_device
 from ballfg.parallel.executor import executor
+from ballfg.parallel.parts import with_jobs
 from ballfg.parallel.processes import Processes
 from ballfg.parallel.stream import finished, in_order, shared
 from ballfg.parallel.work import each, on_one_thread
@@ -141,19 +142,20 @@ def _mapped(
     block: int | None,
 ) -> Iterator[R]:
     stream, others = iter(tracks), executor(jobs)
+    here = partial(with_jobs, jobs, partial(on_one_thread, function))
     if isinstance(others, Processes):
         spent = done = 0.0
         for size in (1, PROBED - 1) if block is None else (block,):
             start = time.perf_counter()
             probed = list(islice(stream, size))
-            yield from on_one_thread(function, probed) if probed else ()
+            yield from here(probed) if probed else ()
             spent, done = time.perf_counter() - start, done + len(probed)
         left = spent / size * (count - done)
         wait = HAND_OVER if others.started else START_UP
         others = others if left * (1.0 - 1.0 / jobs) > wait else None
     if others is None:
         for chunk in _chunks(stream, block or 1):
-            yield from on_one_thread(function, chunk)
+            yield from here(chunk)
         return
     size = block or max(1, min(others.batch, -(-count // (4 * (others.slots + others.helped)))))
     yield from in_order(function, _chunks(stream, size), others)

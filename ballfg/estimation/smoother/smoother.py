@@ -50,6 +50,9 @@ BROKEN = 8.0
 LEAST_POSITION_SIGMA = 0.05
 """m. A position in a track that no graph explains is not trusted better than that."""
 
+LONG = 4000
+"""Samples from which a track is smoothed in pieces that are then joined (docs/derivations/long_tracks.md)."""
+
 OFFSET_ROUNDS = 6
 """How often stamps may be moved by the time offsets that were estimated; 4 ms need three."""
 FIRST_STEPS = 15
@@ -117,6 +120,12 @@ class Smoother(Estimator):
         """
         track = self.prepared(track, factors)
         moving = move_stamps and bool(self.settings.time_offsets)
+        if len(track) >= LONG and not self.settings.time_offsets:
+            from ballfg.estimation.smoother.pieces.whole import in_pieces  # which needs this file
+
+            joined = in_pieces(self, track)
+            if joined is not None:
+                return joined
         smoother = self.first_look() if moving else self
         for _ in range(OFFSET_ROUNDS):
             problem = smoother.problem(track)
