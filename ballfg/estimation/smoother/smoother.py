@@ -44,14 +44,19 @@ MAX_REFINEMENTS = 6
 
 MAX_UNSEEN_HITS = 8
 """How many hits the estimate may add to those that the segmentation found; measured logs needed three at most."""
+NOWHERE = (Convergence.STUCK, Convergence.TOO_MANY_ITERATIONS)
+LEAST_GAIN = 0.9
+"""Of the objective. Where a search leads nowhere and the worst of up to eight hits leaves more than this, hits are not
+what is missing: the noise is stated far too small, and every further hit would cost a long search."""
 BROKEN = 8.0
 """Norm of a whitened dynamics residual (9 dimensions) beyond which its interval hides a hit; chance: one in 1e9."""
 
 LEAST_POSITION_SIGMA = 0.05
 """m. A position in a track that no graph explains is not trusted better than that."""
 
-LONG = 4000
-"""Samples from which a track is smoothed in pieces that are then joined (docs/derivations/long_tracks.md)."""
+LONG = 10_000
+"""Samples from which a track is smoothed in pieces that are then joined (docs/derivations/long_tracks.md). At once it
+takes 20 kB a sample."""
 
 OFFSET_ROUNDS = 6
 """How often stamps may be moved by the time offsets that were estimated; 4 ms need three."""
@@ -184,8 +189,10 @@ class Smoother(Estimator):
             interval = _worst_break(solution)
             if interval is None:
                 break
-            segmentation = replace(segmentation, hits=np.union1d(segmentation.hits, [interval]))
+            segmentation, before = replace(segmentation, hits=np.union1d(segmentation.hits, [interval])), solution
             solution = yield from self._lowest(problem, segmentation, earlier)
+            if solution.minimum.convergence in NOWHERE and solution.minimum.error > LEAST_GAIN * before.minimum.error:
+                break
         found = solution.minimum
         if found.convergence is not Convergence.CONVERGED or found.distance < self.optimizer.tolerance:
             return replace(solution, minimum=found.bare())

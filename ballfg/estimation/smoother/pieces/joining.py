@@ -35,14 +35,13 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 R = TypeVar("R")
 
-PIECE: Final = 500
-"""Samples of a piece. A second look at each bounce costs a minimisation of its piece: with shorter ones the start of
-each costs more, with longer ones these looks."""
+PIECE: Final = 2000
+"""Samples of a piece. Shorter ones are looked at twice in a larger share of their samples, longer ones take memory."""
 OVERLAP: Final = 64
 """Samples beyond both ends of a piece that it is looked at with: as many as the segmentation takes to be sure."""
 MARGIN: Final = 8
 """Samples beyond the ends of a section that velocities from line fits ask for."""
-TOGETHER: Final = 8
+TOGETHER: Final = 2
 """Pieces handed to a process at once."""
 ROUGH: Final = 1e-2
 """Posterior standard deviations, to which a piece by itself is minimised."""
