@@ -70,6 +70,31 @@ def map_estimates(
     return map_blocks(partial(_of_many, function, estimator, device), tracks, count, jobs, TOGETHER)
 
 
+def map_sections(
+    function: Callable[[Iterable[Estimate]], R],
+    estimator: Estimator,
+    tracks: Iterable[Track],
+    count: int,
+    jobs: int,
+    device: str | None = None,
+) -> Iterator[R]:
+    """A function of the estimate of each track in parts (`Estimator.in_sections`), in the order of the tracks.
+
+    Args: function, tracks, count, jobs: as for `map_tracks`.  device: as for `estimate_together`, one part a track.
+    """
+    if device is None:
+        return map_tracks(partial(_of_sections, function, estimator), tracks, count, jobs)
+    return map_estimates(partial(_of_whole, function), estimator, tracks, count, jobs, device)
+
+
+def _of_sections(function: Callable[[Iterable[Estimate]], R], estimator: Estimator, track: Track) -> R:
+    return function(estimator.in_sections(track))
+
+
+def _of_whole(function: Callable[[Iterable[Estimate]], R], estimate: Estimate) -> R:
+    return function((estimate,))
+
+
 def _of_one(function: Callable[[Estimate], R], estimator: Estimator, track: Track) -> R:
     return function(estimator.estimate(track))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -125,7 +125,7 @@ class Smoother(Estimator):
         """
         track = self.prepared(track, factors)
         moving = move_stamps and bool(self.settings.time_offsets)
-        if len(track) >= LONG and not self.settings.time_offsets:
+        if self.is_long(track):
             from ballfg.estimation.smoother.pieces.whole import in_pieces  # which needs this file
 
             joined = in_pieces(self, track)
@@ -142,6 +142,21 @@ class Smoother(Estimator):
                 return estimate
             track, smoother = retimed[0] if retimed else track, self
         return replace(estimate, status=Status.NOT_CONVERGED)
+
+    def is_long(self, track: Track) -> bool:
+        """Whether a track is smoothed in pieces. Where stamps move, a track is smoothed at once whatever its length."""
+        return len(track) >= LONG and not self.settings.time_offsets
+
+    def in_sections(self, track: Track) -> Iterator[Estimate]:
+        """The estimate of a long track section by section, of any other as a whole."""
+        if self.is_long(track):
+            from ballfg.estimation.smoother.pieces.whole import sections  # which needs this file
+
+            found = sections(self, self.prepared(track))
+            if found is not None:
+                yield from found
+                return
+        yield self.estimate(track)
 
     def first_look(self) -> Smoother:
         """The smoother for while stamps are milliseconds off.

@@ -173,9 +173,10 @@ def _search(smoother: Smoother, states: list[State]) -> Found | None:
     last, share = np.full(len(states), np.inf), np.ones(len(states))
     for number in range(1, ROUNDS + 1):
         points = [Point.of(one.values) for one in told]
-        chain = solve_chain([one.ends for one in told], points, priors, anchor)
-        if chain is None:
+        solved = solve_chain([one.ends for one in told], points, priors, anchor)
+        if solved is None:
             return None
+        chain = solved
         steps = [chain.target(k).since(point) for k, point in enumerate(points)]
         length = np.array([one.length(step) for one, step in zip(told, steps, strict=True)])
         near = _is_near(length, last, smoother.optimizer.tolerance)
@@ -184,20 +185,21 @@ def _search(smoother: Smoother, states: list[State]) -> Found | None:
         share = np.where(length > last, 0.5 * share, 1.0)
         moving = np.flatnonzero(~near).tolist()
         tasks = [(State(states[k].section, told[k].values), points[k].moved(steps[k], share[k])) for k in moving]
-        for k, one in zip(
-            moving, watched(partial(advanced, smoother), tasks, f"joined, round {number + 1}"), strict=True
-        ):
+        results = watched(partial(advanced, smoother), tasks, f"joined, round {number + 1}")
+        for k, one in zip(moving, results, strict=True):
             told[k] = one
         last[moving] = length[moving]
-    states = [State(state.section, one.values) for state, one in zip(states, told, strict=True)]
     error = sum(one.promised(step) for one, step in zip(told, steps, strict=True))
     error += objective([moved_rows(rows, chain.coefficients - anchor) for rows in priors])
-    convergence = Convergence.TOO_MANY_ITERATIONS
+    there = [State(state.section, one.values) for state, one in zip(states, told, strict=True)]
+    return Found(there, chain, error, _ended(near, length), number)
+
+
+def _ended(near: NDArray[np.bool_], length: Array) -> Convergence:
+    """How the search ended, by what is left to go in each section."""
     if near.all():
-        convergence = Convergence.CONVERGED
-    elif (near | (length < AT_KINK)).all():
-        convergence = Convergence.AT_KINK
-    return Found(states, chain, error, convergence, number)
+        return Convergence.CONVERGED
+    return Convergence.AT_KINK if (near | (length < AT_KINK)).all() else Convergence.TOO_MANY_ITERATIONS
 
 
 def _is_near(length: Array, last: Array, tolerance: float) -> NDArray[np.bool_]:
@@ -208,7 +210,7 @@ def _is_near(length: Array, last: Array, tolerance: float) -> NDArray[np.bool_]:
 
 def watched(function: Callable[[T], R], parts: Sequence[T], what: str) -> Iterator[R]:
     """The results of parts; says how far they are."""
-    with doing(what) as stage:
+    with doing(f"0 of {len(parts)} pieces {what}") as stage:
         for done, result in enumerate(in_parts(function, parts, TOGETHER), start=1):
             stage.text = f"{done} of {len(parts)} pieces {what}"
             yield result

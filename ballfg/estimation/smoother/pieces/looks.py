@@ -8,9 +8,10 @@ from itertools import pairwise
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ballfg.arrays import Array
-from ballfg.estimation.segmentation import Contact, Segmentation
+from ballfg.arrays import Array, Index
+from ballfg.estimation.segmentation import Contact, Rest, Segmentation
 from ballfg.estimation.smoother.pieces.section import Section, events_of, part_of, shifted
 from ballfg.estimation.smoother.solution import places_of, timed_contacts
 from ballfg.factors.batch import Values
@@ -47,7 +48,7 @@ class Look:
         """The sample after the last."""
         return self.begin + len(self.values.states)
 
-    def busy(self) -> Array:
+    def busy(self) -> Index:
         """Intervals and samples of the track at which something happens."""
         s = self.segmentation
         bounds = [edge for rest in s.rests for edge in (rest.first, rest.last)]
@@ -108,7 +109,8 @@ def joined(looks: Sequence[Look], cuts: Sequence[int]) -> Segmentation:
 
     Args: looks: in order.  cuts: (k + 1,) first sample of each part, and the number of samples.
     """
-    contacts, hits, restarts, rests, quality = [], [], [], [], []
+    contacts, rests = list[Contact](), list[Rest]()
+    hits, restarts, quality = list[Index](), list[Index](), list[NDArray[np.int8]]()
     moved = any(one.moved for one in looks)
     for one, first, last in zip(looks, cuts[:-1], cuts[1:], strict=True):
         s = one.segmentation

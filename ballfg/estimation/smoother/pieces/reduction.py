@@ -135,10 +135,11 @@ class Reduction:
 
 
 def _triangle(covariance: Array) -> Array:
-    """The upper triangle R with (R^T R)^-1 = C."""
+    """The upper triangle R with (R^T R)^-1 = C, where C may have lost its last digits."""
     scale = np.sqrt(np.diagonal(covariance))
-    correlation = covariance / (scale[:, None] * scale)
-    lower = np.linalg.cholesky(correlation[::-1, ::-1])
+    size, axes = np.linalg.eigh((covariance / (scale[:, None] * scale))[::-1, ::-1])
+    size = np.maximum(size, len(size) * np.finfo(float).eps * size[-1])
+    lower = np.linalg.qr((axes * np.sqrt(size)).T)[1].T
     return np.asarray(np.linalg.inv(lower[::-1, ::-1]) / scale)
 
 

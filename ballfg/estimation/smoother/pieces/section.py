@@ -6,8 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.estimation.segmentation import Contact, Rest, Segmentation
 from ballfg.estimation.smoother.problem import Events, TrackProblem
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Rows, Values
@@ -57,7 +58,7 @@ class Section:
         biases = None if values.biases is None else self.padded(values.biases)
         return replace(values, states=self.padded(values.states), biases=biases)
 
-    def owns(self, states: Array) -> Array:
+    def owns(self, states: Index) -> NDArray[np.bool_]:
         """Which of the factors with these first states (m,), index in the part, are the section's; (m,) bool."""
         return (states >= self.first) & (states < self.last + self.ends)
 
@@ -89,7 +90,7 @@ class State:
     values: Values
 
 
-def first_states(batch: FactorBatch) -> Array:
+def first_states(batch: FactorBatch) -> Index:
     """(m,) index of the first state of each factor; -1 where it looks at coefficients alone."""
     states = batch.variables
     least = np.where(states == COEFFICIENTS, np.iinfo(np.int64).max, states).min(axis=1, initial=np.iinfo(np.int64).max)
@@ -122,7 +123,7 @@ def part_of(track: Track, begin: int, end: int) -> Track:
 def events_of(segmentation: Segmentation, begin: int, end: int) -> Segmentation:
     """The events among the samples begin to end - 1, whose first gets the number 0."""
 
-    def inside(intervals: Array) -> Array:
+    def inside(intervals: Index) -> Index:
         return intervals[(intervals >= begin) & (intervals < end - 1)] - begin
 
     contacts = (replace(c, interval=c.interval - begin) for c in segmentation.contacts if begin <= c.interval < end - 1)

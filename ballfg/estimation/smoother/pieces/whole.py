@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact
 from ballfg.estimation.smoother.grip import rival_note
@@ -57,15 +59,18 @@ def in_pieces(smoother: Smoother, track: Track, length: int | None = None) -> Es
     Args: smoother: of the track.  track: prepared.  length: samples of a piece, about.
     Returns: None where pieces cannot be joined, because no finite motion explains one of them.
     """
+    parts = sections(smoother, track, length)
+    return None if parts is None else _assembled(track, parts)
+
+
+def sections(smoother: Smoother, track: Track, length: int | None = None) -> Iterator[Estimate] | None:
+    """The estimate of a long track, section by section, so that nobody need hold all of its covariances.
+
+    Args: smoother, track, length: as for `in_pieces`.
+    Returns: estimates that follow one another, with the status and the coefficients of all; None as for `in_pieces`.
+    """
     found = joined_minimum(smoother, track, length)
-    if found is None:
-        return None
-    end = found.found
-    tasks = [
-        (state, joint, end.chain.target(k))
-        for k, (state, joint) in enumerate(zip(end.states, end.chain.covariances(), strict=True))
-    ]
-    return _assembled(smoother, track, found, tasks)
+    return None if found is None else _sections(smoother, track, found)
 
 
 def smoothed(smoother: Smoother, task: tuple[State, Array, Point]) -> Smoothed:
@@ -109,54 +114,97 @@ def _innovations(problem: TrackProblem, state: State, values: Values, known: Cov
     return {one.name: found[one.name][section.owns(np.asarray(one.state))] for one in problem.observations}
 
 
-def _assembled(smoother: Smoother, track: Track, found: Joined, tasks: list[tuple[State, Array, Point]]) -> Estimate:
-    """The estimate from all sections; each state is told by the section that begins with it, or holds it inside."""
-    n, end = len(track), found.found
-    first = end.states[0].section
-    problem = smoother.problem(first.track, first.segmentation)
-    own = slice(0, problem.width)
+def _sections(smoother: Smoother, track: Track, found: Joined) -> Iterator[Estimate]:
+    """The estimates of the sections, in order. The last state of each is told by the next one."""
+    end, doubts = found.found, smoother.doubts(track)
+    tasks = [
+        (state, joint, end.chain.target(k))
+        for k, (state, joint) in enumerate(zip(end.states, end.chain.covariances(), strict=True))
+    ]
+    before = np.zeros((STATE_DIM, STATE_DIM))
+    bounds = zip(found.cuts[:-1], found.cuts[1:], strict=True)
+    for (first, last), part in zip(bounds, watched(partial(smoothed, smoother), tasks, "smoothed"), strict=True):
+        count = last - first + (last == len(track) - 1)
+        others = np.zeros((count, STATE_DIM, STATE_DIM))
+        others[0] = before
+        for k in (k for k in part.others if k < count):
+            others[k] += part.others[k]
+        before = part.others.get(count, np.zeros((STATE_DIM, STATE_DIM)))
+        notes = (*doubts, *_rival_note(found, part)) if first == 0 else ()
+        yield _section(smoother, track, found, part, others, first, notes)
+
+
+def _section(
+    smoother: Smoother, track: Track, found: Joined, part: Smoothed, others: Array, first: int, notes: tuple[str, ...]
+) -> Estimate:
+    end, events = found.found, found.segmentation
+    count, problem = len(others), smoother.problem(end.states[0].section.track, end.states[0].section.segmentation)
+    coefficients, known = part.values.coefficients, end.chain.coefficient_covariance
+    own, rest = slice(0, problem.width), slice(problem.width, len(coefficients))
+    at_minimum = end.convergence in (Convergence.CONVERGED, Convergence.AT_KINK)
+    return Estimate(
+        name=track.name,
+        times=track.times[first : first + count],
+        states=part.values.states[:count],
+        covariances=part.covariances[:count] + others,
+        other_sides=others,
+        status=Status.OK if at_minimum else Status.NOT_CONVERGED,
+        innovations=part.innovations,
+        coefficient_names=tuple(smoother.settings.coefficients),
+        coefficients=coefficients[own],
+        coefficient_covariance=known[own, own],
+        cross_covariances=part.cross[:count],
+        unknown_names=problem.unknowns.names,
+        unknowns=problem.unknowns.origins + coefficients[rest],
+        unknown_covariance=known[rest, rest],
+        contacts=part.contacts,
+        hits=events.hits[(events.hits >= first) & (events.hits < first + count)] - first,
+        quality=events.quality[first : first + count],
+        error=end.error,
+        iterations=end.rounds,
+        world=smoother.world,
+        notes=notes,
+    )
+
+
+def _rival_note(found: Joined, first: Smoothed) -> tuple[str, ...]:
+    """Says whether another spin at the start explains the track nearly as well."""
+    minimum = Minimum(first.values, found.found.error, None, found.found.convergence, found.found.rounds)
+    solution = Solution(found.found.states[0].section.events, BallGraph(()), minimum, found.rival)
+    return rival_note(solution, first.covariances[0, SPIN, SPIN])
+
+
+def _assembled(track: Track, parts: Iterator[Estimate]) -> Estimate:
+    """One estimate from those of all sections, which it takes in one by one.
+
+    `np.zeros` takes memory for what is written only: `other_sides` is all but empty.
+    """
+    n, first = len(track), next(parts)
+    p = first.cross_covariances.shape[2]
     states, covariances = np.empty((n, STATE_DIM)), np.empty((n, STATE_DIM, STATE_DIM))
-    cross, others = np.empty((n, STATE_DIM, problem.width)), np.zeros((n, STATE_DIM, STATE_DIM))
-    innovations: dict[str, list[Array]] = {one.name: [] for one in problem.observations}
-    contacts: list[Contact] = []
-    coefficients = np.zeros(0)
-    for begin, last, part in zip(
-        found.cuts[:-1], found.cuts[1:], watched(partial(smoothed, smoother), tasks, "smoothed"), strict=True
-    ):
-        inside = slice(begin, last + 1)
-        states[inside], covariances[inside], cross[inside] = part.values.states, part.covariances, part.cross
-        for k, side in part.others.items():
-            others[begin + k] += side
+    cross, others = np.empty((n, STATE_DIM, p)), np.zeros((n, STATE_DIM, STATE_DIM))
+    innovations: dict[str, list[Array]] = {name: [] for name in first.innovations}
+    contacts, hits, quality, begin = list[Contact](), list[Index](), list[NDArray[np.int8]](), 0
+    for part in chain((first,), parts):
+        inside = slice(begin, begin + len(part))
+        states[inside], covariances[inside], cross[inside] = part.states, part.covariances, part.cross_covariances
+        for k in np.flatnonzero(part.other_sides.any(axis=(1, 2))):
+            others[begin + k] = part.other_sides[k]
         for name, whitened in part.innovations.items():
             innovations[name].append(whitened)
         contacts += [replace(contact, interval=contact.interval + begin) for contact in part.contacts]
-        coefficients = part.values.coefficients
-    for k in sorted({k for c in contacts for k in (c.interval, c.interval + 1)} | {n - 1}):
-        covariances[k] += others[k]
-    known, rest = end.chain.coefficient_covariance, slice(problem.width, len(coefficients))
-    at_minimum = end.convergence in (Convergence.CONVERGED, Convergence.AT_KINK)
-    minimum = Minimum(Values(states, coefficients), end.error, None, end.convergence, end.rounds)
-    rival = Solution(first.events, BallGraph(()), minimum, found.rival)
-    return Estimate(
-        name=track.name,
+        hits.append(part.hits + begin)
+        quality.append(part.quality)
+        begin += len(part)
+    return replace(
+        first,
         times=track.times,
         states=states,
         covariances=covariances,
         other_sides=others,
-        status=Status.OK if at_minimum else Status.NOT_CONVERGED,
-        innovations={name: np.concatenate(parts) for name, parts in innovations.items()},
-        coefficient_names=tuple(smoother.settings.coefficients),
-        coefficients=coefficients[own],
-        coefficient_covariance=known[own, own],
         cross_covariances=cross,
-        unknown_names=problem.unknowns.names,
-        unknowns=problem.unknowns.origins + coefficients[rest],
-        unknown_covariance=known[rest, rest],
+        innovations={name: np.concatenate(pieces) for name, pieces in innovations.items()},
         contacts=tuple(contacts),
-        hits=found.segmentation.hits,
-        quality=found.segmentation.quality,
-        error=end.error,
-        iterations=end.rounds,
-        world=smoother.world,
-        notes=smoother.doubts(track) + rival_note(rival, covariances[0, SPIN, SPIN]),
+        hits=np.concatenate(hits),
+        quality=np.concatenate(quality),
     )
