@@ -14,6 +14,7 @@ from ballfg.estimation.result import Estimate
 from ballfg.factors.lockstep import run_together
 from ballfg.machine import usable_device
 from ballfg.parallel.executor import executor
+from ballfg.parallel.parts import with_jobs
 from ballfg.parallel.processes import Processes
 from ballfg.parallel.stream import finished, in_order, shared
 from ballfg.parallel.work import each, on_one_thread
@@ -67,6 +68,31 @@ def map_estimates(
     if device is None:
         return map_tracks(partial(_of_one, function, estimator), tracks, count, jobs)
     return map_blocks(partial(_of_many, function, estimator, device), tracks, count, jobs, TOGETHER)
+
+
+def map_sections(
+    function: Callable[[Iterable[Estimate]], R],
+    estimator: Estimator,
+    tracks: Iterable[Track],
+    count: int,
+    jobs: int,
+    device: str | None = None,
+) -> Iterator[R]:
+    """A function of the estimate of each track in parts (`Estimator.in_sections`), in the order of the tracks.
+
+    Args: function, tracks, count, jobs: as for `map_tracks`.  device: as for `estimate_together`, one part a track.
+    """
+    if device is None:
+        return map_tracks(partial(_of_sections, function, estimator), tracks, count, jobs)
+    return map_estimates(partial(_of_whole, function), estimator, tracks, count, jobs, device)
+
+
+def _of_sections(function: Callable[[Iterable[Estimate]], R], estimator: Estimator, track: Track) -> R:
+    return function(estimator.in_sections(track))
+
+
+def _of_whole(function: Callable[[Iterable[Estimate]], R], estimate: Estimate) -> R:
+    return function((estimate,))
 
 
 def _of_one(function: Callable[[Estimate], R], estimator: Estimator, track: Track) -> R:
@@ -141,19 +167,20 @@ def _mapped(
     block: int | None,
 ) -> Iterator[R]:
     stream, others = iter(tracks), executor(jobs)
+    here = partial(with_jobs, jobs, partial(on_one_thread, function))
     if isinstance(others, Processes):
         spent = done = 0.0
         for size in (1, PROBED - 1) if block is None else (block,):
             start = time.perf_counter()
             probed = list(islice(stream, size))
-            yield from on_one_thread(function, probed) if probed else ()
+            yield from here(probed) if probed else ()
             spent, done = time.perf_counter() - start, done + len(probed)
         left = spent / size * (count - done)
         wait = HAND_OVER if others.started else START_UP
         others = others if left * (1.0 - 1.0 / jobs) > wait else None
     if others is None:
         for chunk in _chunks(stream, block or 1):
-            yield from on_one_thread(function, chunk)
+            yield from here(chunk)
         return
     size = block or max(1, min(others.batch, -(-count // (4 * (others.slots + others.helped)))))
     yield from in_order(function, _chunks(stream, size), others)

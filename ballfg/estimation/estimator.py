@@ -1,7 +1,7 @@
 """The one interface of all estimators."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
 from ballfg.dynamics.model import BallModel
@@ -79,6 +79,15 @@ class Estimator(ABC):
         """
         yield from ()
         return self.estimate(track, factors)
+
+    def in_sections(self, track: Track) -> Iterator[Estimate]:
+        """The estimate of a track in parts that follow one another, for those who need not hold all of a long one.
+
+        By default one part, the whole.
+
+        Args: track: as for `estimate`.
+        """
+        yield self.estimate(track)
 
     def prepared(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Track:
         """The track with further factors among its observations, after a check of its units.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -58,7 +59,7 @@ def estimate(
     Example: ballfg estimate data/aimy --method smoother --out states.csv
     """
     from ballfg.estimation import has_positions
-    from ballfg.estimation.batch import check_device, map_estimates
+    from ballfg.estimation.batch import check_device, map_sections
     from ballfg.tracks import TableWriter
 
     outcome = inputs.Outcome()
@@ -71,9 +72,10 @@ def estimate(
         opened = open_dataset(dataset, model, effects_file, ball=ball)
         count = len(opened.dataset)
         work = partial(_estimated, opened.model)
-        results = map_estimates(work, opened.estimator(method), opened.dataset, count, workers, device)
+        results = map_sections(work, opened.estimator(method), opened.dataset, count, workers, device)
         for result in progress(results, count, "tracks estimated"):
-            table.write(result.columns)
+            for columns in result.columns:
+                table.write(columns)
             outcome.add(result.name, result.status, result.notes, result.outside)
             rows, hits = rows + result.rows, hits + result.hits
     print(f"{out}: {rows} states of {count} tracks by {method}; {hits} hits found")
@@ -87,7 +89,7 @@ class _Estimated:
     """What the table and the last lines need of an estimate: a tenth of it, to be sent between machines."""
 
     name: str
-    columns: dict[str, str | np.ndarray]
+    columns: list[dict[str, str | np.ndarray]]
     status: Status
     notes: tuple[str, ...]
     outside: float | None
@@ -95,14 +97,21 @@ class _Estimated:
     hits: int
 
 
-def _estimated(model: BallModel, result: Estimate) -> _Estimated:
+def _estimated(model: BallModel, parts: Iterable[Estimate]) -> _Estimated:
     from ballfg.estimation.outside import outside_of
 
-    share = outside_of(model, result.states)
-    columns = _columns(result) | ({} if share is None else {"outside": share})
-    outside = None if share is None else float(share.mean())
-    ended = result.status, result.notes, outside, len(result.times), len(result.hits)
-    return _Estimated(result.name, columns, *ended)
+    columns, shares, notes, rows, hits = [], list[float](), list[str](), 0, 0
+    status = None
+    for part in parts:
+        share = outside_of(model, part.states)
+        columns.append(_columns(part) | ({} if share is None else {"outside": share}))
+        shares += [] if share is None else [float(share.sum())]
+        notes += part.notes
+        rows, hits = rows + len(part.times), hits + len(part.hits)
+        status = part.status if status is None or part.status.failed else status
+    outside = sum(shares) / rows if shares else None
+    assert status is not None
+    return _Estimated(part.name, columns, status, tuple(notes), outside, rows, hits)
 
 
 def _columns(result: Estimate) -> dict[str, str | np.ndarray]:

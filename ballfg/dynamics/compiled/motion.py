@@ -131,7 +131,7 @@ def functions_of(model: BallModel) -> CompiledModel | None:
 
 def fly(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> Tensor:
     """As `integrate.fly`, without derivatives."""
-    shape = torch.broadcast_shapes(state.shape[:-1], dt.shape)
+    shape = np.broadcast_shapes(state.shape[:-1], dt.shape)  # torch's own imports sympy, which takes a second
     rows = state.detach().expand(*shape, -1).reshape(-1, state.shape[-1])
     moving = Moving(model, functions, rows, 0)
     moving.fly(dt.detach().expand(shape).reshape(-1).numpy())

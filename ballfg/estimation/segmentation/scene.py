@@ -1,6 +1,6 @@
 """What stays the same during a segmentation, as machine code takes it: the ball, the surfaces, the settings."""
 
-from dataclasses import astuple, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
 import numpy as np
@@ -51,7 +51,8 @@ class Scene:
         shares = np.log([1.0 - s.wide_share - s.outlier_share, s.wide_share, s.outlier_share])
         extent = np.array((-np.inf, np.inf, -np.inf, np.inf) if (known := self.surfaces.extent) is None else known)
         extent += s.extent_margin * np.array((-1.0, 1.0, -1.0, 1.0))
-        numbers = np.array([(*astuple(self.physics), *astuple(s), shares, drift, extent)], dtype=NUMBERS)
+        own = (getattr(part, one.name) for part in (self.physics, s) for one in fields(part))
+        numbers = np.array([(*own, shares, drift, extent)], dtype=NUMBERS)
         object.__setattr__(self, "numbers", numbers[0])
 
         heights = np.array(self.surfaces.heights())

@@ -16,6 +16,7 @@ import torch
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.impact import slip_velocity
+from ballfg.estimation.smoother.near_bounce import worth_a_search
 from ballfg.estimation.smoother.solution import Solution
 from ballfg.factors.batch import Values
 from ballfg.factors.dynamics import model_width
@@ -49,7 +50,7 @@ def with_other_spins(solution: Solution, model: BallModel, optimizer: LevenbergM
     least = optimizer.tolerance
     for bounce in bounces_of(solution):
         side = other_side(solution.minimum.values, bounce, model)
-        if side is None:
+        if side is None or not (yield from worth_a_search(solution, bounce, side, optimizer, TIE)):
             continue
         minimum = yield from searched_while(optimizer.search(solution.graph, side.values), side.holds)
         if minimum is None or minimum.convergence is not Convergence.CONVERGED:

@@ -39,6 +39,8 @@ def other_sides(
     contacts: tuple[Contact, ...],
     model: BallModel,
     surfaces: Surfaces,
+    *,
+    at_end: bool = True,
 ) -> Array:
     """What the covariances lack for the chance that a ball is on the other side of a near contact.
 
@@ -54,6 +56,7 @@ def other_sides(
         contacts: with the times that the estimate gives them.
         model: the ball.
         surfaces: what it may bounce on.
+        at_end: whether the track ends with the last sample; else later ones have shown what comes.
     Returns: (n, 9, 9), to be added; zero far from contacts.
     """
     lacking = np.zeros_like(covariances)
@@ -65,6 +68,8 @@ def other_sides(
                 other = _carried(model, states[beyond], times[k] - times[beyond])
                 if possible(other):  # back over a long gap, drag would have been push
                     lacking[k] += _mixture(margin, other - states[k])
+    if not at_end:
+        return lacking
     last = torch.from_numpy(states[-1])
     height = float(surfaces.height_below(last))
     margin = (

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import window_velocities
-from ballfg.estimation.plausible import measured_only, plausible
+from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Segmentation, physics_of, segment
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
@@ -25,13 +25,15 @@ from ballfg.estimation.smoother.solution import (
     Solution,
     contacts_at_ends,
     places_of,
+    prior_covariances,
     refined_contacts,
+    status_of,
     timed_contacts,
+    worst_break,
 )
 from ballfg.factors.batch import FactorBatch, Values
-from ballfg.factors.dynamics import DynamicsFactors
-from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Minimum, Search, run
-from ballfg.factors.linear.covariance import Covariances, marginal_covariances
+from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, Search, run
+from ballfg.factors.linear.covariance import marginal_covariances
 from ballfg.factors.prior import PriorFactors
 from ballfg.factors.tracker import BiasStartFactors
 from ballfg.state import STATE_DIM
@@ -45,8 +47,13 @@ MAX_REFINEMENTS = 6
 
 MAX_UNSEEN_HITS = 8
 """How many hits the estimate may add to those that the segmentation found; measured logs needed three at most."""
-BROKEN = 8.0
-"""Norm of a whitened dynamics residual (9 dimensions) beyond which its interval hides a hit; chance: one in 1e9."""
+NOWHERE = (Convergence.STUCK, Convergence.TOO_MANY_ITERATIONS)
+LEAST_GAIN = 0.9
+"""Of the objective. Where a search leads nowhere and the worst of up to eight hits leaves more than this, hits are not
+what is missing: the noise is stated far too small, and every further hit would cost a long search."""
+LONG = 10_000
+"""Samples from which a track is smoothed in pieces that are then joined (docs/derivations/long_tracks.md). At once it
+takes 20 kB a sample."""
 
 OFFSET_ROUNDS = 6
 """How often stamps may be moved by the time offsets that were estimated; 4 ms need three."""
@@ -115,6 +122,12 @@ class Smoother(Estimator):
         """
         track = self.prepared(track, factors)
         moving = move_stamps and bool(self.settings.time_offsets)
+        if self.is_long(track):
+            from ballfg.estimation.smoother.pieces.whole import in_pieces  # which needs this file
+
+            joined = in_pieces(self, track)
+            if joined is not None:
+                return joined
         smoother = self.first_look() if moving else self
         for _ in range(OFFSET_ROUNDS):
             problem = smoother.problem(track)
@@ -126,6 +139,21 @@ class Smoother(Estimator):
                 return estimate
             track, smoother = retimed[0] if retimed else track, self
         return replace(estimate, status=Status.NOT_CONVERGED)
+
+    def is_long(self, track: Track) -> bool:
+        """Whether a track is smoothed in pieces. Where stamps move, a track is smoothed at once whatever its length."""
+        return len(track) >= LONG and not self.settings.time_offsets
+
+    def in_sections(self, track: Track) -> Iterator[Estimate]:
+        """The estimate of a long track section by section, of any other as a whole."""
+        if self.is_long(track):
+            from ballfg.estimation.smoother.pieces.whole import sections  # which needs this file
+
+            found = sections(self, self.prepared(track))
+            if found is not None:
+                yield from found
+                return
+        yield self.estimate(track)
 
     def first_look(self) -> Smoother:
         """The smoother for while stamps are milliseconds off.
@@ -170,11 +198,13 @@ class Smoother(Estimator):
         segmentation = problem.segmentation
         solution = yield from self._lowest(problem, segmentation, earlier)
         for _ in range(MAX_UNSEEN_HITS if self.settings.find_events else 0):
-            interval = _worst_break(solution)
+            interval = worst_break(solution)
             if interval is None:
                 break
-            segmentation = replace(segmentation, hits=np.union1d(segmentation.hits, [interval]))
+            segmentation, before = replace(segmentation, hits=np.union1d(segmentation.hits, [interval])), solution
             solution = yield from self._lowest(problem, segmentation, earlier)
+            if solution.minimum.convergence in NOWHERE and solution.minimum.error > LEAST_GAIN * before.minimum.error:
+                break
         found = solution.minimum
         if found.convergence is not Convergence.CONVERGED or found.distance < self.optimizer.tolerance:
             return replace(solution, minimum=found.bare())
@@ -237,14 +267,14 @@ class Smoother(Estimator):
         n, p = len(track), len(values.coefficients)
         contacts = timed_contacts(track.times, solution)
         known = None if minimum.step is None else marginal_covariances(minimum.step.root).definite()
-        covariances = _prior_covariances(problem) if known is None else known
+        covariances = prior_covariances(problem) if known is None else known
         own, rest = slice(0, problem.width), slice(problem.width, p)
         estimate = Estimate(
             name=track.name,
             times=track.times,
             states=values.states,
             covariances=covariances.states[:, :STATE_DIM, :STATE_DIM],
-            status=_status(minimum, n),
+            status=status_of(minimum, n),
             innovations=problem.innovations(values, known),
             coefficient_names=tuple(self.settings.coefficients),
             coefficients=values.coefficients[own],
@@ -264,32 +294,3 @@ class Smoother(Estimator):
         estimate = plausible(estimate, track, problem.sigma, self.settings)
         estimate = replace(estimate, notes=estimate.notes + rival_note(solution, estimate.covariances[0]))
         return with_other_sides(estimate, self.model, self.surfaces)
-
-
-def _worst_break(solution: Solution) -> int | None:
-    """The interval whose dynamics factor is broken most, if any is; intervals with a hit have theirs in the noise."""
-    worst, where = BROKEN, None
-    for batch, rows in zip((b for b in solution.graph.batches if len(b)), solution.minimum.linearized, strict=True):
-        if isinstance(batch, DynamicsFactors):
-            with np.errstate(over="ignore"):  # broken without measure
-                norm = np.linalg.norm(rows.residual, axis=-1)
-            norm[np.isin(batch.variables[:, 0], solution.events.segmentation.hits)] = 0.0
-            if not norm.max() <= worst:
-                worst, where = norm.max(), int(batch.variables[norm.argmax(), 0])
-    return where
-
-
-def _status(minimum: Minimum, samples: int) -> Status:
-    if minimum.convergence is Convergence.NOT_FINITE or minimum.step is None:
-        return Status.FAILED
-    if samples < 2:
-        return Status.NO_VELOCITY
-    at_minimum = minimum.convergence in (Convergence.CONVERGED, Convergence.AT_KINK)
-    return Status.OK if at_minimum else Status.NOT_CONVERGED
-
-
-def _prior_covariances(problem: TrackProblem) -> Covariances:
-    """What is known of each state by itself, where the graph could not be solved."""
-    coefficients = problem.coefficient_sigmas
-    _, states = measured_only(problem.track.positions, problem.sigma, problem.settings)
-    return Covariances(states, np.diag(coefficients**2), np.zeros((len(states), STATE_DIM, len(coefficients))))

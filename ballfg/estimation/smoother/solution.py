@@ -8,12 +8,18 @@ import torch
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.plausible import measured_only
+from ballfg.estimation.result import Status
 from ballfg.estimation.segmentation import Contact
 from ballfg.estimation.smoother.motion import contacts_by_interval
-from ballfg.estimation.smoother.problem import Events, contact_batches
-from ballfg.factors.dynamics import model_width
-from ballfg.factors.graph import BallGraph, Minimum
-from ballfg.state import VZ
+from ballfg.estimation.smoother.problem import Events, TrackProblem, contact_batches
+from ballfg.factors.dynamics import DynamicsFactors, model_width
+from ballfg.factors.graph import BallGraph, Convergence, Minimum
+from ballfg.factors.linear.covariance import Covariances
+from ballfg.state import STATE_DIM, VZ
+
+BROKEN = 8.0
+"""Norm of a whitened dynamics residual (9 dimensions) beyond which its interval hides a hit; chance: one in 1e9."""
 
 
 @dataclass(frozen=True)
@@ -81,3 +87,33 @@ def refined_contacts(times: Array, solution: Solution) -> tuple[Contact, ...]:
         step = np.clip(interval - contact.interval, -1, 1)  # one interval at a time: the estimate moves along
         refined.append(Contact(contact.interval + int(step), contact.time, contact.height))
     return tuple(refined)
+
+
+def worst_break(solution: Solution) -> int | None:
+    """The interval whose dynamics factor is broken most, if any is; intervals with a hit have theirs in the noise."""
+    worst, where = BROKEN, None
+    for batch, rows in zip((b for b in solution.graph.batches if len(b)), solution.minimum.linearized, strict=True):
+        if isinstance(batch, DynamicsFactors):
+            with np.errstate(over="ignore"):  # broken without measure
+                norm = np.linalg.norm(rows.residual, axis=-1)
+            norm[np.isin(batch.variables[:, 0], solution.events.segmentation.hits)] = 0.0
+            if not norm.max() <= worst:
+                worst, where = norm.max(), int(batch.variables[norm.argmax(), 0])
+    return where
+
+
+def status_of(minimum: Minimum, samples: int) -> Status:
+    """How the estimate of a track of so many samples ended."""
+    if minimum.convergence is Convergence.NOT_FINITE or minimum.step is None:
+        return Status.FAILED
+    if samples < 2:
+        return Status.NO_VELOCITY
+    at_minimum = minimum.convergence in (Convergence.CONVERGED, Convergence.AT_KINK)
+    return Status.OK if at_minimum else Status.NOT_CONVERGED
+
+
+def prior_covariances(problem: TrackProblem) -> Covariances:
+    """What is known of each state by itself, where the graph could not be solved."""
+    coefficients = problem.coefficient_sigmas
+    _, states = measured_only(problem.track.positions, problem.sigma, problem.settings)
+    return Covariances(states, np.diag(coefficients**2), np.zeros((len(states), STATE_DIM, len(coefficients))))

@@ -1,0 +1,98 @@
+"""The whole track as a chain of the ends of its sections: small, and solved in one go."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.estimation.smoother.pieces.reduction import Ends, Point
+from ballfg.factors.batch import COEFFICIENTS, Rows, Values
+from ballfg.factors.linear.covariance import NeighbourCovariances, SquareRootInformation
+from ballfg.factors.linear.step import Root, solve
+from ballfg.factors.loss import Loss
+from ballfg.state import STATE_DIM
+
+
+@dataclass(frozen=True)
+class Chain:
+    """The solution for all ends.
+
+    Attributes:
+        states: (k + 1, w) where the ends of k sections are to go.
+        coefficients: (p,) the same of the coefficients.
+        root: of the linear problem.
+    """
+
+    states: Array
+    coefficients: Array
+    root: Root
+
+    def target(self, section: int) -> Point:
+        """Where a section's ends are to go."""
+        return Point(self.states[section], self.states[section + 1], self.coefficients)
+
+    @cached_property
+    def _known(self) -> NeighbourCovariances:
+        return SquareRootInformation([self.root]).covariances()
+
+    @property
+    def coefficient_covariance(self) -> Array:
+        """(p, p) in the products of the coefficients' units."""
+        return self._known.coefficients[0]
+
+    def covariances(self) -> list[Array]:
+        """For each section the joint covariance of its last end, the coefficients, its first end."""
+        found = self._known
+        return [_joint(found, section) for section in range(len(self.states) - 1)]
+
+
+def solve_chain(ends: Sequence[Ends], points: Sequence[Point], priors: Sequence[Rows], anchor: Array) -> Chain | None:
+    """The step of all ends and coefficients that minimises the linearised objective.
+
+    The sections need not have been linearised at the same point: each says where it was.
+
+    Args:
+        ends: of each section.  points: where each was linearised.
+        priors: factors on the coefficients alone.
+        anchor: (p,) in the coefficients' own units, where those were linearised; the solution is a step from there.
+    Returns: None where the system is singular.
+    """
+    states = np.stack([*(point.first for point in points), points[-1].last])
+    rows = [_moved(*each, anchor) for each in zip(ends, points, states[1:], strict=True)]
+    k, w = len(ends), states.shape[1]
+    blocks = [np.stack(column) for column in zip(*rows, strict=True)]
+    columns = [np.arange(k), np.arange(1, k + 1)] + ([np.full(k, COEFFICIENTS)] if len(anchor) else [])
+    chain = Rows(np.stack(columns, axis=1), -blocks[0], tuple(blocks[1 : 1 + len(columns)]), Loss())
+    biases = states[:, STATE_DIM:] if w > STATE_DIM else None
+    step = solve([chain, *priors], Values(states[:, :STATE_DIM], anchor, biases))
+    if step is None:
+        return None
+    return Chain(states + step.states, anchor + step.coefficients, step.root)
+
+
+def _moved(ends: Ends, point: Point, last: Array, coefficients: Array) -> tuple[Array, Array, Array, Array]:
+    """Right side and blocks of a section's rows, as seen from the point that all sections share."""
+    y = ends.y - ends.by_last @ (last - point.last) - ends.by_coefficients @ (coefficients - point.coefficients)
+    return y, ends.by_first, ends.by_last, ends.by_coefficients
+
+
+def _joint(found: NeighbourCovariances, section: int) -> Array:
+    w, p = found.states.shape[-1], found.coefficients.shape[-1]
+    own, shared, behind = slice(0, w), slice(w, w + p), slice(w + p, 2 * w + p)
+    joint = np.empty((2 * w + p, 2 * w + p))
+    joint[own, own], joint[behind, behind] = found.states[0, section + 1], found.states[0, section]
+    joint[shared, shared] = found.coefficients[0]
+    first, last = found.cross[0, section], found.cross[0, section + 1]
+    joint[behind, own], joint[behind, shared], joint[own, shared] = first[:, :w], first[:, w:], last[:, w:]
+    joint[own, behind], joint[shared, behind] = joint[behind, own].T, joint[behind, shared].T
+    joint[shared, own] = joint[own, shared].T
+    return joint
+
+
+def moved_rows(rows: Rows, step: Array) -> Rows:
+    """Factors on the coefficients alone after a step (p,) of these."""
+    return replace(rows, residual=rows.residual + rows.jacobians[0] @ step)

@@ -1,0 +1,216 @@
+"""The estimate of a long track: pieces by themselves, then all of them together, exactly.
+
+Every piece is looked at by itself. Its events are kept; its states and coefficients are where the minimum of the whole
+track is looked for. That goes on by Gauss-Newton steps of the whole track: each piece tells what it means to its ends
+and to the coefficients that all share, and learns where these go. Memory holds some numbers a sample, and the matrices
+of the pieces under way.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from typing import TYPE_CHECKING, Final, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.arrays import Array
+from ballfg.estimation.smoother.pieces.chain import Chain, Point, moved_rows, solve_chain
+from ballfg.estimation.smoother.pieces.looks import bounds_of, cut_between, joined, look, section_of
+from ballfg.estimation.smoother.pieces.reduction import Ends, Reduction
+from ballfg.estimation.smoother.pieces.section import State, part_of, prior_rows
+from ballfg.factors.batch import Values
+from ballfg.factors.graph import AT_KINK, RATE_MARGIN, Convergence, objective
+from ballfg.parallel.parts import in_parts
+from ballfg.progress import doing
+from ballfg.tracks import Track
+
+if TYPE_CHECKING:
+    from ballfg.estimation.segmentation import Segmentation
+    from ballfg.estimation.smoother.smoother import Smoother
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+PIECE: Final = 2000
+"""Samples of a piece. Shorter ones are looked at twice in a larger share of their samples, longer ones take memory."""
+OVERLAP: Final = 64
+"""Samples beyond both ends of a piece that it is looked at with: as many as the segmentation takes to be sure."""
+MARGIN: Final = 8
+"""Samples beyond the ends of a section that velocities from line fits ask for."""
+TOGETHER: Final = 2
+"""Pieces handed to a process at once."""
+ROUGH: Final = 1e-2
+"""Posterior standard deviations, to which a piece by itself is minimised."""
+ROUNDS: Final = 30
+"""Gauss-Newton steps of the whole track at most; half a dozen are usual, the later ones of a few sections."""
+
+
+@dataclass(frozen=True)
+class Told:
+    """What a section says at a point.
+
+    Attributes:
+        values: the point.
+        error: of the section's factors.
+        inner: by which its inner states alone promise to reduce it.
+        ends: what it means to the ends and the coefficients.
+    """
+
+    values: Values
+    error: float
+    inner: float
+    ends: Ends
+
+    def length(self, step: Point) -> float:
+        """Of a step of the whole section, in posterior standard deviations."""
+        return float(np.sqrt(2.0 * self.inner + (self.ends.change(step) ** 2).sum()))
+
+    def promised(self, step: Point) -> float:
+        """The error after a step of the whole section, as the linear problem has it."""
+        y = self.ends.y
+        return self.error - self.inner - 0.5 * float((y**2).sum() - ((y - self.ends.change(step)) ** 2).sum())
+
+
+@dataclass(frozen=True)
+class Found:
+    """How the search for the minimum of the whole track ended.
+
+    Attributes:
+        states: the sections, one step before the minimum.
+        chain: that step, with the covariances.
+        error: the objective after it.
+        convergence, rounds: why the search ended, and its linear solutions.
+    """
+
+    states: Sequence[State]
+    chain: Chain
+    error: float
+    convergence: Convergence
+    rounds: int
+
+
+@dataclass(frozen=True)
+class Joined:
+    """All sections at the minimum of the whole track.
+
+    Attributes:
+        found: the sections and the last step.
+        segmentation: of the whole track.
+        cuts: (k + 1,) first samples of the sections, and the track's last.
+        rival: another first spin, if any.
+    """
+
+    found: Found
+    segmentation: Segmentation
+    cuts: Sequence[int]
+    rival: Array | None
+
+
+def advanced(smoother: Smoother, task: tuple[State, Point | None]) -> Told:
+    """What a section says after its step; at the point where it is, without one.
+
+    Args: smoother: of the track.  task: the section, and where its ends and the coefficients are to go.
+    """
+    state, target = task
+    problem = smoother.problem(state.section.track, state.section.segmentation)
+    rows = state.section.linearized(problem, state.values)
+    values = state.values
+    if target is not None:
+        values = moved(Reduction(rows, values), values, target)
+        rows = state.section.linearized(problem, values)
+    found = Reduction(rows, values)
+    return Told(values, objective(rows), found.inner, found.ends)
+
+
+def moved(reduction: Reduction, values: Values, target: Point) -> Values:
+    """A section's values after the step that leads its ends and the coefficients to a target."""
+    step = target.since(Point.of(values))
+    return values.moved(reduction.steps(step.first, step.last, step.coefficients), step.coefficients)
+
+
+def joined_minimum(smoother: Smoother, track: Track, length: int | None = None) -> Joined | None:
+    """The minimum of a whole track, by sections.
+
+    Args:
+        smoother: of the track.
+        track: prepared.
+        length: samples of a piece, about.
+    Returns: None where a piece has no finite explanation by itself.
+    """
+    rough = type(smoother)(
+        smoother.model, smoother.surfaces, smoother.settings,
+        replace(smoother.optimizer, tolerance=max(ROUGH, smoother.optimizer.tolerance)),
+    )  # fmt: skip
+    bounds = bounds_of(len(track), length or PIECE, OVERLAP)
+    parts = [(begin, part_of(track, begin, end)) for begin, end in bounds]
+    looks = [one for one in watched(partial(look, rough), parts, "looked at") if one is not None]
+    if len(looks) < len(parts):
+        return None
+    inner = [cut_between(*pair) for pair in pairwise(looks)]
+    events = joined(looks, [0, *inner, len(track)])
+    cuts = [0, *inner, len(track) - 1]
+    states = [
+        State(section_of(track, events, first, last, MARGIN), one.taken(first, last + 1))
+        for one, first, last in zip(looks, cuts[:-1], cuts[1:], strict=True)
+    ]
+    found = _search(smoother, states)
+    return None if found is None else Joined(found, events, cuts, looks[0].rival)
+
+
+def _search(smoother: Smoother, states: list[State]) -> Found | None:
+    """Gauss-Newton steps of the whole track until those of all sections are shorter than the optimizer's tolerance.
+
+    Lengths are distances to the minimum in posterior standard deviations, as in
+    `ballfg.factors.graph.LevenbergMarquardt`. A section that is near enough waits where it was linearised.
+    """
+    told = list(watched(partial(advanced, smoother), [(state, None) for state in states], "joined, round 1"))
+    problem = smoother.problem(states[0].section.track, states[0].section.segmentation)
+    priors, anchor = prior_rows(problem, states[0].section, told[0].values), told[0].values.coefficients
+    last, share = np.full(len(states), np.inf), np.ones(len(states))
+    for number in range(1, ROUNDS + 1):
+        points = [Point.of(one.values) for one in told]
+        solved = solve_chain([one.ends for one in told], points, priors, anchor)
+        if solved is None:
+            return None
+        chain = solved
+        steps = [chain.target(k).since(point) for k, point in enumerate(points)]
+        length = np.array([one.length(step) for one, step in zip(told, steps, strict=True)])
+        near = _is_near(length, last, smoother.optimizer.tolerance)
+        if near.all() or number == ROUNDS:
+            break
+        share = np.where(length > last, 0.5 * share, 1.0)
+        moving = np.flatnonzero(~near).tolist()
+        tasks = [(State(states[k].section, told[k].values), points[k].moved(steps[k], share[k])) for k in moving]
+        results = watched(partial(advanced, smoother), tasks, f"joined, round {number + 1}")
+        for k, one in zip(moving, results, strict=True):
+            told[k] = one
+        last[moving] = length[moving]
+    error = sum(one.promised(step) for one, step in zip(told, steps, strict=True))
+    error += objective([moved_rows(rows, chain.coefficients - anchor) for rows in priors])
+    there = [State(state.section, one.values) for state, one in zip(states, told, strict=True)]
+    return Found(there, chain, error, _ended(near, length), number)
+
+
+def _ended(near: NDArray[np.bool_], length: Array) -> Convergence:
+    """How the search ended, by what is left to go in each section."""
+    if near.all():
+        return Convergence.CONVERGED
+    return Convergence.AT_KINK if (near | (length < AT_KINK)).all() else Convergence.TOO_MANY_ITERATIONS
+
+
+def _is_near(length: Array, last: Array, tolerance: float) -> NDArray[np.bool_]:
+    """Which sections need no step, or none after this one, if lengths go on to fall as they do."""
+    rate = np.divide(length, last, out=np.full_like(length, np.inf), where=np.isfinite(last))
+    return np.asarray((length < tolerance) | (RATE_MARGIN * length * rate < tolerance))
+
+
+def watched(function: Callable[[T], R], parts: Sequence[T], what: str) -> Iterator[R]:
+    """The results of parts; says how far they are."""
+    with doing(f"0 of {len(parts)} pieces {what}") as stage:
+        for done, result in enumerate(in_parts(function, parts, TOGETHER), start=1):
+            stage.text = f"{done} of {len(parts)} pieces {what}"
+            yield result

@@ -1,0 +1,177 @@
+"""The linear problem of a section, reduced to what it says of its two ends and the coefficients, and taken up again.
+
+The inner states are eliminated; the first state waits among the coefficients. What is left are rows of the two ends
+and the coefficients, exactly what the section means to the rest of the track. Once the rest has answered, the inner
+states follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.factors.batch import COEFFICIENTS, Rows, Values
+from ballfg.factors.linear import elimination
+from ballfg.factors.linear.covariance import Covariances, SquareRootInformation
+from ballfg.factors.linear.step import Root, damped_rows
+
+
+@dataclass(frozen=True)
+class Point:
+    """Where the ends and the coefficients of a section are or are to go, or a step of them.
+
+    Attributes:
+        first, last: (w,) states with the tracker's biases behind them.
+        coefficients: (p,) in their own units.
+    """
+
+    first: Array
+    last: Array
+    coefficients: Array
+
+    @classmethod
+    def of(cls, values: Values) -> Point:
+        """The ends of a section's values."""
+        whole = values.states if values.biases is None else np.concatenate((values.states, values.biases), axis=1)
+        return cls(whole[0], whole[-1], values.coefficients)
+
+    def since(self, other: Point) -> Point:
+        """The step from another point to this one."""
+        return Point(self.first - other.first, self.last - other.last, self.coefficients - other.coefficients)
+
+    def moved(self, step: Point, share: float) -> Point:
+        """The point after a share of a step."""
+        return Point(
+            self.first + share * step.first,
+            self.last + share * step.last,
+            self.coefficients + share * step.coefficients,
+        )
+
+
+@dataclass(frozen=True)
+class Ends:
+    """What a section says of its ends: |by_first d_first + by_last d_last + by_coefficients d_c - y|^2.
+
+    Attributes:
+        by_first, by_last: (w + w + p, w) or less rows, whitened, per unit of the state.
+        by_coefficients: (.., p) whitened, per unit of each coefficient.
+        y: (..,) whitened.
+    """
+
+    by_first: Array
+    by_last: Array
+    by_coefficients: Array
+    y: Array
+
+    def change(self, step: Point) -> Array:
+        """(..,) whitened, by which the rows change along a step of the ends and the coefficients."""
+        return self.by_first @ step.first + self.by_last @ step.last + self.by_coefficients @ step.coefficients
+
+
+class Reduction:
+    """A section whose inner states are eliminated.
+
+    Args: linearized: the section's factors, at values.  values: of its n states, at least two, and the coefficients.
+
+    Attributes:
+        root: of the states but the first, with the coefficients and the first state behind them.
+        inner: half the squares that a step of the inner states alone takes off the objective.
+    """
+
+    def __init__(self, linearized: Sequence[Rows], values: Values) -> None:
+        self.width, self.coefficients = values.width, len(values.coefficients)
+        w, p, m = self.width, self.coefficients + self.width, len(values.states) - 1
+        point = Values(values.states[1:], np.zeros(p), None if values.biases is None else values.biases[1:])
+        moved = [part for rows in linearized for part in _first_behind(rows, self.coefficients, w)]
+        system, start, _ = damped_rows(moved, point, 0.0)
+        self.root = Root(np.empty((m, w, 2 * w + p + 1)), np.empty((p, 2 * w + p + 1)))
+        elimination.eliminate(system, start, w, self.root.states, self.root.coefficients)
+        self.inner = 0.5 * float((self.root.states[:-1, :, -1] ** 2).sum())
+
+    @property
+    def ends(self) -> Ends:
+        """What is left of the section."""
+        w, p = self.width, self.coefficients
+        last, shared = self.root.states[-1], self.root.coefficients
+        rows = np.concatenate((last, np.concatenate((np.zeros((len(shared), w)), shared[:, w:]), axis=1)))
+        behind = rows[:, 2 * w : -1]
+        return Ends(behind[:, p:], rows[:, :w], behind[:, :p], rows[:, -1])
+
+    def steps(self, first: Array, last: Array, coefficients: Array) -> Array:
+        """(n, w) steps of all states, where those of the ends and the coefficients are known.
+
+        Args: first, last: (w,) and coefficients: (p,), the known steps.
+        """
+        known = np.concatenate((coefficients, first))
+        root = self._known(np.eye(len(known) + self.width))
+        states = self.root.states[..., -1].copy()
+        states[-1] = last
+        elimination.substitute_back(root.states, root.coefficients, states, known.copy())
+        return np.concatenate((first[None], states))
+
+    def covariances(self, ends: Array) -> Covariances:
+        """Of all states and the coefficients, where the joint covariance of the ends and the coefficients is known.
+
+        Args: ends: (w + p + w, w + p + w) of the last state, the coefficients, the first state.
+        """
+        w, p = self.width, self.coefficients
+        found = SquareRootInformation([self._known(_triangle(ends))]).covariances()
+        shared = found.coefficients[0]
+        states = np.concatenate((shared[None, p:, p:], found.states[0]))
+        cross = np.concatenate((shared[None, p:, :p], found.cross[0, :, :, w : w + p]))
+        return Covariances(states, shared[:p, :p], cross)
+
+    def _known(self, triangle: Array) -> Root:
+        """The root with another triangle of the last state, the coefficients and the first state."""
+        w, states = self.width, self.root.states.copy()
+        shared = np.zeros_like(self.root.coefficients)
+        states[-1] = 0.0
+        states[-1, :, :w], states[-1, :, 2 * w : -1] = triangle[:w, :w], triangle[:w, w:]
+        shared[:, 2 * w : -1] = triangle[w:, w:]
+        return Root(states, shared)
+
+
+def _triangle(covariance: Array) -> Array:
+    """The upper triangle R with (R^T R)^-1 = C, where C may have lost its last digits."""
+    scale = np.sqrt(np.diagonal(covariance))
+    size, axes = np.linalg.eigh((covariance / (scale[:, None] * scale))[::-1, ::-1])
+    size = np.maximum(size, len(size) * np.finfo(float).eps * size[-1])
+    lower = np.linalg.qr((axes * np.sqrt(size)).T)[1].T
+    return np.asarray(np.linalg.inv(lower[::-1, ::-1]) / scale)
+
+
+def _first_behind(rows: Rows, coefficients: int, width: int) -> list[Rows]:
+    """The same factors with state 0 behind the coefficients, and the others counted from state 1."""
+    at_first = (rows.variables == 0).any(axis=1)
+    found = []
+    for which in (~at_first, at_first):
+        if which.any():
+            part = replace(
+                rows,
+                variables=rows.variables[which],
+                residual=rows.residual[which],
+                jacobians=tuple(block[which] for block in rows.jacobians),
+            )
+            found.append(_widened(part, coefficients, width))
+    return found
+
+
+def _widened(rows: Rows, coefficients: int, width: int) -> Rows:
+    m, dim = rows.residual.shape
+    shared = np.zeros((m, dim, coefficients + width))
+    variables, blocks, sees_shared = [], [], False
+    for column, block in zip(rows.variables.T, rows.jacobians, strict=True):
+        if column[0] == COEFFICIENTS or column[0] == 0:
+            begin = 0 if column[0] == COEFFICIENTS else coefficients
+            shared[:, :, begin : begin + block.shape[2]] += block
+            sees_shared = True
+        else:
+            variables.append(column - 1)
+            blocks.append(block)
+    if sees_shared:
+        variables.append(np.full(m, COEFFICIENTS))
+        blocks.append(shared)
+    return Rows(np.stack(variables, axis=1), rows.residual, tuple(blocks), rows.loss)

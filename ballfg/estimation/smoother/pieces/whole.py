@@ -1,0 +1,220 @@
+"""The estimate of a long track, from the minimum that its sections have together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ballfg.arrays import Array, Index
+from ballfg.estimation.plausible import plausible
+from ballfg.estimation.result import Estimate, Status
+from ballfg.estimation.segmentation import Contact
+from ballfg.estimation.settings import sample_sigmas
+from ballfg.estimation.smoother.grip import rival_note
+from ballfg.estimation.smoother.near_contact import other_sides
+from ballfg.estimation.smoother.pieces.chain import Point
+from ballfg.estimation.smoother.pieces.joining import Joined, joined_minimum, moved, watched
+from ballfg.estimation.smoother.pieces.reduction import Reduction
+from ballfg.estimation.smoother.pieces.section import State
+from ballfg.estimation.smoother.problem import TrackProblem
+from ballfg.estimation.smoother.solution import Solution, timed_contacts
+from ballfg.factors.batch import Values
+from ballfg.factors.graph import BallGraph, Convergence, Minimum
+from ballfg.factors.linear.covariance import Covariances
+from ballfg.state import STATE_DIM
+from ballfg.tracks import Track
+
+if TYPE_CHECKING:
+    from ballfg.estimation.smoother.smoother import Smoother
+
+
+@dataclass(frozen=True)
+class Smoothed:
+    """A section of the estimate, with n states: those of the section.
+
+    Attributes:
+        values: at the minimum.
+        covariances: (n, 9, 9), and
+        cross: (n, 9, p) with the coefficients, as in an `Estimate`.
+        others: by the index of a state near a contact (9, 9), as `Estimate.other_sides`.
+        innovations: of the section's measurements, by name of the observation.
+        contacts: counted from the section's first sample.
+    """
+
+    values: Values
+    covariances: Array
+    cross: Array
+    others: Mapping[int, Array]
+    innovations: Mapping[str, Array]
+    contacts: tuple[Contact, ...]
+
+
+def in_pieces(smoother: Smoother, track: Track, length: int | None = None) -> Estimate | None:
+    """The estimate of a long track.
+
+    Args: smoother: of the track.  track: prepared.  length: samples of a piece, about.
+    Returns: None where pieces cannot be joined, because no finite motion explains one of them.
+    """
+    parts = sections(smoother, track, length)
+    return None if parts is None else _assembled(track, parts)
+
+
+def sections(smoother: Smoother, track: Track, length: int | None = None) -> Iterator[Estimate] | None:
+    """The estimate of a long track, section by section, so that nobody need hold all of its covariances.
+
+    Args: smoother, track, length: as for `in_pieces`.
+    Returns: estimates that follow one another, with the status and the coefficients of all; None as for `in_pieces`.
+    """
+    found = joined_minimum(smoother, track, length)
+    return None if found is None else _sections(smoother, track, found)
+
+
+def smoothed(smoother: Smoother, task: tuple[State, Array, Point]) -> Smoothed:
+    """A section of the estimate.
+
+    Args:
+        smoother: of the track.
+        task: the section, the joint covariance of its ends and the coefficients, and where the last step leads them.
+    """
+    state, joint, target = task
+    section, values = state.section, state.values
+    problem = smoother.problem(section.track, section.segmentation)
+    reduction = Reduction(section.linearized(problem, values), values)
+    values = moved(reduction, values, target)
+    known = reduction.covariances(joint)
+    covariances = np.ascontiguousarray(known.states[:, :STATE_DIM, :STATE_DIM])
+    contacts = _contacts(problem, state, values)
+    times = section.inside(section.track.times)
+    world = smoother.model, smoother.surfaces
+    sides = other_sides(times, values.states, covariances, contacts, *world, at_end=section.ends)
+    near = np.flatnonzero(sides.any(axis=(1, 2)))
+    innovations = _innovations(problem, state, values, known)
+    cross = np.ascontiguousarray(known.cross[:, :STATE_DIM, : problem.width])
+    return Smoothed(values, covariances, cross, {int(k): sides[k] for k in near}, innovations, contacts)
+
+
+def _contacts(problem: TrackProblem, state: State, values: Values) -> tuple[Contact, ...]:
+    """The section's contacts with the times that the estimate gives them."""
+    section = state.section
+    graph = BallGraph(tuple(section.own(problem)))
+    minimum = Minimum(section.padded_values(values), 0.0, None, Convergence.CONVERGED, 0)
+    found = timed_contacts(section.track.times, Solution(section.events, graph, minimum))
+    return tuple(replace(contact, interval=contact.interval - section.first) for contact in found)
+
+
+def _innovations(problem: TrackProblem, state: State, values: Values, known: Covariances) -> dict[str, Array]:
+    """Of the section's own measurements. What is known of its ends stands in for the samples beyond them."""
+    section = state.section
+    around = Covariances(section.padded(known.states), known.coefficients, section.padded(known.cross))
+    found = problem.innovations(section.padded_values(values), around)
+    return {one.name: found[one.name][section.owns(np.asarray(one.state))] for one in problem.observations}
+
+
+def _sections(smoother: Smoother, track: Track, found: Joined) -> Iterator[Estimate]:
+    """The estimates of the sections, in order. The last state of each is told by the next one."""
+    end, doubts = found.found, smoother.doubts(track)
+    tasks = [
+        (state, joint, end.chain.target(k))
+        for k, (state, joint) in enumerate(zip(end.states, end.chain.covariances(), strict=True))
+    ]
+    before = np.zeros((STATE_DIM, STATE_DIM))
+    bounds = zip(found.cuts[:-1], found.cuts[1:], strict=True)
+    for (first, last), part in zip(bounds, watched(partial(smoothed, smoother), tasks, "smoothed"), strict=True):
+        count = last - first + (last == len(track) - 1)
+        others = np.zeros((count, STATE_DIM, STATE_DIM))
+        others[0] = before
+        for k in (k for k in part.others if k < count):
+            others[k] += part.others[k]
+        before = part.others.get(count, np.zeros((STATE_DIM, STATE_DIM)))
+        notes = (*doubts, *_rival_note(found, part)) if first == 0 else ()
+        yield _section(smoother, track, found, part, others, first, notes)
+
+
+def _section(
+    smoother: Smoother, track: Track, found: Joined, part: Smoothed, others: Array, first: int, notes: tuple[str, ...]
+) -> Estimate:
+    end, events = found.found, found.segmentation
+    count, problem = len(others), smoother.problem(end.states[0].section.track, end.states[0].section.segmentation)
+    coefficients, known = part.values.coefficients, end.chain.coefficient_covariance
+    own, rest = slice(0, problem.width), slice(problem.width, len(coefficients))
+    at_minimum = end.convergence in (Convergence.CONVERGED, Convergence.AT_KINK)
+    inside = slice(first, first + count)
+    stated = None if track.sigmas is None else track.sigmas[inside]
+    measured = Track(track.times[inside], track.positions[inside], stated)
+    estimate = Estimate(
+        name=track.name,
+        times=measured.times,
+        states=part.values.states[:count],
+        covariances=part.covariances[:count],
+        status=Status.OK if at_minimum else Status.NOT_CONVERGED,
+        innovations=part.innovations,
+        coefficient_names=tuple(smoother.settings.coefficients),
+        coefficients=coefficients[own],
+        coefficient_covariance=known[own, own],
+        cross_covariances=part.cross[:count],
+        unknown_names=problem.unknowns.names,
+        unknowns=problem.unknowns.origins + coefficients[rest],
+        unknown_covariance=known[rest, rest],
+        contacts=part.contacts,
+        hits=events.hits[(events.hits >= first) & (events.hits < first + count)] - first,
+        quality=events.quality[inside],
+        error=end.error,
+        iterations=end.rounds,
+        world=smoother.world,
+        notes=notes,
+    )
+    sigma = sample_sigmas(smoother.settings, count, stated)
+    estimate = plausible(estimate, measured, sigma, smoother.settings)
+    return replace(estimate, covariances=estimate.covariances + others, other_sides=others)
+
+
+def _rival_note(found: Joined, first: Smoothed) -> tuple[str, ...]:
+    """Says whether another spin at the start explains the track nearly as well."""
+    minimum = Minimum(first.values, found.found.error, None, found.found.convergence, found.found.rounds)
+    solution = Solution(found.found.states[0].section.events, BallGraph(()), minimum, found.rival)
+    return rival_note(solution, first.covariances[0])
+
+
+def _assembled(track: Track, parts: Iterator[Estimate]) -> Estimate:
+    """One estimate from those of all sections, which it takes in one by one.
+
+    `np.zeros` takes memory for what is written only: `other_sides` is all but empty.
+    """
+    n, first = len(track), next(parts)
+    p = first.cross_covariances.shape[2]
+    states, covariances = np.empty((n, STATE_DIM)), np.empty((n, STATE_DIM, STATE_DIM))
+    cross, others = np.empty((n, STATE_DIM, p)), np.zeros((n, STATE_DIM, STATE_DIM))
+    innovations: dict[str, list[Array]] = {name: [] for name in first.innovations}
+    contacts, hits, quality, begin = list[Contact](), list[Index](), list[NDArray[np.int8]](), 0
+    status = first.status
+    for part in chain((first,), parts):
+        inside = slice(begin, begin + len(part))
+        states[inside], covariances[inside], cross[inside] = part.states, part.covariances, part.cross_covariances
+        for k in np.flatnonzero(part.other_sides.any(axis=(1, 2))):
+            others[begin + k] = part.other_sides[k]
+        for name, whitened in part.innovations.items():
+            innovations[name].append(whitened)
+        contacts += [replace(contact, interval=contact.interval + begin) for contact in part.contacts]
+        hits.append(part.hits + begin)
+        quality.append(part.quality)
+        status = part.status if part.status.failed else status
+        begin += len(part)
+    return replace(
+        first,
+        status=status,
+        times=track.times,
+        states=states,
+        covariances=covariances,
+        other_sides=others,
+        cross_covariances=cross,
+        innovations={name: np.concatenate(pieces) for name, pieces in innovations.items()},
+        contacts=tuple(contacts),
+        hits=np.concatenate(hits),
+        quality=np.concatenate(quality),
+    )

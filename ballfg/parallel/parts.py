@@ -1,0 +1,49 @@
+"""The parts of one large piece of work, computed wherever the work around it may run."""
+
+from collections.abc import Callable, Iterator, Sequence
+from contextvars import ContextVar
+from functools import partial
+from itertools import islice
+from typing import TypeVar
+
+from ballfg.parallel.executor import executor
+from ballfg.parallel.stream import in_order
+from ballfg.parallel.work import each
+
+T = TypeVar("T")
+R = TypeVar("R")
+
+_JOBS: ContextVar[int] = ContextVar("jobs", default=1)
+
+
+def with_jobs(jobs: int, function: Callable[[T], R], argument: T) -> R:
+    """What a function gives, whose parts may use several processes.
+
+    Args: jobs: number of processes.  function: of the argument.
+    """
+    token = _JOBS.set(jobs)
+    try:
+        return function(argument)
+    finally:
+        _JOBS.reset(token)
+
+
+def in_parts(function: Callable[[T], R], parts: Sequence[T], together: int) -> Iterator[R]:
+    """A function of each part, in order: in the processes of `with_jobs`, on a cluster, or here.
+
+    Each result depends on its part alone, so that it has the same bits wherever it is computed.
+
+    Args: function, parts: copied to processes, so they must pickle.  together: parts handed over at once.
+    Raises: what the function raises.
+    """
+    others = executor(_JOBS.get()) if len(parts) > together else None
+    if others is None:
+        yield from map(function, parts)
+        return
+    stream = iter(parts)
+    chunks = iter(partial(_taken, stream, together), [])
+    yield from in_order(partial(each, function), chunks, others)
+
+
+def _taken(stream: Iterator[T], count: int) -> list[T]:
+    return list(islice(stream, count))
