@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.checks import did_you_mean
+from ballfg.checks import did_you_mean, listed, shown
 from ballfg.importing.choices import Choices, UndecidedError
 from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
 from ballfg.importing.names import Meaning, meanings
@@ -69,7 +69,7 @@ def roles_of(table: RawTable, choices: Choices) -> Roles | None:
             return None
         if len(found) > 3:
             raise UndecidedError(
-                f"{table.where}: x, y and z must be three columns; {', '.join(found[:8])} may be meant",
+                f"{table.where}: x, y and z must be three columns; {listed(found[:8])} may be meant",
                 "columns",
                 (),
                 "x={},y={},z={}".format(*found[:3]),
@@ -103,7 +103,7 @@ def _existing(table: RawTable, name: str) -> str:
     if len(alike) == 1:
         return alike[0]
     raise ValueError(
-        f"--columns must name columns of {table.where}; it has no {name!r} but {', '.join(list(table.columns)[:12])}."
+        f"--columns must name columns of {table.where}; it has no {shown(name)} but {listed(table.columns)}."
         f"{did_you_mean(name, table.columns)}"
     )
 

@@ -8,6 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.checks import listed
 from ballfg.importing.choices import Choices, Guess, UndecidedError
 from ballfg.importing.columns import Roles, roles_of
 from ballfg.importing.fall import TIMES
@@ -49,7 +50,7 @@ def understood(tables: Sequence[RawTable], choices: Choices) -> tuple[list[RawTa
         raise questions[0]
     if not read:
         largest = max(tables, key=len)
-        columns = ", ".join(list(largest.columns)[:12])
+        columns = listed(largest.columns)
         raise UndecidedError(
             f"{largest.where}: no columns look like x, y and z; there are {columns}",
             "columns",

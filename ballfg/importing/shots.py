@@ -153,7 +153,7 @@ def _stamps(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> 
             seen = (
                 "has frames but no time"
                 if frames is not None
-                else f"has no column of times, but {', '.join(table.columns)}"
+                else f"has no column of times, but {listed(table.columns)}"
             )
             raise UndecidedError(f"{table.where} {seen}: the number of frames per second is needed", "rate", (), "120")
         return (np.arange(len(table), dtype=np.float64) if frames is None else frames) / rate

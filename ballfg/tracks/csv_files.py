@@ -15,7 +15,7 @@ import pyarrow.csv as pa_csv
 
 from ballfg.checks import did_you_mean, one_line, shown
 
-_NUMBER = re.compile(r"\s*[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?\s*", re.ASCII)
+_NUMBER = re.compile(r"\s*[+-]?(\d++\.?\d*+|\.\d++)([eE][+-]?\d+)?\s*", re.ASCII)
 _NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|infinity)\s*", re.IGNORECASE)
 _HEADER_LIMIT = 1 << 16  # bytes
 

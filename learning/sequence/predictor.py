@@ -36,9 +36,9 @@ class FolderConfig(BaseModel):
 
     kind: Literal["lstm", "diffusion"]
     """Of the model."""
-    width: int
+    width: Annotated[int, Field(ge=1, le=2048)]
     """Of its hidden states."""
-    points: Annotated[int, Field(ge=1)]
+    points: Annotated[int, Field(ge=1, le=100_000)]
     """Of the grid on which it predicts."""
     labels: Annotated[tuple[str, ...], Field(strict=False)]
     """Labels that are launcher settings."""

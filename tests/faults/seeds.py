@@ -83,6 +83,8 @@ def _model(folder: Path) -> None:
     (folder / "model.yaml").write_text(
         "flight:\n  gravity: {g: 9.81}\n  drag: {k: 0.13}\n  magnus: {k: 0.003}\n"
         "bounce:\n  restitution: {e: 0.92}\n  friction: {mu: 0.25}\nmeasurement: {}\nlearned: null\n"
+        "variations:\n  flight.drag.k: {by: group, values: {topspin: 0.148, no_spin: 0.110}}\n"
+        "  bounce.restitution.e: {by: track, values: {'001': 0.93, '025': 0.88}, line: true}\n"
     )
 
 

@@ -8,6 +8,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 Kind = Literal["mlp", "mlp+gs", "skip+gs", "mnn+gs"]
 
+MOST_WIDTH: Final = 2048
+"""Hidden units; such a layer takes 34 MB."""
+MOST_DEPTH: Final = 20
+
 DEFAULT_SIZES: Final[dict[Kind, tuple[int, int, int]]] = {
     "mlp": (39, 40, 3),
     "mlp+gs": (39, 40, 3),
@@ -25,11 +29,11 @@ class Architecture(BaseModel):
 
     kind: Kind
     """mlp sees raw velocity and spin; the others see Gram-Schmidt features."""
-    width_flight: Annotated[int, Field(ge=1)]
+    width_flight: Annotated[int, Field(ge=1, le=MOST_WIDTH)]
     """Hidden units of the flight network."""
-    width_contact: Annotated[int, Field(ge=1)]
+    width_contact: Annotated[int, Field(ge=1, le=MOST_WIDTH)]
     """Hidden units of the contact network."""
-    depth: Annotated[int, Field(ge=1)]
+    depth: Annotated[int, Field(ge=1, le=MOST_DEPTH)]
     """Hidden layers (mlp), blocks (skip), or repetitions of the one layer (mnn) of each network."""
     residual: bool = False
     """The networks correct another model; false: they are all there is."""

@@ -34,6 +34,9 @@ _MODEL, _LAUNCHER, _BASE = "model.", "launcher.", "base."
 """What the names of tensors start with: those of the networks and of the spin embedding; those of the base, which
 stand in the model file itself."""
 
+LARGEST_DENSITY = 100_000
+"""Centres of a density of features; training chooses some hundred."""
+
 
 class _Section(BaseModel):
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
@@ -54,8 +57,8 @@ class _TrainedConfig(_Section):
 
 
 class _FadingConfig(_Section):
-    flight_centres: Annotated[int, Field(ge=0)]
-    contact_centres: Annotated[int, Field(ge=0)]
+    flight_centres: Annotated[int, Field(ge=0, le=LARGEST_DENSITY)]
+    contact_centres: Annotated[int, Field(ge=0, le=LARGEST_DENSITY)]
 
 
 class _Config(_Section):

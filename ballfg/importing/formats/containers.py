@@ -1,6 +1,7 @@
 """Files that hold tables of numbers as such: Parquet, Excel, npz, HDF5, ROS bags."""
 
 import math
+import sys
 import zipfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -113,8 +114,10 @@ def read_npz(path: Path) -> list[RawTable]:
         loaded = np.load(path, allow_pickle=False)
         content: Any = loaded if isinstance(loaded, np.ndarray) else {key: loaded[key] for key in loaded.files}
         for array in [content] if isinstance(content, np.ndarray) else content.values():
-            if array.dtype.kind in "UV":
-                array.tolist()  # refuses code points that no text has
+            if array.dtype.kind == "U" and array.nbytes:
+                codes = np.atleast_1d(array).astype(array.dtype.newbyteorder("=")).view(np.uint32)
+                if codes.max() > sys.maxunicode:  # numpy would make text of it that Python cannot hold
+                    raise ValueError("a text has code points that there are not")
     return nested_tables(content, path.stem, str(path))
 
 

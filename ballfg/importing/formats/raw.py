@@ -29,7 +29,7 @@ MISSING: Final = (
     "-inf",
 )
 """What files write, in lower case, where a number is missing."""
-WITH_UNIT: Final = re.compile(r"^\s*([-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?)\s*([^\W\d_]{1,3})\s*$")
+WITH_UNIT: Final = re.compile(r"^\s*([-+]?(?:\d++\.?\d*+|\.\d++)(?:[eE][-+]?\d++)?)\s*([^\W\d_]{1,3})\s*$")
 """A number with its unit, such as 12.5 mm."""
 _MOSTLY: Final = 0.5
 """Share of a column's cells that must be numbers, where it is taken for one of numbers."""
