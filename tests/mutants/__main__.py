@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -132,6 +132,10 @@ def run_all(
     """Try all, some at the same time, and say how it goes."""
     compiled = {name for name in source_files() if has_machine_code((ROOT / name).read_text(encoding="utf-8"))}
     known, verdicts, reading, begin = judged(), list[Verdict](), threading.Lock(), time.monotonic()
+
+    def is_frozen(mutation: Mutation) -> bool:
+        return recording.known.frozen_in_machine_code(mutation.file, mutation.line, compiled)
+
     with ExitStack() as stack:
         free: queue.SimpleQueue[Workshop] = queue.SimpleQueue()
         for _ in range(jobs):
@@ -143,18 +147,20 @@ def run_all(
             with reading:
                 last = mutation.line + mutation.before.count("\n")
                 tests = recording.reaching(mutation.file, mutation.line, last)
-                frozen = recording.known.frozen_in_machine_code(mutation.file, mutation.line, compiled)
             chosen = ordered(tests, mutation.file, budget)
             if not chosen:
                 return Verdict(mutation, "unreached", "", 0.0)
             workshop = free.get()
             try:
-                outcome = workshop.attempt(mutation, chosen, sum(tests[t] for t in chosen), compile_anew=frozen)
+                outcome = workshop.attempt(
+                    mutation, chosen, sum(tests[t] for t in chosen), compile_anew=is_frozen(mutation)
+                )
             finally:
                 free.put(workshop)
             return _verdict(mutation, outcome, known, len(tests), len(chosen))
 
-        pool = stack.enter_context(ThreadPoolExecutor(jobs))
+        pool = ThreadPoolExecutor(jobs)
+        stack.callback(pool.shutdown, cancel_futures=True)  # Ctrl-C does not wait for all that is left
         for done, future in enumerate(as_completed([pool.submit(attempt, m) for m in mutations]), 1):
             verdict = future.result()
             verdicts.append(verdict)
@@ -162,11 +168,15 @@ def run_all(
                 killed.add(verdict)
             left = (time.monotonic() - begin) / done * (len(mutations) - done) / 60.0
             print(f"{done} of {len(mutations)}: {_line(verdict)}; {left:.0f} min left", flush=True)
-        killers = {v.by for v in verdicts if v.by in recording.seconds}
-        again = sum(recording.seconds[test] for test in killers)
-        failing = set(free.get().failing(sorted(killers), again)) if killers else set()
+        failing, workshop = set[tuple[bool, str]](), free.get()
+        for frozen in (False, True):
+            killers = {v.by for v in verdicts if v.by in recording.seconds and is_frozen(v.mutation) == frozen}
+            again = sum(recording.seconds[test] for test in killers)
+            if killers:
+                found = workshop.failing(sorted(killers), again, compile_anew=frozen)
+                failing |= {(frozen, test) for test in found}
     return sorted(
-        (Verdict(v.mutation, "doubtful", v.by, v.seconds) if v.by in failing else v for v in verdicts),
+        (replace(v, word="doubtful") if (is_frozen(v.mutation), v.by) in failing else v for v in verdicts),
         key=lambda v: (v.mutation.file, v.mutation.line),
     )
 

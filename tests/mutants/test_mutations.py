@@ -117,4 +117,4 @@ def test_every_judged_change_is_one_that_can_still_be_made() -> None:
     for (file, before, after), reason in judged().items():
         changes = {(m.old_line, m.new_line) for m in mutations_of(file, (ROOT / file).read_bytes())}
         assert (before, after) in changes, f"{file}: {before!r} no longer becomes {after!r}; remove it"
-        assert len(reason.split()) > 3
+        assert len(reason.split()) >= 3

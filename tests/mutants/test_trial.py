@@ -41,7 +41,7 @@ def test_a_change_is_noticed_in_a_copy_and_taken_back(tmp_path: Path, change: Mu
         outcome = workshop.attempt(change, [TEST], 1.0, compile_anew=False)
         assert (workshop.tree / FILE).read_bytes() == source
         assert os.stat(workshop.tree / FILE).st_mtime_ns == stamp
-        assert workshop.failing([TEST], 1.0) == []
+        assert workshop.failing([TEST], 1.0, compile_anew=False) == []
     assert (outcome.killed, outcome.by) == (True, TEST)
     assert not workshop.folder.exists()
     assert (ROOT / FILE).read_bytes() == source

@@ -80,15 +80,14 @@ class Workshop:
         source, stamp = path.read_bytes(), path.stat()
         path.write_bytes(mutation.applied(source))
         try:
-            limit = START + SLOWER * expected + (COMPILING if compile_anew else 0.0)
-            return self._run(tests, limit, compile_anew)
+            return self._run(tests, _limit(expected, compile_anew), compile_anew)
         finally:
             path.write_bytes(source)
             os.utime(path, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))  # what was compiled from it stays good
 
-    def failing(self, tests: Sequence[str], expected: float) -> list[str]:
+    def failing(self, tests: Sequence[str], expected: float, *, compile_anew: bool) -> list[str]:
         """Those tests that fail without any change."""
-        self._run(tests, START + SLOWER * expected, False, stop=False)
+        self._run(tests, _limit(expected, compile_anew), compile_anew, stop=False)
         return FAILURE.findall((self.folder / "said").read_text(encoding="utf-8", errors="replace"))
 
     def _run(self, tests: Sequence[str], limit: float, compile_anew: bool, *, stop: bool = True) -> Outcome:
@@ -131,6 +130,11 @@ class Workshop:
             return Outcome(True, f"no end after {limit:.0f} s", seconds)
         failures = FAILURE.findall(said.read_text(encoding="utf-8", errors="replace"))
         return Outcome(True, failures[0] if failures else f"pytest's exit status {code}", seconds)
+
+
+def _limit(expected: float, compile_anew: bool) -> float:
+    """s after which tests that take so long as recorded are stopped."""
+    return START + SLOWER * expected + (COMPILING if compile_anew else 0.0)
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
