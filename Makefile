@@ -12,7 +12,7 @@ OLDEST := tests/factors tests/files tests/importing/test_forms.py tests/live/tes
 
 export OMP_NUM_THREADS ?= 1
 
-.PHONY: bench test check check-speed check-deps check-oldest docs package sbom readme format clean
+.PHONY: bench test check check-speed check-deps check-oldest docs package sbom readme fuzz mutants format clean
 
 bench: $(READY)  ## the estimator comparison: table, results/results.json, pictures; measured tracks too where they are
 	$(BIN)/ballfg-bench estimators --out results
@@ -54,6 +54,12 @@ sbom: $(TOOLS)  ## what the wheel brings along, as CycloneDX JSON beside it; aft
 check-deps: $(READY) $(TOOLS)  ## known vulnerabilities (needs a network, and says so without one) and licences; STRICT=1
 	$(BIN)/python -m tests.dependencies.audit $(TOOLS) $(if $(STRICT),--strict)
 	$(BIN)/python -m tests.dependencies.licences
+
+fuzz: $(READY)  ## ten minutes of damaged files for every reader; what is found goes into tests/faults/corpus
+	$(BIN)/python -m tests.faults.fuzz --replay --seconds 600 --seed 1
+
+mutants: $(READY)  ## small mistakes put into the code: which of them do the tests notice? An hour
+	$(BIN)/python -m tests.mutants
 
 check-oldest:  ## the oldest versions that pyproject.toml allows, in an environment of their own: tests of reading to predicting
 	rm -rf build/oldest && $(PYTHON) -m venv build/oldest
