@@ -346,7 +346,7 @@ def test_the_command_says_so_too(
     write_dataset(tmp_path / "data", replace(shots.info, table_height=height), tracks)
     with pytest.raises(SystemExit) as stopped:
         run(["estimate", str(tmp_path / "data"), "--out", str(tmp_path / "states.csv"), "--jobs", "1"])
-    assert stopped.value.code == 0
+    assert stopped.value.code == (3 if wrong == "axes" else 0)  # no ball flies along a table as fast as that
     assert f"note: track '000': {said}" in capsys.readouterr().err
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from unittest.mock import patch
 
 import cv2
 import numpy as np
@@ -156,8 +157,9 @@ def report(found: bool) -> Callable[[Path], None]:
         from ballfg.diagnosis.report import report
         from tests.diagnosis.made_diagnosis import silent
 
-        report.page = lambda *_: "a page"  # drawing one takes seconds
-        report.write_report(silent(), folder / "diagnosis", {"a": nominal_model(), "b": learned(1)} if found else None)
+        rooms = {"a": nominal_model(), "b": learned(1)} if found else None
+        with patch.object(report, "page", return_value="a page"):  # drawing one takes seconds
+            report.write_report(silent(), folder / "diagnosis", rooms)
 
     return work
 

@@ -13,14 +13,16 @@ from tests.mutants.reach import Recording, record, recorded_tests
 from tests.mutants.trial import Workshop
 from tests.places import ROOT
 
-FILE = "ballfg/files/whole_folder.py"
+FILE = "ballfg/files/moving.py"
 TEST = "tests/files/test_whole_folder.py::test_an_earlier_result_is_replaced_and_other_files_stay"
 
 
 @pytest.fixture(scope="module")
 def change() -> Mutation:
     """An earlier result is not removed."""
-    return next(m for m in mutations_of(FILE, (ROOT / FILE).read_bytes()) if m.before == "path.unlink()")
+    return next(
+        m for m in mutations_of(FILE, (ROOT / FILE).read_bytes()) if m.before == "_put_aside(folder / name, place)"
+    )
 
 
 def test_a_run_tells_which_test_reaches_a_line(tmp_path: Path, change: Mutation) -> None:
