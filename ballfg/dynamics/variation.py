@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from ballfg.checks import check_number, shown
+from ballfg.checks import check_number, listed, shown
 from ballfg.tracks import Track
 
 TRACK: Final = "track"
@@ -55,11 +55,11 @@ class Variation:
         if not self.values:
             raise ValueError("values must hold at least one number, by label or by name of a track; got none")
         for key, value in self.values.items():
-            check_number(f"values[{key!r}]", value)
+            check_number(f"values[{shown(key)}]", value)
         if self.line and (self.by != TRACK or any(number_of(name) is None for name in self.values)):
             raise ValueError(
                 f"line must be false unless by is '{TRACK}' and every track in values has a number in its name; got by "
-                f"'{self.by}' and {', '.join(self.values)}. Leave line out for values that hold until the next one."
+                f"{shown(self.by)} and {listed(self.values)}. Leave line out for values that hold until the next one."
             )
 
     def value(self, track: Track) -> float | None:
@@ -90,7 +90,7 @@ class Variation:
         by, values, line = content["by"], content["values"], content.get("line", False)
         if not isinstance(by, str) or not isinstance(values, Mapping) or not isinstance(line, bool):
             raise ValueError(f"'by' must be text, 'values' a mapping and 'line' true or false; got {shown(content)}")
-        return cls(by, {str(key): check_number(f"values[{str(key)!r}]", v) for key, v in values.items()}, line)
+        return cls(by, {str(key): check_number(f"values[{shown(str(key))}]", v) for key, v in values.items()}, line)
 
     def to_mapping(self) -> dict[str, Any]:
         """What `from_mapping` reads."""

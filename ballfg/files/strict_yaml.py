@@ -5,7 +5,6 @@ that multiply, tags and long numbers are refused before they can cost time or me
 """
 
 import math
-from collections.abc import Hashable
 from pathlib import Path
 from typing import Any, Final
 
@@ -21,9 +20,17 @@ MAX_DIGITS: Final = 100
 """Characters of a number."""
 _TAG: Final = "tag:yaml.org,2002:"
 _NUMBERS: Final = (f"{_TAG}int", f"{_TAG}float")
-_LOADER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_PARSER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 """libyaml's parser, ten times as fast, where PyYAML was built with it."""
 _TEXT_LOADER: Final = getattr(yaml, "CBaseLoader", yaml.BaseLoader)
+
+
+class _Loader(_PARSER):  # type: ignore[misc, valid-type]
+    """Keys are text as they are written: the track 007 is not the number 7."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[str, Any]:
+        self.flatten_mapping(node)
+        return {str(key.value): self.construct_object(value, deep=deep) for key, value in node.value}
 
 
 class YamlError(ValueError):
@@ -63,7 +70,7 @@ def parse_yaml(text: str, where: str, *, text_only: bool = False) -> Any:
     """
     try:
         _check_events(where, text)
-        loader = (_TEXT_LOADER if text_only else _LOADER)(text)
+        loader = (_TEXT_LOADER if text_only else _Loader)(text)
         try:
             node = loader.get_single_node()
             _check_values(where, loader, node, "", set())
@@ -99,7 +106,7 @@ def mapping(what: str, content: Any) -> dict[Any, Any]:
 def _check_events(where: str, text: str) -> None:
     """Refuses what would cost more than its text: deep nesting, aliases that multiply or hold themselves, tags."""
     sizes = _Sizes()
-    for event in yaml.parse(text, Loader=_LOADER):
+    for event in yaml.parse(text, Loader=_PARSER):
         problem = sizes.add(event)
         if problem:
             mark = event.start_mark
@@ -157,31 +164,30 @@ def _check_values(where: str, loader: Any, node: yaml.Node | None, prefix: str, 
         for item in node.value:
             _check_values(where, loader, item, prefix, seen)
     elif isinstance(node, yaml.MappingNode):
-        lines: dict[Hashable, int] = {}
+        lines: dict[str, int] = {}
         for key, value in node.value:
             line = key.start_mark.line + 1
             if not isinstance(key, yaml.ScalarNode):
                 raise YamlError(where, "a key must be a word", line)
-            plain = _check_scalar(where, loader, key)
-            if plain in lines:
-                raise YamlError(where, f"{shown(key.value)} stands twice", lines[plain], f"{prefix}{key.value}")
-            lines[plain] = line
+            _check_scalar(where, loader, key)
+            if key.value in lines:
+                raise YamlError(where, f"{shown(key.value)} stands twice", lines[key.value], f"{prefix}{key.value}")
+            lines[key.value] = line
             _check_values(where, loader, value, f"{prefix}{key.value}.", seen)
 
 
-def _check_scalar(where: str, loader: Any, node: yaml.ScalarNode) -> Hashable:
-    """What a scalar stands for. Raises: YamlError: a number or a date that is none, or beyond what machines hold."""
+def _check_scalar(where: str, loader: Any, node: yaml.ScalarNode) -> None:
+    """Refuses a number or a date that is none, or beyond what machines hold."""
     line = node.start_mark.line + 1
     if node.tag in _NUMBERS and len(node.value) > MAX_DIGITS:
         raise YamlError(where, f"a number must have at most {MAX_DIGITS} digits; got {len(node.value)}", line)
     if node.tag == f"{_TAG}merge":
-        return str(node.value)
+        return
     try:
-        plain: Hashable = loader.construct_object(node)
+        plain = loader.construct_object(node)
     except (ValueError, OverflowError) as error:  # a 30th of February
         raise YamlError(where, f"{shown(node.value)} cannot be read; {error}", line) from None
     if isinstance(plain, int) and abs(plain) > 2**63 - 1:
         raise YamlError(where, f"whole numbers must lie within +-2^63; got {shown(node.value)}", line)
     if isinstance(plain, float) and math.isinf(plain) and "inf" not in node.value.lower():
         raise YamlError(where, f"{shown(node.value)} is larger than any number of double precision", line)
-    return plain

@@ -142,7 +142,10 @@ class SequencePredictor:
             ValueError: a file is damaged, or weights do not go with the config.
         """
         config, weights = _read(Path(folder))
-        architecture = SequenceArchitecture(config.kind, config.width)
+        try:
+            architecture = SequenceArchitecture(config.kind, config.width)
+        except ValueError as error:
+            raise ValueError(f"{Path(folder) / CONFIG}: {error}") from None
         launcher = LauncherSettings(config.labels, config.categories)
         model = architecture.empty(launcher.size, config.points)
         expected = {name: (tuple(value.shape), value.dtype) for name, value in model.state_dict().items()}

@@ -26,6 +26,7 @@ def test_what_is_read(tmp_path: Path) -> None:
         "more": {"k": 1, "l": 2},
     }
     assert read_yaml(written(tmp_path, "")) is None
+    assert read_yaml(written(tmp_path, "007: 1\n7: {yes: {1.50: a}}")) == {"007": 1, "7": {"yes": {"1.50": "a"}}}
 
 
 @pytest.mark.parametrize(
@@ -46,7 +47,6 @@ def test_what_is_read(tmp_path: Path) -> None:
         ("a: " + "9" * 30, "whole numbers must lie within +-2^63", 1, None),
         ("a: 1.0e+400", "'1.0e+400' is larger than any number of double precision", 1, None),
         ("a: 1\nb: 2026-02-30", "'2026-02-30' cannot be read; day is out of range for month", 2, None),
-        ("1: 1\n0x1: 2", "'0x1' stands twice", 1, "0x1"),
         ("? [a, b]\n: 1", "a key must be a word", 1, None),
         ("a: [" + "1, " * 300_000 + "]", "it must hold at most 250000 values, aliases written out", 1, None),
         ("a: 1\n---\nb: 2", "expected a single document in the stream, but found another document", 2, None),

@@ -54,6 +54,8 @@ class SightedDataset(TrackFolder):
                 self._tracks[name] = replace(track, dataset=self)
             except NeverSeenByTwoError as error:
                 notes.append(str(error))
+            except ValueError as error:  # cameras with numbers that no lens has
+                raise ValueError(f"{path}: {error} Look at {CAMERAS_FILE}.") from None
 
     def __len__(self) -> int:
         return len(self._tracks)

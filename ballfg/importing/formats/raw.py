@@ -110,10 +110,16 @@ def _column(label: str, values: Any) -> tuple[Column, str, Column | None]:
 
 def _array(values: Sequence[Any]) -> Column:
     held = list(values)
-    if held and all(isinstance(value, bool | int | np.integer) for value in held):
-        return np.array(held, dtype=np.int64)
-    if held and all(isinstance(value, int | float | np.number) for value in held):
-        return np.array(held, dtype=np.float64)
+    kinds: tuple[tuple[tuple[type, ...], type], ...] = (
+        ((bool, int, np.integer), np.int64),
+        ((int, float, np.number), np.float64),
+    )
+    for kind, dtype in kinds:
+        if held and all(isinstance(value, kind) for value in held):
+            try:
+                return np.array(held, dtype=dtype)
+            except OverflowError:  # digits without end: no number that was measured
+                continue
     made = np.empty(len(held), dtype=object)
     made[:] = held
     return made
