@@ -26,6 +26,8 @@ class SightedDataset(TrackFolder):
         info: what `dataset.yaml` states.
         cameras: of the rig.
         notes: what was ignored or left out, one sentence each.
+
+    Raises: ValueError: cameras with numbers that no lens has.
     """
 
     rough: Final = True
