@@ -119,6 +119,8 @@ def _innovations(problem: TrackProblem, state: State, values: Values, known: Cov
 def _sections(smoother: Smoother, track: Track, found: Joined) -> Iterator[Estimate]:
     """The estimates of the sections, in order. The last state of each is told by the next one."""
     end, doubts = found.found, smoother.doubts(track)
+    beginning = end.states[0].section
+    problem = smoother.problem(beginning.track, beginning.segmentation)  # its unknowns are those of all sections
     tasks = [
         (state, joint, end.chain.target(k))
         for k, (state, joint) in enumerate(zip(end.states, end.chain.covariances(), strict=True))
@@ -133,14 +135,20 @@ def _sections(smoother: Smoother, track: Track, found: Joined) -> Iterator[Estim
             others[k] += part.others[k]
         before = part.others.get(count, np.zeros((STATE_DIM, STATE_DIM)))
         notes = (*doubts, *_rival_note(found, part)) if first == 0 else ()
-        yield _section(smoother, track, found, part, others, first, notes)
+        yield _section(smoother, track, problem, found, part, others, first, notes)
 
 
 def _section(
-    smoother: Smoother, track: Track, found: Joined, part: Smoothed, others: Array, first: int, notes: tuple[str, ...]
+    smoother: Smoother,
+    track: Track,
+    problem: TrackProblem,
+    found: Joined,
+    part: Smoothed,
+    others: Array,
+    first: int,
+    notes: tuple[str, ...],
 ) -> Estimate:
-    end, events = found.found, found.segmentation
-    count, problem = len(others), smoother.problem(end.states[0].section.track, end.states[0].section.segmentation)
+    end, events, count = found.found, found.segmentation, len(others)
     coefficients, known = part.values.coefficients, end.chain.coefficient_covariance
     own, rest = slice(0, problem.width), slice(problem.width, len(coefficients))
     at_minimum = end.convergence in (Convergence.CONVERGED, Convergence.AT_KINK)
