@@ -9,16 +9,9 @@ from ballfg.estimation.observations.sighted_dataset import SightedDataset, read_
 from ballfg.files.moving import settle
 from ballfg.files.strict_yaml import read_mapping
 from ballfg.tracks import Ball, Dataset, read_dataset
-from ballfg.tracks.dataset import TRACK_FILES
-from ballfg.tracks.detections_file import DETECTIONS_FILE
+from ballfg.tracks.dataset import has_positions as has_positions
 
 MODEL_FILE = "model.yaml"
-
-
-def has_positions(folder: str | PathLike[str]) -> bool:
-    """Whether a folder holds a table of tracks, or no detections either."""
-    path = Path(folder)
-    return any((path / name).is_file() for name in TRACK_FILES) or not (path / DETECTIONS_FILE).is_file()
 
 
 def read(folder: str | PathLike[str]) -> Dataset | SightedDataset:

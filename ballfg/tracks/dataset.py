@@ -12,6 +12,7 @@ from typing import Final
 from ballfg.checks import shown
 from ballfg.files.moving import settle
 from ballfg.tracks.checks import Findings, check_scale, tidy
+from ballfg.tracks.detections_file import DETECTIONS_FILE
 from ballfg.tracks.grouping import Index, RowGroup, groups, scan
 from ballfg.tracks.info import INFO_FILE, Ball, DatasetInfo, read_info
 from ballfg.tracks.labels import LABELS_FILE, LabelTable, read_labels
@@ -115,6 +116,12 @@ class Dataset(TrackFolder):
                 if track.name == name:
                     return track
         raise ValueError(f"name must be one of the {len(self)} trajectories of {self.path}; got {name!r}. See names.")
+
+
+def has_positions(folder: str | PathLike[str]) -> bool:
+    """Whether a folder holds a table of tracks, or no detections either."""
+    path = Path(folder)
+    return any((path / name).is_file() for name in TRACK_FILES) or not (path / DETECTIONS_FILE).is_file()
 
 
 def read_dataset(folder: str | PathLike[str]) -> Dataset:

@@ -62,11 +62,9 @@ def show(
 
 def _dataset(folder: Path) -> Dataset | SightedDataset:
     """The tracks of a folder; roughly triangulated ones where there are only detections."""
-    from ballfg.tracks import read_dataset
-    from ballfg.tracks.dataset import TRACK_FILES
-    from ballfg.tracks.detections_file import DETECTIONS_FILE
+    from ballfg.tracks.dataset import has_positions, read_dataset
 
-    if any((folder / name).is_file() for name in TRACK_FILES) or not (folder / DETECTIONS_FILE).is_file():
+    if has_positions(folder):
         return read_dataset(folder)  # without torch, which takes seconds to load
     from ballfg.estimation import read_sighted
 
