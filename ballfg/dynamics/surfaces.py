@@ -9,6 +9,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
+from ballfg.dynamics.motion.limits import DEEPEST
 from ballfg.state import Z
 
 TABLE_ABOVE_FLOOR: Final = 0.76
@@ -75,15 +76,21 @@ class Surfaces:
     def height_below(self, state: Tensor) -> Tensor:
         """(...) m, height of the surface below a ball in states (..., 9), straight down; -inf where there is none.
 
-        A ball whose centre is below the table's surface is beside the table.
+        A ball whose centre is below the table's surface is beside the table; `level_below` on how deep it may be.
         """
-        on_table = (state[..., Z] > self.table_height) & self.over_table(state)
-        return torch.where(on_table, state.new_tensor(self.table_height), state.new_tensor(self.lowest()))
+        return torch.where(self.over_table(state), self.level_below(state), self._lower_level(state))
 
     def level_below(self, state: Tensor) -> Tensor:
-        """(...) m, height of the surface whose level a ball in states (..., 9) falls to, on the table or beside it."""
+        """(...) m, height of the surface whose level a ball in states (..., 9) falls to, on the table or beside it.
+
+        -inf where there is none: below the lowest surface by more than `DEEPEST`.
+        """
         above = state[..., Z] > self.table_height
-        return torch.where(above, state.new_tensor(self.table_height), state.new_tensor(self.lowest()))
+        return torch.where(above, state.new_tensor(self.table_height), self._lower_level(state))
+
+    def _lower_level(self, state: Tensor) -> Tensor:
+        low = self.lowest()
+        return torch.where(state[..., Z] > low - DEEPEST, state.new_tensor(low), state.new_tensor(-math.inf))
 
     def lowest(self) -> float:
         """m, height of the lowest surface under a ball beside the table; -inf where there is none."""

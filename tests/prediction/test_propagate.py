@@ -49,6 +49,19 @@ def test_the_paths_are_what_they_are_called(model, name):
     assert int((torch.diff(states[:, VZ]) > 0.06).sum()) == impacts
 
 
+def test_far_below_the_floor_there_is_nothing_to_bounce_on(model):
+    """A little below it a ball has just gone through; from a depth of 26 m no way leads back to a bounce."""
+    state = torch.tensor([[0, 0, -0.8, 4, 0.3, -5, 10, 30, 5], [0, 0, -27, 4, 0.3, -14, 10, 30, 5]]).double()
+    covariance, times = 1e-6 * torch.eye(STATE_DIM).double().repeat(2, 1, 1), torch.linspace(0.01, 0.3, 30).double()
+    belief = Belief(model, torch.zeros(2).double(), state, covariance)
+    found = Propagator(EDGE, ProcessNoise()).rollout(belief, times)
+    assert found.states[0, 0, VZ] > 0.0
+    with torch.no_grad():
+        free = rollout(model, state[1:], times, Surfaces(table_height=-1e4))[0]
+    np.testing.assert_allclose(found.states[1], free.numpy(), rtol=1e-12)
+    assert np.isfinite(found.covariances).all()
+
+
 # --- closed forms ------------------------------------------------------------------------------------------------
 
 

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs.edges import at_rest, gap_of, over_table
+from ballfg.dynamics.compiled.beliefs.edges import at_rest, gap_of, level_below, over_table
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contacts
 from ballfg.dynamics.compiled.flight import fly_one, fly_together, put, put_all
@@ -89,7 +89,7 @@ def roll_out(rates, impact, surface, values, weights, start, durations, world, s
             for r in range(m):
                 if reached[r] <= j:
                     continue
-                level = world[0] if x[r, 2] > world[0] else world[1]
+                level = level_below(x[r, 2], world)
                 hard = at_rest(x[r], gap_of(surface, x[r], s[r], ws, level, world[2]), level, world)
                 if not hard and after[r, 5] < 0.0 and gap_of(surface, after[r], s[r], ws, level, world[2]) < 0.0:
                     own = (c[r : r + 1], b[r : r + 1], s[r : r + 1])

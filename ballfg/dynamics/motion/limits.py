@@ -13,6 +13,9 @@ GAP_TOLERANCE: Final = 1e-10
 """m. A grazing ball whose search stalled this close to the surface has touched it."""
 TYPICAL_JERK: Final = 60.0
 """m/s^3, in the bound on the search's error."""
+DEEPEST: Final = 0.25
+"""m. A ball whose centre is further below the lowest surface is out of this world, and meets nothing. Floors are known
+to some centimetres."""
 LEAST_FALL: Final = 1.0
 """m/s^2. The search takes a ball to fall at least as fast as this."""
 LONGEST_FALL: Final = 20.0

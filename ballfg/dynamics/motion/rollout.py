@@ -7,7 +7,8 @@ What is defined where nature is not asked:
 - A ball that starts a little below a surface (its centre above it) and moves down bounces at the moment at which it
   went through; one that moves up leaves. One that can no longer come up is put on the surface, at rest.
 - Over more than `LONGEST_MOTION` the ball stays where it was by then.
-- A ball whose centre starts below the table's surface is beside the table; the floor is what it falls on.
+- A ball whose centre starts below the table's surface is beside the table; the floor is what it falls on. One that
+  starts below the lowest surface by more than `DEEPEST` falls on and on.
 - Whether a ball meets the table is decided by its centre's place over it at the moment of contact; edges are not hit. A
   ball that rolls over the edge falls from the end of the integration step in which it does.
 """

@@ -6,7 +6,15 @@ surface as if it were not there, *unbounced*, stands for them for a while: `mixt
 
 import numpy as np
 
-from ballfg.dynamics.compiled.beliefs.edges import at_rest, come_down, falls_past, gap_of, over_table, share_over_table
+from ballfg.dynamics.compiled.beliefs.edges import (
+    at_rest,
+    come_down,
+    falls_past,
+    gap_of,
+    level_below,
+    over_table,
+    share_over_table,
+)
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.contacts import contact_times, contacts
 from ballfg.dynamics.compiled.flight import fly_one
@@ -221,7 +229,7 @@ def carry(
                 level[k + 1, r] = level[k, r]
             else:
                 age[k + 1, r] = np.nan
-            low = world[0] if x[2] > world[0] else world[1]
+            low = level_below(x[2], world)
             after = mean[k + 1, r]
             if at_rest(x[:9], gap_of(surface, x[:9], s[r], ws, low, world[2]), low, world):
                 hard[r], stop = 2.0, True

@@ -17,7 +17,7 @@ from ballfg.dynamics.compiled.signatures import (
     THREE_WEIGHTS,
     TWO,
 )
-from ballfg.dynamics.motion.limits import BEYOND, LEAST_SIGMA, NEGLIGIBLE, REST_GAP, REST_SPEED
+from ballfg.dynamics.motion.limits import BEYOND, DEEPEST, LEAST_SIGMA, NEGLIGIBLE, REST_GAP, REST_SPEED
 
 
 @machine_code(REAL(FUNCTION, ONE, ONE, ONE, REAL, REAL))
@@ -26,6 +26,14 @@ def gap_of(surface, x, s, ws, level, radius):
     offset = np.empty(3)
     evaluate(surface, x, s, ws, np.empty((9, 0)), np.empty((len(s), 0)), offset, np.empty((3, 0)))
     return x[2] - level - offset[0] - radius
+
+
+@machine_code(REAL(REAL, ONE))
+def level_below(z, world):
+    """Height (m) of the surface whose level a ball with its centre at z (m) falls to; -inf where there is none."""
+    if z > world[0]:
+        return world[0]
+    return world[1] if z > world[1] - DEEPEST else -np.inf
 
 
 @machine_code(FLAG(ONE, ONE))

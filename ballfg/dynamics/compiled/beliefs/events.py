@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.beliefs.carry import bounce, fly_belief
-from ballfg.dynamics.compiled.beliefs.edges import at_rest, come_down, falls_past, gap_of, over_table
+from ballfg.dynamics.compiled.beliefs.edges import at_rest, come_down, falls_past, gap_of, level_below, over_table
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.flight import evaluate, fly_one
 from ballfg.dynamics.compiled.signatures import FLAG, FUNCTION, ONE, REAL, THREE, TWO, several
@@ -82,7 +82,7 @@ def _contact_within(rates, surface, x, c, s, w, ws, h, world, touch):
     It is where the ball rests, or falls past the table to the floor within the step. The third number is the time at
     which it falls past the table, NaN where it does not; writes its state there to touch (9,).
     """
-    low, after = world[0] if x[2] > world[0] else world[1], x.copy()
+    low, after = level_below(x[2], world), x.copy()
     if at_rest(x, gap_of(surface, x, s[0], ws, low, world[2]), low, world):
         return low, np.nan, np.nan
     fly_one(rates, after, c[0], w, np.empty((9, 0)), np.empty((c.shape[1], 0)), h, np.empty(0), 1)
