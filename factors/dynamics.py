@@ -22,7 +22,7 @@ from ballfg.dynamics.motion.flight_step import flight_step
 from ballfg.dynamics.motion.integrate import batch_jacobian, fly_jacobian, step_count, steps_over
 from ballfg.dynamics.motion.rollout import roll
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Noise, Values
-from ballfg.factors.noise import Kicks, whitening, whitening_tensor
+from ballfg.factors.noise import Kicks, ProcessNoise, whitening, whitening_tensor
 from ballfg.state import STATE_DIM
 
 
@@ -133,6 +133,16 @@ class DynamicsFactors(FactorBatch):
 
 class FlightFactors(DynamicsFactors):
     """Free flight over the interval."""
+
+    def with_hits(self, rows: Index, noise: ProcessNoise) -> Self:
+        """The same factors, with a hit at an unknown moment in some of the intervals.
+
+        Args: rows: (k,) index of the factors.  noise: their process noise.
+        """
+        other, dt = copy.copy(self), self.dt[rows]
+        other.whitening, other.hit = self.whitening.copy(), self.hit.copy()
+        other.whitening[rows], other.hit[rows] = whitening(noise.flight(dt) + noise.hit(dt)), True
+        return other
 
     def propagate(self, state: Tensor, rows: Index | slice) -> tuple[Tensor, Tensor]:
         """Flight over dt."""

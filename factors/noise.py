@@ -59,6 +59,14 @@ class ProcessNoise:
         tangential = np.hypot(self.contact_velocity, self.contact_tangential)
         return self.kick(dt, time, (tangential, tangential, self.contact_velocity), self.contact_spin)
 
+    def kicks(self, dt: Array, kicks: Kicks) -> Array:
+        """(m, 9, 9) covariance at the end of intervals dt (m,) s of the contacts and hits in them."""
+        covariance = np.zeros((len(dt), STATE_DIM, STATE_DIM))
+        for time in kicks.times.T:
+            covariance += self.contact(dt, time)
+        covariance[kicks.hit] += self.hit(dt[kicks.hit])
+        return covariance
+
     def hit(self, dt: Array) -> Array:
         """(n, 9, 9) covariance at the end of intervals dt (n,) s of a hit at an unknown time in them."""
         ends = (np.zeros_like(dt), dt)

@@ -59,24 +59,32 @@ def motions_of(segmentation: Segmentation, times: Array) -> list[Motion]:
 
     Args: segmentation: of n samples.  times: (n,) s.
     """
+    found = eventful_motions(segmentation, times)
+    return [found.get(i, FLIGHT) for i in range(len(times) - 1)]
+
+
+def eventful_motions(segmentation: Segmentation, times: Array) -> dict[int, Motion]:
+    """The motion of every interval in which something happens, in their order.
+
+    Args: segmentation: of n samples.  times: (n,) s.
+    """
     count = len(times) - 1
-    in_interval = contacts_by_interval(segmentation.contacts)
+    met = contacts_by_interval(segmentation.contacts)
     rests: dict[int, float] = {}
     for rest in segmentation.rests:
         rests.update(dict.fromkeys(range(max(rest.first, 0), min(rest.last, count - 1) + 1), rest.height))
     hits, restarts = set(segmentation.hits.tolist()), set(segmentation.restarts.tolist())
-    return [
-        Motion(
-            heights=tuple(contact.height for contact in met),
-            times=tuple(contact.time - float(times[i]) for contact in met),
-            rest=None if met else rests.get(i),
+    return {
+        i: Motion(
+            heights=tuple(contact.height for contact in met.get(i, ())),
+            times=tuple(contact.time - float(times[i]) for contact in met.get(i, ())),
+            rest=None if i in met else rests.get(i),
             hit=i in hits,
             linked=i not in restarts,
         )
-        if met or i in rests or i in hits or i in restarts
-        else FLIGHT
-        for i, met in ((i, in_interval.get(i, [])) for i in range(count))
-    ]
+        for i in sorted(met.keys() | rests.keys() | hits | restarts)
+        if 0 <= i < count
+    }
 
 
 def contacts_by_interval(contacts: tuple[Contact, ...]) -> dict[int, list[Contact]]:

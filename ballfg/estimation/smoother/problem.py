@@ -5,7 +5,6 @@ rest on a surface; a hit adds its jump to the process noise. An interval that no
 it) gets none. Every observation of the track gives its factors; the first state of each linked piece gets a prior.
 """
 
-from collections import defaultdict
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,21 +12,19 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import steps_over
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.estimation.launcher import SpinLabel
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns, unknowns_of
 from ballfg.estimation.observations.positions import observations_of
 from ballfg.estimation.segmentation import Contact, Quality, Segmentation
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, total_sigmas
+from ballfg.estimation.smoother.dynamics import TrackDynamics
 from ballfg.estimation.smoother.initial import bridged_positions
-from ballfg.estimation.smoother.motion import motions_of
 from ballfg.factors.batch import FactorBatch, Values
-from ballfg.factors.dynamics import ContactFactors, FlightFactors, RestFactors, model_width
+from ballfg.factors.dynamics import ContactFactors, model_width
 from ballfg.factors.graph import BallGraph
 from ballfg.factors.launcher import LauncherSpinFactors
 from ballfg.factors.linear.covariance import Covariances
-from ballfg.factors.noise import Kicks
 from ballfg.factors.prior import (
     CoefficientPriorFactors,
     PriorFactors,
@@ -120,6 +117,7 @@ class TrackProblem:
         self.context = Context(track, model, settings, self.sigma, columns, _velocities(track, segmentation, settings))
         self.observed = {one.name: one.batch(self.context) for one in self.observations}
         self.added: list[FactorBatch] = []
+        self._dynamics = TrackDynamics(track.times, self.ball, settings.process)
 
     @property
     def coefficient_sigmas(self) -> Array:
@@ -129,7 +127,7 @@ class TrackProblem:
     def graph(self, events: Events) -> BallGraph:
         """The factor graph for some events."""
         batches: list[FactorBatch] = [*self.observed.values(), *self.added]
-        batches += _dynamics(self.track.times, self.ball, events, self.settings)
+        batches += self._dynamics.factors(replace(events.segmentation, contacts=events.contacts))
         batches += _priors(self.track, events.segmentation, self.settings)
         if self.biased:
             batches += _biases(self.track.times, self.settings)
@@ -175,41 +173,6 @@ def _biases(times: Array, settings: Settings) -> list[FactorBatch]:
 def contact_batches(graph: BallGraph) -> list[ContactFactors]:
     """The graph's contact factors."""
     return [batch for batch in graph.batches if isinstance(batch, ContactFactors)]
-
-
-def _dynamics(times: Array, model: BallModel, events: Events, settings: Settings) -> list[FactorBatch]:
-    """One factor per linked interval, in batches that share a motion and a number of integration steps."""
-    dt = np.diff(times)
-    motions = motions_of(replace(events.segmentation, contacts=events.contacts), times)
-    covariance = settings.process.flight(dt)
-    groups: defaultdict[tuple[str, int], list[int]] = defaultdict(list)
-    for i, motion in enumerate(motions):
-        if motion.times or motion.hit:
-            covariance[i] = motion.covariance(dt[i : i + 1], settings.process)[0]
-        if not motion.linked:
-            continue
-        if motion.heights:
-            groups["contact", len(motion.heights)].append(i)
-        elif motion.rest is not None:
-            groups["rest", 0].append(i)
-        else:
-            groups["flight", steps_over(float(dt[i]))].append(i)
-    batches: list[FactorBatch] = []
-    for (motion_sort, _), members in groups.items():
-        rows = np.array(members)
-        kicks = Kicks(
-            np.array([motions[i].kick_times(float(dt[i])) for i in members]),
-            np.array([motions[i].hit for i in members]),
-        )
-        if motion_sort == "contact":
-            heights = np.array([motions[i].heights for i in members])
-            batches.append(ContactFactors(model, rows, dt[rows], covariance[rows], heights, kicks))
-        elif motion_sort == "rest":
-            resting = np.array([motions[i].rest for i in members])
-            batches.append(RestFactors(model, rows, dt[rows], covariance[rows], resting, kicks))
-        else:
-            batches.append(FlightFactors(model, rows, dt[rows], covariance[rows], kicks))
-    return batches
 
 
 def _priors(track: Track, segmentation: Segmentation, settings: Settings) -> list[FactorBatch]:

@@ -116,12 +116,12 @@ def advanced(smoother: Smoother, task: tuple[State, Point | None]) -> Told:
     Args: smoother: of the track.  task: the section, and where its ends and the coefficients are to go.
     """
     state, target = task
-    problem = smoother.problem(state.section.track, state.section.segmentation)
-    rows = state.section.linearized(problem, state.values)
+    own = state.section.own(smoother.problem(state.section.track, state.section.segmentation))
+    rows = state.section.linearized(own, state.values)
     values = state.values
     if target is not None:
         values = moved(Reduction(rows, values), values, target)
-        rows = state.section.linearized(problem, values)
+        rows = state.section.linearized(own, values)
     found = Reduction(rows, values)
     return Told(values, objective(rows), found.inner, found.ends)
 

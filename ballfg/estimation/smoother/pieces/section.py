@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -62,24 +62,22 @@ class Section:
         """Which of the factors with these first states (m,), index in the part, are the section's; (m,) bool."""
         return (states >= self.first) & (states < self.last + self.ends)
 
-    def linearized(self, problem: TrackProblem, values: Values) -> list[Rows]:
+    def linearized(self, own: Sequence[FactorBatch], values: Values) -> list[Rows]:
         """The section's factors at a point, their states counted from its first.
 
-        Args: problem: of the part.  values: of the section's states.
+        Args: own: its factors.  values: of the section's states.
         """
         padded = self.padded_values(values)
-        found = [batch.linearize(padded) for batch in self.own(problem)]
+        found = [batch.linearize(padded) for batch in own]
         return [
             replace(rows, variables=np.where(rows.variables < 0, rows.variables, rows.variables - self.first))
             for rows in found
         ]
 
-    def own(self, problem: TrackProblem) -> Iterator[FactorBatch]:
-        """The section's factors, states counted as in the part."""
-        for batch in problem.graph(self.events).batches:
-            own = self.owns(first_states(batch))
-            if own.any():
-                yield batch.taken(np.flatnonzero(own))
+    def own(self, problem: TrackProblem) -> list[FactorBatch]:
+        """The section's factors, states counted as in the part. Args: problem: of the part."""
+        batches = ((batch, self.owns(first_states(batch))) for batch in problem.graph(self.events).batches)
+        return [batch.taken(np.flatnonzero(own)) for batch, own in batches if own.any()]
 
 
 @dataclass(frozen=True)

@@ -85,7 +85,7 @@ def smoothed(smoother: Smoother, task: tuple[State, Array, Point]) -> Smoothed:
     state, joint, target = task
     section, values = state.section, state.values
     problem = smoother.problem(section.track, section.segmentation)
-    reduction = Reduction(section.linearized(problem, values), values)
+    reduction = Reduction(section.linearized(section.own(problem), values), values)
     values = moved(reduction, values, target)
     known = reduction.covariances(joint)
     covariances = np.ascontiguousarray(known.states[:, :STATE_DIM, :STATE_DIM])
