@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.estimation.smoother.pieces.chain import Chain, Point, moved_rows, solve_chain
 from ballfg.estimation.smoother.pieces.looks import bounds_of, cut_between, joined, look, section_of
-from ballfg.estimation.smoother.pieces.reduction import Ends, Reduction
+from ballfg.estimation.smoother.pieces.reduction import Ends, Reduction, Response
 from ballfg.estimation.smoother.pieces.section import State, part_of, prior_rows
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import AT_KINK, RATE_MARGIN, Convergence, objective
@@ -45,6 +45,8 @@ TOGETHER: Final = 2
 """Pieces handed to a process at once."""
 ROUGH: Final = 1e-2
 """Posterior standard deviations, to which a piece by itself is minimised."""
+REACH: Final = 128
+"""States at either end of a section that follow the end at once."""
 ROUNDS: Final = 30
 """Gauss-Newton steps of the whole track at most; half a dozen are usual, the later ones of a few sections."""
 
@@ -58,16 +60,22 @@ class Told:
         error: of the section's factors.
         inner: by which its inner states alone promise to reduce it.
         ends: what it means to the ends and the coefficients.
+        response: how its states follow these.
     """
 
     values: Values
     error: float
     inner: float
     ends: Ends
+    response: Response
 
     def length(self, step: Point) -> float:
         """Of a step of the whole section, in posterior standard deviations."""
         return float(np.sqrt(2.0 * self.inner + (self.ends.change(step) ** 2).sum()))
+
+    def moved(self, step: Point) -> Values:
+        """The values after a step of the ends and the coefficients."""
+        return self.values.moved(self.response.steps(step), step.coefficients)
 
     def promised(self, step: Point) -> float:
         """The error after a step of the whole section, as the linear problem has it."""
@@ -110,26 +118,15 @@ class Joined:
     rival: Array | None
 
 
-def advanced(smoother: Smoother, task: tuple[State, Point | None]) -> Told:
-    """What a section says after its step; at the point where it is, without one.
+def told_by(smoother: Smoother, state: State) -> Told:
+    """What a section says where it is.
 
-    Args: smoother: of the track.  task: the section, and where its ends and the coefficients are to go.
+    Args: smoother: of the track.  state: the section and its values.
     """
-    state, target = task
     own = state.section.own(smoother.problem(state.section.track, state.section.segmentation))
     rows = state.section.linearized(own, state.values)
-    values = state.values
-    if target is not None:
-        values = moved(Reduction(rows, values), values, target)
-        rows = state.section.linearized(own, values)
-    found = Reduction(rows, values)
-    return Told(values, objective(rows), found.inner, found.ends)
-
-
-def moved(reduction: Reduction, values: Values, target: Point) -> Values:
-    """A section's values after the step that leads its ends and the coefficients to a target."""
-    step = target.since(Point.of(values))
-    return values.moved(reduction.steps(step.first, step.last, step.coefficients), step.coefficients)
+    found = Reduction(rows, state.values)
+    return Told(state.values, objective(rows), found.inner, found.ends, found.response(REACH))
 
 
 def joined_minimum(smoother: Smoother, track: Track, length: int | None = None) -> Joined | None:
@@ -167,7 +164,7 @@ def _search(smoother: Smoother, states: list[State]) -> Found | None:
     Lengths are distances to the minimum in posterior standard deviations, as in
     `ballfg.factors.graph.LevenbergMarquardt`. A section that is near enough waits where it was linearised.
     """
-    told = list(watched(partial(advanced, smoother), [(state, None) for state in states], "joined, round 1"))
+    told = list(watched(partial(told_by, smoother), states, "joined, round 1"))
     problem = smoother.problem(states[0].section.track, states[0].section.segmentation)
     priors, anchor = prior_rows(problem, states[0].section, told[0].values), told[0].values.coefficients
     last, share = np.full(len(states), np.inf), np.ones(len(states))
@@ -184,8 +181,8 @@ def _search(smoother: Smoother, states: list[State]) -> Found | None:
             break
         share = np.where(length > last, 0.5 * share, 1.0)
         moving = np.flatnonzero(~near).tolist()
-        tasks = [(State(states[k].section, told[k].values), points[k].moved(steps[k], share[k])) for k in moving]
-        results = watched(partial(advanced, smoother), tasks, f"joined, round {number + 1}")
+        tasks = [State(states[k].section, told[k].moved(steps[k].scaled(share[k]))) for k in moving]
+        results = watched(partial(told_by, smoother), tasks, f"joined, round {number + 1}")
         for k, one in zip(moving, results, strict=True):
             told[k] = one
         last[moving] = length[moving]

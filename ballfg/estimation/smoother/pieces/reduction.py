@@ -42,13 +42,9 @@ class Point:
         """The step from another point to this one."""
         return Point(self.first - other.first, self.last - other.last, self.coefficients - other.coefficients)
 
-    def moved(self, step: Point, share: float) -> Point:
-        """The point after a share of a step."""
-        return Point(
-            self.first + share * step.first,
-            self.last + share * step.last,
-            self.coefficients + share * step.coefficients,
-        )
+    def scaled(self, share: float) -> Point:
+        """A share of the step."""
+        return Point(share * self.first, share * self.last, share * self.coefficients)
 
 
 @dataclass(frozen=True)
@@ -69,6 +65,31 @@ class Ends:
     def change(self, step: Point) -> Array:
         """(..,) whitened, by which the rows change along a step of the ends and the coefficients."""
         return self.by_first @ step.first + self.by_last @ step.last + self.by_coefficients @ step.coefficients
+
+
+@dataclass(frozen=True)
+class Response:
+    """How the states of a section move with its ends and the coefficients.
+
+    Attributes:
+        alone: (n, w) step of the states where ends and coefficients stay.
+        by_first, by_last: (r, w, w) what a step of an end adds to the states next to it, in the track's order. Beyond
+            those it is neglected: the section's next linearisation makes up for it.
+        by_coefficients: (n, w, p) what a step of the coefficients adds.
+    """
+
+    alone: Array
+    by_first: Array
+    by_last: Array
+    by_coefficients: Array
+
+    def steps(self, ends: Point) -> Array:
+        """(n, w) steps of all states for a step of the ends and the coefficients."""
+        steps = self.alone + self.by_coefficients @ ends.coefficients
+        steps[1 : 1 + len(self.by_first)] += self.by_first @ ends.first
+        steps[len(steps) - 1 - len(self.by_last) : -1] += self.by_last @ ends.last
+        steps[0], steps[-1] = ends.first, ends.last
+        return steps
 
 
 class Reduction:
@@ -100,17 +121,26 @@ class Reduction:
         behind = rows[:, 2 * w : -1]
         return Ends(behind[:, p:], rows[:, :w], behind[:, :p], rows[:, -1])
 
-    def steps(self, first: Array, last: Array, coefficients: Array) -> Array:
-        """(n, w) steps of all states, where those of the ends and the coefficients are known.
+    def steps(self, ends: Point) -> Array:
+        """(n, w) steps of all states for a step of the ends and the coefficients."""
+        w, inner = self.width, self.root.states[:-1]
+        right = inner[..., -1] - inner[..., 2 * w : -1] @ np.concatenate((ends.coefficients, ends.first))
+        right[-1:] -= inner[-1:, :, w : 2 * w] @ ends.last
+        return np.concatenate((ends.first[None], _solved(inner, right), ends.last[None]))
 
-        Args: first, last: (w,) and coefficients: (p,), the known steps.
-        """
-        known = np.concatenate((coefficients, first))
-        root = self._known(np.eye(len(known) + self.width))
-        states = self.root.states[..., -1].copy()
-        states[-1] = last
-        elimination.substitute_back(root.states, root.coefficients, states, known.copy())
-        return np.concatenate((first[None], states))
+    def response(self, reach: int) -> Response:
+        """How the states follow. Args: reach: states that an end is taken to move, at most."""
+        w, p, inner = self.width, self.coefficients, self.root.states[:-1]
+        near, far = inner[:reach], inner[max(len(inner) - reach, 0) :]
+        by_end = np.zeros((*far.shape[:2], w))
+        by_end[-1:] = far[-1:, :, w : 2 * w]
+        edge = np.zeros((1, w))
+        return Response(
+            np.concatenate((edge, _solved(inner, inner[..., -1]), edge)),
+            -_solved(near, near[..., 2 * w + p : -1]),
+            -_solved(far, by_end),
+            np.pad(-_solved(inner, inner[..., 2 * w : 2 * w + p]), ((1, 1), (0, 0), (0, 0))),
+        )
 
     def covariances(self, ends: Array) -> Covariances:
         """Of all states and the coefficients, where the joint covariance of the ends and the coefficients is known.
@@ -132,6 +162,19 @@ class Reduction:
         states[-1, :, :w], states[-1, :, 2 * w : -1] = triangle[:w, :w], triangle[:w, w:]
         shared[:, 2 * w : -1] = triangle[w:, w:]
         return Root(states, shared)
+
+
+def _solved(rows: Array, right: Array) -> Array:
+    """What some states are, by their rows of R (m, w, ..), where the state after them stays.
+
+    Args: right: (m, w) or (m, w, k), the right side or k of them.
+    """
+    none, found = np.empty((0, rows.shape[2])), np.empty_like(right)
+    for k in np.ndindex(right.shape[2:]):
+        states = right[..., *k].copy()
+        elimination.substitute_back(rows, none, states, np.empty(0))
+        found[..., *k] = states
+    return found
 
 
 def _triangle(covariance: Array) -> Array:

@@ -19,7 +19,7 @@ from ballfg.estimation.settings import sample_sigmas
 from ballfg.estimation.smoother.grip import rival_note
 from ballfg.estimation.smoother.near_contact import other_sides
 from ballfg.estimation.smoother.pieces.chain import Point
-from ballfg.estimation.smoother.pieces.joining import Joined, joined_minimum, moved, watched
+from ballfg.estimation.smoother.pieces.joining import Joined, joined_minimum, watched
 from ballfg.estimation.smoother.pieces.reduction import Reduction
 from ballfg.estimation.smoother.pieces.section import State
 from ballfg.estimation.smoother.problem import TrackProblem
@@ -86,7 +86,8 @@ def smoothed(smoother: Smoother, task: tuple[State, Array, Point]) -> Smoothed:
     section, values = state.section, state.values
     problem = smoother.problem(section.track, section.segmentation)
     reduction = Reduction(section.linearized(section.own(problem), values), values)
-    values = moved(reduction, values, target)
+    step = target.since(Point.of(values))
+    values = values.moved(reduction.steps(step), step.coefficients)
     known = reduction.covariances(joint)
     covariances = np.ascontiguousarray(known.states[:, :STATE_DIM, :STATE_DIM])
     contacts = _contacts(problem, state, values)
