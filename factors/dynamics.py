@@ -22,7 +22,7 @@ from ballfg.dynamics.motion.flight_step import flight_step
 from ballfg.dynamics.motion.integrate import batch_jacobian, fly_jacobian, step_count, steps_over
 from ballfg.dynamics.motion.rollout import roll
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch, Noise, Values
-from ballfg.factors.noise import Kicks, ProcessNoise, whitening, whitening_tensor
+from ballfg.factors.noise import Kicks, ProcessNoise, along_all_axes, whitening, whitening_tensor
 from ballfg.state import STATE_DIM
 
 
@@ -44,7 +44,8 @@ class DynamicsFactors(FactorBatch):
             motion does not depend on the others, which are unknowns of observations.
         states: (m,) index i; each factor ties state i to state i + 1.
         dt: (m,) s.
-        covariance: (m, 9, 9) m, m/s, rad/s and their products, of the process noise gathered over dt.
+        covariance: (m, 9, 9) m, m/s, rad/s and their products, of the process noise gathered over dt; or (m, 3, 3) of
+            position, velocity and spin along any axis, where all are alike and independent.
         kicks: the contacts and hits in that covariance, for learning it; free flight by default.
 
     Raises: ValueError: if a dt is not positive.
@@ -66,7 +67,8 @@ class DynamicsFactors(FactorBatch):
         self.model = model
         self.width = model_width(model)
         self.dt = dt
-        self.whitening = whitening(covariance)
+        root = whitening(covariance)
+        self.whitening = root if root.shape[-1] == STATE_DIM else along_all_axes(root)
         kicks = kicks or Kicks.none(len(states))
         self.kick_times, self.hit = kicks.times, kicks.hit
         self.device = torch.device("cpu")

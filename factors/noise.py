@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ballfg.arrays import Array
-from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
+from ballfg.state import STATE_DIM
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,10 @@ class ProcessNoise:
 
     def flight(self, dt: Array) -> Array:
         """(n, 9, 9) covariance gathered in free flight over dt (n,) s."""
+        return along_all_axes(self.flight_along_one(dt))
+
+    def flight_along_one(self, dt: Array) -> Array:
+        """(n, 3, 3) the same of position, velocity and spin along one axis; all axes are alike and independent."""
         return _white_acceleration(dt, self.acceleration, self.spin)
 
     def contact(self, dt: Array, time: Array) -> Array:
@@ -117,8 +121,8 @@ class Kicks:
         The covariance is linear in the squares of those numbers, which is what a gradient with respect to them needs.
         """
         basis = np.zeros((len(dt), len(PROCESS_NOISE), STATE_DIM, STATE_DIM))
-        basis[:, 0] = _white_acceleration(dt, 1.0, 0.0)
-        basis[:, 1] = _white_acceleration(dt, 0.0, 1.0)
+        basis[:, 0] = along_all_axes(_white_acceleration(dt, 1.0, 0.0))
+        basis[:, 1] = along_all_axes(_white_acceleration(dt, 0.0, 1.0))
         for time in self.times.T:
             basis[:, 2] += ProcessNoise.kick(dt, time, (1.0, 1.0, 1.0), 0.0)
             basis[:, 3] += ProcessNoise.kick(dt, time, (1.0, 1.0, 0.0), 0.0)
@@ -132,14 +136,21 @@ class Kicks:
 
 
 def _white_acceleration(dt: Array, acceleration: float, spin: float) -> Array:
-    covariance = np.zeros((len(dt), STATE_DIM, STATE_DIM))
-    eye, t = np.eye(3), dt[:, None, None]
-    covariance[:, POSITION, POSITION] = acceleration**2 * t**3 / 3 * eye
-    covariance[:, POSITION, VELOCITY] = acceleration**2 * t**2 / 2 * eye
-    covariance[:, VELOCITY, POSITION] = covariance[:, POSITION, VELOCITY]
-    covariance[:, VELOCITY, VELOCITY] = acceleration**2 * t * eye
-    covariance[:, SPIN, SPIN] = spin**2 * t * eye
+    """(n, 3, 3) of position, velocity and spin along one axis."""
+    covariance = np.zeros((len(dt), 3, 3))
+    covariance[:, 0, 0] = acceleration**2 * dt**3 / 3
+    covariance[:, 0, 1] = covariance[:, 1, 0] = acceleration**2 * dt**2 / 2
+    covariance[:, 1, 1] = acceleration**2 * dt
+    covariance[:, 2, 2] = spin**2 * dt
     return covariance
+
+
+def along_all_axes(one: Array) -> Array:
+    """(n, 9, 9) matrices of states from those (n, 3, 3) of position, velocity and spin along any axis."""
+    found = np.zeros((len(one), 3, 3, 3, 3))
+    for axis in range(3):
+        found[:, :, axis, :, axis] = one
+    return found.reshape(len(one), STATE_DIM, STATE_DIM)
 
 
 def whitening(covariance: Array) -> Array:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-from ballfg.arrays import Array
+from ballfg.arrays import Array, Index
 from ballfg.dynamics.model import BallModel, Rates
 from ballfg.dynamics.motion.limits import MAX_STEP
 from ballfg.state import POSITION, SPIN, VELOCITY
@@ -74,6 +74,11 @@ def step_count(dt: Tensor | Array) -> int:
 def steps_over(duration: float) -> int:
     """Number of equal steps, each at most `MAX_STEP` to rounding, that a duration (s) needs; at least one."""
     return max(1, math.ceil(duration / MAX_STEP - 1e-9))
+
+
+def steps_over_each(durations: Array) -> Index:
+    """`steps_over` of each of some durations (n,) s."""
+    return np.maximum(1, np.ceil(durations / MAX_STEP - 1e-9)).astype(np.int64)
 
 
 def fly(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:

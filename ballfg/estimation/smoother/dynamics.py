@@ -9,7 +9,7 @@ import numpy as np
 
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.model import BallModel
-from ballfg.dynamics.motion.integrate import steps_over
+from ballfg.dynamics.motion.integrate import steps_over_each
 from ballfg.estimation.segmentation import Segmentation
 from ballfg.estimation.smoother.motion import Motion, eventful_motions
 from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors
@@ -25,7 +25,7 @@ class TrackDynamics:
     def __init__(self, times: Array, model: BallModel, noise: ProcessNoise) -> None:
         self.times, self.model, self.noise = times, model, noise
         self.dt = np.diff(times)
-        self._steps = np.array([steps_over(duration) for duration in self.dt.tolist()], dtype=np.int64)
+        self._steps = steps_over_each(self.dt)
 
     @cached_property
     def _flights(self) -> dict[int, FlightFactors]:
@@ -33,7 +33,7 @@ class TrackDynamics:
         found = {}
         for steps in np.unique(self._steps).tolist():
             rows = np.flatnonzero(self._steps == steps)
-            found[steps] = FlightFactors(self.model, rows, self.dt[rows], self.noise.flight(self.dt[rows]))
+            found[steps] = FlightFactors(self.model, rows, self.dt[rows], self.noise.flight_along_one(self.dt[rows]))
         return found
 
     def factors(self, events: Segmentation) -> list[DynamicsFactors]:
