@@ -45,14 +45,15 @@ def contacts_at_ends(times: Array, solution: Solution, model: BallModel, surface
     coefficients = np.tile(values.coefficients[: model_width(model)], (2, 1))
     found = []
     for inside, beyond in ((1, 0), (last - 1, last)) if last > 0 else ():
-        interval = min(inside, beyond)
+        interval, speed = min(inside, beyond), float(values.states[beyond, VZ])
+        if interval in taken or (beyond - inside) * speed >= 0.0:  # it does not move away from the other samples
+            continue
         pair = torch.from_numpy(np.concatenate((values.states[[inside, beyond]], coefficients), axis=1))
         height = surfaces.level_below(pair)[0]
         with torch.no_grad():
             above, below = model.gap(pair, height).tolist()
-        outwards = (beyond - inside) * float(pair[1, VZ]) < 0.0
-        if interval not in taken and above >= 0.0 > below and outwards and bool(surfaces.over_table(pair)[1]):
-            time = times[beyond] - below / float(pair[1, VZ])
+        if above >= 0.0 > below and bool(surfaces.over_table(pair)[1]):
+            time = times[beyond] - below / speed
             found.append(Contact(interval, float(np.clip(time, times[interval], times[interval + 1])), float(height)))
             taken.add(interval)
     return tuple(found)
