@@ -14,6 +14,8 @@ from typing import Any
 
 import yaml
 
+MOST = 1 << 20
+"""Bytes that a repeated line may come to: beyond, a reader would be timed at a large file, not at a damaged one."""
 NASTY = (
     "nan", "inf", "-inf", "1e308", "-1e308", "1e-320", "-0", "-1", "0", "1e999", "99999999999999999999", "0x10", "1_0",
     "1,5", "1e", ".", "", " ", "9" * 5000, "x" * 100_000, "0." + "1" * 100_000, "é", "٣", "\u202e", "\ud7ff", "\x00",
@@ -145,7 +147,7 @@ def _lines(content: bytes, rng: random.Random) -> bytes:
     if kind == 0:
         del lines[at]
     elif kind == 1:
-        lines[to:to] = [lines[at]] * rng.choice((1, 1, 1000))
+        lines[to:to] = [lines[at]] * min(rng.choice((1, 1, 1000)), 1 + MOST // (1 + len(lines[at])))
     elif kind == 2:
         lines[at] = rng.choice((b"", b" ", b",", b"#"))
     elif kind == 3:

@@ -30,9 +30,13 @@ def read_text_table(path: Path) -> list[RawTable]:
 
 def decoded(path: Path) -> str:
     """The text of a file, whatever its encoding. Raises: ValueError: empty, or not text."""
-    content = path.read_bytes()
-    if not content.strip():
+    text = _text(path, path.read_bytes())
+    if not text.strip():
         raise ValueError(f"{path} must hold rows of numbers; the file is empty. Export it again.")
+    return text
+
+
+def _text(path: Path, content: bytes) -> str:
     if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return content.decode("utf-16", "replace")
     head = content[:4096]
