@@ -13,7 +13,7 @@ from ballfg.pages.html import Html, items, section, table, tag, typed
 from ballfg.pages.page import whole_page
 from ballfg.tracks import Track, write_dataset
 from ballfg.tracks.info import INFO_FILE
-from ballfg.tracks.writing import DATASET_FILES
+from ballfg.tracks.writing import DATASET_FILES, TRUTH_FILE, TRUTH_FILES
 
 PAGE: Final = "import.html"
 _MOST_SHOTS: Final = 40
@@ -25,10 +25,15 @@ _MOST_POINTS: Final = 300
 def write_import(folder: Path, proposal: Proposal, file_format: Literal["csv", "parquet"], force: bool) -> None:
     """Writes the dataset and its page as a whole, or nothing.
 
-    Args: folder: new, empty, or with `force` a dataset to replace.  proposal: to write.  file_format: of the tracks.
+    Args:
+        folder: new, empty, or with `force` a dataset to replace, and the truth of a simulated one.
+        proposal: to write.
+        file_format: of the tracks.
+        force: replace it.
     Raises: ValueError: a folder with other content. FileNotFoundError: its parent does not exist.
     """
-    with whole_folder(folder, earlier=(*DATASET_FILES, PAGE)) as stage:
+    simulated = (folder / TRUTH_FILE).is_file()
+    with whole_folder(folder, earlier=(*DATASET_FILES, PAGE, *(TRUTH_FILES if simulated else ()))) as stage:
         check_replaceable(folder, mark=INFO_FILE, what="a dataset", force=force)
         write_dataset(stage, proposal.info, proposal.tracks, file_format)
         (stage / PAGE).write_text(page(proposal), encoding="utf-8")

@@ -16,12 +16,10 @@ from ballfg.simulation.measure import SimulatedTrack
 from ballfg.simulation.synthetic import dataset_info, simulate
 from ballfg.state import STATE_NAMES
 from ballfg.tracks import TableWriter, Track, write_dataset
-from ballfg.tracks.writing import DATASET_FILES
+from ballfg.tracks.writing import DATASET_FILES, TRUTH_FILE, TRUTH_FILES
 
 FileFormat = Literal["csv", "parquet"]
-TRUTH_FILE: Final = "truth.yaml"
 MODEL_FILE: Final = "model.yaml"
-TRUTH_TABLES: Final = ("truth.csv", "truth.parquet")
 
 
 def write_simulation(
@@ -62,7 +60,7 @@ def write_simulation(
 
 def simulation_files() -> tuple[str, ...]:
     """Names, or patterns of names, that the files of a simulated dataset can have."""
-    return (*DATASET_FILES, *TRUTH_TABLES, f"{Path(MODEL_FILE).stem}.learned-*")
+    return (*DATASET_FILES, *TRUTH_FILES)
 
 
 def check_format(name: str) -> FileFormat:

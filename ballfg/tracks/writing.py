@@ -5,7 +5,7 @@ import json
 from collections.abc import Iterable
 from os import PathLike
 from pathlib import Path
-from typing import Literal, TextIO
+from typing import Final, Literal, TextIO
 
 from ballfg.arrays import Array
 from ballfg.files.whole_folder import whole_folder
@@ -20,6 +20,10 @@ from ballfg.tracks.track import Track
 
 DATASET_FILES = (INFO_FILE, *TRACK_FILES, LABELS_FILE)
 """All names that the files of a dataset can have."""
+TRUTH_FILE: Final = "truth.yaml"
+"""What a simulation was made of; where it lies, the files below tell of the simulated tracks alone."""
+TRUTH_FILES: Final = (TRUTH_FILE, "truth.csv", "truth.parquet", "model.yaml", "model.learned-*")
+"""All names, or patterns of names, that a simulation can have beside its dataset."""
 
 _SPOOL = "labels.jsonl"
 

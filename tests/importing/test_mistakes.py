@@ -281,3 +281,16 @@ def test_what_is_there_stays(shots: list[Track], tmp_path: Path, capsys: pytest.
     assert (out / "tracks.csv").read_bytes() == before
     assert status("import", source, "--out", out, "--force", "--format", "parquet") == 0
     assert sorted(file.name for file in out.iterdir()) == ["dataset.yaml", "import.html", "tracks.parquet"]
+
+
+@pytest.mark.parametrize("simulated", [True, False])
+def test_the_truth_of_other_tracks_goes_with_them(shots: list[Track], tmp_path: Path, *, simulated: bool) -> None:
+    """Beside a dataset that was not simulated, a model is somebody's own."""
+    source, out = written(tmp_path / "a.csv", columns_of(shots)), tmp_path / "out"
+    assert status("simulate", "--tracks", 1, "--out", out) == 0
+    if not simulated:
+        (out / "truth.yaml").unlink()
+        (out / "truth.csv").unlink()
+    assert status("import", source, "--out", out, "--force") == 0
+    left = {"dataset.yaml", "import.html", "tracks.csv"} | (set() if simulated else {"model.yaml"})
+    assert {file.name for file in out.iterdir()} == left

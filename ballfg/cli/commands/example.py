@@ -41,7 +41,8 @@ def example(
     """
     from ballfg import simulation
     from ballfg.files.whole_folder import check_replaceable, whole_folder
-    from ballfg.simulation.writing import TRUTH_FILE, simulation_files
+    from ballfg.simulation.writing import simulation_files
+    from ballfg.tracks.writing import TRUTH_FILE
 
     plain = simulation.SimulationConfig(tracks=tracks, seed=seed)
     windy = replace(plain, seed=seed + 1, undeclared=simulation.parse_effects([WIND]))
