@@ -22,6 +22,7 @@ from ballfg.estimation.smoother.near_contact import with_other_sides
 from ballfg.estimation.smoother.problem import Events, TrackProblem
 from ballfg.estimation.smoother.restart import label_let_go, minimise_with_restart
 from ballfg.estimation.smoother.solution import (
+    ROUGH,
     Solution,
     contacts_at_ends,
     places_of,
@@ -39,9 +40,6 @@ from ballfg.factors.tracker import BiasStartFactors
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Ball, Track
 
-ROUGH = 1e-2
-"""Posterior standard deviations. Where contacts and hits lie shows at minima that are known to this; only the last one
-is found to the optimizer's own tolerance."""
 MAX_REFINEMENTS = 6
 """How often contacts may move to a neighbouring interval; two were the most seen on measured tracks."""
 

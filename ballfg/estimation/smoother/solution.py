@@ -18,6 +18,9 @@ from ballfg.factors.graph import BallGraph, Convergence, Minimum
 from ballfg.factors.linear.covariance import Covariances
 from ballfg.state import STATE_DIM, VZ
 
+ROUGH = 1e-2
+"""Posterior standard deviations. Where contacts and hits lie shows at minima that are known to this; only the last one
+is found to the optimizer's own tolerance."""
 BROKEN = 8.0
 """Norm of a whitened dynamics residual (9 dimensions) beyond which its interval hides a hit; chance: one in 1e9."""
 

@@ -22,6 +22,7 @@ from ballfg.estimation.smoother.pieces.chain import Chain, Point, moved_rows, so
 from ballfg.estimation.smoother.pieces.looks import bounds_of, cut_between, joined, look, section_of
 from ballfg.estimation.smoother.pieces.reduction import Ends, Reduction, Response
 from ballfg.estimation.smoother.pieces.section import State, part_of, prior_rows
+from ballfg.estimation.smoother.solution import ROUGH
 from ballfg.factors.batch import Values
 from ballfg.factors.graph import AT_KINK, RATE_MARGIN, Convergence, objective
 from ballfg.parallel.parts import in_parts
@@ -43,8 +44,6 @@ MARGIN: Final = 8
 """Samples beyond the ends of a section that velocities from line fits ask for."""
 TOGETHER: Final = 2
 """Pieces handed to a process at once."""
-ROUGH: Final = 1e-2
-"""Posterior standard deviations, to which a piece by itself is minimised."""
 REACH: Final = 128
 """States at either end of a section that follow the end at once."""
 ROUNDS: Final = 30
