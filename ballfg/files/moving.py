@@ -31,20 +31,23 @@ def move_in(place: Path, folder: Path, earlier: Iterable[str], last: str | None,
 
 
 def carry_out(place: Path, folder: Path) -> None:
-    """Carries out a plan, from wherever an earlier attempt ended."""
+    """Carries out a plan, from wherever an earlier attempt ended.
+
+    Raises: ValueError: it is no plan, or one that would touch what lies outside of the folder.
+    """
     if not (place / PLAN).exists():
         return
-    plan = json.loads((place / PLAN).read_text(encoding="utf-8"))
+    stale, new = _read_plan(place / PLAN, folder)
     (place / OLD).mkdir(exist_ok=True)
-    for name in plan["stale"]:
+    for name in stale:
         _put_aside(folder / name, place)
-    for name in plan["new"]:
+    for name in new:
         source, target = place / NEW / name, folder / name
         if os.path.lexists(source):  # else it has been moved already
             if target.is_dir() or (os.path.lexists(target) and source.is_dir()):
                 _put_aside(target, place)
             os.replace(source, target)
-    for changed in {folder, *((folder / name).parent for name in (*plan["stale"], *plan["new"]))}:
+    for changed in {folder, *((folder / name).parent for name in (*stale, *new))}:
         flush_folder(changed)
     (place / PLAN).unlink()
     flush_folder(place)
@@ -99,10 +102,30 @@ def _write_plan(place: Path, folder: Path, earlier: tuple[str, ...], last: str |
     flush_folder(place)
 
 
+def _read_plan(path: Path, folder: Path) -> tuple[list[str], list[str]]:
+    """Names of what goes and of what comes. A folder from elsewhere may hold a plan that nobody here has written."""
+    try:
+        plan = json.loads(path.read_text(encoding="utf-8"))
+        stale, new = ([str(name) for name in plan[kind]] for kind in ("stale", "new"))
+    except (ValueError, KeyError, TypeError, RecursionError):
+        stale, new = [""], []
+    links = any((path.parent / name).is_symlink() for name in (".", NEW, OLD))
+    for name in (*stale, *new):
+        parts = name.split("/")
+        leads_away = links or len(parts) > 2 or (len(parts) == 2 and (folder / parts[0]).is_symlink())
+        if leads_away or {"", ".", "..", MARK} & set(parts) or "\0" in name:
+            raise ValueError(
+                f"{path} must be the plan of a writing that was ended while files moved, with names in this folder; it "
+                f"is damaged or from elsewhere. Delete {path.parent}, and make the content of {folder} anew."
+            )
+    return stale, new
+
+
 def _names(within: Path, folder: Path, merged: Collection[str]) -> Iterator[str]:
     """Names of the entries, and those in folders that are merged with one that exists, as in `shots/labels.csv`."""
     for entry in within.iterdir():
-        if entry.name in merged and entry.is_dir() and (folder / entry.name).is_dir():
+        there = folder / entry.name
+        if entry.name in merged and entry.is_dir() and there.is_dir() and not there.is_symlink():
             yield from (f"{entry.name}/{inner.name}" for inner in entry.iterdir() if inner.name != MARK)
         elif entry.name != MARK:
             yield entry.name

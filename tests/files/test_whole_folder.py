@@ -121,6 +121,47 @@ def test_a_killed_move_is_finished_by_the_next_reader_or_writer(
     assert not (tmp_path / MARK).exists()
 
 
+PLANS = {
+    "empty": "",
+    "of another kind": "[1, 2]",
+    "without lists": '{"stale": 3, "new": null}',
+    "cut off": '{"stale": ["a"], "ne',
+    "beside the folder": '{"stale": ["../precious"], "new": []}',
+    "anywhere": '{"stale": [], "new": ["/precious"]}',
+    "deeper": '{"stale": ["place/../../precious"], "new": []}',
+    "through a link": '{"stale": ["away/precious"], "new": []}',
+    "its own": f'{{"stale": ["{MARK}"], "new": []}}',
+}
+
+
+@pytest.mark.parametrize("plan", PLANS.values(), ids=PLANS)
+def test_a_plan_from_elsewhere_moves_nothing(tmp_path: Path, plan: str) -> None:
+    """A folder that somebody sends may hold anything; reading it must not touch what lies around it."""
+    folder, precious = tmp_path / "sent", tmp_path / "precious"
+    fill(folder, a="mine", place__y="mine")
+    precious.write_text("mine")
+    (folder / "away").symlink_to(tmp_path)
+    (folder / MARK / NEW).mkdir(parents=True)
+    (folder / MARK / PLAN).write_text(plan)
+    with pytest.raises(ValueError, match="must be the plan of a writing that was ended") as refused:
+        settle(folder)
+    assert len(str(refused.value).splitlines()) == 1
+    assert {name for name in contents(folder) if not name.startswith(MARK)} == {"a", "place/y"}
+    assert precious.read_text() == "mine"
+
+
+def test_a_plan_does_not_fetch_files_through_a_link(tmp_path: Path) -> None:
+    folder, home = tmp_path / "sent", tmp_path / "home"
+    fill(home, secret="mine")
+    fill(folder, a="mine")
+    (folder / MARK).mkdir()
+    (folder / MARK / NEW).symlink_to(home)
+    (folder / MARK / PLAN).write_text('{"stale": [], "new": ["secret"]}')
+    with pytest.raises(ValueError, match="must be the plan"):
+        settle(folder)
+    assert (home / "secret").read_text() == "mine"
+
+
 def test_a_folder_in_one_that_was_killed_is_finished_too(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     fill(tmp_path, place__y="old")
     killed_between(tmp_path, monkeypatch, 1)

@@ -13,7 +13,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ballfg.files.strict_yaml import read_yaml
+from ballfg.checks import type_name
+from ballfg.files.strict_yaml import read_mapping
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
 from ballfg.simulation.scene.recording import Recording, visible_columns
@@ -65,7 +66,7 @@ def write_scene(
         if camera.name != Path(camera.name).name or camera.name.startswith("."):
             raise ValueError(f"camera names must be good as file names; got {camera.name!r}. Rename it.")
     scene = path / SCENE_FILE
-    earlier = [glob.escape(name) for name in read_yaml(scene)["files"]] if scene.is_file() else []
+    earlier = [glob.escape(name) for name in _earlier_files(scene)]
     with whole_folder(path, earlier=earlier, last=SCENE_FILE) as stage:
         check_scene_folder(path, force=force)
         every_image = itertools.chain.from_iterable(map(recording.images, range(len(recording.cameras))))
@@ -83,6 +84,16 @@ def write_scene(
                 table.write(visible_columns(recording, number))
         content = scene_content(recording) | {"files": sorted(entry.name for entry in stage.iterdir())}
         (stage / SCENE_FILE).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
+
+
+def _earlier_files(scene: Path) -> list[str]:
+    """Names of the files of the scene that is to be replaced. Raises: ValueError: its file was damaged."""
+    names = read_mapping(scene).get("files") if scene.is_file() else []
+    if not isinstance(names, list):
+        raise ValueError(
+            f"{scene}: files must be a list of names; got {type_name(names)}. Delete the scene, and render it again."
+        )
+    return [str(name) for name in names]
 
 
 def check_scene_folder(folder: Path, *, force: bool) -> None:
