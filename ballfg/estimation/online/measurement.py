@@ -7,10 +7,14 @@ import gtsam
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.dynamics.model import BallModel
 from ballfg.estimation.observations.innovation import FilterInnovation
+from ballfg.estimation.observations.observation import Context, refuse_unknowns
+from ballfg.estimation.settings import Settings
 from ballfg.factors.batch import FactorBatch, merge
 from ballfg.factors.bridge import Bridge, checked
 from ballfg.state import STATE_DIM
+from ballfg.tracks import Track
 
 
 class Measurement:
@@ -60,3 +64,24 @@ def prepare(measurements: Sequence[Measurement], states: Array) -> None:
         residual, (jacobian,) = checked(batch, slice(None), inputs, *batch.compute(slice(None), inputs))
         for row, k in enumerate(members):
             measurements[k].bridge.keep(0, (inputs[0][row],), residual[row], (jacobian[row],))
+
+
+def measurements_beside(
+    track: Track, model: BallModel, settings: Settings, sigma: Array
+) -> dict[str, list[tuple[int, Measurement]]]:
+    """What was measured beside positions, by name of the observation: each with the number of its sample.
+
+    Args: sigma: (n, 3) m, of the positions.
+    Raises: ValueError: an observation that looks at several states, or settings that ask it for unknowns.
+    """
+    refuse_unknowns(track.observations, settings, "online")
+    context, found = Context(track, model, settings, sigma), {}
+    for observation in track.observations:
+        batch = observation.batch(context)
+        if batch.variables.shape[1] > 1:
+            raise ValueError(
+                f"track {track.name!r}: the estimator 'online' takes observations of one state each; "
+                f"'{observation.name}' looks at other variables too. Use the smoother."
+            )
+        found[observation.name] = [(k, Measurement(one)) for k, one in observation.single_rows(batch)]
+    return found

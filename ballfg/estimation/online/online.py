@@ -13,10 +13,11 @@ from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.window_velocity import WINDOW, window_velocities
-from ballfg.estimation.observations.observation import Context, Observation, refuse_unknowns
-from ballfg.estimation.online.events import SIGMA_FACTOR, EventTracker, contact_step, first_difference
+from ballfg.estimation.observations.observation import Observation
+from ballfg.estimation.online.events import EventTracker
+from ballfg.estimation.online.explanation import explain, move_contacts, tell_velocities
 from ballfg.estimation.online.final import Frozen, final_estimate, freeze, unknown
-from ballfg.estimation.online.measurement import Measurement
+from ballfg.estimation.online.measurement import Measurement, measurements_beside
 from ballfg.estimation.online.sample import Sample, Update
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.online.stream import SightingStream
@@ -28,7 +29,7 @@ from ballfg.estimation.plausible import plausible, possible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import physics_of
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
-from ballfg.estimation.smoother.motion import FLIGHT, Motion, motions_of
+from ballfg.estimation.smoother.motion import FLIGHT
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.factors.batch import FactorBatch
@@ -39,10 +40,6 @@ from ballfg.vision.camera import Camera
 
 LAG = 128
 """States that stay when the window is cut: 0.7 s at 180 Hz, after which new samples say nothing about an old state."""
-LATEST_CHANGE = 80
-"""Samples. The segmenter's events are final after 64; nothing older is built again."""
-YOUNG = 20
-"""Samples after a contact in which the estimate may still move it to another interval."""
 Solver = Literal["isam2", "chain"]
 WINDOWS: Final[Mapping[Solver, type[StreamWindow]]] = {"isam2": IsamWindow, "chain": ChainWindow}
 
@@ -158,8 +155,8 @@ class Online(Estimator):
             raise ValueError("push must not follow push_sighting in one stream; call reset in between.")
         sample = Sample(float(time), point, spread)
         if observations:
-            moment = Track(np.array([sample.time]), point[None], spread[None], name="stream")
-            beside = self._measurements(moment.observed(*observations))
+            moment = Track(np.array([sample.time]), point[None], spread[None], name="stream").observed(*observations)
+            beside = measurements_beside(moment, self.model, self.settings, spread[None])
             sample.measurements += [measurement for found in beside.values() for _, measurement in found]
         return self._observe(sample)
 
@@ -237,89 +234,26 @@ class Online(Estimator):
 
     def _take_in(self, window: StreamWindow, sample: Sample, changed: bool) -> tuple[int, Update]:
         """Explain, go back to where the explanation changed, append, move contacts, keep the window's length."""
-        again = self._explain(window) if changed else []
+        again = explain(window, self._samples, self.events) if changed else []
         if self.settings.stamp_jitter > 0.0 and sample.measured:
-            self._tell_velocities(window)
+            tell_velocities(window, self._samples)
         if again:
             self._append(window, *again)
         update = self._append(window, sample)
-        moved = self._move_contacts(window)
+        moved = move_contacts(window, self._samples, self.events)
+        if moved:
+            self._append(window, *moved)
         if len(window) > 2 * self.lag:
             if self._frozen is not None:
                 self._frozen += freeze(window, len(window) - self.lag)
             window.shorten(self.lag)
             self._samples = list(window.samples)
-        return max(len(again), moved), update
-
-    def _tell_velocities(self, window: StreamWindow) -> None:
-        """Rough velocities of the samples to come, by line fits between the events; they shape the errors of stamps.
-
-        A start or a hit just before the last sample in the window left its velocity open; now there are more samples.
-        """
-        samples, held = self._samples, len(window)
-        times, positions = np.array([s.time for s in samples]), np.array([s.position for s in samples])
-        breaks = [k - 1 for k, s in enumerate(samples) if k and s.motion != FLIGHT]
-        velocities = window_velocities(times, positions, breaks)
-        last = samples[max(held - 1, 0)].motion
-        begins = held > 0 and (held == 1 or last.hit or not last.linked) and held - 1 not in breaks
-        for k in range(held - begins, len(samples)):
-            samples[k].velocity = velocities[k]
-        if begins:
-            window.reweigh([held - 1])
+        return max(len(again), len(moved)), update
 
     def _append(self, window: StreamWindow, *samples: Sample) -> Update:
         update = window.append_all(samples)
         self._counts += update.evaluated, update.calls
         return update
-
-    def _explain(self, window: StreamWindow) -> list[Sample]:
-        """Lay the events over the samples; those from the first difference on are taken back and returned."""
-        samples, held = self._samples, len(window)
-        times, positions = np.array([s.time for s in samples]), np.array([s.position for s in samples])
-        segmentation = self.events.segmentation(window.first, times, positions)
-        motions = motions_of(self.events.moved(segmentation, window.first), times)
-        measured = np.array([s.measured for s in samples])
-        factors = np.where(measured, SIGMA_FACTOR[segmentation.quality], 1.0)  # the loss sets wrong sightings aside
-        settled = max(held - LATEST_CHANGE, 0)
-        motions[: max(settled - 1, 0)] = [s.motion for s in samples[1:settled]]
-        factors[:settled] = [s.factor for s in samples[:settled]]
-        start = first_difference(samples[:held], motions, factors)
-        reweighed = [k for k in range(held) if samples[k].factor != factors[k]]
-        for k, sample in enumerate(samples):
-            sample.factor = float(factors[k])
-            if k and (k >= held or not sample.motion.same(motions[k - 1])):
-                sample.motion = motions[k - 1]
-        again = [] if start is None else samples[max(start, 1) : held]
-        if again:
-            window.retract(max(start or 0, 1))
-        staying = [k for k in reweighed if k < len(window)]
-        if staying:
-            window.reweigh(staying)
-        return again
-
-    def _move_contacts(self, window: StreamWindow) -> int:
-        """Put young contacts where the estimate says they are; the newest one may not have happened yet.
-
-        Returns: how many samples were taken back for it.
-        """
-        samples, n = self._samples, len(window)
-        for k in range(max(n - YOUNG, 1), n):
-            motion = samples[k].motion
-            if len(motion.heights) != 1 or motion.hit:
-                continue
-            (height,) = motion.heights
-            state = window.theta[k - 1] + window.delta[k - 1]
-            step = contact_step(state, self.events.rise(height), samples[k].time - samples[k - 1].time)
-            other = k + step
-            if step == 0 or not 1 <= other < n or samples[other].motion != FLIGHT:
-                continue
-            if self.events.move(window.first + k - 1, height, step):
-                shift = samples[k - 1].time - samples[other - 1].time
-                samples[k].motion, samples[other].motion = FLIGHT, Motion(motion.heights, (motion.times[0] + shift,))
-                window.retract(min(k, other))
-                self._append(window, *samples[min(k, other) :])
-                return n - min(k, other)
-        return 0
 
     def _repair(self, error: Exception, status: Status) -> tuple[Status, Update]:
         """Build the window anew from its samples; if that fails as well, begin a new one with the newest sample."""
@@ -380,7 +314,7 @@ class Online(Estimator):
             Sample(float(t), position, spread, label=label if k == 0 else None, measured=not track.rough)
             for k, (t, position, spread) in enumerate(zip(track.times, track.positions, sigma, strict=True))
         ]
-        beside = self._measurements(track)
+        beside = measurements_beside(track, self.model, self.settings, sigma)
         for measurements in beside.values():
             for k, measurement in measurements:
                 samples[k].measurements.append(measurement)
@@ -399,18 +333,3 @@ class Online(Estimator):
         status = Status.NOT_CONVERGED if lost and not result.status.failed else result.status
         result = replace(result, innovations=innovations, status=status)
         return plausible(result, track, sigma, self.settings) if first else result
-
-    def _measurements(self, track: Track) -> dict[str, list[tuple[int, Measurement]]]:
-        """What was measured beside positions, by name of the observation: each with the number of its sample."""
-        refuse_unknowns(track.observations, self.settings, self.name)
-        context = Context(track, self.model, self.settings, sample_sigmas(self.settings, len(track), track.sigmas))
-        found = {}
-        for observation in track.observations:
-            batch = observation.batch(context)
-            if batch.variables.shape[1] > 1:
-                raise ValueError(
-                    f"track {track.name!r}: the estimator 'online' takes observations of one state each; "
-                    f"'{observation.name}' looks at other variables too. Use the smoother."
-                )
-            found[observation.name] = [(k, Measurement(one)) for k, one in observation.single_rows(batch)]
-        return found
