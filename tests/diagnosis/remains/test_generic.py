@@ -151,7 +151,7 @@ def test_columns_of_a_block_are_those_of_the_generic_effect(calm):
 
 
 def test_every_quantity_of_a_block_differs_over_the_data(calm):
-    """They are in units of their scatter. The height of a contact would be the same in all of them: that of the table."""
+    """They are in units of their scatter. The height of a contact, that of the table, would be the same in all."""
     kinds = set()
     for block in blocks_of(calm):
         changing = [name != EVERYWHERE for name in block.quantities]
