@@ -196,7 +196,7 @@ def test_effects_act_in_one_order_whatever_the_files():
 def test_a_pattern_over_places_acts_on_positions_that_are_late(turned):
     effects = [EFFECTS["gravity"](), GenericMeasurement(x_x=0.1, center_x=0.0), EFFECTS["velocity_lag"](lag=0.003)]
     late = POSITION - 0.003 * VELOCITY
-    expected = late + [0.1 * late[0], 0.0, 0.0]
+    expected = late + np.array([0.1 * late[0], 0.0, 0.0])
     np.testing.assert_allclose(seen(AnalyticModel(effects[::-1] if turned else effects)), expected, atol=1e-14)
 
 
