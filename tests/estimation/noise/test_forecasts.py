@@ -138,6 +138,21 @@ def test_linear_tracks_follow_the_smoother(case):
     assert float((steps[..., :2] - 1.0).abs().max()) < 0.01  # a bounce turns z alone
 
 
+def test_what_is_known_of_a_start_is_told_as_a_deviation_from_the_estimate(case):
+    """The measured place, no velocity, the label or no spin, the usual coefficients: less what the smoother finds."""
+    model, surfaces, settings, tracks, linear, _ = case
+    smoother = Smoother(model, surfaces, replace(settings, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0))
+    usual = [float(dict(model.named_parameters())[name].detach()) for name in settings.coefficients]
+    for own, track in zip(linear.starts.numpy(), tracks, strict=True):
+        estimate = smoother.estimate(track)
+        assert 0 not in estimate.hits
+        spin = np.zeros(3) if track.spin_label is None else track.spin_label
+        known = np.concatenate((track.positions[0], np.zeros(3), spin, usual))
+        assert estimate.coefficient_names == tuple(settings.coefficients)
+        found = np.concatenate((estimate.states[0], estimate.coefficients))
+        np.testing.assert_allclose(own, known - found, rtol=1e-3, atol=1e-4)
+
+
 def test_error_bars_are_those_of_the_curvature_and_of_the_scatter_of_tracks(case):
     """H^-1 (G + P) H^-1 with second differences of the objective itself in place of differences of its gradient."""
     *_, settings, _, linear, forecaster = case
