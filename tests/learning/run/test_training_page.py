@@ -72,7 +72,9 @@ def test_a_page_shows_the_numbers_and_a_shot() -> None:
         assert part in words, part
     pictures = [base64.b64decode(found) for found in re.findall(r"data:image/png;base64,([^\"]+)", text)]
     assert len(pictures) == 2
-    for png in pictures:  # wide and high stand in the first chunk; as wide as the page it is hardly higher than a screen
+    for (
+        png
+    ) in pictures:  # wide and high stand in the first chunk; as wide as the page it is hardly higher than a screen
         width, height = struct.unpack(">II", png[16:24])
         assert height < 1.25 * width
     rest = replace(shot, times=times[5:], measured=measured[5:], predicted=measured[5:])
