@@ -1,8 +1,8 @@
 from __future__ import annotations
 
 import json
-import struct
 import shutil
+import struct
 import subprocess
 import sys
 from pathlib import Path
