@@ -9,7 +9,6 @@ from ballfg.arrays import Array
 from ballfg.estimation import Settings
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
-from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY
 
 
 def gaussian_settings(
@@ -48,10 +47,8 @@ class StepNoise(ProcessNoise):
     step_position: float = 0.001
     step_velocity: float = 0.01
 
-    def flight(self, dt: Array) -> Array:
-        """(n, 9, 9) covariance gathered in one step of free flight; dt (n,) s matters to the spin only."""
-        variance = np.empty((len(dt), STATE_DIM))
-        variance[:, POSITION] = self.step_position**2
-        variance[:, VELOCITY] = self.step_velocity**2
-        variance[:, SPIN] = self.spin**2 * dt[:, None]
-        return variance[:, :, None] * np.eye(STATE_DIM)
+    def flight_along_one(self, dt: Array) -> Array:
+        """(n, 3, 3) covariance along one axis gathered in one step of flight; dt (n,) s matters to the spin only."""
+        variance = np.empty((len(dt), 3))
+        variance[:, 0], variance[:, 1], variance[:, 2] = self.step_position**2, self.step_velocity**2, self.spin**2 * dt
+        return variance[:, :, None] * np.eye(3)

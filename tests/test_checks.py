@@ -18,6 +18,8 @@ from ballfg.checks import (
     check_text,
     did_you_mean,
     is_number,
+    short_text,
+    shown,
 )
 
 
@@ -96,6 +98,14 @@ def test_what_is_wrong_is_told(check: Callable[[], Any], error: type[Exception],
     with pytest.raises(error) as caught:
         check()
     assert str(caught.value) == message
+
+
+def test_a_message_shows_the_first_80_characters_of_a_value() -> None:
+    assert short_text("a" * 80) == "a" * 80
+    assert short_text("a" * 81) == "a" * 77 + "..."
+    assert shown([1, 2.5, "a"]) == "[1, 2.5, 'a']"
+    assert all(len(shown(value)) <= 80 for value in ("a" * 200, 10**200, {"a" * 50: "b" * 50}, [["a" * 30] * 30]))
+    assert shown("a" * 60) == repr("a" * 60)
 
 
 def test_misspelt_names() -> None:

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +18,7 @@ from ballfg.learning.calibration.coefficients import values_of
 from ballfg.learning.cli import run
 from ballfg.learning.run import run_folder as files
 
-SHORT = ("max_iterations=2", "tolerance=1e-12", "jobs=1")
+SHORT = ("max_iterations=2", "tolerance=1e-12", "jobs=1", "coefficients=[flight.drag.k,bounce.restitution.e]")
 
 
 def status(*words: object, command: Any = run) -> int:
@@ -59,7 +60,10 @@ def test_a_run_writes_all_its_files(finished: Path, few_tracks: Path, tmp_path: 
     model = load_model(finished / "model.yaml")
     assert values_of(model, ["flight.drag.k"]).tolist() == [drag["after"]]
     assert "median RMSE" in report["verdict"]
-    assert (finished / "calibration.png").read_bytes().startswith(b"\x89PNG")
+    picture = (finished / "calibration.png").read_bytes()
+    assert picture.startswith(b"\x89PNG")
+    panels = len(report["coefficients"]) + 1
+    assert struct.unpack(">II", picture[16:24]) == (panels * 520, 507)  # side by side, none of them empty
     predictions = tmp_path / "p.csv"
     words = ("predict", few_tracks, "--model", finished / "model.yaml", "--observe", 0.25, "--out", predictions)
     assert status(*words, "--jobs", 1, command=ballfg) == 0

@@ -137,14 +137,14 @@ class Names:
         return {name: ast.parse((ROOT / name).read_bytes()) for name in source_files()}
 
     @cached_property
-    def importers(self) -> dict[tuple[str, str], set[str]]:
-        """The files that import a name from a module."""
-        found: defaultdict[tuple[str, str], set[str]] = defaultdict(set)
+    def importers(self) -> dict[tuple[str, str], dict[str, str]]:
+        """The files that import a name from a module, each with what it calls it."""
+        found: defaultdict[tuple[str, str], dict[str, str]] = defaultdict(dict)
         for name, tree in self.trees.items():
             for node in ast.walk(tree):
                 if isinstance(node, ast.ImportFrom) and node.module is not None:
                     for alias in node.names:
-                        found[node.module, alias.name].add(name)
+                        found[node.module, alias.name][name] = alias.asname or alias.name
         return found
 
     def defined(self, name: str, line: int) -> str | None:
@@ -167,16 +167,28 @@ class Names:
         return range(0)
 
     def uses(self, name: str, defined: str) -> list[tuple[str, int]]:
-        """Files and lines that use a name, in its own module and in those that import it from there."""
-        files = {name} | self.importers.get((module_of(name), defined), set())
-        return sorted(
-            {
-                (file, node.lineno)
-                for file in files
-                for node in ast.walk(self.trees[file])
-                if isinstance(node, ast.Name) and node.id == defined and isinstance(node.ctx, ast.Load)
-            }
-        )
+        """Files and lines that use a name, in its own module and in those that import it from there.
+
+        Where there is none, those with a text that is the name: generated code calls what nobody imports.
+        """
+        files = {name: defined} | self.importers.get((module_of(name), defined), {})
+        found = {
+            (file, node.lineno)
+            for file, called in files.items()
+            for node in ast.walk(self.trees[file])
+            if isinstance(node, ast.Name) and node.id == called and isinstance(node.ctx, ast.Load)
+        }
+        return sorted(found or {(file, line) for file, line, text in self.texts if text == defined})
+
+    @cached_property
+    def texts(self) -> list[tuple[str, int, str]]:
+        """File, line and value of every text."""
+        return [
+            (file, node.lineno, node.value)
+            for file, tree in self.trees.items()
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Constant) and isinstance(node.value, str)
+        ]
 
     def frozen_in_machine_code(self, name: str, line: int, compiled: set[str]) -> bool:
         """Whether machine code on disk would not know of a change: of compiled functions, or of a constant in them.
@@ -187,4 +199,4 @@ class Names:
         if name in compiled:
             return True
         constant = defined is not None and defined.lstrip("_").isupper()
-        return constant and bool(self.importers.get((module_of(name), defined), set()) & compiled)
+        return constant and not compiled.isdisjoint(self.importers.get((module_of(name), defined), {}))

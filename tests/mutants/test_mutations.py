@@ -98,8 +98,12 @@ def test_tests_of_a_file_stay_together_and_those_nearby_come_first() -> None:
     assert ordered(tests, "ballfg/pages/html.py", 10.0) == [*far, *near]
 
 
-def test_a_constant_is_used_by_those_who_import_it() -> None:
-    names = Names()
+@pytest.fixture(scope="module")
+def names() -> Names:
+    return Names()
+
+
+def test_a_constant_is_used_by_those_who_import_it(names: Names) -> None:
     file = "ballfg/state.py"
     line = (ROOT / file).read_text(encoding="utf-8").splitlines().index("STATE_DIM: Final = 9") + 1
     assert names.defined(file, line) == "STATE_DIM"
@@ -111,6 +115,17 @@ def test_a_constant_is_used_by_those_who_import_it() -> None:
     assert text[names.headed("ballfg/prediction/propagate.py", line)[-1] - 1].strip().startswith("return by_axis(")
     assert not names.headed("ballfg/prediction/propagate.py", line + 1)
     assert not names.frozen_in_machine_code("factors/noise.py", 60, compiled)
+
+
+def test_a_name_is_used_under_another_one_and_by_generated_code(names: Names) -> None:
+    file = "ballfg/dynamics/compiled/motion.py"
+    lines = (ROOT / file).read_text(encoding="utf-8").splitlines()
+    assert "from ballfg.dynamics.compiled.roll_out import roll_out as roll_out_rows" in lines
+    called = [i for i, line in enumerate(lines, 1) if line.strip().startswith("roll_out_rows(")]
+    assert called
+    assert {(file, i) for i in called} <= set(names.uses("ballfg/dynamics/compiled/roll_out.py", "roll_out"))
+    helpers = {user for user, _ in names.uses("ballfg/dynamics/compiled/layers.py", "tanh_all")}
+    assert helpers == {"ballfg/dynamics/compiled/build.py"}
 
 
 def test_every_judged_change_is_one_that_can_still_be_made() -> None:

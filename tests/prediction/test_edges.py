@@ -7,8 +7,9 @@ import pytest
 import torch
 from scipy.stats import norm
 
-from ballfg.dynamics import Surfaces, rollout
+from ballfg.dynamics import Surfaces, fly, rollout
 from ballfg.dynamics.compiled.beliefs.course import Course
+from ballfg.dynamics.compiled.beliefs.edges import come_down, falls_past
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import Propagator, apex
 from tests.prediction.conftest import NEARLY_EXACT
@@ -94,3 +95,35 @@ def test_known_places_at_a_known_edge_have_no_doubt(model, beliefs):
     for beyond in (-0.01, 0.01):
         predicted = Propagator(with_end(LANDS + beyond), NEARLY_EXACT).rollout(belief, TIMES)
         assert np.abs(predicted.covariances).max() < 1e-12
+
+
+@pytest.mark.filterwarnings("ignore:.*First-class function type feature is experimental")
+def test_the_spread_of_both_ways_is_that_of_the_states(uncertain, beliefs):
+    """Share times the outer product of the two ways' difference; coefficients are the same on both."""
+    belief = beliefs(uncertain, STEPS["falls past, some bounce"])
+    propagator, h = Propagator(with_end(0.925), NOISY), 0.02
+    carrier = propagator._carrier(belief)
+    rates, impact, surface, c, _, b, _, s, _, *weights = carrier._given
+    covariance, spread, after, touch = np.zeros((18, 18)), np.zeros((18, 18)), np.ones(18), np.empty(9)
+    covariance[:9, :9] = belief.covariance[0, :9, :9]
+    start = belief.mean[0, :9].numpy().copy()
+    tau = come_down(rates, surface, start, c, s, weights[0], weights[2], 0.0, carrier._world, touch)
+    with torch.no_grad():
+        end = torch.tensor([h], dtype=torch.float64)
+        after[:9] = fly(uncertain, belief.mean, end)[0, :9]
+        bounced = rollout(uncertain, belief.mean, end, Surfaces(0.0))[0, 0, :9].numpy()
+    functions, values = (rates, impact, surface), (c, b, s)
+    args = (covariance, touch, tau, h, carrier._world, after, spread)
+    assert falls_past(functions, values, tuple(weights), *args)
+    assert not spread[9:].any()
+    assert not spread[:, 9:].any()
+    share = norm.cdf((0.925 - touch[0]) / np.sqrt(along(touch) @ covariance[:9, :9] @ along(touch)))
+    difference = bounced - after[:9]
+    np.testing.assert_allclose(spread[:9, :9], share * np.outer(difference, difference), rtol=1e-6, atol=1e-12)
+
+
+def along(touch):
+    """How a change of the state moves the place along x at which a ball comes down."""
+    normal = np.zeros(9)
+    normal[0], normal[2] = 1.0, -touch[3] / touch[5]
+    return normal

@@ -10,7 +10,7 @@ from scipy import stats
 
 from ballfg.diagnosis.fit.response import fitted_path, responses
 from ballfg.diagnosis.remains.generic import ALARM, generic_tests, where
-from ballfg.diagnosis.remains.patterns import PLAUSIBLE, WORLD, Block, blocks_of
+from ballfg.diagnosis.remains.patterns import EVERYWHERE, PLAUSIBLE, WORLD, Block, blocks_of
 from ballfg.diagnosis.remains.whiteness import REACHES, whiteness
 from ballfg.diagnosis.search.hypothesis import Hypothesis
 from ballfg.diagnosis.search.score import pattern_tests
@@ -148,6 +148,18 @@ def test_columns_of_a_block_are_those_of_the_generic_effect(calm):
     rest = block.columns[..., place] * scatter - x
     shift = (rest * one).sum() / (one * one).sum()  # a centre is a share of the column that acts everywhere
     np.testing.assert_allclose(rest, shift * one, atol=5e-3 * np.abs(x).max())
+
+
+def test_every_quantity_of_a_block_differs_over_the_data(calm):
+    """They are in units of their scatter. The height of a contact, that of the table, would be the same in all."""
+    kinds = set()
+    for block in blocks_of(calm):
+        changing = [name != EVERYWHERE for name in block.quantities]
+        values = block.values.reshape(-1, len(block.quantities))
+        np.testing.assert_allclose(values.std(axis=0), changing, atol=1e-9)
+        np.testing.assert_allclose(values.mean(axis=0), np.logical_not(changing), atol=1e-9)
+        kinds.add(block.kind)
+    assert kinds == {"flight", "contact", "measurement"}
 
 
 def x_of(fitted):

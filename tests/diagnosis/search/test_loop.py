@@ -208,6 +208,18 @@ def test_predictions_are_worse_where_chance_does_not_make_them_so():
     assert got_worse(errors_of(one), errors_of(before))
 
 
+@pytest.mark.parametrize(
+    ("typical", "ratio", "worse"), [(0.8, 1.04, False), (0.8, 1.06, True), (0.88, 1.04, False), (0.92, 1.04, True)]
+)
+def test_a_few_balls_may_be_predicted_worse_where_half_are_much_better(typical, ratio, worse):
+    """Up to 5 % over all tracks, where the median track errs by a tenth less."""
+    before = np.full(40, 10.0)
+    after = typical * before
+    after[:6] = np.sqrt((ratio**2 * 4000.0 - 34 * (10.0 * typical) ** 2) / 6)  # over all tracks: `ratio` of before
+    assert errors_of(after).prediction_rmse_mm == pytest.approx(ratio * 10.0)
+    assert got_worse(errors_of(after), errors_of(before)) is worse
+
+
 def test_what_later_effects_make_superfluous_is_taken_out_again(make_ball, make_launches, make_shots):
     """The judging half is predicted best with the wind alone, which is found beside the table's tilt."""
     truth = {"table_tilt": {"x": 0.02, "y": 0.0}, "wind": {"x": 0.0, "y": 0.3, "z": 0.0}}

@@ -10,6 +10,7 @@ from torch.autograd import forward_ad
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, Architecture, build, fly, model_from_dict, model_to_dict, substitute
 from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.effects.generic import GenericMeasurement
 from ballfg.dynamics.effects.measurement import SOFT_DISTANCE, signed_permutations
 
 STATE = torch.tensor([[1.2, 0.3, 1.1, 5.0, -1.0, 2.0, 40.0, -150.0, 60.0]], dtype=torch.float64)
@@ -189,6 +190,14 @@ def test_effects_act_in_one_order_whatever_the_files():
     p = p + 0.02 * away / np.sqrt(away @ away + SOFT_DISTANCE**2)
     away = p - [1.0, 0.2, 1.0]
     np.testing.assert_allclose(seen(forward), p + 0.008 * (away @ away) * away, atol=1e-13)
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_a_pattern_over_places_acts_on_positions_that_are_late(turned):
+    effects = [EFFECTS["gravity"](), GenericMeasurement(x_x=0.1, center_x=0.0), EFFECTS["velocity_lag"](lag=0.003)]
+    late = POSITION - 0.003 * VELOCITY
+    expected = late + np.array([0.1 * late[0], 0.0, 0.0])
+    np.testing.assert_allclose(seen(AnalyticModel(effects[::-1] if turned else effects)), expected, atol=1e-14)
 
 
 def test_in_a_model_file_and_among_the_coefficients():

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 from scipy.integrate import solve_ivp
+from torch.autograd import forward_ad
 
 from ballfg.dynamics import fly, fly_jacobian
 from ballfg.dynamics.motion.integrate import MAX_STEP, batch_jacobian, derivative, rk4_step, step_count
@@ -196,6 +197,18 @@ def test_gradcheck_by_state_time_and_parameters(model, states):
 
     assert torch.autograd.gradcheck(after, (start, dt, *values))
     assert torch.autograd.gradgradcheck(after, (start, dt, *values), atol=1e-4, rtol=1e-4)
+
+
+@pytest.mark.filterwarnings("ignore:.torch.jit.script. is deprecated:DeprecationWarning")  # torch's own
+def test_tangents_are_carried_along_where_gradients_are_off(model, states):
+    """Machine code knows no tangents: torch must do the work, though nothing is recorded for a way back."""
+    start, dt = states(3), seconds(0.03, 0.2, -0.1)
+    along = states(3, seed=1)
+    with torch.no_grad(), forward_ad.dual_level():
+        moved = forward_ad.unpack_dual(fly(model, forward_ad.make_dual(start, along), dt)).tangent
+    _, jacobian = fly_jacobian(model, start, dt)
+    assert moved is not None
+    torch.testing.assert_close(moved, (jacobian @ along[..., None])[..., 0], rtol=1e-9, atol=1e-9)
 
 
 def test_empty_batch(model):

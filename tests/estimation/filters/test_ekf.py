@@ -17,7 +17,7 @@ from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.filters.ball_filter import BallFilter
-from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
+from ballfg.estimation.filters.ekf import ExtendedKalmanFilter, _Run
 from ballfg.estimation.filters.sliding_window import SlidingWindow
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Quality
@@ -289,6 +289,17 @@ def test_an_outlier_among_the_first_samples_is_named(flight, bad):
     result = run(with_positions(track, positions))
     assert np.flatnonzero(result.quality == Quality.OUTLIER).tolist() == [bad]
     assert nees(result, truth)[10] < chi2.ppf(0.999, 9)
+
+
+@pytest.mark.parametrize(("height", "believed"), [(0.03, (0, 1)), (0.07, (1, 2))])
+def test_only_near_a_surface_need_the_first_samples_not_lie_on_a_parabola(rng, height, believed):
+    """Within 5 cm of it there may be a bounce between them. The first sample is 6 cm off."""
+    start = np.array([0.0, 0.0, TABLE.table_height + 0.02 + height, 5.0, 0.5, 0.5, 10.0, 60.0, 20.0])
+    _, track = simulate(nominal_model(), PLAIN, start, np.arange(4) * 0.01, rng)
+    positions = track.positions.copy()
+    positions[0, 1] += 0.06
+    filtering = _Run(ExtendedKalmanFilter(nominal_model(), TABLE, PLAIN), with_positions(track, positions))
+    assert filtering._first_pair(0) == believed
 
 
 def test_without_events_every_sample_counts(flight):

@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from ballfg.estimation import Smoother, predict_tracks
+from ballfg.estimation.noise.estimate import _Search
 from ballfg.estimation.noise.forecasts import HORIZONS, ROUNDING, Forecaster
 from ballfg.estimation.noise.linear_tracks import linearise
 from ballfg.estimation.noise.parameters import parameters_of, tensors_of
@@ -135,3 +136,37 @@ def test_linear_tracks_follow_the_smoother(case):
     assert float(linear.errors.abs()[linear.used].max()) < 0.02
     steps = linear.transitions[:, :, POSITION, POSITION].diagonal(dim1=-2, dim2=-1)
     assert float((steps[..., :2] - 1.0).abs().max()) < 0.01  # a bounce turns z alone
+
+
+def test_what_is_known_of_a_start_is_told_as_a_deviation_from_the_estimate(case):
+    """The measured place, no velocity, the label or no spin, the usual coefficients: less what the smoother finds."""
+    model, surfaces, settings, tracks, linear, _ = case
+    smoother = Smoother(model, surfaces, replace(settings, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0))
+    usual = [float(dict(model.named_parameters())[name].detach()) for name in settings.coefficients]
+    for own, track in zip(linear.starts.numpy(), tracks, strict=True):
+        estimate = smoother.estimate(track)
+        assert 0 not in estimate.hits
+        spin = np.zeros(3) if track.spin_label is None else track.spin_label
+        known = np.concatenate((track.positions[0], np.zeros(3), spin, usual))
+        assert estimate.coefficient_names == tuple(settings.coefficients)
+        found = np.concatenate((estimate.states[0], estimate.coefficients))
+        np.testing.assert_allclose(own, known - found, rtol=1e-3, atol=1e-4)
+
+
+def test_error_bars_are_those_of_the_curvature_and_of_the_scatter_of_tracks(case):
+    """H^-1 (G + P) H^-1 with second differences of the objective itself in place of differences of its gradient."""
+    *_, settings, _, linear, forecaster = case
+    known = parameters_of(settings, linear, position_known=True)
+    search = _Search(forecaster, [p for p in known if p.name == "acceleration" or p.axis == 2], settings)
+    logs, step = np.log([0.003, 0.1]), 0.05
+    moves = step * np.eye(2)
+    hessian = np.empty((2, 2))
+    for i, j in ((0, 0), (0, 1), (1, 1)):
+        ends = ((a, b, search.value(logs + a * moves[i] + b * moves[j])[0]) for a in (-1, 1) for b in (-1, 1))
+        hessian[i, j] = hessian[j, i] = sum(a * b * value for a, b, value in ends) / (4.0 * step**2)
+    assert (np.linalg.eigvalsh(hessian) > 1.0 / search.spread.max() ** 2).all()
+    inverse = np.linalg.inv(hessian)
+    covariance = inverse @ (search._scatter(logs) + np.diag(search.spread**-2)) @ inverse
+    errors = search.errors(logs)
+    assert list(errors) == ["memory.z", "acceleration"]
+    np.testing.assert_allclose(list(errors.values()), np.sqrt(np.diagonal(covariance)), rtol=0.02)

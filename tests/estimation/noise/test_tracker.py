@@ -87,7 +87,10 @@ def test_what_is_declared_is_not_looked_for(lasting):
 
 def test_few_tracks_tell_nothing(lasting):
     settings, linear = lasting
-    assert tracker_noise(linear, linear.numbers < 4, settings, WHITE).parts == ()
+    usual = replace(settings, position_noise=(0.001, 0.002, 0.004), position_scale=1.5)
+    found = tracker_noise(linear, linear.numbers < 4, usual, WHITE)
+    assert found.parts == ()
+    assert found.noise.position == pytest.approx((0.0015, 0.003, 0.006))
 
 
 def test_a_filter_without_biases_is_one_without_memory(lasting):

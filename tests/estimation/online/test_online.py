@@ -10,11 +10,12 @@ import torch
 from torch import nn
 
 from ballfg.dynamics import BallModel, Surfaces, nominal_model, rollout
-from ballfg.estimation.online.events import contact_step
+from ballfg.estimation.online.events import EventTracker, contact_step
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.online.windows import stream_window
 from ballfg.estimation.online.windows.interval import IntervalMaker
 from ballfg.estimation.result import Status
+from ballfg.estimation.segmentation import Contact, Segmentation, physics_of
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.motion import FLIGHT, Motion
 from ballfg.estimation.smoother.smoother import Smoother
@@ -208,6 +209,17 @@ def test_contact_step():
     assert contact_step(falling, 0.02, 0.005) == 1
     assert contact_step(falling - 0.05 * np.eye(9)[2], 0.02, 0.02) == -1
     assert contact_step(falling, 10.0, 0.02) == 0
+
+
+def test_a_contact_moves_six_times_at_most():
+    """A contact that flaps between intervals stays in the end; others, on the floor say, may still move."""
+    events = EventTracker(TABLE, physics_of(nominal_model()), True)
+    assert all(events.move(10 + k % 2, 0.0, 1 - 2 * (k % 2)) for k in range(6))
+    assert not events.move(10, 0.0, 1)
+    assert events.move(10, -0.76, 1)
+    none, good = np.zeros(0, dtype=np.int64), np.zeros(20, dtype=np.int8)
+    found = Segmentation((Contact(10, 0.1, 0.0), Contact(10, 0.1, -0.76)), none, none, (), good)
+    assert [contact.interval for contact in events.moved(found, 0).contacts] == [10, 11]
 
 
 def hit_track():

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 import torch
 
 from ballfg.dynamics import LearnedModel, load_model
 from ballfg.estimation import dataset_settings
 from ballfg.learning import TrainConfig, build
+from ballfg.learning.end_to_end.elsewhere import by_room
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset
 
@@ -53,3 +57,14 @@ def test_training_tracks_lie_inside_and_other_speeds_outside(exported):
     fast = states.clone()
     fast[:, 3:6] *= 6.0
     assert (model.inside(fast) < 0.05).all()
+
+
+def test_twelve_tracks_of_each_room_spread_over_it_tell_its_noise(exported):
+    shot = exported[1].shots[0]
+    many = [replace(shot, observed=number, room="hall" if number % 2 else "lab") for number in range(46)]
+    hall, lab, yard = ([shot.observed for shot in room] for room in by_room([*many[::-1], shot]))
+    assert (len(hall), hall[0], hall[-1]) == (12, 45, 1)
+    assert (len(lab), lab[0], lab[-1]) == (12, 44, 0)
+    assert set(np.diff(hall).tolist()) == {-4}
+    assert len(yard) == 1
+    assert [len(room) for room in by_room(many[:9])] == [5, 4]

@@ -8,8 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
+from ballfg.dynamics import nominal_model
+from ballfg.dynamics.analytic import coefficient_sigmas
+from ballfg.estimation import Smoother
 from ballfg.learning.config.training import TrainConfig
+from ballfg.learning.end_to_end import first_spins
 from ballfg.learning.run.training import build
 from ballfg.simulation import MeasurementNoise, SimulationConfig, table_tennis, write_simulation
 from ballfg.tracks import read_dataset, write_dataset
@@ -56,3 +61,17 @@ def test_names_stay_the_default_and_tracks_that_tell_their_spin_are_passed_over(
     write_simulation(tmp_path / "data", SimulationConfig(3, seed=2, spin_labels=True))
     untouched = learned(tmp_path / "data", LEVELS, start="tracks")
     assert torch.equal(untouched.weight, learned(launched, LEVELS).weight)
+
+
+def test_a_spin_is_about_the_axes_of_the_launch(launched: Path) -> None:
+    """Forward is where the ball flies at its first sample, not later: a sidespin of 150 rad/s turns it on the way."""
+    given = {"data": [str(launched)], "split": {"by": "none"}, "observe": {"samples": 25}, "kind": "a-tune"}
+    trainee, *_ = build(TrainConfig.model_validate(given | {"launcher": {"labels": list(LEVELS)}}))
+    shot, model = trainee.shots[0], nominal_model()
+    wide = replace(
+        shot.settings, launcher=None, coefficients=coefficient_sigmas(model), spin_prior=first_spins.SPIN_PRIOR
+    )
+    launch = Smoother(model, shot.surfaces, wide).estimate(shot.track).states[0]
+    heading = np.arctan2(launch[4], launch[3])
+    expected = Rotation.from_euler("z", -heading).apply(launch[6:9])
+    np.testing.assert_allclose(first_spins._spin(shot, model), expected, atol=1e-9)

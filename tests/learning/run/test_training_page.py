@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import base64
+import re
+import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -67,7 +70,13 @@ def test_a_page_shows_the_numbers_and_a_shot() -> None:
         "spin 1 0.37 rad/s/√s random change of the spin in flight",
     ):
         assert part in words, part
-    assert text.count("data:image/png") == 2
+    pictures = [base64.b64decode(found) for found in re.findall(r"data:image/png;base64,([^\"]+)", text)]
+    assert len(pictures) == 2
+    for (
+        png
+    ) in pictures:  # wide and high stand in the first chunk; as wide as the page it is hardly higher than a screen
+        width, height = struct.unpack(">II", png[16:24])
+        assert height < 1.25 * width
     rest = replace(shot, times=times[5:], measured=measured[5:], predicted=measured[5:])
     whole = page("mlp", rows, 0, curves, learned, rest, "", origin)
     assert "Circles mark the 8 samples that it had to predict; those that it observed are not drawn." in whole

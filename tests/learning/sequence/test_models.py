@@ -109,3 +109,14 @@ def test_diffusion_noise_comes_from_seed_epoch_and_track(tracks: list[Track]) ->
     losses = [float(model.losses(batch, [draw])[0].detach()) for draw in [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]]
     assert len(set(losses)) == 4
     assert float(model.losses(batch, [(0, 0, 0)])[0].detach()) == losses[0]
+
+
+def test_a_saved_diffusion_model_has_weights_of_these_shapes(tracks: list[Track]) -> None:
+    """Files of trained models hold them: four heads of pooling, eight blocks, conditions twice as wide as the paths."""
+    shapes = {name: tuple(p.shape) for name, p in untrained("diffusion", tracks, width=16).named_parameters()}
+    assert shapes["encoder.score.weight"] == (4, 24)
+    assert shapes["encoder.outward.weight"] == (24, 4 * 24)
+    assert shapes["encoder.inward.weight"] == (24, 3 + 17 + len(LABELS))
+    assert shapes["denoiser.inward.weight"] == (16, 3 + 17, 1)
+    assert shapes["denoiser.blocks.7.modulate.weight"] == (2 * 16, 2 * 16)
+    assert "denoiser.blocks.8.modulate.weight" not in shapes
