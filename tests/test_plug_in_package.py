@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 import re
-import subprocess
-import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -15,9 +13,10 @@ import pytest
 
 from ballfg.estimation import read
 from ballfg.simulation import MeasurementNoise, SimulationConfig, write_simulation
+from tests.commands import status
+from tests.interpreter import Answer, Interpreter
 from tests.places import DOCS
 
-ROOT = Path(__file__).parents[1]
 EFFECT = re.findall(r"```python\n(.*?)```", (DOCS / "add_an_effect.md").read_text(encoding="utf-8"), re.DOTALL)[0]
 OBSERVATION = '''
 """A laser above the table tells the height of the ball."""
@@ -60,6 +59,18 @@ back-and-forth = ball_lab.estimator:BackAndForth
 """
 
 
+SMALL_RUN = """
+from pathlib import Path
+from ballfg.benchmarks.estimators.suite import Size, run_synthetic
+from ballfg.benchmarks.results import Results
+
+def run(words):
+    results = Results("test", 2)
+    run_synthetic(results, Path(words[0]), Size(compared=2, consistency=2, measured=None, counts=(5, 10)), 1)
+    print(*{(row.case, row.method): row.value for row in results.rows if row.metric == "velocity_rmse"}.items())
+"""
+
+
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder of installed packages with `ball-lab` in it, files as pip leaves them."""
@@ -89,18 +100,19 @@ def shots(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def ballfg(site: Path | None, *words: object, module: str = "ballfg.cli.main", entry: str = "run") -> str:
-    """What a command prints in an interpreter of its own that finds the packages of a folder."""
-    path = os.pathsep.join(str(folder) for folder in (site, ROOT) if folder is not None)
-    code = f"from {module} import {entry}\n{entry}({[str(word) for word in words]})"
-    environment = {**os.environ, "PYTHONPATH": path}
-    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+@pytest.fixture(scope="module")
+def with_package(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Interpreter]:
+    """An interpreter that finds the package; this one does not."""
+    small_run = tmp_path_factory.mktemp("code") / "small_run.py"
+    small_run.write_text(SMALL_RUN, encoding="utf-8")
+    with Interpreter([site, small_run.parent]) as interpreter:
+        yield interpreter
 
 
-def bench(site: Path | None, *words: object) -> str:
-    return ballfg(site, *words, module="ballfg.benchmarks.cli")
+def printed(answer: Answer) -> str:
+    """What a command prints that must end well."""
+    assert answer.status == 0, answer.err
+    return answer.out
 
 
 def column(path: Path, name: str) -> np.ndarray:
@@ -108,28 +120,39 @@ def column(path: Path, name: str) -> np.ndarray:
         return np.array([float(row[name]) for row in csv.DictReader(file)])
 
 
-def test_info_lists_what_the_package_adds(site: Path) -> None:
-    sections = dict(re.findall(r"^(\w+)\n((?:  .*\n)+)", ballfg(site, "info"), re.MULTILINE))
+def test_info_lists_what_the_package_adds(with_package: Interpreter, capsys: pytest.CaptureFixture[str]) -> None:
+    sections = dict(re.findall(r"^(\w+)\n((?:  .*\n)+)", printed(with_package("info")), re.MULTILINE))
     assert "  ball-lab 0.3: static_charge\n" in sections["effects"]
     assert "  ball-lab 0.3: height\n" in sections["observations"]
     assert "  ball-lab 0.3: back-and-forth\n" in sections["estimators"]
     assert ": position, sighting, speed, spin\n" in sections["observations"]
     assert ": a-tune, mlp, mlp+gs, skip+gs, mnn+gs, lstm, diffusion\n" in sections["trainees"]
-    assert "ball-lab" not in ballfg(None, "info")
+    assert status("info") == 0
+    assert "ball-lab" not in capsys.readouterr().out
 
 
-def test_estimate_uses_its_observation_and_its_estimator(site: Path, shots: Path, tmp_path: Path) -> None:
+def test_estimate_uses_its_observation_and_its_estimator(
+    with_package: Interpreter, shots: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """With the laser heights are five times better; the package's estimator smooths, and sees the laser as well."""
+
+    def here(*words: object) -> str:
+        assert status(*words) == 0
+        return capsys.readouterr().out
+
+    def there(*words: object) -> str:
+        return printed(with_package(*words))
+
     truth = column(shots / "truth.csv", "z")
     error, sigma = {}, {}
-    for name, packages, method in (
-        ("plain", None, "smoother"),
-        ("laser", site, "smoother"),
-        ("own", site, "back-and-forth"),
-        ("filter", None, "ekf"),
+    for name, ballfg, method in (
+        ("plain", here, "smoother"),
+        ("laser", there, "smoother"),
+        ("own", there, "back-and-forth"),
+        ("filter", here, "ekf"),
     ):
         out = tmp_path / f"{name}.csv"
-        said = ballfg(packages, "estimate", shots, "--method", method, "--out", out, "--jobs", 2)
+        said = ballfg("estimate", shots, "--method", method, "--out", out, "--jobs", 2)
         assert f"by {method}" in said
         error[name] = np.sqrt(np.mean((column(out, "z") - truth) ** 2))
         sigma[name] = np.median(column(out, "sigma_z"))
@@ -139,48 +162,36 @@ def test_estimate_uses_its_observation_and_its_estimator(site: Path, shots: Path
     assert sigma["own"] == pytest.approx(sigma["laser"], rel=0.1)
 
 
-def test_an_unknown_method_is_told_of_those_there_are(site: Path, shots: Path, tmp_path: Path) -> None:
-    with pytest.raises(AssertionError, match="smoother, online, ekf, sliding-window, back-and-forth; got 'guess'"):
-        ballfg(site, "estimate", shots, "--method", "guess", "--out", tmp_path / "out.csv")
+def test_an_unknown_method_is_told_of_those_there_are(with_package: Interpreter, shots: Path, tmp_path: Path) -> None:
+    answer = with_package("estimate", shots, "--method", "guess", "--out", tmp_path / "out.csv")
+    assert answer.status == 2
+    assert "smoother, online, ekf, sliding-window, back-and-forth; got 'guess'" in answer.err
 
 
 @pytest.mark.slow
-def test_diagnose_finds_its_effect(site: Path, tmp_path: Path) -> None:
+def test_diagnose_finds_its_effect(with_package: Interpreter, tmp_path: Path) -> None:
     """Charged balls, simulated, searched and found with nothing named but the effect to plant."""
     charged, found = tmp_path / "charged", tmp_path / "diagnosis"
     simulated = ("simulate", "--out", charged, "--tracks", 8, "--rate", 100, "--effect", "static_charge.strength=4")
-    assert "undeclared effects: static_charge" in ballfg(site, *simulated)
-    ballfg(site, "diagnose", charged, "--out", found, "--jobs", 1)
+    assert "undeclared effects: static_charge" in printed(with_package(*simulated))
+    printed(with_package("diagnose", charged, "--out", found, "--jobs", 1))
     report = json.loads((found / "report.json").read_text(encoding="utf-8"))
     assert "static_charge" in {hypothesis["name"] for hypothesis in report["rounds"][0]}
     assert [effect["name"] for effect in report["effects"]] == ["static_charge"]
 
 
-def test_the_benchmark_on_measured_tracks_has_its_rows(site: Path, shots: Path, tmp_path: Path) -> None:
-    bench(site, "estimators", "--data", shots, "--quick", "--out", tmp_path / "results", "--jobs", 1)
+def test_the_benchmark_on_measured_tracks_has_its_rows(with_package: Interpreter, shots: Path, tmp_path: Path) -> None:
+    words = ("estimators", "--data", shots, "--quick", "--out", tmp_path / "results", "--jobs", 1)
+    printed(with_package(*words, function="ballfg.benchmarks.cli:run"))
     rows = json.loads((tmp_path / "results" / "results.json").read_text(encoding="utf-8"))["rows"]
     scored = {row["method"]: row["value"] for row in rows if row["metric"] == "prediction_rmse_median"}
     assert list(scored) == ["smoother", "online", "ekf", "sliding-window", "back-and-forth"]
     assert scored["back-and-forth"] == pytest.approx(scored["ekf"], rel=1e-6)  # at the newest sample the pass is over
 
 
-SMALL_RUN = """
-from pathlib import Path
-from ballfg.benchmarks.estimators.suite import Size, run_synthetic
-from ballfg.benchmarks.results import Results
-
-def run(words):
-    results = Results("test", 2)
-    run_synthetic(results, Path(words[0]), Size(compared=2, consistency=2, measured=None, counts=(5, 10)), 1)
-    print(*{(row.case, row.method): row.value for row in results.rows if row.metric == "velocity_rmse"}.items())
-"""
-
-
-def test_the_benchmark_on_simulated_tracks_has_its_rows(site: Path, tmp_path: Path) -> None:
+def test_the_benchmark_on_simulated_tracks_has_its_rows(with_package: Interpreter, tmp_path: Path) -> None:
     """The suite of `ballfg-bench estimators --quick` with fewer tracks."""
-    (tmp_path / "small_run.py").write_text(SMALL_RUN, encoding="utf-8")
-    paths = os.pathsep.join(map(str, (site, tmp_path)))
-    said = ballfg(Path(paths), tmp_path, module="small_run")
+    said = printed(with_package(tmp_path, function="small_run:run"))
     for case in ("paper", "fair"):
         (own,) = re.findall(rf"\(\('{case}', 'back-and-forth'\), ([\d.]+)\)", said)
         (smoother,) = re.findall(rf"\(\('{case}', 'smoother'\), ([\d.]+)\)", said)

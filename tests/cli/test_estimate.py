@@ -71,16 +71,15 @@ def test_parquet_holds_the_same_and_the_smoother_is_the_default(dataset: Path, t
     assert read.equals(pq.read_table(tmp_path / "states.parquet"))
 
 
-def test_the_same_bytes_on_one_process_or_two(tmp_path: Path) -> None:
+def test_the_same_bytes_on_one_process_or_two(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ballfg.estimation.batch.START_UP", 0.0)  # a second process, however little work there is
     folder = tmp_path / "many"
     write_simulation(folder, SimulationConfig(tracks=70, rate=30.0, seed=3))  # more than a block of predictions
     for command in (["estimate", folder], ["predict", folder, "--observe", 0.3]):
-        for name, jobs in (("one", 1), ("again", 1), ("two", 2)):
+        for name, jobs in (("one", 1), ("two", 2)):
             options = ["--method", "sliding-window", "--jobs", jobs, "--out", tmp_path / f"{name}.csv"]
             assert status(*command, *options) == 0
-        first = (tmp_path / "one.csv").read_bytes()
-        assert (tmp_path / "again.csv").read_bytes() == first
-        assert (tmp_path / "two.csv").read_bytes() == first
+        assert (tmp_path / "one.csv").read_bytes() == (tmp_path / "two.csv").read_bytes()
 
 
 def test_together_on_a_device_as_one_by_one(dataset: Path, tmp_path: Path) -> None:

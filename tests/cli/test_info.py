@@ -7,24 +7,26 @@ import re
 import subprocess
 import sys
 import tomllib
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 
 import pytest
 
 from ballfg.cli.commands.info import extras, packages, required
-from tests.places import DOCS
+from tests.commands import status
+from tests.interpreter import Interpreter
+from tests.places import DOCS, ROOT
 
-ROOT = Path(__file__).parents[2]
 GUIDE = (DOCS / "add_an_effect.md").read_text(encoding="utf-8")
 HEAVY = ("torch", "gtsam", "cv2", "scipy", "matplotlib")
 SPY = f"import atexit, sys\natexit.register(lambda: print(set({HEAVY}) & set(sys.modules)))\n"
 """Prints at the end which heavy modules were imported."""
 
 
-def run(code: str, *folders: Path) -> subprocess.CompletedProcess[str]:
-    """A fresh interpreter that finds packages in these folders too."""
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, (*folders, ROOT)))}
+def run(code: str) -> subprocess.CompletedProcess[str]:
+    """A fresh interpreter."""
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
     return subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True)
 
 
@@ -32,34 +34,36 @@ def command(*arguments: str) -> str:
     return f"from ballfg.cli.main import run\nrun({list(arguments)})"
 
 
-@pytest.fixture
-def charged(tmp_path: Path) -> Path:
-    """A folder with the guide's package, installed."""
+@pytest.fixture(scope="module")
+def charged(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Interpreter]:
+    """An interpreter that finds the guide's package, installed."""
+    folder = tmp_path_factory.mktemp("site")
     project = tomllib.loads(re.findall(r"```toml\n(.*?)```", GUIDE, re.DOTALL)[0])["project"]
     name = project["name"].replace("-", "_")
-    (tmp_path / name).mkdir()
-    (tmp_path / name / "__init__.py").touch()
+    (folder / name).mkdir()
+    (folder / name / "__init__.py").touch()
     code = re.findall(r"```python\n(.*?)```", GUIDE, re.DOTALL)[0]
-    (tmp_path / name / "static_charge.py").write_text(code, encoding="utf-8")
-    info = tmp_path / f"{name}-{project['version']}.dist-info"
+    (folder / name / "static_charge.py").write_text(code, encoding="utf-8")
+    info = folder / f"{name}-{project['version']}.dist-info"
     info.mkdir()
     metadata = f"Metadata-Version: 2.1\nName: {project['name']}\nVersion: {project['version']}\n"
     (info / "METADATA").write_text(metadata, encoding="utf-8")
     groups = project["entry-points"].items()
     text = "".join(f"[{group}]\n" + "".join(f"{k} = {v}\n" for k, v in points.items()) for group, points in groups)
     (info / "entry_points.txt").write_text(text, encoding="utf-8")
-    return tmp_path
+    with Interpreter([folder]) as interpreter:
+        yield interpreter
 
 
 def test_version() -> None:
     assert run(command("--version")).stdout == f"ballfg {version('ballfg')}\n"
 
 
-def test_info_lists_packages_machine_and_what_is_registered(charged: Path) -> None:
-    done = run(command("info"), charged)
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith(f"ballfg {version('ballfg')}, python {sys.version.split()[0]}\n")
-    sections = dict(re.findall(r"^(\w+)\n((?:  .*\n)+)", done.stdout, re.MULTILINE))
+def test_info_lists_packages_machine_and_what_is_registered(charged: Interpreter) -> None:
+    done = charged("info")
+    assert done.status == 0, done.err
+    assert done.out.startswith(f"ballfg {version('ballfg')}, python {sys.version.split()[0]}\n")
+    sections = dict(re.findall(r"^(\w+)\n((?:  .*\n)+)", done.out, re.MULTILINE))
     assert list(sections)[:3] == ["packages", "extras", "machine"]
     assert f"  torch {version('torch')}\n" in sections["packages"]
     assert "  diffusion: " in sections["extras"]
@@ -78,13 +82,14 @@ def test_extras_that_are_not_installed_come_with_a_remedy() -> None:
     assert list(extras(needed)) == ["more: lacks no-such-package; pip install 'ballfg[more]'"]
 
 
-def test_commands_use_effects_of_an_installed_package(charged: Path, tmp_path: Path) -> None:
-    out = str(tmp_path / "shots")
-    words = ("simulate", "--out", out, "--tracks", "2", "--effect", "static_charge.strength=2")
-    done = run(command(*words), charged)
-    assert "undeclared effects: static_charge" in done.stdout, done.stderr
-    refused = run(command(*words, "--force"))
-    assert "effect must be one that exists; got 'static_charge'" in refused.stderr
+def test_commands_use_effects_of_an_installed_package(
+    charged: Interpreter, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ("simulate", "--out", tmp_path / "shots", "--tracks", 2, "--effect", "static_charge.strength=2")
+    done = charged(*words)
+    assert "undeclared effects: static_charge" in done.out, done.err
+    assert status(*words, "--force") == 2
+    assert "effect must be one that exists; got 'static_charge'" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("arguments", [("--help",), ("--version",), ("simulate", "--help")])

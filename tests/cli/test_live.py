@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ballfg.cli.main import run
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Online, dataset_settings, dataset_surfaces
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset, write_dataset
+from tests.commands import status
 
 SAMPLES = 14
 COMMAND = [sys.executable, "-c", "from ballfg.cli.main import run; run()", "live"]
@@ -65,12 +65,14 @@ def csv(dataset: Path, number: int, later: float = 0.0) -> list[bytes]:
     return [f"{t + later},{x},{y},{z}\n".encode() for t, (x, y, z) in zip(track.times, track.positions, strict=True)]
 
 
-def test_a_replay_gives_the_states_of_the_online_estimator(dataset: Path, tmp_path: Path) -> None:
+def test_a_replay_gives_the_states_of_the_online_estimator(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "states.jsonl"
     arguments = ("--replay", dataset, "--speed", 0, "--plane", "x=1.0", "--horizon", 0.5, "--out", out)
-    with started(*arguments) as process:
-        printed, said = process.communicate()
-    assert (process.returncode, printed) == (0, b"")
+    assert status("live", *arguments) == 0
+    printed, text = capsys.readouterr()
+    assert printed == ""
     lines = lines_of(out.read_bytes())
     assert [path.name for path in tmp_path.iterdir()] == ["states.jsonl"]
     for number in (0, 1):
@@ -88,7 +90,6 @@ def test_a_replay_gives_the_states_of_the_online_estimator(dataset: Path, tmp_pa
         assert states[-1]["note"] == ""
     others = [line["kind"] for line in lines if line["kind"] != "state"]
     assert others == ["newcomer", "newcomer", "newcomer", "lost", "newcomer", "lost"]  # the second stamp tells
-    text = said.decode()
     assert re.search(r"latency of 24 lines: median [\d.]+ ms, 99 % [\d.]+ ms, 99.9 % [\d.]+ ms, worst [\d.]+ ms", text)
     assert "28 positions, 2 balls; 0 late, 0 too old, 0 repeated, 0 malformed, 0 dropped" in text
 
@@ -171,9 +172,7 @@ def test_bad_input_is_one_line_and_status_2(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as exit_:
-        run(["live", *arguments])
-    assert exit_.value.code == 2
+    assert status("live", *arguments) == 2
     said = capsys.readouterr().err
     assert said.startswith(f"ballfg: error: {message}")
     assert said.count("\n") == 1

@@ -212,6 +212,14 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="module")
+def tracked(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The dataset of its videos."""
+    out = tmp_path_factory.mktemp("tracked") / "shots"
+    assert status("track", *videos(scene), "--out", out, "--jobs", 1) == 0
+    return out
+
+
 def videos(scene: Path) -> list[object]:
     words: list[object] = [scene / f"{name}.mp4" for name in ("left", "right", "far")]
     for name in ("left", "right", "far"):
@@ -228,16 +236,11 @@ def numbers(path: Path, *columns: str) -> dict[str, np.ndarray]:
     return {name: np.array(rows) for name, rows in found.items()}
 
 
-def test_videos_become_the_tracks_that_were_flown(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "shots"
-    assert status("track", *videos(scene), "--out", out, "--jobs", 1) == 0
-    assert capsys.readouterr().out.startswith(f"{out}: 2 tracks of ")
+def test_videos_become_the_tracks_that_were_flown(scene: Path, tracked: Path) -> None:
     truth = numbers(scene / "truth.csv", "t", "x", "y", "z")
     visible = numbers(scene / "visible.csv", "t_true")
     due, found = 0, 0
-    tracks = list(read_dataset(out))
+    tracks = list(read_dataset(tracked))
     assert len(tracks) == len(truth) == 2
     squares = []
     for track, (name, flown) in zip(tracks, truth.items(), strict=True):
@@ -249,19 +252,18 @@ def test_videos_become_the_tracks_that_were_flown(
     assert found >= 0.97 * due
     assert np.sqrt(np.concatenate(squares).max()) < 0.05  # no false point
     assert np.sqrt(np.concatenate(squares).mean()) < 0.005
-    overlay = cv2.VideoCapture(str(out / "overlay.mp4"))
+    overlay = cv2.VideoCapture(str(tracked / "overlay.mp4"))
     assert int(overlay.get(cv2.CAP_PROP_FRAME_COUNT)) == len((scene / "left_stamps.csv").read_text().split()) - 1
     assert (overlay.get(cv2.CAP_PROP_FRAME_WIDTH), overlay.get(cv2.CAP_PROP_FRAME_HEIGHT)) == (1920, 390)
 
 
 def test_states_and_predictions_of_what_was_filmed_agree_with_the_truth(
-    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    scene: Path, tracked: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The whole way: video, dataset, states straight from pixels, prediction from the first 0.3 s."""
-    out, states, ahead = tmp_path / "shots", tmp_path / "states.csv", tmp_path / "ahead.csv"
-    assert status("track", *videos(scene), "--out", out, "--no-overlay", "--jobs", 1) == 0
-    assert status("estimate", out, "--from", "detections", "--out", states, "--jobs", 1) == 0
-    assert status("predict", out, "--observe", 0.3, "--out", ahead, "--jobs", 1) == 0
+    states, ahead = tmp_path / "states.csv", tmp_path / "ahead.csv"
+    assert status("estimate", tracked, "--from", "detections", "--out", states, "--jobs", 1) == 0
+    assert status("predict", tracked, "--observe", 0.3, "--out", ahead, "--jobs", 1) == 0
     capsys.readouterr()
     truth = numbers(scene / "truth.csv", "t", "x", "y", "z", "vx", "vy", "vz")
     found = numbers(states, "t", "x", "y", "z", "vx", "vy", "vz", "sigma_vx", "sigma_vy", "sigma_vz")

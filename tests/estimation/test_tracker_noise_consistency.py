@@ -22,7 +22,7 @@ from ballfg.simulation import MeasurementNoise, SimulationConfig, simulate
 from ballfg.simulation import MotionNoise as TrueNoise
 from tests.estimation.tracker_noise import measured_by
 
-TRACKS = 40
+TRACKS = 16
 CONFIG = SimulationConfig(
     tracks=TRACKS,
     seed=11,

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ballfg.dynamics import Surfaces
-from ballfg.dynamics.motion.rollout import LONGEST_MOTION, advance, rollout
+from ballfg.dynamics.motion.rollout import advance, rollout
 from ballfg.factors.noise import ProcessNoise
 from ballfg.prediction import Belief, Propagator
 from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
@@ -233,14 +233,16 @@ def test_wrong_times(model, beliefs, table):
         table.forward(belief, torch.tensor([-0.1]).double())
 
 
-def test_after_the_longest_motion_a_ball_lies_and_its_doubt_grows(model, beliefs):
+def test_after_the_longest_motion_a_ball_lies_and_its_doubt_grows(model, beliefs, monkeypatch):
     """Nothing moves then, and the noise of the time that is left is added once, as in flight."""
+    longest = 2.0  # of the usual 20 s every step would be computed
+    monkeypatch.setattr("ballfg.prediction.propagate.LONGEST_MOTION", longest)
     noise = ProcessNoise(acceleration=0.01, spin=0.5)
     propagator = Propagator(Surfaces(0.0, -0.76), noise)
     belief = beliefs(model, [0, 0, CENTRE, 0.3, 0.0, 0, 0.0, 15.0, 0.0])
-    times = torch.tensor([LONGEST_MOTION, LONGEST_MOTION + 30.0], dtype=torch.float64)
+    times = torch.tensor([longest, longest + 30.0], dtype=torch.float64)
     last, later = (propagator.forward(belief, time[None]) for time in times)
-    assert float(later.time) == pytest.approx(LONGEST_MOTION + 30.0)
+    assert float(later.time) == pytest.approx(longest + 30.0)
     torch.testing.assert_close(later.mean, last.mean)
     gained = (later.covariance - last.covariance)[0, :9, :9].numpy()
     t, q, w = 30.0, 0.01**2, 0.5**2

@@ -29,7 +29,7 @@ def test_network_is_the_same_each_time_and_close_to_the_model() -> None:
 
 def test_speed_run_has_every_time() -> None:
     results = Results("test", 0)
-    run_speed(results, None, replace(QUICK, fit_iterations=100))
+    run_speed(results, None, replace(QUICK, runs=2, warm_up=1, fit_iterations=100, pretrain_iterations=10, flights=1))
     expected = {
         "matrix_product_time",
         "banded_time",

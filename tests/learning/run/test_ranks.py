@@ -1,19 +1,20 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
-from functools import partial
+import time
 from pathlib import Path
+from threading import Thread
 
 import pytest
 import torch
 from safetensors.torch import load_file
 
-import tests.learning.run.falling_ball  # noqa: F401 - registers its kind
+from ballfg.learning.cli import run
 from ballfg.learning.config.config_file import read_config
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.run.checkpoint import read_checkpoint
@@ -22,6 +23,8 @@ from ballfg.learning.run.metrics import read_metrics
 from ballfg.learning.run.ranks import Ranks, SharedMemory, Trouble
 from ballfg.learning.run.training import run_training
 from ballfg.progress import progress
+from tests.faults.kills import in_fork
+from tests.learning.run import falling_ball
 from tests.learning.run.talking_ranks import die, talk
 
 BALL = Path(__file__).parent / "falling_ball.py"
@@ -36,9 +39,19 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def trained(folder: Path, *words: str, start: tuple[str, ...] = (sys.executable,)) -> subprocess.CompletedProcess[str]:
-    given = [*start, str(BALL), "train.yaml", *words]
-    return subprocess.run(given, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+@pytest.fixture
+def script(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """This process becomes one that was started as `falling_ball.py` in the folder of the runs."""
+    monkeypatch.chdir(folder)
+    monkeypatch.setitem(sys.modules, "__main__", falling_ball)  # processes import the module of their starter first
+
+
+def trained(capfd: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]:
+    """`ballfg-train` in this process: its status, and what it and the processes that it starts print."""
+    with pytest.raises(SystemExit) as exit_:
+        run(["train.yaml", *words])
+    assert isinstance(exit_.value.code, int)
+    return exit_.value.code, *capfd.readouterr()
 
 
 @pytest.fixture(scope="module")
@@ -65,61 +78,56 @@ def check_same(a: Path, b: Path) -> None:
     assert load_file(a / "ball.safetensors")["drag"] == pytest.approx(load_file(b / "ball.safetensors")["drag"])
 
 
-def test_two_processes_give_what_one_gives(folder: Path, one: Path) -> None:
-    done = trained(folder, "--data", "plain", "--out", "two", "jobs=2")
-    assert (done.returncode, done.stderr) == (0, "note: read\n")
-    assert done.stdout.count("epoch 3/3") == 1
-    check_same(one, folder / "two")
-
-
 @pytest.mark.slow
-def test_torchrun_and_another_number_of_processes_on_resume_give_it_too(folder: Path, one: Path) -> None:
-    done = trained(folder, "--data", "plain", "--out", "torchrun", start=TORCHRUN)
+@pytest.mark.usefixtures("script")
+def test_torchrun_and_another_number_of_processes_on_resume_give_what_one_gives(
+    folder: Path, one: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    command = [*TORCHRUN, str(BALL), "train.yaml", "--data", "plain", "--out", "torchrun"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("epoch 3/3") == 1
     check_same(one, folder / "torchrun")
     shutil.copytree(one, folder / "more")
     for name, jobs in (("torchrun", "jobs=1"), ("more", "jobs=2")):
-        done = trained(folder, "--data", "plain", "--resume", name, jobs, "optimizer.epochs=5")
-        assert (done.returncode, done.stderr) == (0, "note: read\n")
+        status, printed, said = trained(capfd, "--data", "plain", "--resume", name, jobs, "optimizer.epochs=5")
+        assert (status, said) == (0, "note: read\n")
+        assert printed.count("epoch 5/5") == 1
     check_same(folder / "torchrun", folder / "more")
     assert len(read_metrics(folder / "more" / "metrics.csv")) == 6
 
 
 @pytest.mark.slow
-def test_a_stop_is_said_once(folder: Path) -> None:
+@pytest.mark.usefixtures("script")
+def test_a_stop_is_said_once(capfd: pytest.CaptureFixture[str]) -> None:
     failing = ("--data", "failing-1", "--data", "failing-4", "--data", "failing-7")
-    done = trained(folder, *failing, "--out", "stopped", "jobs=2")
-    assert done.returncode == 2
-    assert done.stderr.count("ballfg: error: more than 20 % of the 10 training tracks failed in one epoch") == 1
-    assert done.stderr.count("\n") == 2  # with the note
-
-
-def interrupted(folder: Path, *words: str) -> tuple[int, str]:
-    """Ctrl-C after the second epoch. Returns: exit status and what it said."""
-    given = [sys.executable, str(BALL), "train.yaml", "--data", "slow", "optimizer.epochs=300", *words]
-    pipe = subprocess.PIPE
-    # whoever starts the tests in the background has them ignore Ctrl-C, and their children too
-    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
-    with subprocess.Popen(given, cwd=folder, stdout=pipe, stderr=pipe, text=True, preexec_fn=heard) as process:
-        assert process.stdout is not None
-        _wait_for(iter(process.stdout), "epoch 2/300")
-        process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=60)
-    return process.returncode, said
-
-
-def _wait_for(lines: Iterator[str], beginning: str) -> None:
-    while not next(lines).startswith(beginning):
-        pass
+    status, _, said = trained(capfd, *failing, "--out", "stopped", "jobs=2")
+    assert status == 2
+    assert said.count("ballfg: error: more than 20 % of the 10 training tracks failed in one epoch") == 1
+    assert said.count("\n") == 2  # with the note
 
 
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
-def test_ctrl_c_keeps_the_last_epoch(folder: Path, jobs: int) -> None:
-    out = folder / f"interrupted-{jobs}"
-    status, said = interrupted(folder, f"jobs={jobs}", "--out", str(out))
+@pytest.mark.usefixtures("script")
+def test_ctrl_c_keeps_the_last_epoch(tmp_path: Path, jobs: int) -> None:
+    """Ctrl-C after the second epoch, in a copy of this process."""
+    out, heard = tmp_path / "interrupted", tmp_path / "heard"
+
+    def interrupt() -> None:
+        while "epoch 2/300" not in heard.read_text():
+            time.sleep(0.01)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    def train() -> None:
+        # whoever starts the tests in the background has them ignore Ctrl-C, and their children too
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+        Thread(target=interrupt, daemon=True).start()
+        run(["train.yaml", "--data", "slow", "optimizer.epochs=300", f"jobs={jobs}", "--out", str(out)])
+
+    status, said = in_fork(train, heard), heard.read_text()
     assert status == 130
-    assert said.splitlines()[1:] == [
+    assert said.count("note: read\n") == 1
+    assert said.splitlines()[-3:] == [
         f"epochs up to 2 are kept; continue with --resume {out}",
         f"{out / 'ball.safetensors'}: the best model so far, of epoch 2",
         "ballfg: interrupted",
