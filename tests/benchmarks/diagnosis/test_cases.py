@@ -1,5 +1,6 @@
 """What is planted, and the datasets made of it."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -26,6 +27,7 @@ from ballfg.benchmarks.diagnosis.data import actual_model, declared_model, make_
 from ballfg.benchmarks.diagnosis.effects import PAIRS, PLANTS, UNKNOWN
 from ballfg.dynamics import EFFECTS, AnalyticModel, nominal_model
 from ballfg.simulation import SimulationConfig, parse_effects
+from tests.places import ROOT
 
 STATES = torch.tensor(
     [[1.2, 0.3, 0.9, 3.0, 0.4, -2.0, 30.0, 120.0, -60.0], [2.0, -0.2, 1.1, 5.0, -0.3, 1.0, -20.0, -90.0, 40.0]],
@@ -156,3 +158,25 @@ def test_two_sessions_follow_one_another_on_different_tables(tmp_path: Path) -> 
 def test_datasets_of_one_folder_name_are_refused() -> None:
     with pytest.raises(ValueError, match="datasets must differ in the names of their folders; got 'aimy' twice"):
         list(measured_cases([Path("a/aimy"), Path("b/aimy")]))
+
+
+def test_the_page_states_the_sizes_that_are_planted() -> None:
+    """`wind.x` | 0.2 m/s, and so on, in the table of typical sizes."""
+    text = (ROOT / "docs" / "benchmarks_loop.md").read_text(encoding="utf-8")
+    table = text[text.index("| effect | size 1 |") :].split("\n\n")[0]
+    found = re.findall(r"`(\w+)\.(\w+)`(?: \(hidden\))? \| ([\d.]+) ?(\S*)", table)
+    assert len(found) >= 18
+    for name, coefficient, number, unit in found:
+        scale = {"%": 0.01, "ms": 0.001, "mm": 0.001}.get(unit, 1.0)
+        (text,) = PLANTS[name].texts(1.0)
+        assert text.startswith(f"{name}.{coefficient}=")
+        assert float(text.split("=")[1]) == pytest.approx(scale * float(number)), name
+
+
+def test_a_pair_is_planted_with_both_effects_at_their_typical_size() -> None:
+    pairs = [case for case in naming_cases(FULL, 0) if case.part == "pairs"]
+    assert {case.planted for case in pairs} == set(PAIRS)
+    for case in pairs:
+        (texts,) = case.sessions
+        for name in case.planted:
+            assert set(planted_case("naming", name, 1.0, 0).sessions[0]) <= set(texts)

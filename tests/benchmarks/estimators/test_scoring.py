@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from ballfg.benchmarks.estimators.protocols import Candidate, Case
-from ballfg.benchmarks.estimators.scoring import Scores, every, judged, pooled, score_track, score_tracks
-from ballfg.benchmarks.estimators.synthetic_rows import add_consistency, add_rows
+from ballfg.benchmarks.estimators.scoring import Scores, TrackScore, every, judged, pooled, score_track, score_tracks
+from ballfg.benchmarks.estimators.synthetic_rows import _newest_sums, add_consistency, add_rows
 from ballfg.benchmarks.results import Results
 from ballfg.dynamics import Surfaces, nominal_model
 from ballfg.estimation import Estimate, Estimator, Settings, Status
@@ -94,3 +94,17 @@ def test_consistency_tells_an_overconfident_smoother(case: Case) -> None:
     assert results.value("toy", "smoother", "nees_first") == pytest.approx(9.0)
     assert results.value("toy", "smoother", "places_outside_99") == 1
     assert results.value("toy", "smoother", "samples_at_bounce") == 20
+
+
+def test_newest_errors_are_pooled_once_a_filter_has_settled() -> None:
+    """From twenty observations on: 1 and 2 m/s here, and 3 m/s of a track that has no more samples; not 9 m/s."""
+    none = np.zeros(0)
+
+    def score(*newest: float) -> TrackScore:
+        return TrackScore(none, none, none, none, none, np.zeros((0, 0, 9), bool), none > 0, np.array(newest), True)
+
+    squares, number = _newest_sums([score(9.0, 9.0, 1.0, 2.0), score(9.0, 9.0, 3.0, np.nan)], (5, 19, 20, 39))
+    assert squares.tolist() == [5.0, 9.0]
+    assert number.tolist() == [2.0, 1.0]
+    squares, _ = _newest_sums([score(9.0, 2.0)], (5, 12))  # where fewer are asked for, the most
+    assert squares.tolist() == [4.0]

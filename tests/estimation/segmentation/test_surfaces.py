@@ -1,5 +1,7 @@
 """Tables with edges, floors, balls that rest and roll, other balls than those of table tennis."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -44,6 +46,19 @@ def test_beside_the_table(see, match, known):
     truth, found = see([0, 1, 1.1, 0, 3, 1, 0, 0, 0], EDGED, known)
     check_contacts(match, found, truth)
     assert {c.height for c in found.contacts} == {0.0}
+    assert len(found.hits) == 0
+
+
+def test_a_floor_may_be_duller_than_the_table(make_flight, match):
+    """The ball is known to keep 0.9 of its speed on the table; on the floor it keeps 0.6."""
+    dull = model_from_dict({"flight": {"gravity": {}, "drag": {}}, "bounce": {"restitution": {"e": 0.6}}})
+    truth = make_flight(dull, [0, 1, 1.1, 0, 3, 1, 0, 0, 0], TIMES[:180], EDGED)
+    positions = truth.measured(np.random.default_rng(0), 0.0015)
+    found = segment(
+        TIMES[:180], positions, [0.0015] * 3, surfaces=EDGED, physics=replace(physics_of(dull), restitution=0.9)
+    )
+    assert len(truth.contacts) >= 1
+    check_contacts(match, found, truth)
     assert len(found.hits) == 0
 
 

@@ -11,9 +11,10 @@ import torch
 
 import ballfg.estimation.smoother.smoother as room
 from ballfg.dynamics.motion.impact import slip_velocity
-from ballfg.estimation.smoother.grip import bounces_of, other_side
+from ballfg.estimation.smoother.grip import Bounce, bounces_of, other_side
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.estimation.smoother.solution import Solution
+from ballfg.factors.batch import Values
 from tests.estimation.smoother.one_bounce import FALSE, MODEL, SETTINGS, SURFACES, excess, flown, measured, one_bounce
 
 DEFAULT, SQUARED, _, _ = SETTINGS.values()
@@ -91,3 +92,25 @@ def test_the_other_side_keeps_the_direction_of_the_slip() -> None:
     assert np.abs(moved[:, :6]).max() == 0.0
     assert np.ptp(moved[: bounce.interval + 1, 6:], axis=0).max() < 1e-9
     assert np.abs(moved[:, 8]).max() < 1e-9
+
+
+@pytest.mark.parametrize(("share", "slides"), [(0.3, True), (0.55, True), (0.7, True), (1.4, False), (3.0, False)])
+def test_the_other_side_of_a_slip_at_which_the_ball_grips_is_one_at_which_it_slides(share: float, slides: bool) -> None:
+    """A ball that falls at 2 m/s, with a share of the slip at which friction just fails to stop it."""
+    state = np.array([0.0, 0.0, 0.02, 3.0, 0.0, -2.0, 0.0, 0.0, 0.0])
+
+    def with_slip(slip: float) -> np.ndarray:
+        spun = state.copy()
+        spun[7] = (3.0 - slip) / MODEL.radius
+        return spun
+
+    slips = np.linspace(0.1, 6.0, 600)
+    after = MODEL.after_bounce(torch.from_numpy(np.stack([with_slip(slip) for slip in slips]))).detach().numpy()
+    kicks = 3.0 - after[:, 3]
+    gripping = float(slips[np.argmax(kicks > 0.99 * kicks.max())])  # from here on more slip gives no more friction
+    values = Values(np.stack([with_slip(share * gripping)] * 4), np.zeros(0))
+    side = other_side(values, Bounce(1, 0, 3), MODEL)
+    assert side is not None
+    assert side.slides is slides
+    speed = np.linalg.norm(slip_velocity(*torch.from_numpy(side.values.states[1]).split(3)[1:], MODEL.radius).numpy())
+    assert speed > gripping if slides else speed == pytest.approx(0.0, abs=1e-9)

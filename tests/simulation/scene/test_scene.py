@@ -9,11 +9,13 @@ import pytest
 import torch
 
 from ballfg.dynamics import rollout
-from ballfg.simulation import SimulationConfig, parse_effects, simulate
+from ballfg.simulation import SimulationConfig, parse_effects, simulate, table_tennis
 from ballfg.simulation.cameras import looking_at, table_rig
 from ballfg.simulation.scene import Clock, Recording, Renderer, SceneConfig, free_running, record
 from ballfg.simulation.scene.backdrop import backdrop
+from ballfg.simulation.scene.movers import movers
 from ballfg.simulation.scene.recording import visible_columns
+from ballfg.simulation.scene.room import furniture
 from ballfg.simulation.scene.shutter import PATH_POINTS
 
 SMALL = (320, 180)
@@ -211,6 +213,23 @@ def test_other_things_move() -> None:
         first, later = (renderer.draw(time, []).astype(float) for time in (0.0, 0.3))
         moved = np.abs(first - later).max(axis=2) > 20
         assert 20 < moved.sum() < 2000
+
+
+def test_a_short_reflection_glides_over_the_floor() -> None:
+    """What looks most like a ball beside one: small, bright, on its way to and fro along x."""
+    for time in np.linspace(0.0, 20.0, 41):
+        reflection = movers(float(time))[-1]
+        assert min(reflection.colour) > 150
+        assert np.linalg.norm(np.diff(reflection.ends, axis=0)) == pytest.approx(0.17, abs=0.01)
+        assert 0.4 < reflection.ends[:, 0].min() < reflection.ends[:, 0].max() < 2.9
+        assert reflection.ends[:, 2].max() < 0.02
+
+
+def test_the_launcher_stands_where_the_balls_come_from() -> None:
+    ball = table_tennis()
+    muzzle = np.array([ball.launcher.x, 0.0, ball.surfaces.table_height + ball.launcher.height])
+    behind = [box for box in furniture(ball) if 0.0 < muzzle[0] - box.high[0] < 0.05]
+    assert any((box.low[1:] < muzzle[1:]).all() and (muzzle[1:] < box.high[1:]).all() for box in behind)
 
 
 def test_the_same_seed_gives_the_same_frames() -> None:

@@ -212,3 +212,12 @@ def test_the_same_views_give_the_same_numbers() -> None:
 
     np.testing.assert_array_equal(found().camera.matrix, found().camera.matrix)
     np.testing.assert_array_equal(found().sigmas, found().sigmas)
+
+
+def test_a_lens_is_looked_at_every_sixteen_pixels_and_at_its_border() -> None:
+    grid = pixel_grid(TRUE)
+    for axis, side in enumerate(TRUE.size):
+        places = np.unique(grid[:, axis])
+        assert (places[0], places[-1]) == (0.0, side - 1.0)
+        assert 8.0 < np.diff(places).max() <= 16.0
+    assert len(np.unique(grid, axis=0)) == len(grid) == np.prod([len(np.unique(axis)) for axis in grid.T])

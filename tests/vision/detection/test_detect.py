@@ -6,14 +6,16 @@ import os
 import re
 import signal
 from collections.abc import Iterable, Iterator
+from concurrent.futures import Future
 from pathlib import Path
+from queue import Queue
 
 import cv2
 import numpy as np
 import pytest
 
-from ballfg.vision.detection.detect import detect, detect_all, learn_detector
-from ballfg.vision.detection.detections import Candidates
+from ballfg.vision.detection.detect import _told, detect, detect_all, learn_detector
+from ballfg.vision.detection.detections import Candidates, Detections
 from ballfg.vision.detection.video import Video, open_video
 from tests.places import DOCS
 from tests.vision.drawn import Film
@@ -126,3 +128,13 @@ def test_a_video_too_short_for_a_background_is_named(tmp_path: Path) -> None:
     writer.release()
     with pytest.raises(ValueError, match="video 'left' must have at least 3 frames"):
         learn_detector(open_video(path))
+
+
+def test_frames_are_counted_over_all_cameras_until_each_has_ended() -> None:
+    told: Queue[int | None] = Queue()
+    for done in (3, 2, None, 4, None):
+        told.put(done)
+    assert list(_told(told, [Future(), Future()])) == list(range(9))
+    failed: Future[Detections] = Future()
+    failed.set_exception(ValueError("no video"))
+    assert list(_told(told, [Future(), failed])) == []

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from ballfg.vision.detection.video import open_video
+from ballfg.vision.detection.video import Video, open_video
 
 SIZE = (64, 48)
 
@@ -158,3 +158,20 @@ def test_bad_folders_are_refused(tmp_path: Path) -> None:
     (folder / "shot5.png").write_text("no", encoding="utf-8")
     with pytest.raises(ValueError, match=r"shot5\.png must be readable"):
         list(open_video(folder, stamps(tmp_path / "s.csv", range(12))).frames())
+
+
+class Unreadable(Video):
+    """A recording none of whose frames can be decoded."""
+
+    def sample(self, count: int) -> list[np.ndarray]:
+        return []
+
+    def _decoded(self) -> Iterator[tuple[float, np.ndarray]]:
+        yield from ()
+
+
+def test_a_recording_without_a_readable_frame_has_none() -> None:
+    with pytest.raises(ValueError, match="it announces 30 frames and ends after 0"):
+        list(Unreadable(Path("a.mp4"), SIZE, 30, None).frames())
+    with pytest.raises(ValueError, match="has only 0 frames and the file 3 rows"):
+        list(Unreadable(Path("a.mp4"), SIZE, 30, np.arange(3.0)).frames())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +30,7 @@ from ballfg.vision.tracking.overlay import (
 )
 from ballfg.vision.tracking.pipeline import Tracking
 from ballfg.vision.tracking.strobe import HEIGHT, WIDTH, ZOOM, Strobe, tapped
-from ballfg.vision.tracking.view_painter import RING, bgr
+from ballfg.vision.tracking.view_painter import CAPTION, RING, bgr, caption
 
 SIZE = (640, 360)
 RATE = 100.0
@@ -219,6 +220,26 @@ def test_the_sheet_is_the_same_to_the_byte_and_has_a_row_a_track(tmp_path: Path)
         assert len(set(pages)) == 1
         heights.append(cv2.imread(str(tmp_path / "0.png")).shape[0])
     assert heights[1] > 1.6 * heights[0]
+
+
+def test_titles_of_the_sheet_are_alike_and_do_not_run_into_each_other() -> None:
+    figure = ContactSheet(made(2), RADIUS, 0.0, (-0.5, 0.5, -0.3, 0.3))._flights()
+    figure.draw_without_rendering()
+    places = [panel.title.get_window_extent() for panel in figure.axes]
+    assert len(places) == 8
+    assert len({panel.title.get_fontsize() for panel in figure.axes}) == 1
+    for one, other in itertools.combinations(places, 2):
+        assert not one.overlaps(other)
+    assert all(place.x0 >= 0.0 and place.x1 <= figure.bbox.x1 for place in places)
+
+
+def test_text_can_be_read_on_a_white_picture() -> None:
+    view = np.full((100, 300, 3), 255, np.uint8)
+    caption(view, "left   frame 3")
+    strip = view[:CAPTION]
+    assert strip.max() > 220  # the text, on less than half the brightness of the picture
+    assert 60 < np.median(strip) < 128
+    assert (view[CAPTION:] == 255).all()
 
 
 def test_of_many_tracks_some_are_shown() -> None:
