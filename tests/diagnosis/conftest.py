@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 import torch
+from matplotlib.figure import Figure
 from torch import Tensor
 
 from ballfg.diagnosis.fit.fit import first_guess, fit_model, fit_problem
@@ -127,6 +128,12 @@ def fitted_to_known(stretches: Stretches, *effects: Effect) -> Fit:
     """The fit of first states alone, with `known_ball`."""
     unknowns, noise = first_guess(problem := Problem(known_ball(*effects), stretches, {}), LABEL_NOISE, 60.0)
     return fit_problem(problem, unknowns, noise, settle_noise=False)
+
+
+@pytest.fixture
+def blank_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pictures of a page have their captions and are left blank: to draw them takes seconds."""
+    monkeypatch.setattr(Figure, "savefig", lambda *file, **options: None)
 
 
 @pytest.fixture(scope="session")

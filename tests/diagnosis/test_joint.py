@@ -22,7 +22,7 @@ def rooms(tmp_path_factory):
     effects = {"level": (), "leaning": (f"frame_tilt.x={TILT}",)}
     for seed, (name, own) in enumerate(effects.items()):
         ball = (f"drag_spin.gain={GAIN}",)
-        config = SimulationConfig(tracks=14, rate=60.0, seed=seed, undeclared=parse_effects((*ball, *own)))
+        config = SimulationConfig(tracks=10, rate=60.0, seed=seed, undeclared=parse_effects((*ball, *own)))
         write_simulation(folder / name, config)
     found = [read_dataset(folder / name) for name in effects]
     for dataset, name in zip(found, effects, strict=True):
@@ -64,6 +64,7 @@ def test_predictions_get_better_in_both_rooms(joint):
     assert len(joint.whole.before.by_track) == len(joint.whole.after.by_track)
 
 
+@pytest.mark.usefixtures("blank_pictures")
 def test_the_folder_holds_the_ball_and_the_rooms(joint, tmp_path):
     write_report(joint.whole, tmp_path / "out", joint.rooms)
     files = {path.name for path in (tmp_path / "out").iterdir() if path.is_file()}

@@ -17,7 +17,7 @@ from tests.faults import worker
 from tests.faults.worker import Worker, verdict
 from tests.places import ROOT
 
-SECONDS = 5
+SECONDS = 3
 
 
 def test_every_reader_refuses_damaged_files_in_one_line() -> None:

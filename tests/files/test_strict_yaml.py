@@ -85,9 +85,9 @@ def test_an_alias_counts_as_what_it_names() -> None:
 
 
 def test_what_is_long_is_named_by_its_beginning(tmp_path: Path) -> None:
-    content = "\n".join(f"k{i}: {{a: 1}}" for i in range(20_000))
-    with pytest.raises(ValueError, match=r"got k0, .*, k11 and 19988 more\. Add it\.") as caught:
-        check_keys("x", read_yaml(written(tmp_path, content)), [f"k{i}" for i in range(20_000)], ["wanted"])
+    content = "\n".join(f"k{i}: {{a: 1}}" for i in range(2_000))
+    with pytest.raises(ValueError, match=r"got k0, .*, k11 and 1988 more\. Add it\.") as caught:
+        check_keys("x", read_yaml(written(tmp_path, content)), [f"k{i}" for i in range(2_000)], ["wanted"])
     assert len(str(caught.value)) < 200
     assert (
         shown({"a": [[1] * 1000] * 1000})

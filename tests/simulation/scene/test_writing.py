@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
@@ -88,9 +89,8 @@ def test_the_same_recording_gives_the_same_bytes(scene: Path, recording: Recordi
         assert path.read_bytes() == (tmp_path / "again" / path.name).read_bytes(), path.name
 
 
-def test_images_lose_nothing_and_replace_videos(recording: Recording, tmp_path: Path) -> None:
-    folder = tmp_path / "scene"
-    write_scene(folder, recording)
+def test_images_lose_nothing_and_replace_videos(scene: Path, recording: Recording, tmp_path: Path) -> None:
+    folder = Path(shutil.copytree(scene, tmp_path / "scene"))
     (folder / "mine.txt").write_text("stays", encoding="utf-8")
     with pytest.raises(ValueError, match=r"holds a rendered scene\. Replace it with --force"):
         write_scene(folder, recording, images=True)
