@@ -167,5 +167,5 @@ def test_memory_does_not_grow_with_the_number_of_tracks() -> None:
         return size
 
     peak(8)  # warms up caches
-    few, many = (min(peak(tracks) for _ in range(2)) for tracks in (8, 40))  # of two: what is made once is no growth
+    few, many = (min(peak(tracks) for _ in range(2)) for tracks in (16, 48))  # of two: what is made once is no growth
     assert many < 1.3 * few
