@@ -11,6 +11,7 @@ OLDEST := tests/factors tests/files tests/importing/test_forms.py tests/live/tes
 	tests/vision/test_camera_file.py tests/cli/test_estimate.py tests/cli/test_show.py tests/simulation tests/test_front.py
 
 export OMP_NUM_THREADS ?= 1
+unexport PYTHONDONTWRITEBYTECODE  # interpreters that tests start compile the package once
 
 .PHONY: bench test check check-speed check-deps check-oldest docs package sbom readme fuzz mutants format clean
 
