@@ -322,3 +322,13 @@ def test_null_in_a_json_file_is_a_missing_sample(shots: list[Track], tmp_path: P
     (tmp_path / "shot.json").write_text(json.dumps(columns))
     (track,) = bf.import_tracks(tmp_path / "shot.json", table_height=TABLE)
     np.testing.assert_allclose(track.positions, np.delete(shot.positions, 3, axis=0), atol=1e-6)
+
+
+def test_a_unit_that_one_of_the_named_columns_has_is_that_of_all(shots: list[Track], tmp_path: Path) -> None:
+    rows = [
+        (shot.name, t, *p) for shot in shots for t, p in zip(shot.times, (1e3 * shot.positions).tolist(), strict=True)
+    ]
+    write_rows(tmp_path / "a.csv", "shot,t,left_x,left_y_mm,left_z_mm", rows)
+    named = {"x": "left_x", "y": "left_y_mm", "z": "left_z_mm"}
+    imported = propose(tmp_path / "a.csv", Choices(table_height=TABLE, columns=named)).info.imported
+    assert imported["unit of length"] == "mm (sure: named in the source, and the fall agrees)"
