@@ -48,6 +48,14 @@ def test_uncertain_takes_the_coefficients_that_vary() -> None:
     assert Settings.for_measured(AnalyticModel([EFFECTS["gravity"]()])).coefficients == {}
 
 
+def test_noise_that_nothing_has_is_raised_to_a_micrometre() -> None:
+    own = np.array([[0.0, 1.5e-6, 1e9]])
+    least, stated, most = sample_sigmas(Settings(), 1, own)[0].tolist()
+    assert 1e-7 < least <= 1e-6
+    assert stated == 1.5e-6
+    assert 100.0 < most < 1e6
+
+
 def test_a_track_s_own_sigmas_come_first_and_are_copied() -> None:
     settings = Settings(position_noise=(0.001, 0.002, 0.003))
     np.testing.assert_array_equal(sample_sigmas(settings, 2, None), [[0.001, 0.002, 0.003]] * 2)

@@ -16,6 +16,7 @@ import pytest
 import scipy.io
 
 import ballfg as bf
+from ballfg.importing import Choices, propose
 from ballfg.simulation import SimulationConfig, simulate
 from ballfg.tracks import Track, read_dataset
 from tests.commands import status
@@ -300,3 +301,34 @@ def test_the_same_bytes_again(shots: list[Track], tmp_path: Path) -> None:
         assert status("import", source, "--out", tmp_path / name, "--name", "shots") == 0
     for file in (tmp_path / "one").iterdir():
         assert file.read_bytes() == (tmp_path / "two" / file.name).read_bytes()
+
+
+def test_cells_that_are_no_numbers_are_told_of_columns_that_are_used(shots: list[Track], tmp_path: Path) -> None:
+    rows = [
+        [shot.name, t, *p, 0.5] for shot in shots[:2] for t, p in zip(shot.times, shot.positions.tolist(), strict=True)
+    ]
+    rows[5][4], rows[7][4], rows[9][5] = "blurred", "hidden", "warm"
+    write_rows(tmp_path / "shots.csv", "shot,t,x,y,z,temperature", rows)
+    notes = " ".join(propose(tmp_path / "shots.csv", Choices(table_height=TABLE)).notes)
+    assert "column 'z': 2 cells such as 'blurred' count as missing" in notes
+    assert "'temperature'" not in notes  # whose cells nobody needs
+
+
+def test_null_in_a_json_file_is_a_missing_sample(shots: list[Track], tmp_path: Path) -> None:
+    """Arrays side by side, as loggers write them; one coordinate of the fourth sample was not there."""
+    shot = shots[0]
+    columns = {"t": shot.times.tolist()} | {axis: shot.positions[:, i].tolist() for i, axis in enumerate("xyz")}
+    columns["y"][3] = None
+    (tmp_path / "shot.json").write_text(json.dumps(columns))
+    (track,) = bf.import_tracks(tmp_path / "shot.json", table_height=TABLE)
+    np.testing.assert_allclose(track.positions, np.delete(shot.positions, 3, axis=0), atol=1e-6)
+
+
+def test_a_unit_that_one_of_the_named_columns_has_is_that_of_all(shots: list[Track], tmp_path: Path) -> None:
+    rows = [
+        (shot.name, t, *p) for shot in shots for t, p in zip(shot.times, (1e3 * shot.positions).tolist(), strict=True)
+    ]
+    write_rows(tmp_path / "a.csv", "shot,t,left_x,left_y_mm,left_z_mm", rows)
+    named = {"x": "left_x", "y": "left_y_mm", "z": "left_z_mm"}
+    imported = propose(tmp_path / "a.csv", Choices(table_height=TABLE, columns=named)).info.imported
+    assert imported["unit of length"] == "mm (sure: named in the source, and the fall agrees)"

@@ -166,6 +166,8 @@ def test_wrong_shapes_are_refused_at_the_edge() -> None:
         tracker().push(0.0, [1.0, 2.0, 3.0], [0.1])
     with pytest.raises(ValueError, match="lag must be at least 0"):
         tracker(lag=-1.0)
+    with pytest.raises(ValueError, match="lag must be at least 0, at most 10; got 11"):  # it holds all samples back
+        tracker(lag=11.0)
 
 
 @pytest.mark.parametrize("seed", range(3))

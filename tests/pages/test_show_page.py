@@ -46,6 +46,15 @@ def test_the_data_are_those_of_the_files(made: Made, report: Path) -> None:
     assert "The model lacks wind" in page
 
 
+def test_no_number_has_more_digits_than_trackers_resolve(made: Made) -> None:
+    """Ten micrometres and microseconds of the shots, a micrometre of standard deviations: pages stay small."""
+    data = data_of(show_page(collect(recognise([made.dataset, made.states, made.predictions]))))
+    shots = [{key: columns for key, columns in shot.items() if key != "marks"} for shot in data["shots"]]
+    numbers = re.findall(r"\d\.(\d+)", json.dumps([shots, data["coverage"]]))
+    assert len(numbers) > 1000
+    assert max(map(len, numbers)) <= 6
+
+
 def test_nothing_is_loaded_and_plotly_is_there_once(made: Made) -> None:
     page = own_part(show_page(collect(recognise([made.dataset]))))
     assert not re.search(r"(src|href)\s*=|https?://|@import|url\(|fetch\(|XMLHttpRequest", page)

@@ -31,6 +31,20 @@ def test_noise_of_the_residuals_where_none_is_stated(tmp_path: Path) -> None:
     assert "states no noise" in shown.noise
 
 
+@pytest.mark.parametrize(
+    ("stated", "sigma"),
+    [("position: [0.001, 0.002, 0.004]", (0.001, 0.002, 0.004)), ("acceleration: 0.2", (NOISE, NOISE, NOISE))],
+)
+def test_noise_that_the_dataset_states_of_each_axis_comes_first(tmp_path: Path, stated: str, sigma: tuple) -> None:
+    made = make(tmp_path, {"a": Fall()})
+    file = made.dataset / "dataset.yaml"
+    file.write_text(file.read_text() + f"noise: {{{stated}}}\n")
+    shown = collect(recognise([made.dataset, made.states]))
+    np.testing.assert_allclose(shown.shots[0].noise, np.broadcast_to(sigma, (60, 3)))
+    x, y, z = (f"{1e3 * s:.2g}" for s in sigma)
+    assert f"those of dataset.yaml: {x} mm in x, {y} mm in y, {z} mm in z." in shown.noise
+
+
 def test_results_without_a_dataset(made: Made) -> None:
     shown = collect(recognise([made.predictions]))
     assert (shown.table, shown.coverage, shown.count) == (None, None, 3)

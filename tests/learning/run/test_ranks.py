@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -20,7 +21,7 @@ from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.run.checkpoint import read_checkpoint
 from ballfg.learning.run.launch import launch
 from ballfg.learning.run.metrics import read_metrics
-from ballfg.learning.run.ranks import Ranks, SharedMemory, Trouble
+from ballfg.learning.run.ranks import Ranks, SharedMemory, Trouble, join_ranks
 from ballfg.learning.run.training import run_training
 from ballfg.progress import progress
 from tests.faults.kills import in_fork
@@ -180,6 +181,21 @@ class Talk(Ranks):
 
     def gather(self, value: object) -> list[object]:  # type: ignore[override]
         return [value, *self.others]
+
+
+def test_torchrun_may_start_a_single_rank(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ctrl-C then stops it as it stops any program, while it runs and after it."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    for name, value in (("RANK", 0), ("WORLD_SIZE", 1), ("MASTER_ADDR", "127.0.0.1"), ("MASTER_PORT", port)):
+        monkeypatch.setenv(name, str(value))
+    before = signal.getsignal(signal.SIGINT)
+    with join_ranks() as ranks:
+        assert (ranks.rank, ranks.size) == (0, 1)
+        assert signal.getsignal(signal.SIGINT) is before
+    assert signal.getsignal(signal.SIGINT) is before
+    assert not torch.distributed.is_initialized()
 
 
 def test_memory_of_other_ranks_does_not_grow_old() -> None:

@@ -30,7 +30,7 @@ from ballfg.vision.tracking.overlay import (
 )
 from ballfg.vision.tracking.pipeline import Tracking
 from ballfg.vision.tracking.strobe import HEIGHT, WIDTH, ZOOM, Strobe, tapped
-from ballfg.vision.tracking.view_painter import CAPTION, RING, bgr, caption
+from ballfg.vision.tracking.view_painter import CAPTION, RING, ViewPainter, bgr, caption
 
 SIZE = (640, 360)
 RATE = 100.0
@@ -231,6 +231,25 @@ def test_titles_of_the_sheet_are_alike_and_do_not_run_into_each_other() -> None:
     for one, other in itertools.combinations(places, 2):
         assert not one.overlaps(other)
     assert all(place.x0 >= 0.0 and place.x1 <= figure.bbox.x1 for place in places)
+
+
+def test_a_trail_begins_with_its_ball_and_stays_a_moment_after_it() -> None:
+    painter, dark = ViewPainter(made(), 0, SIZE[0]), np.full((SIZE[1], SIZE[0], 3), 60, np.uint8)
+    before, after, gone = (painter.paint(dark, 55, time)[CAPTION:] for time in (0.05, 0.55, 0.85))
+    assert (before == 60).all()
+    assert (gone == 60).all()
+    u, v = RIG[0].project(centre(np.array([0.4])))[0].round().astype(int)
+    assert np.abs(after[v - CAPTION - 2 : v - CAPTION + 3, u].astype(int) - 60).max() > 60
+
+
+def test_a_candidate_that_is_no_ball_has_a_ring() -> None:
+    dark = np.full((SIZE[1], SIZE[0], 3), 60, np.uint8)
+    view = ViewPainter(replace(made(), balls=()), 0, SIZE[0]).paint(dark, 30, 0.3)
+    view[:CAPTION] = 60  # its text
+    changed = np.argwhere((view != 60).any(axis=-1))
+    place = RIG[0].project(centre(np.array([0.3])))[0][::-1]
+    assert len(changed) > 10
+    assert np.linalg.norm(changed - place, axis=1).max() < 8.0
 
 
 def test_text_can_be_read_on_a_white_picture() -> None:
