@@ -18,7 +18,7 @@ YOUNG = 20
 """Samples after a contact in which the estimate may still move it to another interval."""
 
 
-def explain(window: StreamWindow, samples: Sequence[Sample], events: EventTracker) -> list[Sample]:
+def explain(window: StreamWindow, samples: list[Sample], events: EventTracker) -> list[Sample]:
     """Lay the events over the samples; those from the first difference on are taken back and returned.
 
     Args: window: holds the first of the samples.  samples: that it is to hold.  events: found in them.

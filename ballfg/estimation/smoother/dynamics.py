@@ -51,7 +51,7 @@ class TrackDynamics:
                 groups["rest", 0].append(i)
             flying[i] = motion.linked and not motion.heights and motion.rest is None
         hit = np.array([i for i, motion in motions.items() if motion.hit], dtype=np.int64)
-        found = [self._flown(steps, flying, hit) for steps in self._flights]
+        found: list[DynamicsFactors] = [self._flown(steps, flying, hit) for steps in self._flights]
         for (sort, _), rows in groups.items():
             made = self._contacts if sort == "contact" else self._rests
             found.append(made(np.array(rows), [motions[i] for i in rows]))
