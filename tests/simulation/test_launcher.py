@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
 from ballfg.simulation import (
     SETTING_LEVELS,
@@ -144,3 +145,17 @@ def test_launcher_refuses_impossible_values() -> None:
         SimulatedLauncher(x=5.0)
     with pytest.raises(ValueError, match="launcher has no field 'hight'"):
         SimulatedLauncher().with_fields({"hight": 0.4})
+
+
+def test_shots_scatter_about_the_aim_to_all_sides() -> None:
+    """Directions by the aim's spread, speeds by theirs, around those of the level."""
+    launcher, n = SimulatedLauncher(), 4000
+    settings = torch.tensor([[0.0, 0.0, 10.0]], dtype=torch.float64).expand(n, 3).numpy()
+    states = launcher.launch(settings, 0.76, np.random.default_rng(6)).numpy()
+    speed = np.linalg.norm(states[:, 3:6], axis=1)
+    azimuth, elevation = np.arctan2(states[:, 4], states[:, 3]), np.arcsin(states[:, 5] / speed)
+    for angles in (azimuth, elevation):
+        assert angles.std() == pytest.approx(launcher.aim_spread, rel=4.0 / np.sqrt(2 * n))
+    assert abs(azimuth.mean()) < 4.0 * launcher.aim_spread / np.sqrt(n)
+    assert abs(np.corrcoef(azimuth, elevation)[0, 1]) < 4.0 / np.sqrt(n)
+    assert speed.std() / speed.mean() == pytest.approx(launcher.speed_spread, rel=4.0 / np.sqrt(2 * n))

@@ -162,3 +162,17 @@ def test_process_noise_is_that_of_the_estimators() -> None:
     declared = ProcessNoise(acceleration=0.7, spin=3.0).flight(np.array([dt]))[0]
     scale = np.sqrt(np.diagonal(declared))
     np.testing.assert_allclose(np.cov(drawn.T) / np.outer(scale, scale), declared / np.outer(scale, scale), atol=0.02)
+
+
+@pytest.mark.parametrize("name", ["acceleration", "spin"])
+def test_any_density_disturbs_the_flight(name: str) -> None:
+    noise = MotionNoise(**{name: 1e-3})
+    assert noise.in_flight
+    assert not noise.in_contact
+
+
+@pytest.mark.parametrize("name", ["contact_velocity", "contact_spin"])
+def test_any_kick_disturbs_contacts(name: str) -> None:
+    noise = MotionNoise(**{name: 1e-3})
+    assert noise.in_contact
+    assert not noise.in_flight
