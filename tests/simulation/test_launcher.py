@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
 from ballfg.simulation import (
     SETTING_LEVELS,
@@ -150,7 +149,7 @@ def test_launcher_refuses_impossible_values() -> None:
 def test_shots_scatter_about_the_aim_to_all_sides() -> None:
     """Directions by the aim's spread, speeds by theirs, around those of the level."""
     launcher, n = SimulatedLauncher(), 4000
-    settings = torch.tensor([[0.0, 0.0, 10.0]], dtype=torch.float64).expand(n, 3).numpy()
+    settings = np.tile([0.0, 0.0, 10.0], (n, 1))
     states = launcher.launch(settings, 0.76, np.random.default_rng(6)).numpy()
     speed = np.linalg.norm(states[:, 3:6], axis=1)
     azimuth, elevation = np.arctan2(states[:, 4], states[:, 3]), np.arcsin(states[:, 5] / speed)
