@@ -9,10 +9,12 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
 from ballfg.files.damaged import FREE, check_unpacked, library_reads
+from ballfg.importing.formats.containers import read_hdf5
 from tests.faults import worker
 from tests.faults.worker import Worker, verdict
 from tests.places import ROOT
@@ -88,6 +90,17 @@ def test_what_a_file_unpacks_to_is_bounded(tmp_path: Path) -> None:
     check_unpacked(path, FREE + 100_000)
     with pytest.raises(ValueError, match=r"a\.npz must unpack to at most 64 MB, .*; it says 80000 MB"):
         check_unpacked(path, 80_000_000_000)
+
+
+def test_empty_data_of_any_size_are_not_made(tmp_path: Path) -> None:
+    """HDF5 keeps no room for what nobody has written; together these would take 96 MB, and say so in 3 kB."""
+    path = tmp_path / "a.h5"
+    with h5py.File(path, "w") as file:
+        for name in ("t", "x", "y"):
+            file.create_dataset(name, shape=(4_000_000,), dtype="f8")
+    assert path.stat().st_size < 10_000
+    with pytest.raises(ValueError, match=r"a\.h5 must unpack to at most 64 MB"):
+        read_hdf5(path)
 
 
 def test_a_librarys_error_becomes_one_line(tmp_path: Path) -> None:
