@@ -74,8 +74,8 @@ def whiteness(fit: Fit, system: System, tracker: TrackNoise | None = None) -> Wh
         kernel = _kernel(stretches.times.numpy(), kept, reach)
         total, variance, third = _summed(residual, taken, kept, kernel)
         sums.append(total)
-        spreads.append(np.sqrt(variance))
-        p_values.append(float(stats.pearson3.sf(total / np.sqrt(variance), third / variance**1.5)))
+        spreads.append(np.sqrt(max(variance, 0.0)))
+        p_values.append(_p_value(total, variance, third))
         products.append(total / (3.0 * kernel.sum()))
     most = int(np.argmin(p_values))
     sigma = float(np.sqrt((fit.sigmas[stretches.used.numpy()] ** 2).mean()))
@@ -86,6 +86,13 @@ def whiteness(fit: Fit, system: System, tracker: TrackNoise | None = None) -> Wh
         explained=np.array(sums),
         spread=np.array(spreads),
     )
+
+
+def _p_value(total: float, variance: float, third: float) -> float:
+    """That sums as large as this come by chance; 1 where the fit has taken up all that could scatter."""
+    if not variance > 0.0:
+        return 1.0
+    return float(stats.pearson3.sf(total / np.sqrt(variance), third / variance**1.5))
 
 
 def _whitened(fit: Fit, system: System, kept: Mask, tracker: TrackNoise) -> System:

@@ -24,6 +24,8 @@ FLOOR = 2e-4
 """m. No tracker of flying balls is better; identical or computed positions would give zero."""
 FALLBACK = 2e-3
 """m. Assumed where no track has a window: the noise of a camera tracker in a room."""
+LEAST_LEFT = 1e-6
+"""Share of a sample's variance that a fit leaves, at least: a sample far from all others determines the cubic alone."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal variable divided by the median of its absolute value."""
 
@@ -72,7 +74,8 @@ def _window_residuals(times: Array, positions: Array) -> Array:
     basis, _ = np.linalg.qr(scaled[..., None] ** np.arange(DEGREE + 1))
     leverage = np.einsum("wij,wij->wi", basis, basis)
     residuals = values - basis @ (basis.transpose(0, 2, 1) @ values)
-    scaled_residuals: Array = residuals / np.sqrt(1.0 - leverage)[..., None].clip(min=1e-3)
+    left = np.sqrt((1.0 - leverage).clip(min=LEAST_LEFT))  # rounding may take it below zero
+    scaled_residuals: Array = residuals / left[..., None]
     return scaled_residuals
 
 

@@ -7,9 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy import stats
 
 from ballfg.diagnosis.remains.generic import ALARM, generic_tests
-from ballfg.diagnosis.remains.whiteness import _summed, whiteness
+from ballfg.diagnosis.remains.whiteness import _p_value, _summed, whiteness
 from ballfg.tracks import TrackNoise
 from tests.diagnosis.conftest import POSITION_NOISE
 
@@ -81,3 +82,9 @@ def test_a_force_that_is_lacking_stays_a_pattern(make_ball, make_launches, make_
     windy = make_ball(wind={"x": 0.0, "y": 0.9, "z": 0.0})
     fit = make_fit(make_ball(), wandering(make_shots(windy, make_launches(12, 83), 83).stretches, 5))
     assert min(t.p_value for t in generic_tests(fit, tracker=TRACKER)) < ALARM
+
+
+def test_a_fit_that_takes_up_everything_leaves_nothing_to_test() -> None:
+    """By rounding the variance of what is left may come out below zero."""
+    assert _p_value(1e-14, -1e-12, 0.0) == _p_value(0.0, 0.0, 0.0) == 1.0
+    assert _p_value(3.0, 1.0, 0.0) == pytest.approx(stats.norm.sf(3.0), rel=1e-9)

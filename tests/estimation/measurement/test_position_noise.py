@@ -60,3 +60,14 @@ def test_nothing_to_see_gives_the_fallback(n):
     assert np.array_equal(estimate_position_noise([bouncing(np.random.default_rng(0), n=n)]), np.full(3, FALLBACK))
     slow = Track(np.arange(50) * 1.0, np.zeros((50, 3)))
     assert np.array_equal(estimate_position_noise([slow]), np.full(3, FALLBACK))
+
+
+def test_a_sample_far_from_all_others_leaves_a_number() -> None:
+    """It determines the cubic through its window alone: rounding took what is left of it below zero."""
+    rng = np.random.default_rng(0)
+    for alone in (1e-3, 0.05, 0.29):
+        times = np.concatenate((np.arange(10) * 1e-6, [alone], alone + 0.2 + np.arange(10) * 1e-6))
+        track = Track(times, rng.normal(0.0, 1.0, (len(times), 3)))
+        sigma = estimate_position_noise([track])
+        assert np.isfinite(sigma).all()
+        assert (sigma > 0.0).all()
