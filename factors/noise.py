@@ -55,7 +55,10 @@ class ProcessNoise:
         return along_all_axes(self.flight_along_one(dt))
 
     def flight_along_one(self, dt: Array) -> Array:
-        """(n, 3, 3) the same of position, velocity and spin along one axis; all axes are alike and independent."""
+        """(n, 3, 3) the same of position (m), velocity (m/s) and spin (rad/s) along one axis, over dt (n,) s.
+
+        All axes are alike and independent.
+        """
         return _white_acceleration(dt, self.acceleration, self.spin)
 
     def contact(self, dt: Array, time: Array) -> Array:
