@@ -14,9 +14,9 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 AHEAD: Final = 3
-"""Chunks per worker that were handed over and not yet taken back. Memory is bounded by them."""
+"""Chunks per worker that were handed over and are not done."""
 HELPED: Final = 8
-"""Chunks that the process that asks computes ahead of what is taken, besides."""
+"""Chunks that are done and not yet taken, besides. Memory is bounded by both."""
 LOOK: Final = 0.02
 """s between two looks at what has finished."""
 
@@ -44,7 +44,8 @@ def in_order(
 ) -> Iterator[R]:
     """The results of chunks, one after the other, in the order of the stream.
 
-    However slowly they are taken, no more than `AHEAD` chunks per worker and `HELPED` more are begun.
+    However slowly they are taken, no more than `AHEAD` chunks per worker and `HELPED` more are begun; and no worker has
+    more than `AHEAD` before it.
 
     Args: function: of a chunk; gives its results.  chunks: a stream.  executor: computes them.
     Raises: what the function raises.
@@ -53,9 +54,11 @@ def in_order(
     pending: deque[Pending] = deque()
     try:
         while True:
-            most = AHEAD * executor.slots
-            while len(pending) < most and (chunk := next(chunks, None)) is not None:
+            # what is done and waits behind an earlier chunk must not keep new ones from the workers
+            most, away = AHEAD * executor.slots, sum(not one.done() for one in pending)
+            while away < most and len(pending) < most + HELPED and (chunk := next(chunks, None)) is not None:
                 pending.append(send(chunk))
+                away += 1
             if not pending:
                 return
             if executor.helped and len(pending) < most + HELPED and not pending[0].done():
