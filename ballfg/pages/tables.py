@@ -89,7 +89,7 @@ def read_table(path: Path, kind: Kind) -> ResultTable:
                 column_types=types, include_columns=names, strings_can_be_null=False, null_values=["", "nan", "NaN"]
             )
             found = pa_csv.read_csv(path, convert_options=options)
-    except (pa.ArrowException, OSError) as error:
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} must hold a number in each cell; {one_line(error)[:160]}. Correct it.") from None
     values = np.column_stack([found[name].to_numpy().astype(np.float64) for name in names[1:]])
     if not len(values):

@@ -110,7 +110,7 @@ class ParquetRows(RowSource):
         try:
             about = pq.read_metadata(path)
             schema = about.schema.to_arrow_schema()
-        except (pa.ArrowException, OSError) as error:
+        except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
             raise ValueError(f"{path}: must be a Parquet file; {one_line(error)}. Write it again.") from None
         check_unpacked(path, 8 * about.num_rows * about.num_columns)
         super().__init__(path, schema.names)
@@ -131,7 +131,7 @@ class ParquetRows(RowSource):
                 for batch in file.iter_batches(_PARQUET_BLOCK, columns=names, use_threads=False):
                     yield _block(batch.select(names), start)
                     start += batch.num_rows
-        except (pa.ArrowException, OSError) as error:
+        except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
             raise ValueError(
                 f"{self.path}: cannot be read as a table of tracks; {one_line(error)}. Write it again."
             ) from None
