@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 
-from ballfg.checks import did_you_mean, listed, shown
+from ballfg.checks import did_you_mean, listed, short_text, shown
 from ballfg.importing.choices import Choices, UndecidedError
 from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
 from ballfg.importing.names import Meaning, meanings
@@ -132,10 +132,11 @@ def _places(
     chosen = {axis: given.get(axis, best[0][axis][0]) for axis in "xyz"}
     found_units = {meaning.unit for _, meaning in best[0].values()}
     if len(found_units) > 1:
+        units = sorted(short_text(str(unit)) for unit in found_units)
         raise UndecidedError(
-            f"{table.where}: x, y and z must have one unit; their names state {', '.join(map(str, found_units))}",
+            f"{table.where}: x, y and z must have one unit; their names state {', '.join(units)}",
             "length",
-            tuple(str(unit) for unit in found_units if unit),
+            [unit for unit in units if unit != "None"],
         )
     return (chosen["x"], chosen["y"], chosen["z"]), found_units.pop()
 
