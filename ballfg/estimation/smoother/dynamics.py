@@ -11,7 +11,7 @@ from ballfg.arrays import Array, Index
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import steps_over_each
 from ballfg.estimation.segmentation import Segmentation
-from ballfg.estimation.smoother.motion import Motion, eventful_motions
+from ballfg.estimation.smoother.motion import Motion, eventful_motions, kicks_of
 from ballfg.factors.dynamics import ContactFactors, DynamicsFactors, FlightFactors, RestFactors
 from ballfg.factors.noise import Kicks, ProcessNoise
 
@@ -77,6 +77,5 @@ class TrackDynamics:
     def _kicked(self, rows: Index, motions: list[Motion]) -> tuple[Kicks, Array]:
         """Contacts and hits of some intervals, as many contacts in each, and the process noise with them."""
         dt = self.dt[rows]
-        times = np.array([m.kick_times(float(t)) for m, t in zip(motions, dt, strict=True)])
-        kicks = Kicks(times, np.array([m.hit for m in motions]))
+        kicks = kicks_of(motions, dt)
         return kicks, self.noise.flight(dt) + self.noise.kicks(dt, kicks)

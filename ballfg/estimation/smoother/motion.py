@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.segmentation import Contact, Segmentation
-from ballfg.factors.noise import ProcessNoise
+from ballfg.factors.noise import Kicks, ProcessNoise
 
 
 @dataclass(frozen=True)
@@ -40,18 +41,19 @@ class Motion:
 
     def covariance(self, dt: Array, noise: ProcessNoise) -> Array:
         """(1, 9, 9) process noise over dt (1,) s: flight, each contact's kick, a hit at an unknown time."""
-        covariance = noise.flight(dt)
-        for time in self.kick_times(float(dt[0])):
-            covariance += noise.contact(dt, np.array([time]))
-        if self.hit:
-            covariance += noise.hit(dt)
-        return covariance
+        return noise.flight(dt) + noise.kicks(dt, kicks_of([self], dt))
 
 
 FLIGHT = Motion()
 KICK_PARTS = 64
 """Of an interval, in which contact times enter the process noise. Finer, and an estimate would depend on how a
 segmentation rounds, which knows the axes of the frame: with these parts it turns with the data."""
+
+
+def kicks_of(motions: Sequence[Motion], dt: Array) -> Kicks:
+    """The contacts and hits of m motions with as many contacts each, over dt (m,) s."""
+    times = [motion.kick_times(duration) for motion, duration in zip(motions, dt.tolist(), strict=True)]
+    return Kicks(np.array(times), np.array([motion.hit for motion in motions]))
 
 
 def motions_of(segmentation: Segmentation, times: Array) -> list[Motion]:
