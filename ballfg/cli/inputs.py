@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
 
 import typer
 
+from ballfg.checks import shown
 from ballfg.cli.errors import NOT_ESTIMATED
 from ballfg.machine import usable_cores
 from ballfg.progress import progress
@@ -266,7 +267,7 @@ class Outcome:
         for note in notes:
             self.doubtful += 1
             if self.doubtful <= MOST_DOUBTS:
-                self.doubts.append(f"track {name!r}: {note}")
+                self.doubts.append(f"track {shown(name)}: {note}")
         if outside is not None:
             self.outside, self.far, self.shares = self.outside + 1, self.far + (outside > 0.5), self.shares + outside
 

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.checks import listed
+from ballfg.checks import listed, shown
 from ballfg.importing.choices import Choices, Guess, UndecidedError
 from ballfg.importing.columns import Roles, roles_of
 from ballfg.importing.fall import TIMES
@@ -139,7 +139,7 @@ def split(shots: list[Shot], roles: Roles, frame: Frame, choices: Choices) -> tu
             f"--split-gap {choices.split_gap:g}",
         )
     if roles.trajectory is not None:
-        why = f"one for each value of {roles.trajectory!r}"
+        why = f"one for each value of {shown(roles.trajectory)}"
         return shots, Guess("shots", str(count), why, "sure", f"--columns trajectory={roles.trajectory}")
     steps = [np.diff(shot.stamps).astype(np.float64) * unit for shot in shots]
     typical = float(np.median(np.concatenate(steps)))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import listed
+from ballfg.checks import listed, shown
 from ballfg.importing.choices import Choices, UndecidedError
 from ballfg.importing.columns import Roles
 from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
@@ -161,8 +161,8 @@ def _stamps(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> 
     stamps = as_stamps(column)
     if stamps is None:
         raise UndecidedError(
-            f"{table.where}: the column of times, {roles.time[0]!r}, must hold numbers or dates; it holds "
-            f"{str(column[0])[:30]!r}",
+            f"{table.where}: the column of times, {shown(roles.time[0])}, must hold numbers or dates; it holds "
+            f"{shown(str(column[0])[:30])}",
             "columns",
             (),
             "t=NAME",

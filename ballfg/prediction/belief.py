@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from ballfg.arrays import Array
+from ballfg.checks import shown
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.model import BallModel
 from ballfg.prediction.state import BallState
@@ -57,7 +58,7 @@ class Belief:
             own = state.coefficient_names
             if not set(own) <= set(names) or (coefficients is None and own != names):
                 raise ValueError(
-                    f"states must share their coefficients; that of track {state.name!r} has {list(own)}, "
+                    f"states must share their coefficients; that of track {shown(state.name)} has {list(own)}, "
                     f"not {list(names)}. Make them with the same settings."
                 )
         bounded = AugmentedModel(model, names) if names else model

@@ -55,11 +55,11 @@ def check_header(path: Path, header: Sequence[str], required: Sequence[str], kno
             if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
                 hint += " Cells must be separated by commas."
             raise ValueError(
-                f"{path}: column {name!r} is missing; {expected}got {got}. Add or rename the column.{hint}"
+                f"{path}: column {shown(name)} is missing; {expected}got {got}. Add or rename the column.{hint}"
             )
     for name in known:
         if list(header).count(name) > 1:
-            raise ValueError(f"{path}: column {name!r} must appear once; got {got}. Rename one of them.")
+            raise ValueError(f"{path}: column {shown(name)} must appear once; got {got}. Rename one of them.")
 
 
 def convert_options(texts: Sequence[str], numbers: Sequence[str]) -> pa_csv.ConvertOptions:

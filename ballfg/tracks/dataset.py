@@ -115,7 +115,9 @@ class Dataset(TrackFolder):
             for track in self:
                 if track.name == name:
                     return track
-        raise ValueError(f"name must be one of the {len(self)} trajectories of {self.path}; got {name!r}. See names.")
+        raise ValueError(
+            f"name must be one of the {len(self)} trajectories of {self.path}; got {shown(name)}. See names."
+        )
 
 
 def has_positions(folder: str | PathLike[str]) -> bool:

@@ -89,7 +89,7 @@ def read_sightings(
     if doubles:
         notes.append(f"{path.name}: {doubles} candidates with a lower score than another of the same ball left out")
     for number, camera in enumerate(time_offsets):
-        check_step(f"{path}, camera {camera!r}", np.unique(table.values["t"][rows][table.camera[rows] == number]))
+        check_step(f"{path}, camera {shown(camera)}", np.unique(table.values["t"][rows][table.camera[rows] == number]))
     offsets = np.array(list(time_offsets.values()))
     rows = rows[np.argsort((table.values["t"] - offsets[table.camera])[rows], kind="stable")]
     found = {}
@@ -232,4 +232,4 @@ def seen_columns(times: Array, camera: ArrayLike, pixels: Array, spread: Array) 
 def _place(path: Path, lines: NDArray[np.int64], column: str) -> str:
     """The first of some rows of the file, and the column, for a message."""
     (line,) = csv_files.lines_of_rows(path, [int(lines[0])])
-    return f"{path}, line {line}, column {column!r}:"
+    return f"{path}, line {line}, column {shown(column)}:"

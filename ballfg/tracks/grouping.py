@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
+from ballfg.checks import shown
 from ballfg.tracks.csv_files import no_rows
 from ballfg.tracks.rows import Block, RowSource
 
@@ -99,7 +100,7 @@ def check_cells(source: RowSource, block: Block) -> None:
             row = block.start + int(np.argmax(block.codes == code))
             raise ValueError(
                 f"{source.where(row)}, column 'trajectory': must name the trajectory in printable text; "
-                f"got {name or ''!r}. Fill in a name."
+                f"got {shown(name or '')}. Fill in a name."
             )
     bad = ~(np.abs(block.values) <= LARGEST)
     sigmas = block.values[:, 4:]
@@ -112,7 +113,7 @@ def check_cells(source: RowSource, block: Block) -> None:
         if column >= 4:
             rule = f"a standard deviation of {MIN_SIGMA:g} to {MAX_SIGMA:g} m"
             remedy = "Correct it, or drop the sigma columns."
-        place = f"{source.where(block.start + row)}, column {source.columns[column]!r}"
+        place = f"{source.where(block.start + row)}, column {shown(source.columns[column])}"
         raise ValueError(f"{place}: must be {rule}; got {value:g}. {remedy}")
 
 

@@ -251,5 +251,5 @@ def _need(content: Mapping[str, Any], key: str, prefix: str) -> None:
     if content.get(key) is not None:
         return
     found = nearest(key, (str(name) for name in content if name not in _KNOWN))
-    remedy = f"Add it, or rename {found!r}." if found else "Add it."
+    remedy = f"Add it, or rename {shown(found)}." if found else "Add it."
     raise ValueError(f"{prefix}{key} is required; got {listed(content)}. {remedy}")

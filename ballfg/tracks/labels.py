@@ -105,7 +105,7 @@ def _column(path: Path, name: str, cells: list[str], lines: list[int]) -> list[L
     for value, line in zip(values, lines, strict=True):
         if name in SPIN_LABELS and isinstance(value, float) and abs(value) > FASTEST_SPIN:
             raise ValueError(
-                f"{path}, line {line}, column {name!r}: must be within {FASTEST_SPIN:g} rad/s, as the spin of every "
-                f"ball; got {value:g}. Correct it, or leave the cell empty if it is unknown."
+                f"{path}, line {line}, column {shown(name)}: must be within {FASTEST_SPIN:g} rad/s, as the spin of "
+                f"every ball; got {value:g}. Correct it, or leave the cell empty if it is unknown."
             )
     return values

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ballfg.checks import shown
 from ballfg.tracks.checks import Findings
 from ballfg.tracks.dataset import Dataset, check_group
 from ballfg.tracks.grouping import groups, scan
@@ -38,7 +39,7 @@ class MemoryRows(RowSource):
     def where(self, *rows: int) -> str:
         """The tracks that hold these rows."""
         places = np.searchsorted(self._starts, rows, side="right") - 1
-        return " and ".join(dict.fromkeys(f"track {self._tracks[int(place)].name!r}" for place in places))
+        return " and ".join(dict.fromkeys(f"track {shown(self._tracks[int(place)].name)}" for place in places))
 
 
 def dataset_in_memory(info: DatasetInfo, tracks: Sequence[Track], notes: Sequence[str] = ()) -> Dataset:
@@ -57,7 +58,7 @@ def dataset_in_memory(info: DatasetInfo, tracks: Sequence[Track], notes: Sequenc
     names = Counter(track.name for track in tracks)
     name, count = names.most_common(1)[0]
     if count > 1:
-        raise ValueError(f"track names must be unique; got {name!r} twice. Rename one of them.")
+        raise ValueError(f"track names must be unique; got {shown(name)} twice. Rename one of them.")
     source = MemoryRows(tracks)
     index = scan(source)
     findings = Findings()

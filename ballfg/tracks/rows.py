@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import one_line
+from ballfg.checks import one_line, shown
 from ballfg.files.damaged import check_unpacked
 from ballfg.tracks import csv_files
 
@@ -118,7 +118,8 @@ class ParquetRows(RowSource):
             kind = schema.field(name).type
             if not (pa.types.is_floating(kind) or pa.types.is_integer(kind) or pa.types.is_decimal(kind)):
                 raise ValueError(
-                    f"{path}, column {name!r}: must hold numbers; got type {kind}. Convert it to float64 (SI units)."
+                    f"{path}, column {shown(name)}: must hold numbers; got type {kind}. "
+                    "Convert it to float64 (SI units)."
                 )
 
     def blocks(self) -> Iterator[Block]:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import check_array
+from ballfg.checks import check_array, shown
 
 ROUNDING = 1e-6
 """Relative to the trace: a covariance that was computed in single precision is symmetric up to this."""
@@ -74,7 +74,7 @@ class Sightings:
             if wrong.size:
                 first, second = (int(row) for row in rows[wrong[0] : wrong[0] + 2])
                 raise ValueError(
-                    f"times of camera {name!r} must increase; times[{second}]={self.times[second]} <= "
+                    f"times of camera {shown(name)} must increase; times[{second}]={self.times[second]} <= "
                     f"times[{first}]={self.times[first]}. Sort the rows, and keep one sighting a frame."
                 )
 

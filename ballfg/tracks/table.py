@@ -15,6 +15,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 from numpy.typing import ArrayLike
 
+from ballfg.checks import shown
 from ballfg.files.whole_file import check_file, whole_file
 
 ENDINGS = (".csv", ".parquet")
@@ -120,7 +121,9 @@ def _batch(columns: Mapping[str, ArrayLike]) -> pa.RecordBatch:
     arrays = {name: np.asarray(values) for name, values in columns.items()}
     for name, array in arrays.items():
         if array.ndim > 1:
-            raise ValueError(f"columns[{name!r}] must have shape (n,); got {array.shape}. Pass one column at a time.")
+            raise ValueError(
+                f"columns[{shown(name)}] must have shape (n,); got {array.shape}. Pass one column at a time."
+            )
     lengths = {name: len(array) for name, array in arrays.items() if array.ndim == 1}
     if len(set(lengths.values())) > 1:
         raise ValueError(f"columns must have one length; got {lengths}. Pass one value per row.")
@@ -138,10 +141,10 @@ def _arrow(name: str, array: np.ndarray, count: int) -> pa.Array:
     elif array.dtype.kind in "OU":
         wrong = [value for value in array.ravel().tolist() if not isinstance(value, str)]
         if wrong:
-            raise ValueError(f"columns[{name!r}] must hold numbers or text; got {wrong[0]!r}. Convert it.")
+            raise ValueError(f"columns[{shown(name)}] must hold numbers or text; got {shown(wrong[0])}. Convert it.")
         array = array.astype(object)
     elif array.dtype.kind != "b":
-        raise ValueError(f"columns[{name!r}] must hold numbers or text; got dtype {array.dtype}. Convert it.")
+        raise ValueError(f"columns[{shown(name)}] must hold numbers or text; got dtype {array.dtype}. Convert it.")
     kind = pa.string() if array.dtype.kind == "O" else None
     if array.ndim == 0:
         return pa.repeat(pa.scalar(array.item(), type=kind or pa.from_numpy_dtype(array.dtype)), count)
@@ -158,7 +161,7 @@ def _conformed(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:
     for name, got, want in zip(schema.names, batch.schema.types, schema.types, strict=True):
         if got != want and not (pa.types.is_integer(got) and pa.types.is_floating(want)):
             raise ValueError(
-                f"columns[{name!r}] must be {want} as in the first block; got {got}. Convert it, or write floats from "
-                "the start."
+                f"columns[{shown(name)}] must be {want} as in the first block; got {got}. Convert it, or write floats "
+                "from the start."
             )
     return batch if batch.schema == schema else batch.cast(schema)

@@ -218,8 +218,8 @@ def _checked_labels(track: str, labels: Mapping[str, Label]) -> dict[str, Label]
         elif isinstance(value, int | float | np.integer | np.floating) and np.isfinite(value):
             if key in SPIN_LABELS and abs(value) > FASTEST_SPIN:
                 raise ValueError(
-                    f"track {track!r}: label {key!r} must be within {FASTEST_SPIN:g} rad/s, as the spin of every ball; "
-                    f"got {value:g}. Correct it, or leave it out if it is unknown."
+                    f"track {shown(track)}: label {shown(key)} must be within {FASTEST_SPIN:g} rad/s, as the spin "
+                    f"of every ball; got {value:g}. Correct it, or leave it out if it is unknown."
                 )
             checked[key] = float(value)
         else:

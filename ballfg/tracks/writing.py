@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Final, Literal, TextIO
 
 from ballfg.arrays import Array
+from ballfg.checks import shown
 from ballfg.files.whole_folder import whole_folder
 from ballfg.tracks.checks import check_scale
 from ballfg.tracks.dataset import TRACK_FILES
@@ -82,20 +83,20 @@ def _write_tracks(path: Path, info: DatasetInfo, tracks: Iterable[Track], spool:
 
 def _check_track(track: Track, names: set[str], info: DatasetInfo, has_sigmas: bool) -> None:
     if track.name in names:
-        raise ValueError(f"track names must be unique; got {track.name!r} twice. Rename one of them.")
+        raise ValueError(f"track names must be unique; got {shown(track.name)} twice. Rename one of them.")
     if len(track) < 2:
-        raise ValueError(f"track {track.name!r} must have at least two samples; got one. Leave it out.")
+        raise ValueError(f"track {shown(track.name)} must have at least two samples; got one. Leave it out.")
     if (track.sigmas is not None) != has_sigmas:
         raise ValueError(
-            f"tracks must have sigmas all or none; {track.name!r} differs from the first. "
+            f"tracks must have sigmas all or none; {shown(track.name)} differs from the first. "
             "Set sigmas=None in all of them, or give them all."
         )
     if track.sigmas is not None and not (MIN_SIGMA <= track.sigmas.min() <= track.sigmas.max() <= MAX_SIGMA):
         raise ValueError(
-            f"track {track.name!r}: sigmas must be {MIN_SIGMA:g} to {MAX_SIGMA:g} m; "
+            f"track {shown(track.name)}: sigmas must be {MIN_SIGMA:g} to {MAX_SIGMA:g} m; "
             f"got {track.sigmas.min():g} to {track.sigmas.max():g}. Correct them or set sigmas=None."
         )
-    check_scale(f"track {track.name!r}", track.times, track.positions, track.sigmas, info.rate)
+    check_scale(f"track {shown(track.name)}", track.times, track.positions, track.sigmas, info.rate)
 
 
 def _columns(track: Track) -> dict[str, Array | str]:

@@ -98,7 +98,7 @@ def write_opencv(path: str | PathLike[str], cameras: Iterable[Camera], *, posed:
         if not (plain.isascii() and plain.isalnum() and plain[0].isalpha()):
             raise ValueError(
                 f"names of cameras must be letters, digits, - and _, a letter first, in OpenCV's files; "
-                f"got {camera.name!r}. Rename it, or write cameras.yaml."
+                f"got {shown(camera.name)}. Rename it, or write cameras.yaml."
             )
     with whole_file(path) as temporary:
         storage = cv2.FileStorage(str(temporary), cv2.FILE_STORAGE_WRITE)

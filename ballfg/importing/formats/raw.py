@@ -8,6 +8,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.checks import shown
+
 Column = NDArray[Any]
 """(n,) int64, float64 or object (text)."""
 
@@ -58,7 +60,7 @@ class RawTable:
         found = {}
         for name, text in self.texts.items():
             wrong = [cell for cell in text.tolist() if cell.lower() not in MISSING and _real(cell) is None]
-            found[name] = f"column {name!r}: {len(wrong)} cells such as {wrong[0]!r} count as missing"
+            found[name] = f"column {shown(name)}: {len(wrong)} cells such as {shown(wrong[0])} count as missing"
         return found
 
     def __len__(self) -> int:

@@ -7,6 +7,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
+from ballfg.checks import shown
 from ballfg.importing.formats.containers import read_bag, read_excel, read_hdf5, read_npz, read_parquet
 from ballfg.importing.formats.matlab import read_matlab
 from ballfg.importing.formats.nested import nested_tables
@@ -53,7 +54,7 @@ def tables_of(data: Any, topic: str | None = None, key: str | None = None) -> li
         table for table in found if key in f"{table.source}/{table.name}"
     ]
     if not chosen:
-        raise ValueError(f"--key must name a table of the source; got {key!r}, there are {_listed(found)}.")
+        raise ValueError(f"--key must name a table of the source; got {shown(key)}, there are {_listed(found)}.")
     return chosen
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
+from ballfg.checks import shown
 from ballfg.vision.arrays import Image
 from ballfg.vision.detection.video import IMAGE_ENDINGS
 
@@ -107,7 +108,7 @@ class Charuco(_Squares):
             )
         if self.dictionary not in DICTIONARIES:
             raise ValueError(
-                f"dictionary must be one of {', '.join(DICTIONARIES)}; got {self.dictionary!r}. Choose one."
+                f"dictionary must be one of {', '.join(DICTIONARIES)}; got {shown(self.dictionary)}. Choose one."
             )
         needed, there = self.columns * self.rows // 2, len(_dictionary(self.dictionary).bytesList)
         if there < needed:

@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.checks import shown
 from ballfg.vision.calibration.table_points import Marked
 from ballfg.vision.camera import Camera
 
@@ -74,14 +75,14 @@ def calibrate_extrinsics(lens: Camera, marked: Marked) -> Extrinsics:
     above = [camera for camera in poses if not flat or _is_above(camera, marked.points)]
     if not above:
         raise ValueError(
-            f"camera {lens.name!r}: points must be seen from above; these are mirrored, as if seen from below. "
+            f"camera {shown(lens.name)}: points must be seen from above; these are mirrored, as if seen from below. "
             "Swap left and right, or correct the points."
         )
     best = Extrinsics(above[0], marked, np.zeros((6, 6)))
     _check_fit(best)
     if len(above) > 1 and _squares(above[1], marked) - _squares(above[0], marked) < CLEARLY and _apart(*above[:2]):
         raise ValueError(
-            f"camera {lens.name!r}: points must tell one pose; two explain them alike. "
+            f"camera {shown(lens.name)}: points must tell one pose; two explain them alike. "
             "Mark more points, farther apart or at other heights."
         )
     return replace(best, covariance=_covariance(best))
@@ -91,21 +92,21 @@ def _check_points(lens: Camera, marked: Marked) -> bool:
     """Whether the points lie in a plane; refuses those that cannot tell a pose."""
     if len(marked.points) < MIN_POINTS:
         raise ValueError(
-            f"camera {lens.name!r}: at least {MIN_POINTS} points must be marked; got {len(marked.points)} "
+            f"camera {shown(lens.name)}: at least {MIN_POINTS} points must be marked; got {len(marked.points)} "
             f"({', '.join(marked.names)}). Mark more."
         )
     inside = ((marked.pixels >= -0.5) & (marked.pixels <= np.array(lens.size) - 0.5)).all(axis=1)
     if not inside.all():
         first = int(np.argmin(inside))
         raise ValueError(
-            f"camera {lens.name!r}: pixels must lie in the image of {lens.size[0]}x{lens.size[1]}; "
+            f"camera {shown(lens.name)}: pixels must lie in the image of {lens.size[0]}x{lens.size[1]}; "
             f"{marked.names[first]} is at {marked.pixels[first].tolist()}. Correct it, or the camera's size."
         )
     extent = np.linalg.svd(marked.points - marked.points.mean(axis=0), compute_uv=False)
     seen = np.linalg.svd(marked.pixels - marked.pixels.mean(axis=0), compute_uv=False)
     if extent[1] < FLAT * extent[0] or seen[1] < FLAT * seen[0]:
         raise ValueError(
-            f"camera {lens.name!r}: points must not lie in one line; {', '.join(marked.names)} do. "
+            f"camera {shown(lens.name)}: points must not lie in one line; {', '.join(marked.names)} do. "
             "Mark points on both sides of the table."
         )
     return bool(extent[2] < FLAT * extent[1])
@@ -132,8 +133,8 @@ def _poses(lens: Camera, marked: Marked, flat: bool) -> list[Camera]:
     cameras = [camera for camera in cameras if (camera.depth(points) > 0.0).all()]
     if not cameras:
         raise ValueError(
-            f"camera {lens.name!r}: points must be explained by some pose; there is none with them all in front of "
-            "the camera. Check which point is which."
+            f"camera {shown(lens.name)}: points must be explained by some pose; there is none with them all in front "
+            "of the camera. Check which point is which."
         )
     return cameras
 
@@ -165,7 +166,7 @@ def _check_fit(found: Extrinsics) -> None:
         return
     culprit = _culprit(found)
     raise ValueError(
-        f"camera {found.camera.name!r}: points must be explained within {MAX_RMS * found.marked.sigma:g} px; "
+        f"camera {shown(found.camera.name)}: points must be explained within {MAX_RMS * found.marked.sigma:g} px; "
         f"got {found.rms:.1f}. {culprit}Check names and pixels, and that the lens is this camera's."
     )
 
@@ -184,7 +185,7 @@ def _culprit(found: Extrinsics) -> str:
             return ""
         cameras = _poses(found.camera, rest, _check_points(found.camera, rest))
         if min(_rms(camera.project(rest.points) - rest.pixels) for camera in cameras) <= MAX_RMS / 3 * marked.sigma:
-            return f"Without {marked.names[i]!r} the others agree. "
+            return f"Without {shown(marked.names[i])} the others agree. "
     return ""
 
 

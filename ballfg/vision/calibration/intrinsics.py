@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.checks import shown
 from ballfg.vision.calibration.boards import View
 from ballfg.vision.calibration.lens_covariance import covariance_of_lens, pixel_grid, sigma_of_rays
 from ballfg.vision.camera import DISTORTIONS, Camera
@@ -139,8 +140,8 @@ def calibrate_intrinsics(name: str, views: Sequence[View], distortion: int = 5) 
         if len(used) < MIN_VIEWS or len(left_out) > MAX_LEFT_OUT * (len(used) + len(left_out)):
             names = ", ".join(view.name for view in left_out)
             raise ValueError(
-                f"camera {name!r}: views must agree on one lens; {len(left_out)} of {len(used) + len(left_out)} do not "
-                f"({names}). Check that board and focus were never changed, and delete blurred images."
+                f"camera {shown(name)}: views must agree on one lens; {len(left_out)} of {len(used) + len(left_out)} "
+                f"do not ({names}). Check that board and focus were never changed, and delete blurred images."
             )
         fitted = _fit(name, used, distortion)
     _check_fit(name, fitted)
@@ -163,14 +164,14 @@ def _check_views(name: str, used: Sequence[View], missed: Sequence[str]) -> None
     if len(used) < MIN_VIEWS:
         lack = f" No board (or hardly any of it) in {', '.join(missed)}." if missed else ""
         raise ValueError(
-            f"camera {name!r}: at least {MIN_VIEWS} images must show the board; got {len(used)} of "
+            f"camera {shown(name)}: at least {MIN_VIEWS} images must show the board; got {len(used)} of "
             f"{len(used) + len(missed)}.{lack} Check squares and kind of board, or take more, turned differently."
         )
     for view in used:
         if view.size != used[0].size:
             first, other = (f"{one.size[0]}x{one.size[1]}" for one in (used[0], view))
             raise ValueError(
-                f"camera {name!r}: images must have one size; {used[0].name} has {first} and {view.name} "
+                f"camera {shown(name)}: images must have one size; {used[0].name} has {first} and {view.name} "
                 f"{other} pixels. Take them all as the videos will be."
             )
 
@@ -188,7 +189,7 @@ def _fit(name: str, views: Sequence[View], distortion: int) -> Intrinsics:
         camera = Camera(name, size, np.array(matrix, dtype=np.float64), bent, np.zeros(3), np.zeros(3))
     except (cv2.error, ValueError):
         raise ValueError(
-            f"camera {name!r}: views must tell the lens; no lens explains them. "
+            f"camera {shown(name)}: views must tell the lens; no lens explains them. "
             "Turn the board to different sides, up to 45 degrees, and check that it is flat."
         ) from None
     fitted = tuple(
@@ -233,24 +234,24 @@ def _check_fit(name: str, fitted: Intrinsics) -> None:
     turned = turn(np.stack([view.normal for view in fitted.views]))
     if turned < MIN_TURN:
         raise ValueError(
-            f"camera {name!r}: boards must be turned against each other by {np.degrees(MIN_TURN):.0f} degrees or more; "
-            f"got {np.degrees(turned):.1f}. Parallel boards cannot tell the focal length: turn it all ways."
+            f"camera {shown(name)}: boards must be turned against each other by {np.degrees(MIN_TURN):.0f} degrees or "
+            f"more; got {np.degrees(turned):.1f}. Parallel boards cannot tell the focal length: turn it all ways."
         )
     sigma = float((fitted.sigmas[:2] / fitted.camera.matrix[[0, 1], [0, 1]]).max())
     if not sigma <= MAX_FOCAL_SIGMA:
         raise ValueError(
-            f"camera {name!r}: the focal length must be known to {100 * MAX_FOCAL_SIGMA:g} %; got {100 * sigma:.1f} %. "
-            "Take more images, with the board near and turned to all sides, up to 45 degrees."
+            f"camera {shown(name)}: the focal length must be known to {100 * MAX_FOCAL_SIGMA:g} %; got "
+            f"{100 * sigma:.1f} %. Take more images, with the board near and turned to all sides, up to 45 degrees."
         )
     if fitted.coverage < MIN_COVERAGE:
         raise ValueError(
-            f"camera {name!r}: corners must lie in {100 * MIN_COVERAGE:.0f} % of the image or more; "
+            f"camera {shown(name)}: corners must lie in {100 * MIN_COVERAGE:.0f} % of the image or more; "
             f"got {100 * fitted.coverage:.0f} %. Take images with the board near all borders and corners of the image."
         )
     sigma, _ = fitted.ray_sigma
     if not sigma <= MAX_RAY_SIGMA:
         raise ValueError(
-            f"camera {name!r}: the lens must be known to {MAX_RAY_SIGMA:g} px in {RAYS:.0%} of the image; "
+            f"camera {shown(name)}: the lens must be known to {MAX_RAY_SIGMA:g} px in {RAYS:.0%} of the image; "
             f"got {sigma:.1f} px. Take images with the board in its corners, or fewer coefficients than "
             f"{len(fitted.camera.distortion)}."
         )
@@ -265,7 +266,7 @@ def _check_fold(camera: Camera) -> None:
     apart = float(np.linalg.norm(again - pixels, axis=1).max())
     if not apart <= MAX_FOLD or _has_pole(camera, float((plane**2).sum(axis=1).max())):
         raise ValueError(
-            f"camera {camera.name!r}: the distortion must be possible to undo; it folds a part of the image. "
+            f"camera {shown(camera.name)}: the distortion must be possible to undo; it folds a part of the image. "
             f"Take images with the board in all its corners, or fewer coefficients than {len(camera.distortion)}."
         )
 

@@ -12,7 +12,7 @@ from typing import Final, TypeVar
 import cv2
 from joblib.externals.loky import get_reusable_executor
 
-from ballfg.checks import did_you_mean
+from ballfg.checks import did_you_mean, shown
 from ballfg.files.python_file import blamed, run_file
 from ballfg.progress import Watch, unwatched
 from ballfg.vision.arrays import Image
@@ -45,7 +45,7 @@ def learn_detector(video: Video, settings: DetectorSettings | None = None) -> Ba
     images = video.sample(SAMPLE)
     if len(images) < FEWEST:
         raise ValueError(
-            f"video {video.name!r} must have at least {FEWEST} frames to learn a background; got {len(images)}. "
+            f"video {shown(video.name)} must have at least {FEWEST} frames to learn a background; got {len(images)}. "
             "Record longer, or leave the camera out."
         )
     return BallDetector.learn(images, settings)
@@ -63,7 +63,7 @@ def load_detector(text: str) -> Maker:
     """
     file, colon, name = text.rpartition(":")
     if not (colon and file and name.isidentifier()):
-        raise ValueError(f"detector must be FILE.py:NAME; got {text!r}. Name the callable after a colon.")
+        raise ValueError(f"detector must be FILE.py:NAME; got {shown(text)}. Name the callable after a colon.")
     path = Path(file).resolve()
     if not path.is_file():
         raise FileNotFoundError(f"detector: {path} does not exist. A detector of one's own is one Python file.")
@@ -72,7 +72,7 @@ def load_detector(text: str) -> Maker:
         own = [word for word, item in found.items() if callable(item) and not word.startswith("_")]
         problem = "is not callable" if name in found else "is not defined there"
         raise ValueError(
-            f"{path} must define the callable {name!r}; it {problem}. Correct the name.{did_you_mean(name, own)}"
+            f"{path} must define the callable {shown(name)}; it {problem}. Correct the name.{did_you_mean(name, own)}"
         )
     return partial(_made, found[name], path)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array, Index, Mask
-from ballfg.checks import check_array
+from ballfg.checks import check_array, shown
 from ballfg.tracks.sightings import are_covariances
 from ballfg.vision.arrays import Image
 
@@ -97,8 +97,8 @@ class Detections:
 
     def __post_init__(self) -> None:
         if not isinstance(self.camera, str):
-            raise TypeError(f"camera must be a name; got {self.camera!r}. Put it in quotes.")
-        what = f"detections of camera {self.camera!r}"
+            raise TypeError(f"camera must be a name; got {shown(self.camera)}. Put it in quotes.")
+        what = f"detections of camera {shown(self.camera)}"
         object.__setattr__(self, "frames", _numbers(what, "frames", self.frames, (np.asarray(self.frames).size,)))
         _check_increasing(what, self.frames)
         _check_fields(self, what)

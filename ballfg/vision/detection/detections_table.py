@@ -65,7 +65,7 @@ def read_detections(
     names, values = names[kept], {name: column[kept] for name, column in values.items()}
     found = [_of_camera(camera.name, names == camera.name, values) for camera in cameras]
     for seen in found:
-        check_step(f"{path}, camera {seen.camera!r}", seen.frames)
+        check_step(f"{path}, camera {shown(seen.camera)}", seen.frames)
     return found, notes
 
 

@@ -8,6 +8,7 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Array, Index
+from ballfg.checks import shown
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Track
 from ballfg.vision.association.agreement import Agreement, check_agreement
@@ -168,8 +169,8 @@ def check_overlap(detections: Sequence[Detections], cameras: Sequence[Camera]) -
     for name, (start, end) in spans.items():
         others = [span for other, span in spans.items() if other != name]
         if others and not any(start <= last and first <= end for first, last in others):
-            when = "; ".join(f"{other!r} {first:g} to {last:g} s" for other, (first, last) in spans.items())
+            when = "; ".join(f"{shown(other)} {first:g} to {last:g} s" for other, (first, last) in spans.items())
             raise ValueError(
-                f"videos must overlap in time; camera {name!r} overlaps with no other: {when} (true time). "
+                f"videos must overlap in time; camera {shown(name)} overlaps with no other: {when} (true time). "
                 "Check stamps and time_offset, or that the files are of one recording."
             )

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from ballfg.checks import did_you_mean
+from ballfg.checks import did_you_mean, shown
 from ballfg.vision.camera import Camera
 
 SAME_SHAPE: Final = 0.01
@@ -27,11 +27,13 @@ def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Seque
             continue
         if name not in names:
             raise ValueError(
-                f"video {text!r} must be of a camera: {', '.join(names)}; got {name!r}. Rename it, or write "
+                f"video {shown(text)} must be of a camera: {', '.join(names)}; got {shown(name)}. Rename it, or write "
                 f"NAME={path}.{did_you_mean(name, names)}"
             )
         if name in found:
-            raise ValueError(f"camera {name!r} must have one video; got {found[name]} and {path}. Drop one of them.")
+            raise ValueError(
+                f"camera {shown(name)} must have one video; got {found[name]} and {path}. Drop one of them."
+            )
         found[name] = path
     missing = [name for name in names if name not in found]
     if missing:
@@ -63,10 +65,10 @@ def stamp_files(given: Sequence[str], cameras: Sequence[Camera]) -> dict[str, Pa
     for text in given:
         name, equals, path = text.partition("=")
         if not (equals and path):
-            raise ValueError(f"stamps must be NAME=FILE; got {text!r}. Put the camera's name before the file.")
+            raise ValueError(f"stamps must be NAME=FILE; got {shown(text)}. Put the camera's name before the file.")
         if name not in names or name in found:
             problem = "is given twice" if name in found else "is no camera's"
-            raise ValueError(f"stamps must be one file a camera; {name!r} {problem}. Cameras: {', '.join(names)}.")
+            raise ValueError(f"stamps must be one file a camera; {shown(name)} {problem}. Cameras: {', '.join(names)}.")
         found[name] = Path(path)
     return found
 
@@ -80,7 +82,7 @@ def without(cameras: Sequence[Camera], names: Sequence[str]) -> list[Camera]:
     for name in names:
         if name not in known:
             hint = did_you_mean(name, known)
-            raise ValueError(f"without must name a camera: {', '.join(known)}; got {name!r}. Correct it.{hint}")
+            raise ValueError(f"without must name a camera: {', '.join(known)}; got {shown(name)}. Correct it.{hint}")
     return [camera for camera in cameras if camera.name not in names]
 
 
@@ -95,7 +97,7 @@ def check_sizes(sizes: Mapping[str, tuple[int, int]], cameras: Sequence[Camera])
         if size != camera.size:
             calibrated, filmed = (f"{width}x{height}" for width, height in (camera.size, size))
             raise ValueError(
-                f"camera {camera.name!r} must be calibrated at the size of its video; got {calibrated} in the "
+                f"camera {shown(camera.name)} must be calibrated at the size of its video; got {calibrated} in the "
                 f"cameras' file and a video of {filmed}. {_remedy(camera.size, size)}"
             )
 

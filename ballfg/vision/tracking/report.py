@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator
 
+from ballfg.checks import shown
 from ballfg.vision.association.agreement import LEAST_MISFIT
 from ballfg.vision.tracking.pipeline import Tracking
 
@@ -17,7 +18,7 @@ def blind_cameras(tracking: Tracking) -> Iterator[str]:
     """A sentence for each camera that had no part in any ball, where there are balls."""
     for number, camera in enumerate(tracking.cameras):
         if tracking.balls and not any((ball.sightings.camera == number).any() for ball in tracking.balls):
-            yield f"camera {camera.name!r} saw none of the balls. Check its stamps, its pose and its candidates."
+            yield f"camera {shown(camera.name)} saw none of the balls. Check its stamps, its pose and its candidates."
 
 
 def disagreement(tracking: Tracking) -> str | None:
