@@ -9,6 +9,7 @@ from typing import TypeVar
 
 import torch
 
+from ballfg.checks import shown
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.result import Estimate
 from ballfg.factors.lockstep import run_together
@@ -126,7 +127,9 @@ def check_device(method: str, device: str | None) -> None:
     if device is None:
         return
     if method != "smoother":
-        raise ValueError(f"device must be left out for the method {method!r}: only the smoother can compute on one.")
+        raise ValueError(
+            f"device must be left out for the method {shown(method)}: only the smoother can compute on one."
+        )
     usable_device(device)
 
 

@@ -100,7 +100,7 @@ class ConformalScales:
         if most < FEWEST:
             raise ValueError(
                 f"conformal must hold at least {FEWEST} tracks with samples after their first {observe:g} s: a finite "
-                f"{100 * LEVEL:.0f} % interval needs as many; got {most} in {source!r}. Give a larger dataset."
+                f"{100 * LEVEL:.0f} % interval needs as many; got {most} in {shown(source)}. Give a larger dataset."
             )
         while found[-1].count < FEWEST:
             found.pop()
@@ -159,7 +159,7 @@ class ConformalScales:
         if not isclose(observe, self.observe) or method != self.method:
             raise ValueError(
                 f"conformal must be calibrated as the tracks are predicted: with {observe:g} s observed, by {method}; "
-                f"the scales from {self.source!r} have {self.observe:g} s by {self.method}. Calibrate again."
+                f"the scales from {shown(self.source)} have {self.observe:g} s by {self.method}. Calibrate again."
             )
 
 

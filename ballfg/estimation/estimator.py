@@ -4,6 +4,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
+from ballfg.checks import shown
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
@@ -102,7 +103,7 @@ class Estimator(ABC):
                 "(n, 3) m."
             )
         if len(track) >= LEAST_CHECKED and not track.part:
-            check_scale(f"track {track.name!r}", track.times, track.positions, track.sigmas, None)
+            check_scale(f"track {shown(track.name)}", track.times, track.positions, track.sigmas, None)
         return track.observed(*given(factors))
 
     def doubts(self, track: Track) -> tuple[str, ...]:

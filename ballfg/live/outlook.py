@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ballfg.checks import shown
 from ballfg.estimation.online.state import OnlineState
 from ballfg.estimation.result import Status
 from ballfg.prediction import BallState, Crossing, apex, next_contact, plane_crossing
@@ -60,7 +61,7 @@ class Plane:
         except ValueError:
             place = math.nan
         if found is None or not math.isfinite(place):
-            raise ValueError(f"plane must be an axis and a place in m; got {text!r}. Write x=2.0, for instance.")
+            raise ValueError(f"plane must be an axis and a place in m; got {shown(text)}. Write x=2.0, for instance.")
         return cls(found[1], place)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.checks import did_you_mean
+from ballfg.checks import did_you_mean, shown
 from ballfg.pages.coverage import Coverage, coverage
 from ballfg.pages.given import Given
 from ballfg.pages.marks import marks
@@ -66,7 +66,7 @@ def collect(given: Given, names: Sequence[str] = (), limited: bool = True) -> Sh
         if limited and sum(other.rows for other in shots) + shot.rows > MOST_ROWS:
             if not shots or names:
                 raise ValueError(
-                    f"a page holds {MOST_ROWS} samples, states and predictions; shot {shot.name!r} brings more. "
+                    f"a page holds {MOST_ROWS} samples, states and predictions; shot {shown(shot.name)} brings more. "
                     "Name fewer shots with --track, or write a recording with --rerun."
                 )
             break
@@ -96,7 +96,9 @@ def _check_names(names: Sequence[str], known: Sequence[str]) -> None:
     for name in names:
         if name not in known:
             hint = did_you_mean(name, known)
-            raise ValueError(f"--track must name one of the {len(known)} shots; got {name!r}.{hint} Correct the name.")
+            raise ValueError(
+                f"--track must name one of the {len(known)} shots; got {shown(name)}.{hint} Correct the name."
+            )
 
 
 def _check_results(given: Given) -> Iterator[str]:
@@ -112,14 +114,14 @@ def _check_results(given: Given) -> Iterator[str]:
         for name in table.rows:
             if name not in there:
                 raise ValueError(
-                    f"{table.path} must belong to {dataset.path}; it has a trajectory {name!r}, which the dataset does "
-                    "not have. Give the dataset that it was made from."
+                    f"{table.path} must belong to {dataset.path}; it has a trajectory {shown(name)}, which the dataset "
+                    "does not have. Give the dataset that it was made from."
                 )
         if len(table.rows) < len(there):
             yield f"{table.path.name} has rows for {len(table.rows)} of the {len(there)} shots."
     named = None if given.diagnosis is None else given.diagnosis.get("dataset")
     if dataset is not None and named is not None and named != dataset.info.name:
-        yield f"The diagnosis is of {named!r}, the tracks are of {dataset.info.name!r}."
+        yield f"The diagnosis is of {shown(named)}, the tracks are of {shown(dataset.info.name)}."
 
 
 def _all_shots(given: Given, wanted: set[str] | None = None) -> Iterator[Shot]:
@@ -158,7 +160,7 @@ def _rows(table: ResultTable, name: str, track: Track | None) -> Array:
         if len(wrong):
             raise ValueError(
                 f"{table.path} must belong to the dataset: it has t = {rows[wrong[0], 0]:.9g} s of trajectory "
-                f"{name!r}, where the dataset has no sample. Give the dataset that it was made from."
+                f"{shown(name)}, where the dataset has no sample. Give the dataset that it was made from."
             )
     return rows
 

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, Protocol
 
+from ballfg.checks import shown
 from ballfg.parallel.work import is_inside
 
 CLUSTERS = ("dask", "ray")
@@ -93,11 +94,13 @@ def on_cluster(kind: str | None, address: str | None = None) -> Iterator[int | N
     """
     if kind is None:
         if address is not None:
-            raise ValueError(f"address must come with a cluster; got {address!r} alone. Add --cluster dask or ray.")
+            raise ValueError(
+                f"address must come with a cluster; got {shown(address)} alone. Add --cluster dask or ray."
+            )
         yield None
         return
     if kind not in CLUSTERS:
-        raise ValueError(f"cluster must be {' or '.join(CLUSTERS)}; got {kind!r}. Choose one of them.")
+        raise ValueError(f"cluster must be {' or '.join(CLUSTERS)}; got {shown(kind)}. Choose one of them.")
     opened = _open(kind, address)
     token = _CLUSTER.set(opened)
     try:

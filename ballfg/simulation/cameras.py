@@ -7,6 +7,7 @@ import cv2
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ballfg.checks import shown
 from ballfg.dynamics.surfaces import TABLE_ABOVE_FLOOR, TABLE_LENGTH
 from ballfg.vision.camera import Camera
 
@@ -103,7 +104,7 @@ def _level_rotation(name: str, forward: NDArray[np.float64]) -> NDArray[np.float
     right = np.cross(forward, _UP)
     if not np.linalg.norm(right) > 0.0:
         raise ValueError(
-            f"camera {name!r}: centre must not stand over or under target; they differ by {forward.tolist()} m. "
+            f"camera {shown(name)}: centre must not stand over or under target; they differ by {forward.tolist()} m. "
             "Move one of them sideways a little."
         )
     rows = np.stack((right, np.cross(forward, right), forward))

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ballfg.checks import shown
 from ballfg.dynamics import BallModel, Surfaces
 from ballfg.simulation.bounded import bounded, check_bounds
 from ballfg.simulation.settings import SETTING_LEVELS, Settings
@@ -91,7 +92,9 @@ class SimulatedLauncher:
         Raises: ValueError, TypeError: changes that are not a mapping, an unknown field or a bad value.
         """
         if not isinstance(changes, Mapping):
-            raise TypeError(f"launcher must map fields to numbers; got {changes!r}. Write launcher: {{height: 0.4}}.")
+            raise TypeError(
+                f"launcher must map fields to numbers; got {shown(changes)}. Write launcher: {{height: 0.4}}."
+            )
         known = [field.name for field in fields(self)]
         for key in changes:
             if key not in known:

@@ -8,6 +8,7 @@ from typing import Any, Final, Literal, cast
 
 import yaml
 
+from ballfg.checks import shown
 from ballfg.dynamics import Effect, model_to_dict, save_model
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
@@ -69,7 +70,7 @@ def check_format(name: str) -> FileFormat:
     Raises: ValueError: if there is no such format.
     """
     if name not in ("csv", "parquet"):
-        raise ValueError(f"format must be 'csv' or 'parquet'; got {name!r}. Choose one of them.")
+        raise ValueError(f"format must be 'csv' or 'parquet'; got {shown(name)}. Choose one of them.")
     return cast(FileFormat, name)
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import yaml
 
+from ballfg.checks import shown
 from ballfg.files.moving import settle
 from ballfg.files.whole_file import write_text
 from ballfg.files.whole_folder import reserved
@@ -72,8 +73,8 @@ def _check_resumable(folder: Path, config: Config) -> None:
     for name in ("kind", *now):
         if name not in config.FREE_TO_CHANGE and earlier.get(name) != now[name]:
             raise ValueError(
-                f"a resumed run must keep its config; '{name}' was {earlier.get(name)!r} and is {now[name]!r}. "
-                f"Give {folder / CONFIG} as the config, or start a new run."
+                f"a resumed run must keep its config; '{name}' was {shown(earlier.get(name))} and is "
+                f"{shown(now[name])}. Give {folder / CONFIG} as the config, or start a new run."
             )
 
 

@@ -6,6 +6,7 @@ from typing import Literal, Self, get_args
 
 import torch
 
+from ballfg.checks import shown
 from ballfg.learning.sequence.data import Example
 from ballfg.learning.sequence.diffusion import DiffusionModel
 from ballfg.learning.sequence.frame import Frame
@@ -33,9 +34,11 @@ class SequenceArchitecture:
 
     def __post_init__(self) -> None:
         if self.kind not in _MODELS:
-            raise ValueError(f"kind must be one of {', '.join(get_args(SequenceKind))}; got {self.kind!r}. Rename it.")
+            raise ValueError(
+                f"kind must be one of {', '.join(get_args(SequenceKind))}; got {shown(self.kind)}. Rename it."
+            )
         if isinstance(self.width, bool) or not isinstance(self.width, int) or self.width < 8 or self.width % 8:
-            raise ValueError(f"width must be a positive multiple of 8; got {self.width!r}. Round it.")
+            raise ValueError(f"width must be a positive multiple of 8; got {shown(self.width)}. Round it.")
 
     @classmethod
     def of(cls, kind: SequenceKind) -> Self:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
+from ballfg.checks import shown
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.learning.augment import apply
 from ballfg.tracks import Track
@@ -46,7 +47,7 @@ class LauncherSettings:
         if settings is None:
             got = {name: track.labels.get(name) for name in self.labels}
             raise ValueError(
-                f"labels of track {track.name!r} must be known launcher settings; got {got}. "
+                f"labels of track {shown(track.name)} must be known launcher settings; got {got}. "
                 "Complete them or leave the track out."
             )
         return settings
@@ -126,7 +127,7 @@ def example(track: Track, observed: int, settings: Tensor, times: ArrayLike | No
     """
     if not LEAST_OBSERVED <= observed <= len(track):
         raise ValueError(
-            f"observed must lie in {LEAST_OBSERVED} .. {len(track)}, the samples of track {track.name!r}; got "
+            f"observed must lie in {LEAST_OBSERVED} .. {len(track)}, the samples of track {shown(track.name)}; got "
             f"{observed}. Observe fewer samples or leave the track out."
         )
     origin = float(track.times[observed - 1])
@@ -148,14 +149,14 @@ def example(track: Track, observed: int, settings: Tensor, times: ArrayLike | No
 def _check_asked(name: str, asked: np.ndarray, origin: float) -> None:
     if asked.ndim != 1 or len(asked) == 0:
         raise ValueError(
-            f"times of track {name!r} must have shape (m,) with m >= 1; got {asked.shape}. "
+            f"times of track {shown(name)} must have shape (m,) with m >= 1; got {asked.shape}. "
             "Ask for a time after the observed part, or observe fewer samples."
         )
     steps = np.diff(asked, prepend=origin)
     if not (steps > 0).all():
         at = int(np.flatnonzero(~(steps > 0))[0])
         raise ValueError(
-            f"times of track {name!r} must increase from the last observed stamp {origin:g} s; times[{at}]="
+            f"times of track {shown(name)} must increase from the last observed stamp {origin:g} s; times[{at}]="
             f"{asked[at]:g}. Sort them and drop what is observed."
         )
 

@@ -12,6 +12,8 @@ from typing import Final
 import torch
 from torch import Tensor, nn
 
+from ballfg.checks import shown
+
 SPIN_UNIT: Final = 100.0
 """rad/s that a weight of one stands for, so that weights are of order one."""
 SOFT_SPEED: Final = 0.05
@@ -75,7 +77,9 @@ class SpinEmbedding(nn.Module):
             elif isinstance(value, int | float):
                 settings.append(float(value))
             else:
-                raise ValueError(f"label '{label}' must be a number; got {value!r}. Declare its values as categories.")
+                raise ValueError(
+                    f"label '{label}' must be a number; got {shown(value)}. Declare its values as categories."
+                )
         return torch.tensor(settings, dtype=torch.float64)
 
     def local(self, settings: Tensor) -> Tensor:

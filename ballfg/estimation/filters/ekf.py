@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
+from ballfg.checks import shown
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.advance_jacobian import Motion
 from ballfg.dynamics.surfaces import Surfaces
@@ -81,7 +82,7 @@ class ExtendedKalmanFilter(Estimator):
     ) -> None:
         super().__init__(model, surfaces, settings)
         if initialise not in ("prior", "window"):
-            raise ValueError(f"initialise must be 'prior' or 'window'; got {initialise!r}")
+            raise ValueError(f"initialise must be 'prior' or 'window'; got {shown(initialise)}")
         self.ball = trackwise_model(self.model, self.settings)
         self.smooth = smooth
         self.initialise = initialise

@@ -83,7 +83,7 @@ def _read(path: Path, sort: type[Observation], known: set[str], notes: list[str]
         if header.count(name) != 1:
             raise ValueError(
                 f"{path}: must have the columns {', '.join((KEY, *wanted))}, each once; got {given}. "
-                f"Add or rename {name!r}."
+                f"Add or rename {shown(name)}."
             )
     notes += [f"{path.name}: column {shown(name)} ignored" for name in header if name not in (KEY, *wanted)]
     places, key = [header.index(name) for name in wanted], header.index(KEY)
@@ -102,13 +102,13 @@ def _read(path: Path, sort: type[Observation], known: set[str], notes: list[str]
             if not csv_files.is_number(cells[place]) or (header[place] == "sigma" and not float(cells[place]) > 0.0):
                 rule = "a positive number" if header[place] == "sigma" else "a number"
                 raise ValueError(
-                    f"{path}, line {line}, column {header[place]!r}: must be {rule}; got {shown(cells[place])}. "
+                    f"{path}, line {line}, column {shown(header[place])}: must be {rule}; got {shown(cells[place])}. "
                     "Correct it, or delete the line."
                 )
             if header[place] in sort.columns and abs(float(cells[place])) > sort.largest:
                 raise ValueError(
-                    f"{path}, line {line}, column {header[place]!r}: must be within {sort.largest:g}, as of every "
-                    f"ball; got {cells[place]}. Correct it, or delete the line."
+                    f"{path}, line {line}, column {shown(header[place])}: must be within {sort.largest:g}, as of every "
+                    f"ball; got {shown(cells[place])}. Correct it, or delete the line."
                 )
         rows[cells[key]].append([float(cells[place]) for place in places])
     return {name: np.array(numbers) for name, numbers in rows.items()}

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ballfg.arrays import Array, Index
+from ballfg.checks import shown
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.observations.innovation import leave_one_out
 from ballfg.estimation.settings import Settings
@@ -146,8 +147,9 @@ class Observation(ABC):
         Raises: ValueError: if the observation cannot change its stamps.
         """
         raise ValueError(
-            f"track {old.name!r}: the observation '{self.name}' cannot stand beside time offsets that are estimated, "
-            f"because it does not know how its samples move. Write {type(self).__name__}.onto, or fix the offsets."
+            f"track {shown(old.name)}: the observation '{self.name}' cannot stand beside time offsets that are "
+            f"estimated, because it does not know how its samples move. Write {type(self).__name__}.onto, or fix "
+            "the offsets."
         )
 
     @classmethod

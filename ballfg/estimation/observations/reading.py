@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from ballfg.arrays import Array, Index
+from ballfg.checks import shown
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import batch_jacobian, rk4_step
 from ballfg.estimation.observations.observation import Context, Observation
@@ -100,8 +101,8 @@ class Reading(Observation):
         if len(delay) and np.abs(delay).max() > FARTHEST:
             worst = int(np.abs(delay).argmax())
             raise ValueError(
-                f"track {track.name!r}: readings '{cls.name}' must lie within {FARTHEST:g} s of a sample; the one at "
-                f"t={when[worst]:g} s is {abs(delay[worst]):.3g} s away. Check its clock, or leave it out."
+                f"track {shown(track.name)}: readings '{cls.name}' must lie within {FARTHEST:g} s of a sample; the one "
+                f"at t={when[worst]:g} s is {abs(delay[worst]):.3g} s away. Check its clock, or leave it out."
             )
         return cls(state, given, spread[order] if spread.ndim else spread, delay)
 

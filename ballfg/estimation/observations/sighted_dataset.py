@@ -6,6 +6,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Final
 
+from ballfg.checks import shown
 from ballfg.estimation.observations.sightings import NeverSeenByTwoError, sighted_track
 from ballfg.files.moving import settle
 from ballfg.tracks.dataset import TrackFolder
@@ -75,7 +76,7 @@ class SightedDataset(TrackFolder):
         """
         if name not in self._tracks:
             raise ValueError(
-                f"name must be one of the {len(self)} trajectories of {self.path}; got {name!r}. See names."
+                f"name must be one of the {len(self)} trajectories of {self.path}; got {shown(name)}. See names."
             )
         return self._tracks[name]
 

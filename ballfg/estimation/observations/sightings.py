@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array, Index
+from ballfg.checks import listed, shown
 from ballfg.estimation.observations.observation import Context, Observation, Unknowns
 from ballfg.estimation.observations.ray_path import Path, Rays, rough_path
 from ballfg.estimation.settings import Settings
@@ -105,7 +106,7 @@ class CameraSightings(Observation):
         names = self.sightings.cameras
         for name in settings.time_offsets:
             if name not in names:
-                raise ValueError(f"time_offsets must name cameras of the track, {', '.join(names)}; got {name!r}")
+                raise ValueError(f"time_offsets must name cameras of the track, {listed(names)}; got {shown(name)}")
         chosen = [names.index(name) for name in settings.time_offsets]
         return Unknowns(
             tuple(TIME_OFFSET + name for name in settings.time_offsets),
@@ -156,7 +157,9 @@ def sightings_of(track: Track) -> CameraSightings:
     for observation in track.observations:
         if observation.name == CameraSightings.name:
             return cast(CameraSightings, observation)
-    raise ValueError(f"track {track.name!r} must have sightings of cameras; it has none. Make it with sighted_track.")
+    raise ValueError(
+        f"track {shown(track.name)} must have sightings of cameras; it has none. Make it with sighted_track."
+    )
 
 
 def sighted_track(
@@ -181,8 +184,9 @@ def sighted_track(
     if (np.diff(times) < 0.0).any():
         row = int(np.argmax(np.diff(times) < 0.0)) + 1
         raise ValueError(
-            f"track {name!r}: sightings must be in order of true time; row {row}, camera "
-            f"{sightings.cameras[sightings.camera[row]]!r}, is earlier than the one before. Sort them with `in_order`."
+            f"track {shown(name)}: sightings must be in order of true time; row {row}, camera "
+            f"{shown(sightings.cameras[sightings.camera[row]])}, is earlier than the one before. "
+            "Sort them with `in_order`."
         )
     first = _firsts(times)
     moments = times[first]
@@ -198,7 +202,7 @@ def cameras_of(sightings: Sightings, cameras: Sequence[Camera]) -> tuple[Camera,
     for name in sightings.cameras:
         if name not in known:
             raise ValueError(
-                f"cameras must hold every camera of the sightings; {name!r} is missing among {', '.join(known)}. "
+                f"cameras must hold every camera of the sightings; {shown(name)} is missing among {listed(known)}. "
                 "Add it to cameras.yaml, or leave its sightings out."
             )
     return tuple(known[name] for name in sightings.cameras)
@@ -240,7 +244,7 @@ def filled(moments: Array, path: Path, name: str) -> Path:
     firm = path.sigmas.max(axis=1) <= LOOSE
     if not firm.any():
         raise NeverSeenByTwoError(
-            f"track {name!r}: the ball must be seen by two cameras within a few frames; it never is. "
+            f"track {shown(name)}: the ball must be seen by two cameras within a few frames; it never is. "
             "Leave the track out, or look at the time offsets of the cameras."
         )
     if firm.all():

@@ -7,6 +7,7 @@ import gtsam
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.checks import shown
 from ballfg.dynamics.model import BallModel
 from ballfg.estimation.observations.innovation import FilterInnovation
 from ballfg.estimation.observations.observation import Context, refuse_unknowns
@@ -80,7 +81,7 @@ def measurements_beside(
         batch = observation.batch(context)
         if batch.variables.shape[1] > 1:
             raise ValueError(
-                f"track {track.name!r}: the estimator 'online' takes observations of one state each; "
+                f"track {shown(track.name)}: the estimator 'online' takes observations of one state each; "
                 f"'{observation.name}' looks at other variables too. Use the smoother."
             )
         found[observation.name] = [(k, Measurement(one)) for k, one in observation.single_rows(batch)]

@@ -9,6 +9,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ballfg.checks import shown
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
@@ -77,7 +78,7 @@ class Online(Estimator):
     ) -> None:
         super().__init__(model, surfaces, settings)
         if solver not in WINDOWS:
-            raise ValueError(f"solver must be one of {', '.join(WINDOWS)}; got {solver!r}")
+            raise ValueError(f"solver must be one of {', '.join(WINDOWS)}; got {shown(solver)}")
         if lag < 2:
             raise ValueError(f"lag must be at least 2 states; got {lag}")
         if self.settings.time_offsets:
@@ -148,7 +149,9 @@ class Online(Estimator):
         """
         own = None if sigma is None else np.asarray(sigma, dtype=np.float64)[None]
         if own is not None and not (np.isfinite(own) & (own > 0.0)).all():
-            raise ValueError(f"sigma must be positive and finite, in m; got {sigma!r}. Leave it out if it is unknown.")
+            raise ValueError(
+                f"sigma must be positive and finite, in m; got {shown(sigma)}. Leave it out if it is unknown."
+            )
         spread = sample_sigmas(self.settings, 1, own)[0]
         point = np.array(position, dtype=np.float64)
         if self._samples and not self._samples[-1].measured:

@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ballfg.checks import listed, shown
 from ballfg.estimation.observations.ray_path import AROUND, BEFORE, Path, Rays, rough_path
 from ballfg.estimation.observations.sightings import LOOSE, SAME_MOMENT, filled
 from ballfg.estimation.online.measurement import Measurement
@@ -61,7 +62,9 @@ class SightingStream:
         Raises: ValueError: an unknown camera, a wrong shape, a number that is not finite, a time before the last.
         """
         if camera not in self.cameras:
-            raise ValueError(f"camera must be one of {', '.join(self.cameras)}; got {camera!r}. Name them to `Online`.")
+            raise ValueError(
+                f"camera must be one of {listed(self.cameras)}; got {shown(camera)}. Name them to `Online`."
+            )
         own, number = self.cameras[camera], list(self.cameras).index(camera)
         row = Sightings(
             tuple(self.cameras), np.array([number]), np.array([time]), np.array([pixel]), np.array([covariance])
@@ -70,8 +73,8 @@ class SightingStream:
         stamps = self._stamps[camera]
         if true < self._last or (stamps and true <= stamps[-1]):
             raise ValueError(
-                f"sightings must come in order of true time; got {true} s of camera {camera!r} after {self._last} s. "
-                "Hold them back by a frame and sort them."
+                f"sightings must come in order of true time; got {true} s of camera {shown(camera)} after "
+                f"{self._last} s. Hold them back by a frame and sort them."
             )
         stamps.append(true)
         self._last = true

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
+from ballfg.checks import listed, shown
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.observations.sightings import sightings_of
@@ -79,9 +80,11 @@ def estimate_time_offsets(
     names = _rig_of(tracks)
     reference = names[0] if reference is None else reference
     if reference not in names:
-        raise ValueError(f"reference must be one of the cameras {', '.join(names)}; got {reference!r}")
+        raise ValueError(f"reference must be one of the cameras {listed(names)}; got {shown(reference)}")
     if len(names) < 2:
-        raise ValueError(f"tracks must be seen by two cameras or more; got {names[0]!r} alone. Its clock is the time.")
+        raise ValueError(
+            f"tracks must be seen by two cameras or more; got {shown(names[0])} alone. Its clock is the time."
+        )
     free = np.array([k for k, name in enumerate(names) if name != reference])
     own = replace(settings, time_offsets={names[k]: prior for k in free})
     smoother = Smoother(model, surfaces, own)
@@ -110,8 +113,8 @@ def _rig_of(tracks: list[Track]) -> tuple[str, ...]:
     for track in tracks:
         if sightings_of(track).cameras != first.cameras:
             raise ValueError(
-                f"tracks must be seen by the same cameras; those of {track.name!r} and {tracks[0].name!r} differ. "
-                "Make all of them with the same list of cameras."
+                f"tracks must be seen by the same cameras; those of {shown(track.name)} and {shown(tracks[0].name)} "
+                "differ. Make all of them with the same list of cameras."
             )
     return first.sightings.cameras
 

@@ -8,6 +8,7 @@ import socket
 import threading
 from collections.abc import Iterator
 
+from ballfg.checks import shown
 from ballfg.live.sources.source import CHUNK, Arrival, LineBuffer, Source
 
 WAIT = 0.1
@@ -25,7 +26,7 @@ def listen(address: str) -> Source:
     found = ADDRESS.fullmatch(address)
     if found is None or int(found[3]) > 65535:
         raise ValueError(
-            f"listen must be tcp://HOST:PORT or udp://HOST:PORT; got {address!r}. Write tcp://0.0.0.0:5005."
+            f"listen must be tcp://HOST:PORT or udp://HOST:PORT; got {shown(address)}. Write tcp://0.0.0.0:5005."
         )
     kind = TcpServer if found[1] == "tcp" else UdpSocket
     try:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
+from ballfg.checks import shown
 from ballfg.simulation.balls import BallKind
 from ballfg.simulation.scene.room import (
     CEILING_COLOUR,
@@ -65,7 +66,7 @@ def backdrop(camera: Camera, kind: BallKind, rng: np.random.Generator) -> Backdr
     """
     if not ((WALLS[0] < camera.centre) & (camera.centre < WALLS[1])).all():
         raise ValueError(
-            f"camera {camera.name!r} must stand in the room, {WALLS[0].tolist()} to {WALLS[1].tolist()} m; "
+            f"camera {shown(camera.name)} must stand in the room, {WALLS[0].tolist()} to {WALLS[1].tolist()} m; "
             f"it stands at {np.round(camera.centre, 2).tolist()} m. Lower the distance."
         )
     room = _Room(camera, kind, furniture(kind), _texture(rng))

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
+from ballfg.checks import shown
 from ballfg.dynamics import AnalyticModel, Surfaces, advance
 from ballfg.simulation.config import MotionNoise
 from ballfg.simulation.motion import simulate_motion
@@ -62,7 +63,7 @@ class Flight:
         flat = times.reshape(-1)
         if flat.size and not (self.start <= flat.min() and flat.max() <= self.end):
             raise ValueError(
-                f"times must lie in the flight {self.name!r}, {self.start:.4f} to {self.end:.4f} s; "
+                f"times must lie in the flight {shown(self.name)}, {self.start:.4f} to {self.end:.4f} s; "
                 f"got {flat.min():.4f} to {flat.max():.4f} s. Ask for others."
             )
         since = flat - self.start

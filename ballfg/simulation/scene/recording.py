@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.checks import listed, shown
 from ballfg.simulation.scene.config import Clock, SceneConfig
 from ballfg.simulation.scene.flights import Flight, duration, fly_shots
 from ballfg.simulation.scene.renderer import Renderer
@@ -62,7 +63,7 @@ def record(config: SceneConfig, cameras: Sequence[Camera]) -> Recording:
         raise ValueError(f"cameras must be at least one, with names of their own; got {', '.join(names) or 'none'}.")
     for name in config.clocks:
         if name not in names:
-            raise ValueError(f"clocks must be of cameras {', '.join(names)}; got one of {name!r}. Rename it.")
+            raise ValueError(f"clocks must be of cameras {listed(names)}; got one of {shown(name)}. Rename it.")
     flights = fly_shots(config)
     until = duration(flights)
     frames = [frames_of(config, camera, number, until) for number, camera in enumerate(cameras)]

@@ -13,7 +13,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from ballfg.checks import type_name
+from ballfg.checks import shown, type_name
 from ballfg.files.strict_yaml import read_mapping
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 from ballfg.progress import Watch, unwatched
@@ -64,7 +64,7 @@ def write_scene(
     check_scene_folder(path, force=force)
     for camera in recording.cameras:
         if camera.name != Path(camera.name).name or camera.name.startswith("."):
-            raise ValueError(f"camera names must be good as file names; got {camera.name!r}. Rename it.")
+            raise ValueError(f"camera names must be good as file names; got {shown(camera.name)}. Rename it.")
     scene = path / SCENE_FILE
     earlier = [glob.escape(name) for name in _earlier_files(scene)]
     with whole_folder(path, earlier=earlier, last=SCENE_FILE) as stage:

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.checks import shown
+from ballfg.checks import listed, shown
 from ballfg.vision.calibration.table_points import Marked
 from ballfg.vision.camera import Camera
 
@@ -93,7 +93,7 @@ def _check_points(lens: Camera, marked: Marked) -> bool:
     if len(marked.points) < MIN_POINTS:
         raise ValueError(
             f"camera {shown(lens.name)}: at least {MIN_POINTS} points must be marked; got {len(marked.points)} "
-            f"({', '.join(marked.names)}). Mark more."
+            f"({listed(marked.names)}). Mark more."
         )
     inside = ((marked.pixels >= -0.5) & (marked.pixels <= np.array(lens.size) - 0.5)).all(axis=1)
     if not inside.all():
@@ -106,7 +106,7 @@ def _check_points(lens: Camera, marked: Marked) -> bool:
     seen = np.linalg.svd(marked.pixels - marked.pixels.mean(axis=0), compute_uv=False)
     if extent[1] < FLAT * extent[0] or seen[1] < FLAT * seen[0]:
         raise ValueError(
-            f"camera {shown(lens.name)}: points must not lie in one line; {', '.join(marked.names)} do. "
+            f"camera {shown(lens.name)}: points must not lie in one line; {listed(marked.names)} do. "
             "Mark points on both sides of the table."
         )
     return bool(extent[2] < FLAT * extent[1])

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Final
 
-from ballfg.checks import did_you_mean, shown
+from ballfg.checks import did_you_mean, listed, shown
 from ballfg.vision.camera import Camera
 
 SAME_SHAPE: Final = 0.01
@@ -27,7 +27,7 @@ def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Seque
             continue
         if name not in names:
             raise ValueError(
-                f"video {shown(text)} must be of a camera: {', '.join(names)}; got {shown(name)}. Rename it, or write "
+                f"video {shown(text)} must be of a camera: {listed(names)}; got {shown(name)}. Rename it, or write "
                 f"NAME={path}.{did_you_mean(name, names)}"
             )
         if name in found:
@@ -37,9 +37,8 @@ def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Seque
         found[name] = path
     missing = [name for name in names if name not in found]
     if missing:
-        listed = " and ".join(map(repr, missing))
         raise ValueError(
-            f"every camera must have a video; got none for {listed}. Give it as {missing[0]}=FILE, "
+            f"every camera must have a video; got none for {listed(missing)}. Give it as {missing[0]}=FILE, "
             f"or leave the camera out with --without {missing[0]}."
         )
     return {name: found[name] for name in names}
@@ -68,7 +67,7 @@ def stamp_files(given: Sequence[str], cameras: Sequence[Camera]) -> dict[str, Pa
             raise ValueError(f"stamps must be NAME=FILE; got {shown(text)}. Put the camera's name before the file.")
         if name not in names or name in found:
             problem = "is given twice" if name in found else "is no camera's"
-            raise ValueError(f"stamps must be one file a camera; {shown(name)} {problem}. Cameras: {', '.join(names)}.")
+            raise ValueError(f"stamps must be one file a camera; {shown(name)} {problem}. Cameras: {listed(names)}.")
         found[name] = Path(path)
     return found
 
@@ -82,7 +81,7 @@ def without(cameras: Sequence[Camera], names: Sequence[str]) -> list[Camera]:
     for name in names:
         if name not in known:
             hint = did_you_mean(name, known)
-            raise ValueError(f"without must name a camera: {', '.join(known)}; got {shown(name)}. Correct it.{hint}")
+            raise ValueError(f"without must name a camera: {listed(known)}; got {shown(name)}. Correct it.{hint}")
     return [camera for camera in cameras if camera.name not in names]
 
 
