@@ -38,7 +38,8 @@ def match_videos(given: Sequence[str], cameras: Sequence[Camera], ignored: Seque
     missing = [name for name in names if name not in found]
     if missing:
         raise ValueError(
-            f"every camera must have a video; got none for {' and '.join(map(shown, missing))}. Give it as {missing[0]}=FILE, "
+            f"every camera must have a video; got none for {' and '.join(map(shown, missing))}. "
+            f"Give it as {missing[0]}=FILE, "
             f"or leave the camera out with --without {missing[0]}."
         )
     return {name: found[name] for name in names}
