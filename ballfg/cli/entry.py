@@ -3,6 +3,8 @@
 import sys
 from importlib import import_module
 
+from ballfg.collector import collect_rarely
+
 
 def ballfg() -> None:
     """The program `ballfg`."""
@@ -20,6 +22,7 @@ def train() -> None:
 
 
 def _run(module: str) -> None:
+    collect_rarely()
     try:
         import_module(module).run()
     except KeyboardInterrupt:

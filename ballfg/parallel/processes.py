@@ -9,6 +9,7 @@ from typing import Any, Final
 from joblib.externals.loky import get_reusable_executor
 from joblib.externals.loky.process_executor import ProcessPoolExecutor, TerminatedWorkerError
 
+from ballfg.collector import collect_rarely
 from ballfg.parallel.same_versions import own_versions
 from ballfg.parallel.work import Work, compute, packed
 
@@ -58,7 +59,7 @@ class Processes:
         _started.clear()
 
     def _pool(self) -> ProcessPoolExecutor:
-        return get_reusable_executor(max_workers=self._others, timeout=IDLE, env=ONE_THREAD)
+        return get_reusable_executor(max_workers=self._others, timeout=IDLE, env=ONE_THREAD, initializer=collect_rarely)
 
 
 class _Chunk:

@@ -1,10 +1,10 @@
 """Stamps so close to a contact that the sample may lie on either side of it."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import torch
-from scipy.special import ndtr
 
 from ballfg.arrays import Array
 from ballfg.dynamics.model import BallModel
@@ -87,8 +87,8 @@ def other_sides(
 
 def _mixture(margin: float, jump: Array) -> Array:
     """(9, 9) what the other side adds; on the wrong side of its own contact a state has even chances."""
-    p = float(ndtr(max(margin, 0.0)))
-    return np.asarray(p * (1.0 - p) * np.outer(jump, jump))
+    chance = 0.5 * math.erfc(max(margin, 0.0) / math.sqrt(2.0))
+    return np.asarray(chance * (1.0 - chance) * np.outer(jump, jump))
 
 
 def _carried(model: BallModel, state: Array, dt: float) -> Array:
