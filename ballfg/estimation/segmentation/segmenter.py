@@ -90,8 +90,8 @@ class Segmenter:
         Returns: the events that became final, then the best explanation of the rest, oldest first.
         """
         events: list[Event] = []
-        noise = np.maximum(sigmas, self._scene.settings.sigma_floor)
-        for sample in zip(times.tolist(), np.array(positions), noise, strict=True):
+        noise = np.array(np.maximum(sigmas, self._scene.settings.sigma_floor), order="C")
+        for sample in zip(times.tolist(), np.array(positions, order="C"), noise, strict=True):
             events += self._taken(*sample)
         return events + ([node.event for node in open_nodes(self._tips[0])] if self._tips else [])
 
