@@ -8,8 +8,8 @@ import numpy as np
 from ballfg.arrays import Array, Index
 from ballfg.factors.batch import COEFFICIENTS
 from ballfg.factors.linear.definite import definite, variances_positive
-from ballfg.factors.linear.elimination import covariances_of
 from ballfg.factors.linear.step import Root
+from ballfg.factors.linear.substitution import covariances_of
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,8 @@ from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, INDEX, NOTHING, O
 
 FOUR_AT_ONCE = 4
 """Numbers that one instruction multiplies."""
+BLOCK = 64
+"""States that are reduced with one room for what they leave to each other, which so stays near the processor."""
 
 
 def padded(columns: int) -> int:
@@ -161,7 +163,7 @@ def absorb(upper: Array, system: Array, begin: int, end: int, first: int, count:
 
 
 @machine_code(NOTHING(TWO, TWO))
-def _close(rows: Array, root: Array) -> None:
+def close(rows: Array, root: Array) -> None:
     """Copy rows without the zeros before the right side."""
     end = root.shape[1] - 1
     for i in range(root.shape[0]):
@@ -190,7 +192,7 @@ def eliminate_on(system: Array, start: Index, width: int, carries: Array, shared
     for i in range(m):
         put_all(upper, carries[i])
         absorb(upper, system, start[i], start[i + 1], 0, width, column)
-        _close(upper, root[i])
+        close(upper, root[i])
         for j in range(width):
             for k in range(columns):
                 carry[j, k] = 0.0
@@ -204,6 +206,23 @@ def eliminate_on(system: Array, start: Index, width: int, carries: Array, shared
         absorb(shared[i + 1], system, start[i], start[i + 1], 2 * width, p, column)
 
 
+@machine_code(NOTHING(TWO, COUNTS, COUNT, COUNT, COUNT, THREE, THREE, THREE))
+def reduce_block(
+    system: Array, start: Index, width: int, first: int, end: int, carries: Array, shared: Array, root: Array
+) -> None:
+    """Reduce the rows of the states first to end - 1, at most `BLOCK` of them.
+
+    Args:
+        system, start, width, root: as for `eliminate`.
+        carries, shared: (`BLOCK` + 1, ..) as for `eliminate_on`; their first entries are what the states before have
+            left, and become what these leave.
+    """
+    count = end - first
+    eliminate_on(system, start[first : end + 1], width, carries[: count + 1], shared[: count + 1], root[first:end])
+    put_all(carries[0], carries[count])
+    put_all(shared[0], shared[count])
+
+
 @machine_code(NOTHING(TWO, COUNTS, COUNT, THREE, TWO))
 def eliminate(system: Array, start: Index, width: int, root: Array, last: Array) -> None:
     """Reduce all rows to the triangle R with its right side.
@@ -214,117 +233,8 @@ def eliminate(system: Array, start: Index, width: int, root: Array, last: Array)
         last: (p, 2 w + p + 1), written: the rows of the coefficients, at the end.
     """
     n, columns, p = len(start) - 2, system.shape[1], len(last)
-    carries, shared = np.zeros((n + 1, width, columns)), np.zeros((n + 1, p, columns))
-    eliminate_on(system, start[: n + 1], width, carries, shared, root)
-    absorb(shared[n], system, start[n], start[n + 1], 2 * width, p, np.empty(start[n + 1] - start[n]))
-    _close(shared[n], last)
-
-
-@machine_code(NOTHING(THREE, TWO, TWO, ONE))
-def substitute_back(root: Array, last: Array, states: Array, coefficients: Array) -> None:
-    """Solve R x = y.
-
-    Args: root, last: rows of R as `eliminate` leaves them.  states: (n, w) and coefficients: (p,), y, which become x.
-    """
-    n, w = root.shape[:2]
-    p = len(coefficients)
-    for j in range(p - 1, -1, -1):
-        for k in range(j + 1, p):
-            coefficients[j] -= last[j, 2 * w + k] * coefficients[k]
-        coefficients[j] /= last[j, 2 * w + j]
-    for i in range(n - 1, -1, -1):
-        for j in range(w - 1, -1, -1):
-            left = states[i, j]
-            for k in range(j + 1, w):
-                left -= root[i, j, k] * states[i, k]
-            if i + 1 < n:
-                for k in range(w):
-                    left -= root[i, j, w + k] * states[i + 1, k]
-            for k in range(p):
-                left -= root[i, j, 2 * w + k] * coefficients[k]
-            states[i, j] = left / root[i, j, j]
-
-
-@machine_code(NOTHING(THREE, TWO, TWO, ONE))
-def substitute_forward(root: Array, last: Array, states: Array, coefficients: Array) -> None:
-    """Solve R^T y = x.
-
-    Args: root, last: as above.  states: (n, w) and coefficients: (p,), x, which become y.
-    """
-    n, w = root.shape[:2]
-    p = len(coefficients)
-    for i in range(n):
-        for j in range(w):
-            states[i, j] /= root[i, j, j]
-            value = states[i, j]
-            for k in range(j + 1, w):
-                states[i, k] -= root[i, j, k] * value
-            if i + 1 < n:
-                for k in range(w):
-                    states[i + 1, k] -= root[i, j, w + k] * value
-            for k in range(p):
-                coefficients[k] -= root[i, j, 2 * w + k] * value
-    for j in range(p):
-        coefficients[j] /= last[j, 2 * w + j]
-        for k in range(j + 1, p):
-            coefficients[k] -= last[j, 2 * w + k] * coefficients[j]
-
-
-@machine_code(NOTHING(TWO, TWO))
-def invert(upper: Array, inverse: Array) -> None:
-    """The inverse (m, m) of a triangle (m, m), in the inverse of its units."""
-    m = len(upper)
-    for column in range(m):
-        for j in range(m):
-            inverse[j, column] = 0.0
-        for j in range(column, -1, -1):
-            left = 1.0 if j == column else 0.0
-            for k in range(j + 1, column + 1):
-                left -= upper[j, k] * inverse[k, column]
-            inverse[j, column] = left / upper[j, j]
-
-
-@machine_code(NOTHING(TWO, COUNT, REAL, TWO))
-def _part(rows: Array, first: int, scale: float, part: Array) -> None:
-    """Copy columns from the first on, scaled, into an array of their own."""
-    for a in range(part.shape[0]):
-        for b in range(part.shape[1]):
-            part[a, b] = scale * rows[a, first + b]
-
-
-@machine_code(NOTHING(THREE, TWO, THREE, THREE, TWO))
-def covariances_of(root: Array, last: Array, states: Array, cross: Array, coefficients: Array) -> None:
-    """Blocks of (R^T R)^-1, from the last state back to the first.
-
-    p(x_i | y) with y = (x_{i+1}, c) is Gaussian with R_i and the coupling S_i to y; with K_i = -R_i^-1 S_i the
-    covariance of x_i follows from that of y.
-
-    Args:
-        root, last: as above.
-        states: (n, w, w), cross: (n, w, w + p) of each state with the next one and the coefficients, coefficients:
-            (p, p); written, in the products of the unknowns' units.
-    """
-    n, w = root.shape[:2]
-    p = len(coefficients)
-    if p:
-        own, shared = np.empty((p, p)), np.empty((p, p))
-        _part(last, 2 * w, 1.0, shared)
-        invert(shared, own)
-        coefficients[:] = np.dot(own, own.T)
-    later, inverse = np.zeros((w + p, w + p)), np.empty((w, w))
-    upper, coupling = np.empty((w, w)), np.empty((w, w + p))
-    for a in range(p):
-        for b in range(p):
-            later[w + a, w + b] = coefficients[a, b]
-    for i in range(n - 1, -1, -1):
-        _part(root[i], 0, 1.0, upper)
-        _part(root[i], w, -1.0, coupling)
-        invert(upper, inverse)
-        gain = np.dot(inverse, coupling)
-        put_all(cross[i], np.dot(gain, later))
-        own_part, later_part = np.dot(inverse, inverse.T), np.dot(cross[i], gain.T)
-        for a in range(w):
-            for b in range(w):
-                states[i, a, b] = later[a, b] = own_part[a, b] + later_part[a, b]
-            for b in range(p):
-                later[a, w + b] = later[w + b, a] = cross[i, a, w + b]
+    carries, shared = np.zeros((BLOCK + 1, width, columns)), np.zeros((BLOCK + 1, p, columns))
+    for first in range(0, n, BLOCK):
+        reduce_block(system, start, width, first, min(first + BLOCK, n), carries, shared, root)
+    absorb(shared[0], system, start[n], start[n + 1], 2 * width, p, np.empty(start[n + 1] - start[n]))
+    close(shared[0], last)

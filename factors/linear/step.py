@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array, Index
 from ballfg.factors.batch import Rows, Values
 from ballfg.factors.linear import elimination
+from ballfg.factors.linear.substitution import substitute_back
 
 N = TypeVar("N", bound=np.generic)
 
@@ -107,7 +108,7 @@ def solve(linearized: Sequence[Rows], values: Values, damping: float = 0.0) -> S
     root = Root(np.empty((len(values.states), w, 2 * w + p + 1)), np.empty((p, 2 * w + p + 1)))
     elimination.eliminate(system, start, w, root.states, root.coefficients)
     states, coefficients = root.states[..., -1].copy(), root.coefficients[:, -1].copy()
-    elimination.substitute_back(root.states, root.coefficients, states, coefficients)
+    substitute_back(root.states, root.coefficients, states, coefficients)
     return Step.of(root, states, coefficients, damping, diagonal)
 
 

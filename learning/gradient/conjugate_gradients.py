@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ballfg.factors.linear.covariance import SquareRootInformation
-from ballfg.factors.linear.elimination import substitute_back, substitute_forward
+from ballfg.factors.linear.substitution import substitute_back, substitute_forward
 
 Product = Callable[[Tensor], Tensor]
 

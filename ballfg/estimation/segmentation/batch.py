@@ -39,14 +39,7 @@ def segment(
     """
     t, x, s = _checked(times, positions, sigma)
     physics, settings = physics or SegmentationPhysics(), settings or SegmentationSettings()
-    segmenter = Segmenter(surfaces, physics, settings)
-    events: list[Event] = []
-    pending: tuple[Event, ...] = ()
-    for k in range(len(t)):
-        decision = segmenter.push(float(t[k]), x[k], s[k])
-        events += decision.final
-        pending = decision.pending
-    events += pending
+    events = Segmenter(surfaces, physics, settings).push_all(t, x, s)
     return _assemble(t, x, events, physics, settings)
 
 
@@ -83,4 +76,11 @@ def _checked(times: ArrayLike, positions: ArrayLike, sigma: ArrayLike) -> tuple[
         raise ValueError(f"sigma must be (3,) or {x.shape}; got {s.shape}. Give one standard deviation a coordinate.")
     if not (s > 0).all():
         raise ValueError(f"sigma must be positive; got {s.min():g}. Use estimate_position_noise where none is known.")
+    good = np.isfinite(t) & (np.diff(t, prepend=-np.inf) > 0.0)
+    if not good.all():
+        raise ValueError(f"times must be finite and increase; got {t[~good][0]} s. Sort the samples.")
+    for name, array in (("positions", x), ("sigma", s)):
+        if not np.isfinite(array).all():
+            wrong = array[~np.isfinite(array)][0]
+            raise ValueError(f"{name} must be finite numbers in m; got {wrong}. Drop samples without a position.")
     return t, x, np.broadcast_to(s, x.shape)

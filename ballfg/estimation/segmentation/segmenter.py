@@ -80,13 +80,29 @@ class Segmenter:
         Raises: ValueError: if the time does not increase, or something is not finite or has a wrong shape.
         """
         point, noise = self._checked(time, position, sigma)
-        noise = np.maximum(noise, self._scene.settings.sigma_floor)
+        final = self._taken(time, point, np.maximum(noise, self._scene.settings.sigma_floor))
+        return Decision(final, tuple(node.event for node in open_nodes(self._tips[0])))
+
+    def push_all(self, times: Array, positions: Array, sigmas: Array) -> list[Event]:
+        """Takes in samples that are known to be in order and finite, and tells the events of all samples so far.
+
+        Args: times: (n,) s.  positions, sigmas: (n, 3) m.
+        Returns: the events that became final, then the best explanation of the rest, oldest first.
+        """
+        events: list[Event] = []
+        noise = np.array(np.maximum(sigmas, self._scene.settings.sigma_floor), order="C")
+        for sample in zip(times.tolist(), np.array(positions, order="C"), noise, strict=True):
+            events += self._taken(*sample)
+        return events + ([node.event for node in open_nodes(self._tips[0])] if self._tips else [])
+
+    def _taken(self, time: float, position: Array, sigma: Array) -> tuple[Event, ...]:
+        """The events that a sample makes final."""
         last, scene = (self._bank, self._time), self._scene
-        self._bank, log = explain(*last, time, point, noise, self._count, scene.numbers, scene.rows)
+        self._bank, log = explain(*last, time, position, sigma, self._count, scene.numbers, scene.rows)
         self._tips = self._followed(self._bank["tip"].tolist(), log)
         self._time = time
         self._count += 1
-        return self._decide()
+        return self._made_final()
 
     def _followed(self, tips: list[int], log: Records) -> list[Node | None]:
         """The last node of each hypothesis after a sample; hypotheses that pass through the same event share its node.
@@ -107,16 +123,15 @@ class Segmenter:
 
         return [old[-1 - tip] if NO_EVENT < tip < 0 else node(tip) for tip in tips]
 
-    def _decide(self) -> Decision:
-        """Makes old events final, drops the hypotheses that deny them, and reports."""
-        pending = open_nodes(self._tips[0])
+    def _made_final(self) -> tuple[Event, ...]:
+        """Makes old events final, and drops the hypotheses that deny them."""
         cutoff = self._count - self._scene.settings.lag
-        old = [node for node in pending if node.event.index < cutoff]
+        old = [node for node in open_nodes(self._tips[0]) if node.event.index < cutoff]
         if not old:
-            return Decision((), tuple(node.event for node in pending))
+            return ()
         agreeing = [row for row, tip in enumerate(self._tips) if contains(tip, old[-1])]
         self._bank, self._tips = self._bank[agreeing], [self._tips[row] for row in agreeing]
-        return Decision(make_final(old), tuple(node.event for node in pending[len(old) :]))
+        return make_final(old)
 
     def _checked(self, time: float, position: ArrayLike, sigma: ArrayLike) -> tuple[Array, Array]:
         if not math.isfinite(time) or time <= self._time:

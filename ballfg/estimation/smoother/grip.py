@@ -8,6 +8,7 @@ side.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,9 +48,10 @@ def with_other_spins(solution: Solution, model: BallModel, optimizer: LevenbergM
 
     Args: solution: so far.  model: of the ball, with the coefficients that are estimated.  optimizer: for the others.
     """
-    least = optimizer.tolerance
-    for bounce in bounces_of(solution):
-        side = other_side(solution.minimum.values, bounce, model)
+    least, bounces = optimizer.tolerance, bounces_of(solution)
+    sides = other_sides(solution.minimum.values, bounces, model)
+    for number, bounce in enumerate(bounces):
+        side = next(sides)
         if side is None or not (yield from worth_a_search(solution, bounce, side, optimizer, TIE)):
             continue
         minimum = yield from searched_while(optimizer.search(solution.graph, side.values), side.holds)
@@ -59,6 +61,8 @@ def with_other_spins(solution: Solution, model: BallModel, optimizer: LevenbergM
         tie = least < abs(minimum.error - found.error) < TIE
         rival = (found if lower else minimum).values.states[0, SPIN] if tie else solution.rival
         solution = replace(solution, minimum=minimum if lower else found, rival=rival)
+        if lower:
+            sides = other_sides(minimum.values, bounces[number + 1 :], model)
     return solution
 
 
@@ -128,52 +132,64 @@ class OtherSide:
         return bool((slip >= self.edge) == self.slides)
 
 
-def other_side(values: Values, bounce: Bounce, model: BallModel) -> OtherSide | None:
-    """The start with another spin at a bounce: rolling where the ball slid, sliding where it gripped.
+def other_sides(values: Values, bounces: Sequence[Bounce], model: BallModel) -> Iterator[OtherSide | None]:
+    """The starts with another spin at each of some bounces: rolling where the ball slid, sliding where it gripped.
 
     Args:
         values: of a minimum.
-        bounce: whose spin changes, from the first to the last state that belongs to it.
+        bounces: whose spin changes, from the first to the last state that belongs to one; each by itself.
         model: of the ball, with the coefficients that are estimated.
-    Returns: None where the ball does not slip, or never slides.
+    Yields: one for each bounce; None for bounces at which the ball does not slip, or never slides.
     """
-    before = np.concatenate((values.states[bounce.interval], values.coefficients[: model_width(model)]))
+    at = np.array([bounce.interval for bounce in bounces], dtype=np.int64)
+    known = np.tile(values.coefficients[: model_width(model)], (len(at), 1))
+    before = np.concatenate((values.states[at], known), axis=1)
     slip = _slip(before, model.radius)
-    sliding = _slopes(before, slip, model) < SLIDES
-    if np.linalg.norm(slip) < LEAST_SLIP or not sliding.any():
-        return None
-    edge = float(SCALES[sliding.argmax()])
+    speed, sliding = np.linalg.norm(slip, axis=1), _slopes(before, slip, model) < SLIDES
+    edge = SCALES[sliding.argmax(axis=1)]
     slides = edge > 1.0  # on the other side
-    turned = _with_slip(before, slip, WELL_BEYOND * edge if slides else 0.0, model.radius)
+    turned = _with_slip(before, slip, np.where(slides, WELL_BEYOND * edge, 0.0), model.radius)
     old, new = _bounced(np.stack((before, turned)), model)
+    first, later = turned[:, SPIN] - before[:, SPIN], new[:, SPIN] - old[:, SPIN]
+    there = (speed >= LEAST_SLIP) & sliding.any(axis=1)
+    ends = speed * np.where(slides, NEXT, edge)
+    for k, bounce in enumerate(bounces):
+        if there[k]:
+            start = _turned(values, bounce, first[k], later[k])
+            yield OtherSide(start, bounce.interval, float(ends[k]), bool(slides[k]), model.radius)
+        else:
+            yield None
+
+
+def _turned(values: Values, bounce: Bounce, before: Array, after: Array) -> Values:
+    """Values with more spin on both sides of a bounce."""
     states = values.states.copy()
-    states[bounce.first : bounce.interval + 1, SPIN] += turned[SPIN] - before[SPIN]
-    states[bounce.interval + 1 : bounce.last + 1, SPIN] += new[SPIN] - old[SPIN]
-    speed = float(np.linalg.norm(slip))
-    return OtherSide(
-        replace(values, states=states), bounce.interval, speed * (NEXT if slides else edge), slides, model.radius
-    )
+    states[bounce.first : bounce.interval + 1, SPIN] += before
+    states[bounce.interval + 1 : bounce.last + 1, SPIN] += after
+    return replace(values, states=states)
 
 
 def _slopes(before: Array, slip: Array, model: BallModel) -> Array:
-    """Slope of log(friction) by log(slip) at `SCALES` of a slip."""
-    rows = [_with_slip(before, slip, nudge * scale, model.radius) for nudge in (1.0, NUDGE) for scale in SCALES]
-    kicks = _bounced(np.stack(rows), model)[:, VELOCITY][:, :2] - before[VELOCITY][:2]
-    at, beyond = np.maximum(np.linalg.norm(kicks, axis=-1), 1e-12).reshape(2, -1)
+    """Slopes of log(friction) by log(slip) at `SCALES` of the slips of some states."""
+    scales = np.concatenate((SCALES, NUDGE * SCALES))
+    rows = _with_slip(before[:, None], slip[:, None], scales, model.radius)
+    kicks = (_bounced(rows, model) - before[:, None, :STATE_DIM])[..., VELOCITY][..., :2]
+    at, beyond = np.split(np.maximum(np.linalg.norm(kicks, axis=-1), 1e-12), 2, axis=1)
     return np.asarray(np.log(beyond / at) / np.log(NUDGE))
 
 
 def _slip(state: Array, radius: float) -> Array:
-    """(2,) m/s, velocity of the ball's lowest point over a level surface."""
-    velocity, spin = torch.from_numpy(state[VELOCITY]), torch.from_numpy(state[SPIN])
+    """(.., 2) m/s, velocity of the ball's lowest point over a level surface, of states (.., 9) or longer."""
+    velocity, spin = torch.from_numpy(state[..., VELOCITY]), torch.from_numpy(state[..., SPIN])
     return np.asarray(slip_velocity(velocity, spin, radius).numpy())
 
 
-def _with_slip(before: Array, slip: Array, scale: float, radius: float) -> Array:
-    """The state with a multiple of its slip, by another spin."""
-    changed, more = before.copy(), (scale - 1.0) * slip / radius
-    changed[SPIN.start] += more[1]
-    changed[SPIN.start + 1] -= more[0]
+def _with_slip(before: Array, slip: Array, scale: Array, radius: float) -> Array:
+    """States (.., s) with multiples of their slip (.., 2), by another spin."""
+    more = (scale - 1.0)[..., None] * slip / radius
+    changed = np.array(np.broadcast_to(before, (*more.shape[:-1], before.shape[-1])))
+    changed[..., SPIN.start] += more[..., 1]
+    changed[..., SPIN.start + 1] -= more[..., 0]
     return changed
 
 

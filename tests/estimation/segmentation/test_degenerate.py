@@ -156,8 +156,8 @@ def test_below_every_surface():
         (T, PARABOLA[:5], np.ones(3), r"positions \(n, 3\); got \(60,\) and \(5, 3\)"),
         (T, PARABOLA, np.ones(2), r"sigma must be \(3,\) or \(60, 3\); got \(2,\)"),
         (T, PARABOLA, np.zeros(3), r"sigma must be positive; got 0"),
-        (T[::-1], PARABOLA, np.ones(3), r"time must be finite and increase; got 0.32"),
-        (T, PARABOLA * np.nan, np.ones(3), r"position must be three finite numbers"),
+        (T[::-1], PARABOLA, np.ones(3), r"times must be finite and increase; got 0.32"),
+        (T, PARABOLA * np.nan, np.ones(3), r"positions must be finite numbers"),
     ],
 )
 def test_bad_input_is_named(times, positions, sigma, message):

@@ -11,7 +11,7 @@ import torch
 
 import ballfg.estimation.smoother.smoother as room
 from ballfg.dynamics.motion.impact import slip_velocity
-from ballfg.estimation.smoother.grip import Bounce, bounces_of, other_side
+from ballfg.estimation.smoother.grip import Bounce, bounces_of, other_sides
 from ballfg.estimation.smoother.smoother import Smoother
 from ballfg.estimation.smoother.solution import Solution
 from ballfg.factors.batch import Values
@@ -77,7 +77,7 @@ def test_the_other_side_keeps_the_direction_of_the_slip() -> None:
     (bounce,) = bounces_of(solution)
     assert (bounce.first, bounce.last) == (0, len(track) - 1)
     assert truth[bounce.interval, 5] < 0.0 < truth[bounce.interval + 1, 5]
-    side = other_side(solution.minimum.values, bounce, MODEL)
+    (side,) = other_sides(solution.minimum.values, [bounce], MODEL)
     assert side is not None
     assert side.holds(side.values)
     assert not side.holds(solution.minimum.values)
@@ -109,7 +109,7 @@ def test_the_other_side_of_a_slip_at_which_the_ball_grips_is_one_at_which_it_sli
     kicks = 3.0 - after[:, 3]
     gripping = float(slips[np.argmax(kicks > 0.99 * kicks.max())])  # from here on more slip gives no more friction
     values = Values(np.stack([with_slip(share * gripping)] * 4), np.zeros(0))
-    side = other_side(values, Bounce(1, 0, 3), MODEL)
+    (side,) = other_sides(values, [Bounce(1, 0, 3)], MODEL)
     assert side is not None
     assert side.slides is slides
     speed = np.linalg.norm(slip_velocity(*torch.from_numpy(side.values.states[1]).split(3)[1:], MODEL.radius).numpy())

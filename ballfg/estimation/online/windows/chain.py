@@ -23,7 +23,8 @@ from ballfg.estimation.online.windows.linear import LinearFactors
 from ballfg.estimation.online.windows.stream_window import Arrival, StreamWindow
 from ballfg.factors.batch import COEFFICIENTS, FactorBatch
 from ballfg.factors.dynamics import DynamicsFactors
-from ballfg.factors.linear.elimination import covariances_of, eliminate_on, padded, substitute_back
+from ballfg.factors.linear.elimination import eliminate_on, padded
+from ballfg.factors.linear.substitution import covariances_of, substitute_back
 from ballfg.factors.prior import coefficient_prior
 from ballfg.factors.tracker import BiasFactors, BiasStartFactors
 from ballfg.state import STATE_DIM

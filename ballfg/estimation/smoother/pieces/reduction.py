@@ -14,9 +14,10 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.factors.batch import COEFFICIENTS, Rows, Values
-from ballfg.factors.linear import elimination
 from ballfg.factors.linear.covariance import Covariances, SquareRootInformation
+from ballfg.factors.linear.fading import eliminate_fading
 from ballfg.factors.linear.step import Root, damped_rows
+from ballfg.factors.linear.substitution import substitute_back
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ class Reduction:
         moved = [part for rows in linearized for part in _first_behind(rows, self.coefficients, w)]
         system, start, _ = damped_rows(moved, point, 0.0)
         self.root = Root(np.empty((m, w, 2 * w + p + 1)), np.empty((p, 2 * w + p + 1)))
-        elimination.eliminate(system, start, w, self.root.states, self.root.coefficients)
+        eliminate_fading(system, start, w, w, self.root.states, self.root.coefficients)
         self.inner = 0.5 * float((self.root.states[:-1, :, -1] ** 2).sum())
 
     @property
@@ -172,7 +173,7 @@ def _solved(rows: Array, right: Array) -> Array:
     none, found = np.empty((0, rows.shape[2])), np.empty_like(right)
     for k in np.ndindex(right.shape[2:]):
         states = right[..., *k].copy()
-        elimination.substitute_back(rows, none, states, np.empty(0))
+        substitute_back(rows, none, states, np.empty(0))
         found[..., *k] = states
     return found
 
