@@ -9,8 +9,6 @@ from collections.abc import Iterable
 from importlib import metadata
 from typing import TYPE_CHECKING, Final
 
-from ballfg.checks import shown
-
 if TYPE_CHECKING:
     import torch
 
@@ -41,7 +39,7 @@ def usable_device(name: str) -> torch.device:
         torch.zeros(1, dtype=torch.float64, device=device).cpu()
     except (RuntimeError, AssertionError, NotImplementedError, TypeError) as error:  # torch's, for all it cannot use
         reason = str(error).splitlines()[0]
-        raise ValueError(f"device must be one that torch computes on; got {shown(name)}: {reason}") from None
+        raise ValueError(f"device must be one that torch computes on; got {name!r}: {reason}") from None
     return device
 
 

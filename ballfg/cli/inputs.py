@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Annotated, Generic, TypeVar
 
 import typer
 
-from ballfg.checks import shown
 from ballfg.cli.errors import NOT_ESTIMATED
 from ballfg.machine import usable_cores
 from ballfg.progress import progress
@@ -259,6 +258,8 @@ class Outcome:
             name: of the track.  status: how it ended.  notes: doubts about its frame.
             outside: share of it outside of a network's training data, 0 to 1; None without a network.
         """
+        from ballfg.checks import shown
+
         self.statuses[status.value] += 1
         if status.failed:
             self.failures += 1
