@@ -18,6 +18,7 @@ from torch import Tensor
 
 from ballfg.estimation.noise.linear_filter import Filtered, LinearFilter, Noise, half_square
 from ballfg.estimation.noise.linear_tracks import LinearTracks
+from ballfg.state import POSITION, STATE_DIM
 
 HORIZONS: Final = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 """s ahead of a start; the first good sample at or after each is scored."""
@@ -80,7 +81,7 @@ class Forecaster:
         self.tracks, self.filter = tracks, LinearFilter(tracks, velocity_prior, biased=biased)
         self.count, self.samples = tracks.times.shape
         self.starts = self._starts(earliest, every)
-        self._plan = self._scored()
+        self._ahead = _Ahead.of(tracks, self.starts)
 
     def _starts(self, earliest: float, every: float) -> Tensor:
         found = []
@@ -90,56 +91,78 @@ class Forecaster:
             found += [(track, k) for k in np.unique(np.searchsorted(times, moments)).tolist()]
         return torch.tensor(found, dtype=torch.int64).reshape(-1, 2)
 
-    def _scored(self) -> list[Tensor]:
-        """For each number of samples ahead, the rows of `starts` whose sample there is scored."""
-        track, start = self.starts.T
-        begin, reached = self.tracks.times[track, start], torch.zeros(len(track), dtype=torch.float64)
-        horizons, plan = torch.tensor(HORIZONS, dtype=torch.float64), []
-        for ahead in range(1, self.samples):
-            sample = (start + ahead).clamp(max=self.samples - 1)
-            elapsed = self.tracks.times[track, sample] - begin + ROUNDING
-            fresh = (start + ahead < self.samples) & self.tracks.used[track, sample]
-            due = ((horizons > reached[:, None]) & (horizons <= elapsed[:, None])).any(dim=1)
-            scored = torch.nonzero(fresh & due)[:, 0]
-            reached = torch.where(fresh, elapsed, reached)
-            plan.append(scored)
-            if bool((reached >= HORIZONS[-1]).all()):
-                break
-        while plan and not len(plan[-1]):
-            plan.pop()
-        return plan
-
     def score(self, noise: Noise) -> Score:
         """The score of some noise."""
-        transitions, gathered = self.filter.motion(noise)
         measured = self.filter.measured(noise)
-        filtered = self.filter.run(noise, transitions, gathered, measured)
-        total, inside, count = self._forecast(filtered, transitions, gathered, measured)
+        filtered = self.filter.run(noise, *self.filter.motion(noise), measured)
+        total, inside, count = self._forecast(filtered, noise, measured)
         by_track = total / max(count, 1) + MARGINAL_WEIGHT * filtered.following / max(filtered.count, 1)
         return Score(by_track, inside / max(3 * count, 1), len(self.starts))
 
-    def _forecast(
-        self, filtered: Filtered, transitions: Tensor, gathered: Tensor, measured: Tensor
-    ) -> tuple[Tensor, float, int]:
+    def _forecast(self, filtered: Filtered, noise: Noise, measured: Tensor) -> tuple[Tensor, float, int]:
         """(t,) summed scores of forecasts, coordinates inside their 90 % intervals, and the number of forecasts."""
-        observe, (track, start) = self.filter.measure, self.starts.T
-        mean, covariance = filtered.means[track, start], filtered.covariances[track, start]
-        departures = torch.nn.functional.pad(self.tracks.departures, (0, self.filter.biases))
-        intervals = (start[:, None] + torch.arange(len(self._plan))).clamp(max=self.samples - 2)
-        steps, added = (x[track[:, None], intervals].unbind(1) for x in (transitions, gathered))
-        total, inside, count = torch.zeros(self.count, dtype=torch.float64), 0.0, 0
-        for ahead, scored in enumerate(self._plan, start=1):
-            step = steps[ahead - 1]
-            mean = (step @ mean[..., None])[..., 0] + departures[track, intervals[:, ahead - 1]]
-            covariance = step @ covariance @ step.mT + added[ahead - 1]
-            if not len(scored):
-                continue
-            at = track[scored], start[scored] + ahead
-            spread = observe @ covariance[scored] @ observe.mT + measured[at]
-            variance = torch.diagonal(spread, dim1=-2, dim2=-1)
-            square = (self.tracks.errors[at] - mean[scored] @ observe.mT).square() / variance
-            scores = (half_square(square, TAIL) + 0.5 * variance.log()).sum(dim=1)
-            total = total.index_add(0, track[scored], scores)
-            inside += float((square.detach() < NINETY**2).sum())
-            count += len(scored)
-        return total, inside, count
+        ahead = self._ahead
+        mean, covariance = filtered.means[ahead.track, ahead.start], filtered.covariances[ahead.track, ahead.start]
+        process = noise.process.square().expand(self.count, -1)[ahead.track]
+        observe, gathered = ahead.by_state, (ahead.kicks @ process[..., None])[..., 0]
+        if self.filter.biases:
+            time, memory = (x.expand(self.count, *x.shape[1:])[ahead.track] for x in (noise.memory_time, noise.memory))
+            decay = torch.exp(-ahead.elapsed / time)
+            observe = torch.cat((observe, decay[:, None, None] * torch.eye(3, dtype=torch.float64)), dim=2)
+            gathered = gathered + memory * (1.0 - decay.square())[:, None]
+        new = torch.diagonal(measured[ahead.track, ahead.sample], dim1=-2, dim2=-1)
+        variance = ((observe @ covariance) * observe).sum(dim=2) + gathered + new
+        predicted = (observe @ mean[..., None])[..., 0] + ahead.departures
+        square = (self.tracks.errors[ahead.track, ahead.sample] - predicted).square() / variance
+        scores = (half_square(square, TAIL) + 0.5 * variance.log()).sum(dim=1)
+        total = torch.zeros(self.count, dtype=torch.float64).index_add(0, ahead.track, scores)
+        return total, float((square.detach() < NINETY**2).sum()), len(scores)
+
+
+@dataclass(frozen=True)
+class _Ahead:
+    """The forecasts that are scored, and what leads to them whatever the noise is: s forecasts.
+
+    Attributes:
+        track, start, sample: (s,) the track, the sample from which, and the one of which.
+        elapsed: (s,) s between the two.
+        by_state: (s, 3, d) how the position moves with state and coefficients at the start.
+        kicks: (s, 3, 7) m^2, its variance per axis that a unit of each number of `PROCESS_NOISE` gathers on the way.
+        departures: (s, 3) m, what the departures on the way make of it.
+    """
+
+    track: Tensor
+    start: Tensor
+    sample: Tensor
+    elapsed: Tensor
+    by_state: Tensor
+    kicks: Tensor
+    departures: Tensor
+
+    @classmethod
+    def of(cls, tracks: LinearTracks, starts: Tensor) -> _Ahead:
+        """All forecasts from some starts (r, 2), track and sample."""
+        (track, start), (samples, own) = starts.T, (tracks.times.shape[1], tracks.transitions.shape[-1])
+        begin, reached = tracks.times[track, start], torch.zeros(len(track), dtype=torch.float64)
+        horizons, found = torch.tensor(HORIZONS, dtype=torch.float64), []
+        way = torch.eye(own, dtype=torch.float64).expand(len(track), own, own)
+        kicks = torch.zeros((len(track), *tracks.kicks.shape[2:]), dtype=torch.float64)
+        departed = torch.zeros((len(track), own), dtype=torch.float64)
+        for ahead in range(1, samples):
+            interval = (start + ahead - 1).clamp(max=samples - 2)
+            step = tracks.transitions[track, interval]
+            moved = step[:, None, :STATE_DIM, :STATE_DIM]
+            way, kicks = step @ way, moved @ kicks @ moved.mT + tracks.kicks[track, interval]
+            departed = (step @ departed[..., None])[..., 0] + tracks.departures[track, interval]
+            sample = (start + ahead).clamp(max=samples - 1)
+            elapsed = tracks.times[track, sample] - begin
+            fresh = (start + ahead < samples) & tracks.used[track, sample]
+            due = ((horizons > reached[:, None]) & (horizons <= elapsed[:, None] + ROUNDING)).any(dim=1)
+            rows = torch.nonzero(fresh & due)[:, 0]
+            reached = torch.where(fresh, elapsed + ROUNDING, reached)
+            gathered = torch.diagonal(kicks[rows][..., POSITION, POSITION], dim1=-2, dim2=-1).mT
+            found.append((rows, sample[rows], elapsed[rows], way[rows, POSITION], gathered, departed[rows, POSITION]))
+            if bool((reached >= HORIZONS[-1]).all()):
+                break
+        rows, *rest = (torch.cat(parts) for parts in zip(*found, strict=True))
+        return cls(track[rows], start[rows], *rest)

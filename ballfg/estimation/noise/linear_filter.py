@@ -111,34 +111,39 @@ class LinearFilter:
         prior = tracks.prior_variances(noise.spin_prior, noise.spin_label, noise.coefficients, self.velocity_prior)
         covariance = torch.diag_embed(torch.cat((prior, noise.memory.expand(self.count, -1)[:, : self.biases]), dim=1))
         mean = torch.cat((tracks.starts, torch.zeros((self.count, self.biases), dtype=torch.float64)), dim=1)
-        unit = torch.eye(self.width, dtype=torch.float64)
         departures = torch.nn.functional.pad(tracks.departures, (0, self.biases))
-        total, nexts = torch.zeros(self.count, dtype=torch.float64), 0
-        means, covariances = [], []
+        means, covariances, squares, volumes = [], [], [], []
         # taken apart once: the derivative of an index would fill a tensor of the whole size at every step
         steps, added, news = transitions.unbind(1), gathered.unbind(1), measured.unbind(1)
         for k in range(self.samples):
             if k:
                 mean = (steps[k - 1] @ mean[..., None])[..., 0] + departures[:, k - 1]
                 covariance = steps[k - 1] @ covariance @ steps[k - 1].mT + added[k - 1]
-            spread = observe @ covariance @ observe.mT + news[k]
-            root = torch.linalg.cholesky(spread)
+            seen = observe @ covariance
+            root = torch.linalg.cholesky(seen @ observe.mT + news[k])
             missed = tracks.errors[:, k] - mean @ observe.mT
-            whitened = torch.linalg.solve_triangular(root, missed[..., None], upper=False)[..., 0]
-            square = whitened.square().sum(dim=-1)
-            if k >= NEXT_FROM:
-                used = tracks.used[:, k]
-                volume = torch.diagonal(root, dim1=-2, dim2=-1).log().sum(dim=-1)
-                total = total + (half_square(square, NEXT_TAIL) + volume) * used
-                nexts += int(used.sum())
-            gain = torch.cholesky_solve(observe @ covariance, root).mT
-            gain = gain * (tracks.used[:, k] & (square < GATE))[:, None, None]
-            mean = mean + (gain @ missed[..., None])[..., 0]
-            rest = unit - gain @ observe
-            covariance = rest @ covariance @ rest.mT + gain @ news[k] @ gain.mT
+            # of the innovation and of what it tells, the columns per whitened innovation
+            whitened = torch.linalg.solve_triangular(root, torch.cat((missed[..., None], seen), dim=2), upper=False)
+            innovation, told = whitened[..., :1], whitened[..., 1:]
+            square = innovation.square().sum(dim=(1, 2))
+            squares.append(square)
+            volumes.append(torch.diagonal(root, dim1=-2, dim2=-1))
+            told = told * (tracks.used[:, k] & (square < GATE))[:, None, None]
+            mean = mean + (told.mT @ innovation)[..., 0]
+            if k:
+                covariance = covariance - told.mT @ told
+            else:  # a difference would lose ten digits: the prior of the position is that much wider than what is left
+                gain = torch.linalg.solve_triangular(root.mT, told, upper=True).mT
+                rest = torch.eye(self.width, dtype=torch.float64) - gain @ observe
+                covariance = rest @ covariance @ rest.mT + gain @ news[k] @ gain.mT
             means.append(mean)
             covariances.append(covariance)
-        return Filtered(torch.stack(means, dim=1), torch.stack(covariances, dim=1), total, nexts)
+        used = tracks.used[:, NEXT_FROM:]
+        volume = torch.stack(volumes[NEXT_FROM:], dim=1).log().sum(dim=-1)
+        following = (half_square(torch.stack(squares[NEXT_FROM:], dim=1), NEXT_TAIL) + volume) * used
+        return Filtered(
+            torch.stack(means, dim=1), torch.stack(covariances, dim=1), following.sum(dim=1), int(used.sum())
+        )
 
 
 def half_square(square: Tensor, tail: float) -> Tensor:

@@ -79,7 +79,7 @@ def test_score_is_that_of_the_joint_gaussian(case):
     transitions, gathered = forecaster.filter.motion(noise)
     measured = forecaster.filter.measured(noise)
     filtered = forecaster.filter.run(noise, transitions, gathered, measured)
-    own, _, scored = forecaster._forecast(filtered, transitions, gathered, measured)
+    own, _, scored = forecaster._forecast(filtered, noise, measured)
     assert scored == count
     np.testing.assert_allclose(float(own.sum()) / scored, total / count, rtol=1e-6)
 
