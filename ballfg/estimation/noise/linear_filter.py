@@ -118,7 +118,7 @@ class LinearFilter:
         for k in range(self.samples):
             if k:
                 mean = (steps[k - 1] @ mean[..., None])[..., 0] + departures[:, k - 1]
-                covariance = steps[k - 1] @ covariance @ steps[k - 1].mT + added[k - 1]
+                covariance = torch.baddbmm(added[k - 1], steps[k - 1] @ covariance, steps[k - 1].mT)
             seen = observe @ covariance
             root = torch.linalg.cholesky(seen @ observe.mT + news[k])
             missed = tracks.errors[:, k] - mean @ observe.mT
@@ -131,7 +131,7 @@ class LinearFilter:
             told = told * (tracks.used[:, k] & (square < GATE))[:, None, None]
             mean = mean + (told.mT @ innovation)[..., 0]
             if k:
-                covariance = covariance - told.mT @ told
+                covariance = torch.baddbmm(covariance, told.mT, told, alpha=-1.0)
             else:  # a difference would lose ten digits: the prior of the position is that much wider than what is left
                 gain = torch.linalg.solve_triangular(root.mT, told, upper=True).mT
                 rest = torch.eye(self.width, dtype=torch.float64) - gain @ observe
