@@ -9,7 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LEVELS = (
-    ("state", "arrays", "checks", "progress", "registry", "machine"),
+    ("state", "arrays", "checks", "progress", "registry", "machine", "collector"),
     ("files",),
     ("parallel",),
     ("tracks",),

@@ -2,6 +2,7 @@
 
 import sys
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -16,9 +17,7 @@ def start(app: typer.Typer, name: str, arguments: Sequence[str] | None) -> NoRet
     Args: app: the program.  name: its name, as users type it.  arguments: its words.
     Raises: SystemExit: always; status 0, 2 on bad input, 130 after Ctrl-C, or what the command returns.
     """
-    command = typer.main.get_command(app)
-    for one in _commands(command):
-        one.params.append(_quiet())
+    command = _command(app)
     given = sys.argv[1:] if arguments is None else list(arguments)
 
     def work() -> object:
@@ -26,6 +25,15 @@ def start(app: typer.Typer, name: str, arguments: Sequence[str] | None) -> NoRet
             return command.main(given, prog_name=name, standalone_mode=False)
 
     sys.exit(guarded(work))
+
+
+@cache
+def _command(app: typer.Typer) -> Any:
+    """A program's command line, each command with --quiet; read from the signatures once in a process."""
+    command, quiet = typer.main.get_command(app), _quiet()
+    for one in _commands(command):
+        one.params.append(quiet)
+    return command
 
 
 def _commands(command: Any) -> Iterator[Any]:
