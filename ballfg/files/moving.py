@@ -67,6 +67,18 @@ def settle(folder: Path) -> None:
             _finish(each)
 
 
+def reclaim(folder: Path) -> None:
+    """Settles a folder, and takes away what a killed writer left in it; for whoever goes on to write there.
+
+    Raises: ValueError: another process is writing there. OSError: nothing can be removed there.
+    """
+    settle(folder)
+    place = folder / MARK
+    if place.is_dir():
+        with held(place, folder, "a folder"):  # which clears it
+            pass
+
+
 def _finish(folder: Path) -> None:
     place, begun = folder / MARK, time.monotonic()
     while (place / PLAN).exists():

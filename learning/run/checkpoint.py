@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ballfg.checks import one_line
 from ballfg.dynamics.earlier_names import todays_name
-from ballfg.files.moving import settle
+from ballfg.files.moving import reclaim
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.weights import read_tensors
 from ballfg.files.whole_folder import whole_folder
@@ -84,12 +84,12 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
 
 
 def read_checkpoint(folder: Path) -> Checkpoint | None:
-    """The checkpoint of a run; None if it stopped before the first.
+    """The checkpoint of a run that goes on; None if it stopped before the first.
 
     Raises: ValueError: if it is damaged.
     """
     path = folder / NAME
-    settle(path)
+    reclaim(path)
     if not path.exists():
         return None
     try:
