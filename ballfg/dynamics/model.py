@@ -80,6 +80,11 @@ class BallModel(nn.Module, ABC):
                 model = _with_value(model, name, value)
         return model
 
+    @property
+    def in_flight(self) -> "BallModel":
+        """A model that flies and meets surfaces alike and is not random; this one, unless it is."""
+        return self
+
     @functools.cached_property
     def parameter_count(self) -> int:
         """Number of the model's parameters."""

@@ -49,6 +49,11 @@ class KickedModel(BallModel):
         sigma[VELOCITY], sigma[SPIN] = noise.contact_velocity, noise.contact_spin
         self._sigma = sigma
 
+    @property
+    def in_flight(self) -> BallModel:
+        """The undisturbed model."""
+        return self.model
+
     def rates(self, state: Tensor) -> Rates:
         """Those of the undisturbed model."""
         return self.model.rates(state)

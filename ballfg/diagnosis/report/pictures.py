@@ -35,6 +35,8 @@ SHOWN_SHARE = 0.98
 """Share of the single points that lie within the axes."""
 LEAST_EXPLAINED = 0.3
 """Least squared residual that is drawn: chance alone explains about 1."""
+MARGINS = (0.8, 0.12, 0.52, 0.32)
+"""Inches left and right of a grid of panels and below it, for names and numbers; above it, for a line of a title."""
 NAMED = 6
 """Candidates of the first round that the picture of the rounds names, beside those added later."""
 LINES_OF_TEXT = 18
@@ -45,7 +47,7 @@ MARKED = {Outcome.ADDED: ("added", AFTER), Outcome.ALIKE: ("alike", BEFORE)}
 
 def flight_in_time(series: Series) -> Figure:
     """Acceleration that the model lacks against the time since launch, one column for each of the series."""
-    figure, panels = _grid(3, len(series), (max(7.4, 5.0 * len(series)), 6.0))
+    figure, panels = _grid(3, len(series), (max(7.4, 5.0 * len(series)), 6.0), titles=2)
     for column, (label, residuals) in zip(panels.T, series.items(), strict=True):
         flight = residuals.flight
         _means(column, flight.times, *in_flight(flight), flight.stretch, label)
@@ -77,7 +79,7 @@ def flight_against(series: Series) -> Figure:
 def contacts(series: Series, radius: float) -> Figure:
     """Outgoing minus predicted velocity at contacts against the normal speed and the slip; radius: m, of the ball."""
     count = len(series)
-    figure, panels = _grid(3, 2 * count, (max(8.2, 5.9 * count), 6.2))
+    figure, panels = _grid(3, 2 * count, (max(8.2, 5.9 * count), 6.2), titles=2)
     points = []
     for i, (label, residuals) in enumerate(series.items()):
         contact = residuals.contact
@@ -214,10 +216,18 @@ def _apart(places: Mapping[str, float]) -> dict[str, float]:
     return placed
 
 
-def _grid(rows: int, columns: int, size: tuple[float, float]) -> tuple[Figure, NDArray[np.object_]]:
-    """A figure of panels: those in a column have the same horizontal axis, all of them the same vertical one."""
-    figure = Figure(figsize=size, layout="constrained")
-    panels = figure.subplots(rows, columns, squeeze=False, sharex="col", sharey=True)
+def _grid(rows: int, columns: int, size: tuple[float, float], titles: int = 1) -> tuple[Figure, NDArray[np.object_]]:
+    """A figure of panels: those in a column have the same horizontal axis, all of them the same vertical one.
+
+    Args: size: inches.  titles: lines above the panels.
+    """
+    (left, right, bottom, line), (width, height) = MARGINS, size
+    top = titles * line
+    places = {"left": left / width, "right": 1 - right / width, "bottom": bottom / height, "top": 1 - top / height}
+    figure = Figure(figsize=size)  # matplotlib's own search for a layout takes longer than all the drawing
+    panels = figure.subplots(
+        rows, columns, squeeze=False, sharex="col", sharey=True, gridspec_kw=places | {"wspace": 0.05, "hspace": 0.1}
+    )
     for axes in panels.flat:
         axes.grid(visible=True, which="major", alpha=0.25)
     return figure, panels

@@ -50,9 +50,10 @@ def _found(model: BallModel, state: Tensor, height: Tensor | float, longest: Ten
     if not followed(state, height, longest):
         from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
 
-        functions = motion.functions_of(model)
+        calm = model.in_flight
+        functions = motion.functions_of(calm)
         if functions is not None:
-            return motion.contact_time(model, functions, state, height, longest)
+            return motion.contact_time(calm, functions, state, height, longest)
     tau = _search(model, state, height, torch.zeros_like(state[..., Z]), longest)
     if bool(tau.isnan().any()):  # rare: lift above the weight, near misses, or no contact at all
         start = _scan(model, state, height, tau.isnan(), longest)

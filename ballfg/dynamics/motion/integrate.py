@@ -93,9 +93,10 @@ def fly(model: BallModel, state: Tensor, dt: Tensor) -> Tensor:
     if not followed(state, dt):
         from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
 
-        functions = motion.functions_of(model)
+        calm = model.in_flight
+        functions = motion.functions_of(calm)
         if functions is not None:
-            return motion.fly(model, functions, state, dt)
+            return motion.fly(calm, functions, state, dt)
     steps = step_count(dt)
     h = (dt / steps).unsqueeze(-1)
     for _ in range(steps):
