@@ -56,8 +56,11 @@ def load_model(
     learned = content.get("learned") if isinstance(content, Mapping) else None
     if learned is None:
         return model_from_dict(content, radius=radius, inertia_factor=inertia_factor, where=str(path))
-    if not isinstance(learned, str) or not 0 < len(learned) <= LONGEST_NAME:
-        raise ValueError(f"{path}: section 'learned' must be null or the name of a folder; got {shown(learned)}")
+    if not isinstance(learned, str) or not 0 < len(learned) <= LONGEST_NAME or not _is_plain(learned):
+        raise ValueError(
+            f"{path}: section 'learned' must be null or the name of a folder beside the file; got {shown(learned)}. "
+            "Copy the folder there."
+        )
     analytic = model_from_dict(
         {**content, "learned": None}, radius=radius, inertia_factor=inertia_factor, where=str(path)
     )
@@ -66,6 +69,11 @@ def load_model(
     if abroad and isinstance(model, LearnedModel) and model.fading is not None:
         model.fading.strength = float(model.fading.get_buffer("abroad"))
     return model
+
+
+def _is_plain(name: str) -> bool:
+    """Whether a name leads nowhere else."""
+    return name not in (".", "..") and Path(name).name == name
 
 
 def model_from_dict(

@@ -120,9 +120,12 @@ def test_missing_file(tmp_path):
         ("flight: {friction: {}}\nbounce: {}", r"there is no flight effect 'friction'"),
         (
             "flight: {}\nbounce: {}\nlearned: {x: 1}",
-            r"section 'learned' must be null or the name of a folder; got \{'x': 1\}$",
+            r"section 'learned' must be null or the name of a folder beside the file; got \{'x': 1\}",
         ),
-        ("flight: {}\nbounce: {}\nlearned: ''", r"section 'learned' must be null or the name of a folder; got ''$"),
+        ("flight: {}\nbounce: {}\nlearned: ''", r"section 'learned' must be null or the name of a folder .*; got ''"),
+        ("flight: {}\nbounce: {}\nlearned: /dev/null", "the name of a folder beside the file; got '/dev/null'"),
+        ("flight: {}\nbounce: {}\nlearned: ../model", r"the name of a folder beside the file; got '\.\./model'"),
+        ("flight: {}\nbounce: {}\nlearned: ..", r"the name of a folder beside the file; got '\.\.'"),
         (
             "flight: {}\nbounce: {}\nmeasurement: {x: {}}",
             r"there is no measurement effect 'x'; known ones: time_offset, velocity_lag, frame_tilt",
