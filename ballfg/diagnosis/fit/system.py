@@ -77,8 +77,10 @@ class System:
 
     @property
     def start_information(self) -> Array:
-        """(n, 9, 9) information of the first states."""
-        return np.asarray(self.by_start.swapaxes(-1, -2) @ self.by_start)
+        """(n, 9, 9) information of the first states; one for a number that no row tells of, which so stays."""
+        found, diagonal = self.by_start.swapaxes(-1, -2) @ self.by_start, np.arange(STATE_DIM)
+        found[:, diagonal, diagonal] += found[:, diagonal, diagonal] == 0.0
+        return np.asarray(found)
 
     def eliminated(self, damping: float = 0.0) -> Eliminated:
         """The first states solved for in terms of everything else; `damping` as in Levenberg-Marquardt."""

@@ -22,6 +22,8 @@ REACHES = (0.02, 0.06, 0.18)
 """s. Widths of the Gaussian kernels in the time between two samples: from the size of a contact to that of an arc."""
 LEAST_WEIGHT = 0.5
 """Samples of a smaller robust weight are outliers: their products say nothing about drift."""
+LEAST_FREEDOM = 1e-6
+"""Residuals that a fit leaves free in a stretch; one whose samples are all outliers has none."""
 
 
 @dataclass(frozen=True)
@@ -145,13 +147,17 @@ def _summed(residual: Array, taken: Array, kept: Mask, kernel: Array) -> tuple[f
 
     Args: taken: (n, k, 3, d) directions that the fit takes up.  kept: (n, k) samples that count.  kernel: (n, k, k).
     """
+    freedom = 3.0 * kept.sum(axis=1) - (taken**2).sum(axis=(1, 2, 3))
+    tells = freedom > LEAST_FREEDOM
+    if not tells.any():
+        return 0.0, 0.0, 0.0
+    residual, taken, kernel, freedom = residual[tells], taken[tells], kernel[tells], freedom[tells]
     n, k, _ = residual.shape
     once = np.einsum("nst,ntad->nsad", kernel, taken)
     rows, moved = taken.reshape(n, 3 * k, -1), once.reshape(n, 3 * k, -1)
     inner = rows.swapaxes(-1, -2) @ moved
     squared = moved.swapaxes(-1, -2) @ moved
     cubed = moved.swapaxes(-1, -2) @ np.einsum("nst,ntad->nsad", kernel, once).reshape(n, 3 * k, -1)
-    freedom = 3.0 * kept.sum(axis=1) - (rows**2).sum(axis=(1, 2))
     first = -_trace(inner)
     second = 3.0 * (kernel**2).sum(axis=(1, 2)) - 2.0 * _trace(squared) + (inner**2).sum(axis=(1, 2))
     third = 3.0 * ((kernel @ kernel) * kernel).sum(axis=(1, 2)) - 3.0 * _trace(cubed)

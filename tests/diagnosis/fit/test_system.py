@@ -42,6 +42,17 @@ def test_projected_columns_are_what_first_states_leave(system):
     np.testing.assert_allclose(gram[2], dense[2 * M : 3 * M].T @ dense[2 * M : 3 * M], atol=1e-11)
 
 
+def test_a_number_of_which_no_sample_tells_stays(system):
+    """As of a stretch whose samples are all outliers: it takes no part, and the others are as without it."""
+    by_start = system.by_start.copy()
+    by_start[1, :, :6] = 0.0
+    lost = System(system.residual, by_start, system.by_common)
+    dense = off(lost.columns[1], by_start[1, :, 6:])
+    np.testing.assert_allclose(lost.projected()[1], dense, atol=1e-12)
+    np.testing.assert_array_equal(lost.projected()[2:], system.projected()[2:])
+    assert (lost.eliminated().start_step(np.ones(Q + P))[1, :6] == 0.0).all()
+
+
 @pytest.mark.parametrize("damping", [0.0, 0.3])
 def test_the_step_is_that_of_the_dense_normal_equations(system, damping):
     states, common, residual = stacked(system)

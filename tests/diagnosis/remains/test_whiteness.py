@@ -88,3 +88,18 @@ def test_a_fit_that_takes_up_everything_leaves_nothing_to_test() -> None:
     """By rounding the variance of what is left may come out below zero."""
     assert _p_value(1e-14, -1e-12, 0.0) == _p_value(0.0, 0.0, 0.0) == 1.0
     assert _p_value(3.0, 1.0, 0.0) == pytest.approx(stats.norm.sf(3.0), rel=1e-9)
+
+
+def test_a_stretch_of_outliers_takes_no_part() -> None:
+    """Its sums would be nothing divided by nothing."""
+    n, k, d = 3, 12, 4
+    rng = np.random.default_rng(2)
+    kept, kernel = np.ones((n, k), dtype=bool), np.abs(rng.normal(size=(n, k, k)))
+    kept[1], kernel[1] = False, 0.0
+    taken = 0.2 * np.linalg.qr(rng.normal(size=(n, 3 * k, d)))[0].reshape(n, k, 3, d)
+    taken[1] = 0.0
+    residual = rng.normal(size=(n, k, 3)) * kept[..., None]
+    others = [0, 2]
+    alone = _summed(residual[others], taken[others], kept[others], kernel[others])
+    assert _summed(residual, taken, kept, kernel) == pytest.approx(alone, rel=1e-12)
+    assert _summed(residual[1:2], taken[1:2], kept[1:2], kernel[1:2]) == (0.0, 0.0, 0.0)
