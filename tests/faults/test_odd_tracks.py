@@ -3,6 +3,7 @@
 import warnings
 from dataclasses import replace
 from functools import partial
+from itertools import islice
 
 import numpy as np
 import pytest
@@ -32,6 +33,16 @@ def test_odd_tracks_end_with_finite_numbers(tracks, method):
     tally = judged(estimator_of(method), list(tracks(COUNTS[method], seed=5)), verbose=True)
     assert (tally.raised, tally.not_finite, tally.warned, tally.far) == (0, 0, 0, 0)
     assert tally.ok > tally.tracks / 3
+
+
+def test_a_filter_that_is_lost_says_so_in_its_status_alone():
+    """Its innovations spread over 29 powers of ten, which filterpy warned of."""
+    (odd,) = islice(wild(871, seed=1), 870, None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        estimate = estimator_of("ekf").estimate(odd.track)
+    assert estimate.status.failed
+    assert sound(estimate.states, estimate.covariances)
 
 
 def test_the_same_seed_gives_the_same_tracks():

@@ -5,11 +5,13 @@ docs/estimators_ekf.md has the equations, what the filter does at contacts, hits
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import LinAlgWarning
 
 from ballfg.arrays import Array
 from ballfg.checks import shown
@@ -175,7 +177,8 @@ class _Run:
         self.record.least = self._least()
         for k in range(len(track)):
             self.record.measurement_noise[k] = self._measurement_noise(k, self.velocities[k])
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # ends in Status.FAILED
+        calm = np.errstate(over="ignore", invalid="ignore", divide="ignore")
+        with calm, warnings.catch_warnings(category=LinAlgWarning, action="ignore"):  # ends in a status that failed
             self._filter()
 
     def finite(self) -> bool:
