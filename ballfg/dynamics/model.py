@@ -50,8 +50,8 @@ class BallModel(nn.Module, ABC):
         trained: the noise and the launcher that were learned together with the model; None where nothing was.
         noise: how far tracks scatter about the model; None where nobody has looked.
         variations: coefficients that differ between tracks, by name as in `named_parameters()`.
-        random: whether it draws random numbers, so that the same state has another future each time; such a model is
-            not compiled.
+        random: whether it draws random numbers, so that the same state has another future each time; what is
+            compiled of such a model is its `in_flight`.
 
     Raises: ValueError: if the radius is not within 0.001 to 1 m, or the inertia factor not within 0 to 1.
     """

@@ -22,6 +22,7 @@ BLOCK = 64
 """States that are reduced with one room for what they leave to each other, which so stays near the processor."""
 
 
+@machine_code(COUNT(COUNT))
 def padded(columns: int) -> int:
     """The next multiple of `FOUR_AT_ONCE`."""
     return -(-columns // FOUR_AT_ONCE) * FOUR_AT_ONCE
@@ -162,14 +163,13 @@ def absorb(upper: Array, system: Array, begin: int, end: int, first: int, count:
         upper[j, c] = diagonal
 
 
-@machine_code(NOTHING(TWO, TWO))
-def close(rows: Array, root: Array) -> None:
-    """Copy rows without the zeros before the right side."""
-    end = root.shape[1] - 1
-    for i in range(root.shape[0]):
-        for j in range(end):
-            root[i, j] = rows[i, j]
-        root[i, end] = rows[i, rows.shape[1] - 1]
+@machine_code(NOTHING(TWO, TWO, COUNT))
+def copy_kept(target: Array, source: Array, kept: int) -> None:
+    """Copy the first columns of some rows, and the right side, which is last in both."""
+    for i in range(target.shape[0]):
+        for j in range(kept):
+            target[i, j] = source[i, j]
+        target[i, target.shape[1] - 1] = source[i, source.shape[1] - 1]
 
 
 @machine_code(NOTHING(TWO, COUNTS, COUNT, THREE, THREE, THREE))
@@ -192,7 +192,7 @@ def eliminate_on(system: Array, start: Index, width: int, carries: Array, shared
     for i in range(m):
         put_all(upper, carries[i])
         absorb(upper, system, start[i], start[i + 1], 0, width, column)
-        close(upper, root[i])
+        copy_kept(root[i], upper, root.shape[2] - 1)
         for j in range(width):
             for k in range(columns):
                 carry[j, k] = 0.0
@@ -237,4 +237,4 @@ def eliminate(system: Array, start: Index, width: int, root: Array, last: Array)
     for first in range(0, n, BLOCK):
         reduce_block(system, start, width, first, min(first + BLOCK, n), carries, shared, root)
     absorb(shared[0], system, start[n], start[n + 1], 2 * width, p, np.empty(start[n + 1] - start[n]))
-    close(shared[0], last)
+    copy_kept(last, shared[0], last.shape[1] - 1)

@@ -10,10 +10,10 @@ import numpy as np
 from ballfg.arrays import Array, Index
 from ballfg.dynamics.compiled.build import machine_code
 from ballfg.dynamics.compiled.signatures import COUNT, COUNTS, NOTHING, REAL, THREE, TWO
-from ballfg.factors.linear.elimination import BLOCK, FOUR_AT_ONCE, absorb, close, reduce_block
+from ballfg.factors.linear.elimination import BLOCK, absorb, copy_kept, padded, reduce_block
 
 FADED = 1e-13
-"""Of what is known of a number already: what is dropped moves no estimate by more of its standard deviation."""
+"""Share of what is known of a number already, below which what a state still tells of it is dropped."""
 
 
 @machine_code(REAL(TWO, TWO, COUNT, COUNT, COUNT))
@@ -29,15 +29,6 @@ def _strength(carry: Array, shared: Array, width: int, own: int, held: int) -> f
         if told > most * known:
             most = told / known if known > 0.0 else np.inf
     return most
-
-
-@machine_code(NOTHING(TWO, TWO, COUNT))
-def _narrowed(narrow: Array, wide: Array, kept: int) -> None:
-    """Copy the first columns and the right side."""
-    for i in range(len(narrow)):
-        for j in range(kept):
-            narrow[i, j] = wide[i, j]
-        narrow[i, -1] = wide[i, -1]
 
 
 @machine_code(NOTHING(TWO, COUNTS, COUNT, COUNT, THREE, TWO))
@@ -59,7 +50,7 @@ def eliminate_fading(system: Array, start: Index, width: int, held: int, root: A
     if first < n:
         _eliminate_rest(system, start, width, first, carries[0], shared[0], own, root)
     absorb(shared[0], system, start[n], start[n + 1], 2 * width, p, np.empty(start[n + 1] - start[n]))
-    close(shared[0], last)
+    copy_kept(last, shared[0], last.shape[1] - 1)
 
 
 @machine_code(NOTHING(TWO, COUNTS, COUNT, COUNT, TWO, TWO, COUNT, THREE))
@@ -72,19 +63,17 @@ def _eliminate_rest(
         shared: of the coefficients; becomes that after the last state.
     """
     n, kept = len(start) - 2, 2 * width + own
-    columns = -(-(kept + 1) // FOUR_AT_ONCE) * FOUR_AT_ONCE
+    columns = padded(kept + 1)
     rows, begins = np.zeros((start[n] - start[first], columns)), start[first : n + 1] - start[first]
-    _narrowed(rows, system[start[first] : start[n]], kept)
+    copy_kept(rows, system[start[first] : start[n]], kept)
     carries, known = np.zeros((BLOCK + 1, width, columns)), np.zeros((BLOCK + 1, own, columns))
-    _narrowed(carries[0], carry, kept)
+    copy_kept(carries[0], carry, kept)
     part = np.empty((n - first, width, kept + 1))
     for k in range(0, n - first, BLOCK):
         reduce_block(rows, begins, width, k, min(k + BLOCK, n - first), carries, known, part)
+    root[first:] = 0.0
     for i in range(n - first):
-        for j in range(width):
-            for k in range(root.shape[2]):
-                root[first + i, j, k] = 0.0
-        _narrowed(root[first + i], part[i], kept)
+        copy_kept(root[first + i], part[i], kept)
     more = np.zeros((own, system.shape[1]))
-    _narrowed(more, known[0], kept)
+    copy_kept(more, known[0], kept)
     absorb(shared, more, 0, own, 2 * width, len(shared), np.empty(own))
