@@ -5,6 +5,8 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
+from ballfg.checks import one_line, short_text
+from ballfg.files.json_file import read_json
 from ballfg.files.whole_file import whole_file
 from ballfg.parallel.executor import executor
 from ballfg.parallel.stream import finished
@@ -57,8 +59,8 @@ def read_record(path: Path, digest: str, build: Callable[[dict[str, Any]], R], w
     if not path.is_file():
         return None
     try:
-        content: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        content: dict[str, Any] = read_json(path)
         return None if content["digest"] != digest else build(content)
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        reason = " ".join(repr(error).split())  # on one line
+        reason = short_text(f"{type(error).__name__}: {one_line(error)}")
         raise ValueError(f"{path}: must be {what} ({reason}). Delete it, and it is run again.") from error

@@ -4,7 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 from scipy.special import ndtri
 
 from ballfg.estimation import Estimator, Status, predict_tracks
@@ -18,19 +18,19 @@ NINETY = float(ndtri(0.95))
 class TrackScore(BaseModel):
     """Prediction errors of one track."""
 
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str
     """Name of the track."""
-    samples: int
+    samples: int = Field(ge=1)
     """Number of predicted samples."""
-    rmse: float
+    rmse: float = Field(ge=0.0, le=1e9)
     """m, root of the mean squared distance between predicted and measured positions."""
-    covered: float
+    covered: float = Field(ge=0.0, le=1.0)
     """Share of measured coordinates inside the central 90 % intervals."""
-    prediction_nis: float
+    prediction_nis: float = Field(ge=0.0, le=1e100)
     """Mean over the predicted samples of the squared errors in standard deviations, x, y and z added; 3 is right."""
-    nis: float
+    nis: float = Field(ge=0.0, le=1e100)
     """Mean NIS of the observed samples, each against its prediction from the others; 3 is right."""
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Final
 
 from ballfg.files.held import MARK, NEW, OLD, PLAN, BeingWrittenError, clear, held
+from ballfg.files.json_file import read_json
 from ballfg.files.whole_file import flush, flush_folder
 
 PATIENCE: Final = 10.0
@@ -89,6 +90,8 @@ def _finish(folder: Path) -> None:
             if time.monotonic() - begun > PATIENCE:
                 raise
             time.sleep(0.01)
+        except FileNotFoundError as error:
+            raise _damaged(place / PLAN, folder) from error
         except OSError as error:
             raise ValueError(
                 f"{folder} is between two results: its writer was ended while files moved, and they cannot be moved "
@@ -117,20 +120,24 @@ def _write_plan(place: Path, folder: Path, earlier: tuple[str, ...], last: str |
 def _read_plan(path: Path, folder: Path) -> tuple[list[str], list[str]]:
     """Names of what goes and of what comes. A folder from elsewhere may hold a plan that nobody here has written."""
     try:
-        plan = json.loads(path.read_text(encoding="utf-8"))
+        plan = read_json(path)
         stale, new = ([str(name) for name in plan[kind]] for kind in ("stale", "new"))
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (ValueError, KeyError, TypeError):
         stale, new = [""], []
     links = any((path.parent / name).is_symlink() for name in (".", NEW, OLD))
     for name in (*stale, *new):
         parts = name.split("/")
         leads_away = links or len(parts) > 2 or (len(parts) == 2 and (folder / parts[0]).is_symlink())
         if leads_away or {"", ".", "..", MARK} & set(parts) or "\0" in name:
-            raise ValueError(
-                f"{path} must be the plan of a writing that was ended while files moved, with names in this folder; it "
-                f"is damaged or from elsewhere. Delete {path.parent}, and make the content of {folder} anew."
-            )
+            raise _damaged(path, folder)
     return stale, new
+
+
+def _damaged(path: Path, folder: Path) -> ValueError:
+    return ValueError(
+        f"{path} must be the plan of a writing that was ended while files moved, with names in this folder; it is "
+        f"damaged or from elsewhere. Delete {path.parent}, and make the content of {folder} anew."
+    )
 
 
 def _names(within: Path, folder: Path, merged: Collection[str]) -> Iterator[str]:

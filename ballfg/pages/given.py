@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any, Protocol
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ballfg.checks import listed, short_text, shown
+from ballfg.files.json_file import read_json
 from ballfg.files.moving import settle
 from ballfg.pages.tables import Kind, ResultTable, columns_of, kind_of, read_table
 from ballfg.tracks import Ball, DatasetInfo, Track, read_dataset
@@ -111,8 +111,8 @@ def _read(path: Path, opened: Callable[[Path], Folder]) -> tuple[str, Any]:
 
 def _diagnosis(path: Path) -> Mapping[str, Any]:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-    except (ValueError, RecursionError):
+        content = read_json(path)
+    except ValueError:
         raise ValueError(f"{path} must be the {REPORT} of a diagnosis; it is no JSON. Diagnose again.") from None
     if not isinstance(content, dict) or not {"verdict", "sentence", "error", "calibrated", "rounds"} <= content.keys():
         raise ValueError(f"{path} must be the {REPORT} of a diagnosis; its fields are others. Give {COULD_BE}.")

@@ -15,6 +15,7 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 from numpy.typing import ArrayLike
+from pydantic import TypeAdapter
 from scipy import optimize, stats
 
 from ballfg.arrays import Array
@@ -109,4 +110,4 @@ def read_ideal(path: Path, digest: str) -> Ideal | None:
 
     Raises: ValueError: if the file holds something else.
     """
-    return read_record(path, digest, lambda content: Ideal(**content), "an ideal test")
+    return read_record(path, digest, TypeAdapter(Ideal).validate_python, "an ideal test")

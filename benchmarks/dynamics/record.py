@@ -7,7 +7,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict
 
 from ballfg.benchmarks.dynamics.fan import Fan
 from ballfg.benchmarks.dynamics.scoring import PathScore
@@ -47,9 +49,35 @@ class Record:
 
     @classmethod
     def from_json(cls, content: dict[str, Any]) -> Record:
-        """The record that `save` wrote."""
+        """The record that `save` wrote. Raises: ValueError: it is another one."""
+        _Content.model_validate(content)
         scores, fan = tuple(map(PathScore.from_json, content["scores"])), content["fan"]
         return cls(**content | {"scores": scores, "fan": None if fan is None else Fan.from_json(fan)})
+
+
+class _Part(BaseModel):
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
+
+
+class _Score(_Part):
+    track: tuple[float | None, int]
+    rest: tuple[float | None, int]
+    apex: tuple[float | None, float | None, float | None]
+    apex_ahead: tuple[bool, bool, bool]
+
+
+class _Content(_Part):
+    """What a record must hold."""
+
+    digest: str
+    method: str
+    seed: int
+    parameters: int
+    training_time: float
+    inference_time: float
+    not_converged: int
+    scores: list[_Score]
+    fan: dict[Literal["topspin", "sidespin"], dict[int, list[tuple[float, float, float]]]] | None
 
 
 def read_record(path: Path, digest: str) -> Record | None:

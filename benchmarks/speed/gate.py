@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from pydantic import TypeAdapter
+
 from ballfg.benchmarks.results import Row
+from ballfg.checks import one_line, short_text
+from ballfg.files.json_file import read_json
 
 CONTROL: Final = "banded_time"
 """Bound by Python's own speed, as the estimators are."""
@@ -18,6 +21,7 @@ UNSTEADY: Final = ("matrix", "stream")
 on what the caches hold. So does the unrolled gradient, a reference."""
 SLOWER: Final = 1.3
 """Multiple of the earlier ratio from which on something has become slower; runs of the same code differ by 1.1."""
+_ROWS: Final = TypeAdapter(list[Row])
 
 
 class SlowerError(Exception):
@@ -35,10 +39,11 @@ def check_ratios(rows: Sequence[Row], baseline: Path) -> list[str]:
         ValueError: if the file holds no times that this run has too.
     """
     try:
-        earlier = [Row(**row) for row in json.loads(baseline.read_text(encoding="utf-8"))["rows"]]
+        earlier = _ROWS.validate_python(read_json(baseline)["rows"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ValueError(
-            f"--gate must be the results.json of an earlier `ballfg-bench speed`; {baseline} is none ({error})."
+            f"--gate must be the results.json of an earlier `ballfg-bench speed`; {baseline} is none "
+            f"({short_text(one_line(error))})."
         ) from error
     before, now = _ratios(earlier), _ratios(rows)
     shared = [key for key in before if key in now]
@@ -61,15 +66,21 @@ def _ratios(rows: Sequence[Row]) -> dict[tuple[str, str, str], float]:
     for row in rows:
         steady = row.metric != CONTROL and not row.metric.startswith(UNSTEADY) and not row.metric.endswith(RARE)
         steady = steady and not row.method.endswith("unrolled")
-        timed = row.unit == "ms" and steady
-        if timed and row.value is not None and row.case in controls:
-            found[row.case, row.method, row.metric] = row.value / min(controls[row.case])
+        time = _time(row)
+        if row.unit == "ms" and steady and time is not None and row.case in controls:
+            found[row.case, row.method, row.metric] = time / min(controls[row.case])
     return found
 
 
 def _controls(rows: Sequence[Row]) -> dict[str, list[float]]:
     found: dict[str, list[float]] = {}
     for row in rows:
-        if row.metric == CONTROL and row.value is not None:
-            found.setdefault(row.case, []).append(row.value)
+        time = _time(row)
+        if row.metric == CONTROL and time is not None:
+            found.setdefault(row.case, []).append(time)
     return found
+
+
+def _time(row: Row) -> float | None:
+    """The value, where it can be a time in ms: between a picosecond and ten days."""
+    return row.value if row.value is not None and 1e-9 < row.value < 1e9 else None

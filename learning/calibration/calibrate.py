@@ -60,7 +60,7 @@ class Problem:
 class TrackFit(BaseModel):
     """Posterior of one track's p coefficients, the model's prior included."""
 
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     name: str
     values: tuple[float, ...]
@@ -70,7 +70,7 @@ class TrackFit(BaseModel):
 class Step(BaseModel):
     """One step in plain numbers, which a checkpoint keeps to the last bit. Step 0 only judges the first model."""
 
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     number: int
     mean: tuple[float, ...]

@@ -34,7 +34,7 @@ from ballfg.progress import Watch
 class Checkpoint(BaseModel):
     """The checkpoint of a calibration, from which it continues to the same numbers."""
 
-    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
     data: str
     """Digest of the dataset's content."""
@@ -138,4 +138,21 @@ def read_checkpoint(folder: Path, problem: Problem) -> list[Step]:
         raise ValueError(f"{path}: was made from another dataset than {problem.dataset.path}. Give the same --data.")
     if checkpoint.model != model_to_dict(problem.model):
         raise ValueError(f"{path}: was started from another model. Give the same model.")
+    if not _follow(checkpoint.steps, problem):
+        raise ValueError(f"{path}: not a checkpoint (its steps are not those of this run). Start a new run.")
     return list(checkpoint.steps)
+
+
+def _follow(steps: Sequence[Step], problem: Problem) -> bool:
+    """Whether steps could be those of a problem: numbered from 0, with its coefficients and its tracks."""
+    size, tracks, judged = len(problem.chosen.names), set(problem.split.fit), len(problem.split.judge)
+    for number, step in enumerate(steps):
+        rows = [step.mean]
+        if number:
+            rows += [step.sigma, step.spread, step.next_track]
+            rows += [values for fit in step.fits for values in (fit.values, fit.sigmas)]
+        names = {fit.name for fit in step.fits} | {name for name, _ in step.skipped}
+        fit = all(len(row) == size for row in rows) and names <= tracks and len(step.scores) == judged
+        if not fit or step.number != number or (step.moved is None) != (number == 0):
+            return False
+    return True

@@ -95,7 +95,8 @@ class Fuzzer:
         self._worker.close()
 
     def _write(self) -> None:
-        from tests.faults.seeds import write_odd, write_seeds
+        from tests.faults.odd_seeds import write_odd
+        from tests.faults.seeds import write_seeds
 
         write_seeds(self._seeds)
         write_odd(self._odd)

@@ -2,15 +2,26 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
+from ballfg.benchmarks.diagnosis.ideal import read_ideal
+from ballfg.benchmarks.diagnosis.record import read_record as read_case
+from ballfg.benchmarks.dynamics.record import read_record as read_contender
+from ballfg.benchmarks.speed.gate import SlowerError, check_ratios
 from ballfg.diagnosis.design.reported import reported_pairs
 from ballfg.dynamics import load_model
 from ballfg.estimation import load_conformal, with_readings
 from ballfg.estimation.observations.sighted_dataset import read_sighted
+from ballfg.files.held import MARK, PLAN
+from ballfg.files.moving import settle
 from ballfg.importing import Choices, propose
+from ballfg.learning.calibration.report import compare
+from ballfg.learning.calibration.run import read_checkpoint as read_steps
 from ballfg.learning.config.config_file import read_config
 from ballfg.learning.run.checkpoint import read_checkpoint
 from ballfg.learning.run.metrics import read_metrics
@@ -18,12 +29,14 @@ from ballfg.learning.sequence.predictor import SequencePredictor
 from ballfg.live.sources.source import LineBuffer
 from ballfg.pages import collect, recognise, show_page
 from ballfg.simulation.balls import ball_kind
+from ballfg.simulation.scene.writing import earlier_files
 from ballfg.tracks import read_dataset
 from ballfg.vision import open_video, read_cameras
 from ballfg.vision.calibration.table_points import read_table
 from ballfg.vision.detection.detections_table import read_detections
 from ballfg.vision.detection.video import read_stamps
 from tests.estimation.observations.sighted_rig import RIG
+from tests.faults.seeds_of_models import posed, timed_rows
 
 Read = Callable[[Path, Path], object]
 """Reads a folder in which one file, the second argument, was damaged."""
@@ -83,6 +96,33 @@ def _video(folder: Path, file: Path) -> object:
     return video.sample(3), list(video.frames())
 
 
+def _record(folder: Path, file: Path) -> object:
+    if file.name == "results.json":
+        with suppress(SlowerError):  # which is an answer
+            return check_ratios(timed_rows(), file)
+    read = {"case": read_case, "ideal": read_ideal, "contender": read_contender}[file.stem]
+    return read(file, "d")
+
+
+def _steps(folder: Path, file: Path) -> object:
+    """Steps from which the calibration could go on, and end."""
+    problem = posed()
+    steps = read_steps(folder, problem)
+    return [compare(step.scores, step.scores, step.scores, step.scores) for step in steps]
+
+
+def _moving(folder: Path, file: Path) -> object:
+    """A writing that was ended is carried out, in a copy."""
+    with TemporaryDirectory() as place:
+        copy = Path(shutil.copytree(folder, Path(place) / "moving", symlinks=True))
+        try:
+            settle(copy / "out")
+        except ValueError as error:
+            raise ValueError(str(error).replace(str(copy), str(folder))) from None
+        if (copy / "out" / MARK / PLAN).exists():
+            raise RuntimeError("a plan must be carried out or refused")
+
+
 def _import(folder: Path, file: Path) -> object:
     return propose(folder / file.relative_to(folder).parts[0], Choices())
 
@@ -108,6 +148,11 @@ READERS = {
         Reader("detections", _detections),
         Reader("live", _live, names_file=False),
         Reader("video", _video),
+        Reader("noise", lambda folder, file: load_model(file)),
+        Reader("steps", _steps),
+        Reader("records", _record),
+        Reader("scene", lambda folder, file: earlier_files(file)),
+        Reader("moving", _moving),
     )
 }
 IMPORT = Reader("import", _import)

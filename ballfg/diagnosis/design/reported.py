@@ -1,6 +1,5 @@
 """The pairs of effects that a diagnosis could not tell apart."""
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -9,6 +8,7 @@ from ballfg.diagnosis.report.report import REPORT
 from ballfg.diagnosis.result import Diagnosis
 from ballfg.diagnosis.search.hypothesis import TWINS
 from ballfg.dynamics import EFFECTS
+from ballfg.files.json_file import read_json
 from ballfg.files.moving import settle
 
 
@@ -30,9 +30,9 @@ def reported_pairs(folder: Path) -> list[tuple[str, str]]:
     if not path.is_file():
         raise FileNotFoundError(f"diagnosis must be a folder with {REPORT}; {folder} has none. Run ballfg diagnose.")
     try:
-        effects = json.loads(path.read_text(encoding="utf-8"))["effects"]
+        effects = read_json(path)["effects"]
         found = {str(e["name"]): [str(name) for name in e["indistinguishable_from"]] for e in effects}
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+    except (ValueError, KeyError, TypeError) as error:
         said = short_text(one_line(error))
         raise ValueError(f"{path} is not the report of a diagnosis ({said}). Run ballfg diagnose again.") from None
     return _pairs(found, str(path))

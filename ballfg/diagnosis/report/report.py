@@ -16,6 +16,7 @@ from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.page import page
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Value
 from ballfg.dynamics import BallModel, save_model
+from ballfg.files.json_file import read_json
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 
 REPORT: Final = "report.json"
@@ -87,7 +88,7 @@ def check_report_folder(folder: Path, *, force: bool = True) -> None:
 def earlier_files(path: Path) -> list[str] | None:
     """Names of the files that an earlier diagnosis wrote; None where `report.json` is missing or of no diagnosis."""
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = read_json(path)
     except (FileNotFoundError, NotADirectoryError, ValueError):
         return None
     if not isinstance(found, dict) or found.get("program") != PROGRAM or not isinstance(found.get("files"), list):

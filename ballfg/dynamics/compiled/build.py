@@ -9,32 +9,53 @@ import os
 import sys
 import tempfile
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cache, lru_cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
 from numba import njit
+from numba.core.caching import FunctionCache
 from numba.core.types import WrapperAddressProtocol
 from numba.extending import typeof_impl
 
 from ballfg.dynamics.compiled.signatures import FUNCTION
+from ballfg.files.json_file import read_json
 from ballfg.progress import doing
 
 HEADER: Final = '''"""Generated from a model of a ball; safe to delete."""
 import math
 
 import numpy as np
-from numba import njit, types
+from numba import types
+
+from ballfg.dynamics.compiled.build import machine_code
 {imports}
 ONE, TWO, THREE = (types.Array(types.float64, dimensions, "C") for dimensions in (1, 2, 3))
 
 
-@njit(types.void(TWO, TWO, ONE, THREE, THREE, TWO, THREE), error_model="numpy", cache=True)
+@machine_code(types.void(TWO, TWO, ONE, THREE, THREE, TWO, THREE))
 '''
-"""What comes before `compute` in a file. Without numpy's error model every division would be checked for a zero."""
+"""What comes before `compute` in a file."""
 HELPERS: Final = ("add_product", "tanh_all")
 """Functions of `layers.py` that generated ones may call."""
+
+
+class _Kept(FunctionCache):  # type: ignore[misc]
+    """Machine code on disk. What cannot be read, as after a power failure, is made again; a full disk costs time."""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # pickle's, of any class, at a file that is empty or cut
+            with suppress(OSError):
+                self.flush()
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        with suppress(OSError):
+            super().save_overload(sig, data)
 
 
 def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -45,11 +66,9 @@ def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
     """
 
     def declared(function: Callable[..., Any]) -> Any:
-        dispatcher: Any
-        try:
-            dispatcher = njit(error_model="numpy", cache=True)(function)
-        except RuntimeError:  # no folder: compiled anew by every process
-            dispatcher = njit(error_model="numpy")(function)
+        dispatcher: Any = njit(error_model="numpy")(function)  # numba's own would look for a zero in every division
+        with suppress(RuntimeError):  # no folder: compiled anew by every process
+            dispatcher._cache = _Kept(function)
 
         def for_call(*_: Any, **__: Any) -> Any:
             """The machine code, which numba asks for at the first call from Python."""
@@ -109,9 +128,19 @@ def built(source: str) -> Code:
 def _built(text: str) -> Code:
     name = f"ballfg_compiled_{hashlib.sha256(text.encode()).hexdigest()[:20]}"
     path = cache_folder() / f"{name}.py"
-    if not path.exists():
+    if not _holds(path, text):
         _write(path, text)
-    return Code(_imported(name, path).compute)
+    compute = _imported(name, path).compute
+    compute._compile_for_args()
+    return Code(compute)
+
+
+def _holds(path: Path, text: str) -> bool:
+    """Whether a file has this content, whole."""
+    try:
+        return path.read_bytes() == text.encode()
+    except OSError:
+        return False
 
 
 @cache
@@ -122,15 +151,21 @@ def digest(file: Path) -> str:
 
 def write_note(about: str, note: Mapping[str, Any]) -> None:
     """Keep a note on disk for other processes."""
-    _write(_note_path(about), json.dumps(note))
+    _write(_note_path(about), json.dumps({"note": note, "digest": _digest_of(note)}))
 
 
 def read_note(about: str) -> Any | None:
-    """A note that was kept; None where there is none, or none that can be read."""
+    """A note that was kept; None where there is none, or a damaged one."""
     try:
-        return json.loads(_note_path(about).read_text(encoding="utf-8"))
+        kept = read_json(_note_path(about))
     except (OSError, ValueError):
         return None
+    whole = isinstance(kept, dict) and "note" in kept and kept.get("digest") == _digest_of(kept["note"])
+    return kept["note"] if whole else None
+
+
+def _digest_of(note: Any) -> str:
+    return hashlib.sha256(json.dumps(note).encode()).hexdigest()
 
 
 def _note_path(about: str) -> Path:

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ballfg.checks import shown
+from ballfg.files.json_file import parse_json
 from ballfg.importing.formats.containers import read_bag, read_excel, read_hdf5, read_npz, read_parquet
 from ballfg.importing.formats.matlab import read_matlab
 from ballfg.importing.formats.nested import nested_tables
@@ -109,7 +110,7 @@ def _of_file(path: Path, topic: str | None) -> list[RawTable]:
 def _json(path: Path, text: str) -> list[RawTable]:
     """The tables of a JSON file, or of one with a JSON value on each line."""
     try:
-        content = _loaded(text)
+        content = parse_json(text)
     except json.JSONDecodeError as error:
         lines = [line for line in text.splitlines() if line.strip()]
         if not _whole_line(lines[0]):
@@ -123,21 +124,9 @@ def _json(path: Path, text: str) -> list[RawTable]:
     return nested_tables(content, path.stem, str(path))
 
 
-def _loaded(text: str) -> Any:
-    """The content of JSON. Raises: JSONDecodeError: it is none, or beyond what can be read."""
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError:
-        raise
-    except RecursionError:
-        raise json.JSONDecodeError("values are nested too deep", text, 0) from None
-    except ValueError:  # whole numbers beyond 4300 digits
-        raise json.JSONDecodeError("a number has too many digits", text, 0) from None
-
-
 def _whole_line(line: str) -> bool:
     try:
-        _loaded(line)
+        parse_json(line)
     except json.JSONDecodeError:
         return False
     return True
@@ -147,7 +136,7 @@ def _json_lines(path: Path, lines: Sequence[str]) -> list[Any]:
     values: list[Any] = []
     for number, line in enumerate(lines, 1):
         try:
-            values.append(_loaded(line))
+            values.append(parse_json(line))
         except json.JSONDecodeError as error:
             raise ValueError(
                 f"{path}, line {number}: must be valid JSON; {error.msg} at column {error.colno}. Correct or delete "

@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from ballfg.files.json_file import parse_json
+
 LONGEST = 65536
 """Bytes of a line; of a longer one the rest is skipped."""
 COLUMNS = ("t", "x", "y", "z")
@@ -91,8 +93,8 @@ def _numbers(cells: Sequence[Any]) -> list[float]:
 def _of_json(text: str) -> Sample:
     """An object with t and x, y, z, or position, or positions; or the array [t, x, y, z]."""
     try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
+        content = parse_json(text)
+    except ValueError as error:
         raise ValueError(f"not valid JSON: {error}") from None
     if isinstance(content, list):
         content = dict(zip(COLUMNS, content, strict=False)) if len(content) == 4 else {}

@@ -66,7 +66,7 @@ def write_scene(
         if camera.name != Path(camera.name).name or camera.name.startswith("."):
             raise ValueError(f"camera names must be good as file names; got {shown(camera.name)}. Rename it.")
     scene = path / SCENE_FILE
-    earlier = [glob.escape(name) for name in _earlier_files(scene)]
+    earlier = [glob.escape(name) for name in earlier_files(scene)]
     with whole_folder(path, earlier=earlier, last=SCENE_FILE) as stage:
         check_scene_folder(path, force=force)
         every_image = itertools.chain.from_iterable(map(recording.images, range(len(recording.cameras))))
@@ -86,7 +86,7 @@ def write_scene(
         (stage / SCENE_FILE).write_text(yaml.safe_dump(content, sort_keys=False), encoding="utf-8")
 
 
-def _earlier_files(scene: Path) -> list[str]:
+def earlier_files(scene: Path) -> list[str]:
     """Names of the files of the scene that is to be replaced. Raises: ValueError: its file was damaged."""
     names = read_mapping(scene).get("files") if scene.is_file() else []
     if not isinstance(names, list):
