@@ -23,6 +23,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from tests.faults.mutations import damaged
+from tests.faults.odd_seeds import write_odd
+from tests.faults.readers import reader_of
+from tests.faults.seeds import write_seeds
 from tests.faults.worker import Worker, verdict
 
 CORPUS = Path(__file__).with_name("corpus")
@@ -95,9 +98,6 @@ class Fuzzer:
         self._worker.close()
 
     def _write(self) -> None:
-        from tests.faults.odd_seeds import write_odd
-        from tests.faults.seeds import write_seeds
-
         write_seeds(self._seeds)
         write_odd(self._odd)
 
@@ -128,16 +128,12 @@ class Fuzzer:
         return found
 
     def _judge(self, reader: str, name: str) -> tuple[str, str]:
-        from tests.faults.readers import reader_of
-
         folder, wanted = self._place / reader, reader_of(reader)
         names = (Path(name).name, str(folder)) if wanted.names_file else ()
         return verdict(lambda: wanted.read(folder, folder / name), names)
 
     def _warm(self) -> None:
         """Each reader reads its good files once: what it imports and compiles is no part of a case."""
-        from tests.faults.readers import reader_of
-
         for reader, name in self.files:
             folder = self._seeds / reader
             try:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from pathlib import Path
+from zipfile import ZIP_DEFLATED, ZipFile
 
 import numpy as np
 import pyarrow as pa
@@ -104,7 +105,9 @@ def _odd_matlab(folder: Path) -> None:
 
 
 def _odd_arrays(folder: Path) -> None:
-    np.savez_compressed(folder / "bomb.npz", t=np.zeros((50_000_000, 4)))
+    archive = ZipFile(folder / "bomb.npz", "w", ZIP_DEFLATED, compresslevel=1)
+    with archive, archive.open("t.npy", "w", force_zip64=True) as member:
+        np.save(member, np.zeros((50_000_000, 4)))  # 1.6 GB in memory, 7 MB in the file
     np.savez(folder / "pickled.npz", t=np.array([{"a": 1}], dtype=object), allow_pickle=True)
     np.savez(folder / "mixed.npz", t=np.arange(4.0), x=np.ones((4, 3, 2)), y=np.array("a"), z=np.zeros((0, 3)))
     np.save(folder / "dates.npy", np.arange(12).reshape(3, 4).astype("datetime64[s]"))

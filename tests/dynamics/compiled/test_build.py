@@ -3,9 +3,11 @@
 import errno
 import importlib.util
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -17,7 +19,7 @@ from ballfg.dynamics import nominal_model
 from ballfg.dynamics.compiled.build import cache_folder
 from ballfg.dynamics.compiled.functions import compiled
 assert compiled(nominal_model()) is not None
-print(cache_folder(), *sorted(p.name for p in cache_folder().glob("*.py")))
+print(*sorted(p.name for p in cache_folder().glob("*.py")))
 """
 
 FUNCTION_FILE = """
@@ -37,20 +39,27 @@ def in_process(folder) -> list[str]:
     ).stdout.split()
 
 
-def test_a_second_process_finds_what_the_first_has_made(tmp_path) -> None:
-    first = in_process(tmp_path)
-    made = {path: path.stat().st_mtime_ns for path in (tmp_path / "ballfg").rglob("*") if path.is_file()}
-    assert len(first) == 4  # the folder; rates, impact and surface
-    assert in_process(tmp_path) == first
-    assert {path: path.stat().st_mtime_ns for path in made} == made
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> tuple[Path, list[str]]:
+    """What a first process leaves: the folder, and names of its functions."""
+    folder = tmp_path_factory.mktemp("cache")
+    return folder, in_process(folder)
 
 
-def test_what_a_power_failure_has_damaged_is_made_again(tmp_path) -> None:
-    first = in_process(tmp_path)
-    whole = {path: path.read_bytes() for path in (tmp_path / "ballfg").rglob("*") if path.is_file()}
+def test_a_second_process_finds_what_the_first_has_made(made) -> None:
+    folder, names = made
+    stamps = {path: path.stat().st_mtime_ns for path in (folder / "ballfg").rglob("*") if path.is_file()}
+    assert len(names) == 3  # rates, impact and surface
+    assert in_process(folder) == names
+    assert {path: path.stat().st_mtime_ns for path in stamps} == stamps
+
+
+def test_what_a_power_failure_has_damaged_is_made_again(made, tmp_path) -> None:
+    folder = Path(shutil.copytree(made[0], tmp_path / "cache"))
+    whole = {path: path.read_bytes() for path in (folder / "ballfg").rglob("*") if path.is_file()}
     for number, (path, content) in enumerate(whole.items()):
         path.write_bytes(content[: len(content) // 2] if number % 2 else b"")
-    assert in_process(tmp_path) == first
+    assert in_process(folder) == made[1]
     for path, content in whole.items():
         assert path.read_bytes() == content if path.suffix in (".py", ".json") else path.stat().st_size
 
