@@ -15,9 +15,16 @@ class UndecidedError(ValueError):
 
     def __init__(self, what: str, option: str, choices: Sequence[str], example: str | None = None) -> None:
         self.option, self.choices = option, tuple(choices)
-        remedy = example or (choices[0] if choices else "...")
-        many = f" (or {', '.join(choices[1:4])})" if len(choices) > 1 else ""
-        super().__init__(f"{what}. Decide it with --{option} {remedy}{many}.")
+        remedy, *others = [
+            _cut(choice, 240) for choice in (example or (choices[0] if choices else "..."), *choices[1:4])
+        ]
+        many = f" (or {', '.join(others)})" if others else ""
+        super().__init__(f"{_cut(what, 900)}. Decide it with --{option} {remedy}{many}.")
+
+
+def _cut(text: str, most: int) -> str:
+    """The beginning of a text with the names of columns, which may be of any length."""
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 @dataclass(frozen=True)
