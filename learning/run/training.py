@@ -1,16 +1,13 @@
 """A training from config to model: the work of `ballfg-train` in each of its processes."""
 
+from __future__ import annotations
+
 import io
-import math
-import shlex
-import sys
 from contextlib import ExitStack, redirect_stderr, redirect_stdout
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING
 
-from ballfg.estimation import spread_over
-from ballfg.files.whole_file import write_text
 from ballfg.learning.config.training import TrainConfig
 from ballfg.learning.registry import TRAINEES
 from ballfg.learning.run import run_folder as files
@@ -18,16 +15,11 @@ from ballfg.learning.run.checkpoint import Checkpoint, read_checkpoint
 from ballfg.learning.run.loop import Task, Training, TrainingStoppedError
 from ballfg.learning.run.metrics import Epoch
 from ballfg.learning.run.ranks import TOLD_BY_FIRST, Ranks, join_ranks
-from ballfg.learning.run.record import Record, curves
-from ballfg.learning.run.training_page import beside_untrained, improved, page, verdict
-from ballfg.learning.trainee import PredictedShot, Prepared
-from ballfg.machine import date, versions
+from ballfg.learning.trainee import Prepared
 from ballfg.progress import Watch, unwatched
 
-NOT_BETTER: Final = 1
-"""Exit status of a training that ended and whose model is not better than before."""
-MOST_JUDGED: Final = 25
-"""Validation tracks that are judged one by one, to show the median one."""
+if TYPE_CHECKING:
+    from ballfg.learning.run.record import Record
 
 
 def build(config: TrainConfig) -> Prepared:
@@ -46,8 +38,8 @@ def run_training(
 
     Every process of a group calls this; the first one writes and prints.
 
-    Returns: the exit status of `ballfg-train`: 0, or `NOT_BETTER` if no epoch predicts the validation tracks better
-        than the model before the first step.
+    Returns: the exit status of `ballfg-train`: 0, or 1 if no epoch predicts the validation tracks better than the model
+        before the first step.
 
     Args:
         config: of the training.
@@ -69,21 +61,21 @@ def run_training(
         checkpoint = ranks.from_first(lambda: read_checkpoint(folder) if resume else None)
         task = Task(trainee, tuple(train), tuple(validation), config, ranks, watch)
         training = ranks.together(lambda: Training(task, checkpoint))
-        record = ranks.together(lambda: Record(task, folder, checkpoint) if ranks.first else None)
+        record = ranks.together(lambda: _opened(task, folder, checkpoint) if ranks.first else None)
         try:
             for epoch in training.epochs():
                 due = epoch.epoch % config.checkpoint_every == 0 or epoch.epoch == config.optimizer.epochs
                 kept = training.checkpoint() if due else None
                 ranks.from_first(partial(_write, record, epoch, kept))
             training.take_best()
-            return ranks.from_first(lambda: _finish(training, record, folder, command))
+            return ranks.from_first(lambda: 0 if record is None else _finish(training, record, command))
         except TrainingStoppedError:
             if not ranks.first:
                 raise SystemExit(TOLD_BY_FIRST) from None
             raise
         except KeyboardInterrupt:
             if record is not None:
-                _stop(training, record, folder, command)
+                _stop(training, record, command)
             raise
         finally:
             if record is not None:
@@ -109,79 +101,22 @@ def _write(record: Record | None, epoch: Epoch, checkpoint: Checkpoint | None) -
         record.write(epoch, checkpoint)
 
 
-def _finish(training: Training, record: Record | None, folder: Path, command: str) -> int:
-    """Write the model with the best weights and the page, and print whether it helped. Returns: the exit status."""
-    model = training.task.trainee.export(folder)
-    progress, epochs = training.progress, [] if record is None else record.epochs
-    if progress is None or record is None:
-        return 0
-    shot = median_shot(training.task)
-    untrained = _untrained(training.task)
-    _write_page(training, record, folder, model, command, shot, untrained)
-    better = improved(epochs, progress.best_epoch)
-    print(verdict(epochs, progress.best_epoch))
-    beside = beside_untrained(epochs, progress.best_epoch, untrained)
-    print(beside, end="\n" if beside else "")
-    if progress.best_rmse is not None:
-        print(f"best: epoch {progress.best_epoch}, validation RMSE {1e3 * progress.best_rmse:.2f} mm")
-    else:
-        print("no validation track could be judged: the weights are those of the last epoch")
-    what = "the model before the first step, which no epoch improved" if better is False else "the trained model"
-    print(f"{folder / files.PAGE}: the training, to read")
-    print(f"{model}: {what}\n{folder / files.METRICS}: all numbers\n{folder / files.CURVES}")
-    return NOT_BETTER if better is False else 0
+# Pictures and TensorBoard take half a second to import; the other processes do without.
 
 
-def _stop(training: Training, record: Record, folder: Path, command: str) -> None:
-    """Write the best model so far after Ctrl-C, and say what is kept."""
-    print(f"{record.kept}; continue with --resume {folder}", file=sys.stderr, flush=True)
-    if training.progress is None:
-        print("no model is written: not even the first one had been judged", file=sys.stderr)
-        return
-    training.take_best()
-    model = training.task.trainee.export(folder)
-    _write_page(training, record, folder, model, command, None)
-    print(f"{model}: the best model so far, of epoch {training.progress.best_epoch}", file=sys.stderr)
+def _opened(task: Task, folder: Path, checkpoint: Checkpoint | None) -> Record:
+    from ballfg.learning.run.record import Record
+
+    return Record(task, folder, checkpoint)
 
 
-def _untrained(task: Task) -> float | None:
-    """RMSE of the model that one has without a training on the validation tracks, m; None where there is no other."""
-    judged = task.trainee.without_training(task.validation) if task.validation else None
-    return math.sqrt(judged.squared_error / judged.points) if judged is not None and judged.points else None
+def _finish(training: Training, record: Record, command: str) -> int:
+    from ballfg.learning.run.ending import finish
+
+    return finish(training, record, command)
 
 
-def _write_page(
-    training: Training,
-    record: Record,
-    folder: Path,
-    model: Path,
-    command: str,
-    shot: PredictedShot | None,
-    untrained: float | None = None,
-) -> None:
-    best = 0 if training.progress is None else training.progress.best_epoch
-    data = training.task.config.data
-    dataset = data[0] if data else "DATASET"
-    following = (
-        shlex.join(
-            ["ballfg", "predict", dataset, "--model", str(model), "--observe", "0.3", "--out", "predictions.csv"]
-        )
-        if model.is_file()
-        else ""
-    )
-    origin = {"made on": date()} | ({"command": command} if command else {}) | {"data": ", ".join(data or ())}
-    origin["with"] = ", ".join(f"{name} {version}" for name, version in versions(files.PACKAGES).items())
-    drawn, learned = curves(record.epochs, record.title), training.task.trainee.learned()
-    text = page(record.title, record.epochs, best, drawn, learned, shot, following, origin, untrained)
-    write_text(folder / files.PAGE, text)
+def _stop(training: Training, record: Record, command: str) -> None:
+    from ballfg.learning.run.ending import stop
 
-
-def median_shot(task: Task) -> PredictedShot | None:
-    """The validation track with the median error, of at most `MOST_JUDGED`, as the model predicts it."""
-    tracks, errors = spread_over(task.validation, len(task.validation), MOST_JUDGED), {}
-    for track in tracks:
-        judged = task.trainee.judge([track])
-        if judged.points and math.isfinite(judged.squared_error):
-            errors[track] = judged.squared_error / judged.points
-    ordered = sorted(errors, key=errors.__getitem__)
-    return task.trainee.shown(ordered[(len(ordered) - 1) // 2]) if ordered else None
+    stop(training, record, command)
