@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ballfg.dynamics import BallModel, Surfaces, advance
+from ballfg.dynamics import BallModel, Surfaces, advance, rollout
 from ballfg.dynamics.motion.rollout import is_resting
 from ballfg.simulation.config import MotionNoise
 from ballfg.simulation.launcher import SimulatedLauncher
@@ -17,6 +17,8 @@ from ballfg.state import POSITION, SPIN, STATE_DIM, VELOCITY, VZ, Z
 NOISE_STEP = 0.005
 """s. Process noise enters at least this often. In free flight its discretisation is exact for any step; in a step with
 a contact the noise is added after the bounce, so that the step must be short."""
+TOGETHER = 32
+"""Frames that are computed at once; a ball that has left the view is followed for as many more at most."""
 MIN_FRAMES = 5
 """Every track has this many frames, even of a ball that leaves the view at once."""
 
@@ -60,15 +62,34 @@ def simulate_motion(
     lengths = torch.ones(len(start), dtype=torch.int64)
     alive = torch.arange(len(start))
     state = start
-    for k in range(1, frames):
-        state = _next_frame(model, state, 1.0 / rate, surfaces, noise, rng)
-        keep = launcher.in_view(state, surfaces, model) | (k < MIN_FRAMES)
-        alive, state = alive[keep], state[keep]
+    # a random draw depends on which balls are still followed, so that those go frame by frame
+    together = 1 if noise.in_flight or model.random else TOGETHER
+    for k in range(1, frames, together):
+        count = min(together, frames - k)
+        ahead = _next_frames(model, state, count, 1.0 / rate, surfaces, noise, rng)
+        seen = launcher.in_view(ahead, surfaces, model) | (torch.arange(k, k + count) < MIN_FRAMES)
+        kept = seen.cumprod(dim=1).sum(dim=1)
+        states[alive, k : k + count] = ahead
+        lengths[alive] += kept
+        alive, state = alive[kept == count], ahead[kept == count, -1]
         if len(alive) == 0:
             break
-        states[alive, k] = state
-        lengths[alive] = k + 1
     return Motion(states.numpy(), lengths.numpy())
+
+
+def _next_frames(
+    model: BallModel,
+    state: Tensor,
+    count: int,
+    dt: float,
+    surfaces: Surfaces,
+    noise: MotionNoise,
+    rng: np.random.Generator,
+) -> Tensor:
+    """(n, count, 9) the frames after a state (n, 9), which are `dt` s apart."""
+    if count == 1:
+        return _next_frame(model, state, dt, surfaces, noise, rng)[:, None]
+    return rollout(model, state, dt * torch.arange(1, count + 1, dtype=torch.float64), surfaces)
 
 
 def _next_frame(
