@@ -18,6 +18,8 @@ MAX_NODES: Final = 250_000
 MAX_DEPTH: Final = 40
 MAX_DIGITS: Final = 100
 """Characters of a number."""
+MAX_KEY: Final = 1000
+"""Characters of a key, which messages name in full."""
 _TAG: Final = "tag:yaml.org,2002:"
 _NUMBERS: Final = (f"{_TAG}int", f"{_TAG}float")
 _PARSER: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -169,6 +171,8 @@ def _check_values(where: str, loader: Any, node: yaml.Node | None, prefix: str, 
             line = key.start_mark.line + 1
             if not isinstance(key, yaml.ScalarNode):
                 raise YamlError(where, "a key must be a word", line)
+            if len(key.value) > MAX_KEY:
+                raise YamlError(where, f"a key must have at most {MAX_KEY} characters; got {shown(key.value)}", line)
             _check_scalar(where, loader, key)
             if key.value in lines:
                 raise YamlError(where, f"{shown(key.value)} stands twice", lines[key.value], f"{prefix}{key.value}")

@@ -47,6 +47,7 @@ def test_what_is_read(tmp_path: Path) -> None:
         ("a: " + "9" * 30, "whole numbers must lie within +-2^63", 1, None),
         ("a: 1.0e+400", "'1.0e+400' is larger than any number of double precision", 1, None),
         ("a: 1\nb: 2026-02-30", "'2026-02-30' cannot be read; day is out of range for month", 2, None),
+        ("a: 1\n" + 1001 * "b" + ": 1", "a key must have at most 1000 characters; got 'bbb", 2, None),
         ("? [a, b]\n: 1", "a key must be a word", 1, None),
         ("a: [" + "1, " * 300_000 + "]", "it must hold at most 250000 values, aliases written out", 1, None),
         ("a: 1\n---\nb: 2", "expected a single document in the stream, but found another document", 2, None),
