@@ -45,6 +45,19 @@ def test_true_apexes_are_those_of_the_parabolas(hops) -> None:  # type: ignore[n
     np.testing.assert_allclose(when, (np.array(STARTS[:-1]) + STARTS[1:]) / 2, atol=1e-12)
 
 
+def test_a_true_apex_against_drag_is_that_of_the_closed_form() -> None:
+    """Only the two frames about the top tell it: the motion is no cubic elsewhere."""
+    k, up = 0.8, 2.0
+    times = np.arange(0.0011, 0.5, 1 / RATE)
+    states, fade = np.zeros((len(times), 9)), np.exp(-k * times)
+    states[:, 2] = (up + G / k) * (1 - fade) / k - G * times / k
+    states[:, 5] = (up + G / k) * fade - G / k
+    top = np.log(1 + k * up / G) / k
+    points, when = true_apexes(times, states, np.zeros(0))
+    assert when[0] == pytest.approx(top, abs=1e-7)
+    assert points[0, 2] == pytest.approx(up / k - G * top / k, abs=1e-9)
+
+
 def test_apexes_of_positions_alone_are_the_same(hops) -> None:  # type: ignore[no-untyped-def]
     times, states, bounces, expected = hops
     points, _ = measured_apexes(times, states[:, :3], bounces)

@@ -203,6 +203,17 @@ def test_a_jump_through_zero_is_no_crossing(model, beliefs, table):
     assert again.time == pytest.approx(apex(table, beliefs(model, FALLING)).time, abs=1e-9)
 
 
+@pytest.mark.parametrize("start", [FALLING, RISING, [0, 0, CENTRE, 1, 0.3, 0, -15, 50, 5]])
+def test_an_event_of_ones_own_is_found_as_a_plane_is(model, beliefs, table, start):
+    """The same crossing as any function of the state, which torch follows: flying, after a bounce, rolling."""
+    plane = plane_crossing(table, beliefs(model, start), X, 0.2, 1.0)
+    own = next_crossing(table, beliefs(model, start), lambda state: 0.2 - state[..., :1], 1.0)
+    assert own.time == pytest.approx(plane.time, abs=1e-9)
+    assert own.time_sigma == pytest.approx(plane.time_sigma, rel=1e-6)
+    np.testing.assert_allclose(own.state, plane.state, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(own.covariance, plane.covariance, rtol=1e-6, atol=1e-9)
+
+
 def test_results_are_plain_arrays(uncertain, beliefs, table):
     """Warnings are errors here: torch's scalars would give one under numpy's functions."""
     belief = beliefs(uncertain, FALLING)

@@ -109,6 +109,8 @@ def test_jitter_and_dropped_frames() -> None:
         assert np.std(after.stamps - after.times) == pytest.approx(0.001, rel=0.1)
         assert (np.diff(after.stamps) > 0).all()
     assert not np.array_equal(spoilt[0].times, spoilt[1].times)
+    few = record(SceneConfig(shots=1, dropout=0.95), table_rig(SMALL)).frames
+    assert [frames.times[0] for frames in few] == [0.0, 0.0, 0.0]  # a recording begins with a frame of each camera
 
 
 def test_free_running_cameras_never_expose_together() -> None:
