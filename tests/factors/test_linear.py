@@ -8,9 +8,9 @@ import pytest
 
 from ballfg.factors.batch import COEFFICIENTS, Rows, Values
 from ballfg.factors.dynamics import ContactFactors, FlightFactors
-from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt
+from ballfg.factors.graph import BallGraph, Convergence, LevenbergMarquardt, _Point, _tried
 from ballfg.factors.linear.covariance import marginal_covariances
-from ballfg.factors.linear.step import solve, weighted
+from ballfg.factors.linear.step import Root, Step, solve, weighted
 from ballfg.factors.loss import Loss
 from ballfg.factors.noise import ProcessNoise
 from ballfg.factors.position import PositionFactors
@@ -258,3 +258,35 @@ def test_minimum_has_no_gradient_left(problem, tolerance) -> None:
         curvature = ahead + behind - 2 * minimum.error
         assert curvature > 0
         assert abs(ahead - behind) < 1e-2 * curvature
+
+
+def at_error(error: float) -> list[Rows]:
+    """A position whose objective is `error`, linearised."""
+    states = np.zeros((1, 9))
+    states[0, 0] = np.sqrt(2.0 * error)
+    return BallGraph((PositionFactors(np.zeros(1, int), np.zeros((1, 3)), np.ones((1, 3))),)).linearize(
+        Values(states, np.zeros(0))
+    )
+
+
+@pytest.mark.parametrize(
+    ("whole", "nearer", "taken"),
+    [
+        (1.2, 0.7, 0.7),  # a share of the step is better than both ends
+        (1.2, 1.1, 1.2),  # it is worse than where the step began: nobody asks for it
+        (0.9, 0.95, 0.9),
+        (0.7, None, 0.7),  # more than half of the promise: the whole step, at once
+    ],
+)
+def test_a_step_that_breaks_its_promise_is_tried_in_part(whole: float, nearer: float | None, taken: float) -> None:
+    point = _Point(Values(np.zeros((1, 9)), np.zeros(0)), at_error(1.0))
+    step = Step(np.eye(1, 9), np.zeros(0), Root(np.empty((1, 9, 19)), np.empty((0, 19))), decrease=0.4)
+    search = _tried(BallGraph(()), point, step, 0.0)
+    questions, answers = [next(search)], [at_error(e) for e in (whole, nearer) if e is not None]
+    questions += [search.send(answer) for answer in answers[:-1]]
+    with pytest.raises(StopIteration) as end:
+        search.send(answers[-1])
+    assert end.value.value.error == pytest.approx(taken)
+    gain = (1.0 - whole) / 0.4  # of the promise
+    moves = [float(question.values.states[0, 0]) for question in questions]
+    assert moves == pytest.approx([1.0, 1.0 / (2.0 - gain)][: len(answers)])
