@@ -42,7 +42,7 @@ HELPERS: Final = ("add_product", "tanh_all")
 """Functions of `layers.py` that generated ones may call."""
 
 
-class _Kept(FunctionCache):  # type: ignore[misc]
+class _Kept(FunctionCache):
     """Machine code on disk. What cannot be read, as after a power failure, is made again; a full disk costs time."""
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
