@@ -130,6 +130,11 @@ def test_resume_refuses_another_run(
         assert message in said.err
         assert len(complaints(said.err)) == 1
     assert {name: (out / name).read_bytes() for name in names(out)} == before
+    kept = json.loads((out / "checkpoint.json").read_text())
+    kept["steps"][0]["mean"].append(1.0)
+    (out / "checkpoint.json").write_text(json.dumps(kept))
+    assert status(*given, "--resume", out) == 2
+    assert "its steps are not those of this run" in capsys.readouterr().err
     (out / "checkpoint.json").write_text('{"data": 1}')
     assert status(*given, "--resume", out) == 2
     assert "not a checkpoint" in capsys.readouterr().err
