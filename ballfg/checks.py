@@ -55,9 +55,9 @@ def shown(value: object) -> str:
     return short_text(short.repr(value))
 
 
-def short_text(text: str) -> str:
-    """The text, or its beginning where it is longer than a message can hold."""
-    return text if len(text) <= MAX_SHOWN else f"{text[: MAX_SHOWN - 3]}..."
+def short_text(text: str, most: int = MAX_SHOWN) -> str:
+    """The text, or its beginning where it is longer than a message can hold, `most` characters."""
+    return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def listed(names: Collection[object]) -> str:

@@ -4,10 +4,15 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
+from ballfg.checks import short_text
 from ballfg.importing.fall import AXES, LENGTHS, TIMES
 
 ROLES: Final = ("t", "frame", "trajectory", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
 """What a column can be."""
+MAX_WHAT: Final = 900
+"""Characters of what is not decided, in a message."""
+MAX_CHOICE: Final = 240
+"""Characters of a choice in it: three names of columns of a usual length can be copied whole."""
 
 
 class UndecidedError(ValueError):
@@ -15,16 +20,11 @@ class UndecidedError(ValueError):
 
     def __init__(self, what: str, option: str, choices: Sequence[str], example: str | None = None) -> None:
         self.option, self.choices = option, tuple(choices)
-        remedy, *others = [
-            _cut(choice, 240) for choice in (example or (choices[0] if choices else "..."), *choices[1:4])
-        ]
+        first = example or (choices[0] if choices else "...")
+        # with names of columns, which may be of any length
+        remedy, *others = [short_text(choice, MAX_CHOICE) for choice in (first, *choices[1:4])]
         many = f" (or {', '.join(others)})" if others else ""
-        super().__init__(f"{_cut(what, 900)}. Decide it with --{option} {remedy}{many}.")
-
-
-def _cut(text: str, most: int) -> str:
-    """The beginning of a text with the names of columns, which may be of any length."""
-    return text if len(text) <= most else f"{text[: most - 3]}..."
+        super().__init__(f"{short_text(what, MAX_WHAT)}. Decide it with --{option} {remedy}{many}.")
 
 
 @dataclass(frozen=True)
