@@ -16,7 +16,7 @@ NINETY = float(ndtri(0.95))
 
 
 class TrackScore(BaseModel):
-    """Prediction errors of one track."""
+    """Prediction errors of one track, within bounds that only numbers from a damaged checkpoint pass."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid", allow_inf_nan=False)
 
