@@ -23,7 +23,7 @@ def compile_ahead(
     ] = None,
     effects_file: inputs.EffectsFiles = None,
 ) -> None:
-    """Compile the machine code of estimates, predictions and streams, for the balls that ship and for model files.
+    """Compile the machine code of estimates, predictions, noise and streams, for the balls that ship and model files.
 
     What is compiled is kept on disk. The first estimate on a machine then takes 3 s; without, it compiles for half a
     minute. A change of coefficients or weights needs no new code, another set of effects does.
@@ -51,7 +51,7 @@ def _done(parts: list[Callable[[], object]]) -> Iterator[object]:
 def _parts(model: BallModel) -> list[Callable[[], object]]:
     """Whatever an estimate, a stream and their predictions call, with the settings that commands use."""
     from ballfg.dynamics import Surfaces
-    from ballfg.estimation import Online, Settings, Smoother
+    from ballfg.estimation import Online, Settings, Smoother, estimate_noise
     from ballfg.estimation.online.warm_up import falling_ball
     from ballfg.tracks import Track
 
@@ -60,4 +60,5 @@ def _parts(model: BallModel) -> list[Callable[[], object]]:
     smoother = Smoother(model, table, settings)
     streams = [Online(model, table, settings, solver=solver) for solver in ("chain", "isam2")]
     track = Track(*falling_ball(streams[0]), name="falling")
-    return [partial(smoother.estimate, track), *(online.warm_up for online in streams)]
+    noise = partial(estimate_noise, model, table, settings, [track], errors=False)
+    return [partial(smoother.estimate, track), noise, *(online.warm_up for online in streams)]

@@ -8,6 +8,7 @@ ONE: Final[Any] = types.Array(types.float64, 1, "C")
 TWO: Final[Any] = types.Array(types.float64, 2, "C")
 THREE: Final[Any] = types.Array(types.float64, 3, "C")
 FOUR: Final[Any] = types.Array(types.float64, 4, "C")
+FIVE: Final[Any] = types.Array(types.float64, 5, "C")
 COUNTS: Final[Any] = types.Array(types.int64, 1, "C")
 INDEX: Final[Any] = types.Array(types.int64, 2, "C")
 REAL: Final[Any] = types.float64

@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ballfg.estimation.noise.linear_filter import Filtered, LinearFilter, Noise, half_square
+from ballfg.estimation.noise.linear_filter import Filtered, LinearFilter, Noise
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.state import POSITION, STATE_DIM
 
@@ -94,7 +94,7 @@ class Forecaster:
     def score(self, noise: Noise) -> Score:
         """The score of some noise."""
         measured = self.filter.measured(noise)
-        filtered = self.filter.run(noise, *self.filter.motion(noise), measured)
+        filtered = self.filter.run(noise, measured)
         total, inside, count = self._forecast(filtered, noise, measured)
         by_track = total / max(count, 1) + MARGINAL_WEIGHT * filtered.following / max(filtered.count, 1)
         return Score(by_track, inside / max(3 * count, 1), len(self.starts))
@@ -114,7 +114,8 @@ class Forecaster:
         variance = ((observe @ covariance) * observe).sum(dim=2) + gathered + new
         predicted = (observe @ mean[..., None])[..., 0] + ahead.departures
         square = (self.tracks.errors[ahead.track, ahead.sample] - predicted).square() / variance
-        scores = (half_square(square, TAIL) + 0.5 * variance.log()).sum(dim=1)
+        beyond = TAIL * square.clamp(min=1e-12).sqrt() - 0.5 * TAIL**2
+        scores = (torch.where(square < TAIL**2, 0.5 * square, beyond) + 0.5 * variance.log()).sum(dim=1)
         total = torch.zeros(self.count, dtype=torch.float64).index_add(0, ahead.track, scores)
         return total, float((square.detach() < NINETY**2).sum()), len(scores)
 

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from ballfg.arrays import Array
+from ballfg.estimation.noise.filter_code import NEXT_FROM, filter_tracks
+from ballfg.estimation.noise.filter_derivative import pull_back
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.estimation.settings import LEAST_NOISE
-from ballfg.state import POSITION, STATE_DIM
 
 BIAS_DIM: Final = 3
-NEXT_FROM: Final = 3
-"""Samples that determine a state; the marginal likelihood counts those after them."""
-GATE: Final = 30.0
-"""Squared whitened innovation of three coordinates; beyond it, one in a million, a sample does not update."""
-NEXT_TAIL: Final = 4.0
-"""Standard deviations, of the norm of three coordinates, beyond which the score of a next sample grows linearly; a
-missed hit must not decide the noise."""
 
 
 @dataclass(frozen=True)
@@ -76,23 +73,9 @@ class LinearFilter:
         self.own = tracks.transitions.shape[-1]
         self.biases = BIAS_DIM if biased else 0
         self.width = self.own + self.biases
-        self.measure = torch.zeros((3, self.width), dtype=torch.float64)
-        self.measure[:, POSITION] = torch.eye(3, dtype=torch.float64)
-        self.measure[:, self.own :] = torch.eye(3, dtype=torch.float64)[:, : self.biases]
-
-    def motion(self, noise: Noise) -> tuple[Tensor, Tensor]:
-        """(t, n - 1, w, w) transitions and covariances gathered, of state, coefficients and biases."""
-        shape = (self.count, self.samples - 1, self.width, self.width)
-        transitions, gathered = (torch.zeros(shape, dtype=torch.float64) for _ in range(2))
-        transitions[..., : self.own, : self.own] = self.tracks.transitions
-        process = noise.process.square().expand(self.count, -1)
-        gathered[..., :STATE_DIM, :STATE_DIM] = torch.einsum("tk,tnkij->tnij", process, self.tracks.kicks)
-        if self.biases:
-            decay = torch.exp(-torch.diff(self.tracks.times, dim=1) / noise.memory_time[:, None])
-            axes = torch.arange(self.own, self.width)
-            transitions[..., axes, axes] = decay[..., None]
-            gathered[..., axes, axes] = noise.memory[:, None, :] * (1.0 - decay.square())[..., None]
-        return transitions, gathered
+        self._starts = torch.nn.functional.pad(tracks.starts, (0, self.biases)).contiguous().numpy()
+        self._used = tracks.used.to(torch.int64).numpy()
+        self._scored = int(tracks.used[:, NEXT_FROM:].sum())
 
     def measured(self, noise: Noise) -> Tensor:
         """(t, n, 3, 3) m^2, of the part of a measured position that is new in each sample."""
@@ -103,49 +86,60 @@ class LinearFilter:
 
     def losses(self, noise: Noise) -> Tensor:
         """(t,) negative logarithms of the marginal likelihood of each track."""
-        return self.run(noise, *self.motion(noise), self.measured(noise)).following
+        return self.run(noise, self.measured(noise)).following
 
-    def run(self, noise: Noise, transitions: Tensor, gathered: Tensor, measured: Tensor) -> Filtered:
-        """The filter over all samples, with what `motion` and `measured` make of the noise."""
-        tracks, observe = self.tracks, self.measure
+    def run(self, noise: Noise, measured: Tensor) -> Filtered:
+        """The filter over all samples, differentiable by the noise.
+
+        Args:
+            noise: all of it.
+            measured: (t, n, 3, 3) m^2, what `measured` makes of it.
+        Raises: torch.linalg.LinAlgError: the covariance of an innovation is not positive definite.
+        """
+        tracks, count = self.tracks, self.count
+        memory = noise.memory.expand(count, -1)
+        decays = torch.exp(-torch.diff(tracks.times, dim=1) / noise.memory_time[:, None])
         prior = tracks.prior_variances(noise.spin_prior, noise.spin_label, noise.coefficients, self.velocity_prior)
-        covariance = torch.diag_embed(torch.cat((prior, noise.memory.expand(self.count, -1)[:, : self.biases]), dim=1))
-        mean = torch.cat((tracks.starts, torch.zeros((self.count, self.biases), dtype=torch.float64)), dim=1)
-        departures = torch.nn.functional.pad(tracks.departures, (0, self.biases))
-        means, covariances, squares, volumes = [], [], [], []
-        # taken apart once: the derivative of an index would fill a tensor of the whole size at every step
-        steps, added, news = transitions.unbind(1), gathered.unbind(1), measured.unbind(1)
-        for k in range(self.samples):
-            if k:
-                mean = (steps[k - 1] @ mean[..., None])[..., 0] + departures[:, k - 1]
-                covariance = torch.baddbmm(added[k - 1], steps[k - 1] @ covariance, steps[k - 1].mT)
-            seen = observe @ covariance
-            root = torch.linalg.cholesky(seen @ observe.mT + news[k])
-            missed = tracks.errors[:, k] - mean @ observe.mT
-            # of the innovation and of what it tells, the columns per whitened innovation
-            whitened = torch.linalg.solve_triangular(root, torch.cat((missed[..., None], seen), dim=2), upper=False)
-            innovation, told = whitened[..., :1], whitened[..., 1:]
-            square = innovation.square().sum(dim=(1, 2))
-            squares.append(square)
-            volumes.append(torch.diagonal(root, dim1=-2, dim2=-1))
-            told = told * (tracks.used[:, k] & (square < GATE))[:, None, None]
-            mean = mean + (told.mT @ innovation)[..., 0]
-            if k:
-                covariance = torch.baddbmm(covariance, told.mT, told, alpha=-1.0)
-            else:  # a difference would lose ten digits: the prior of the position is that much wider than what is left
-                gain = torch.linalg.solve_triangular(root.mT, told, upper=True).mT
-                rest = torch.eye(self.width, dtype=torch.float64) - gain @ observe
-                covariance = rest @ covariance @ rest.mT + gain @ news[k] @ gain.mT
-            means.append(mean)
-            covariances.append(covariance)
-        used = tracks.used[:, NEXT_FROM:]
-        volume = torch.stack(volumes[NEXT_FROM:], dim=1).log().sum(dim=-1)
-        following = (half_square(torch.stack(squares[NEXT_FROM:], dim=1), NEXT_TAIL) + volume) * used
-        return Filtered(
-            torch.stack(means, dim=1), torch.stack(covariances, dim=1), following.sum(dim=1), int(used.sum())
-        )
+        prior = torch.cat((prior, memory[:, : self.biases]), dim=1)
+        process = noise.process.square().expand(count, -1)
+        means, covariances, following = _Run.apply(self, process, decays, memory, prior, measured)
+        return Filtered(means, covariances, following, self._scored)
 
 
-def half_square(square: Tensor, tail: float) -> Tensor:
-    """Huber's loss of the root of a square: half of it, linear in the root beyond the tail."""
-    return torch.where(square < tail**2, 0.5 * square, tail * square.clamp(min=1e-12).sqrt() - 0.5 * tail**2)
+class _Run(torch.autograd.Function):
+    """Machine code as a function that torch can differentiate once."""
+
+    @staticmethod
+    def forward(ctx: Any, tracks: LinearFilter, *noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        linear, shape = tracks.tracks, (tracks.count, tracks.samples)
+        process, decays, memory, prior, measured = (tensor.detach().contiguous().numpy() for tensor in noise)
+        sizes = ((tracks.width,), (tracks.width, tracks.width), (tracks.width, 3), (3, 3), (3,), ())
+        made = [np.empty(shape + size) for size in sizes]
+        following = np.empty(tracks.count)
+        moved = [x.numpy() for x in (linear.transitions, linear.departures, linear.kicks)]
+        seen = linear.errors.numpy(), tracks._used, tracks._starts
+        if not filter_tracks(*moved, process, decays, memory, measured, *seen, prior, *made, following):
+            raise torch.linalg.LinAlgError("the covariance of an innovation is not positive definite")
+        ctx.tracks, ctx.decays, ctx.memory, ctx.made = tracks, decays, memory, made
+        ctx.set_materialize_grads(False)
+        return torch.from_numpy(made[0]), torch.from_numpy(made[1]), torch.from_numpy(following)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, by_mean: Tensor | None, by_covariance: Tensor | None, by_following: Tensor | None) -> Any:
+        tracks, (means, covariances, *_) = ctx.tracks, ctx.made
+        linear, (count, samples, width) = tracks.tracks, means.shape
+        if by_mean is None and by_covariance is None:  # of the densities of next samples alone
+            by_states = np.empty((count, 0, width)), np.empty((count, 0, width, width))
+        else:
+            by_states = _dense(by_mean, means), _dense(by_covariance, covariances)
+        shapes = (linear.kicks.shape[2],), (samples - 1,), (BIAS_DIM,), (width,), (samples, 3, 3)
+        found = [np.empty((count, *shape)) for shape in shapes]
+        moved = linear.transitions.numpy(), linear.kicks.numpy(), ctx.decays, ctx.memory, tracks._used
+        pull_back(*moved, *ctx.made, *by_states, _dense(by_following, np.empty(count)), *found)
+        return None, *(torch.from_numpy(x) for x in found)
+
+
+def _dense(derivative: Tensor | None, like: Array) -> Array:
+    """A derivative as machine code takes it; zero where there is none."""
+    return np.zeros(like.shape) if derivative is None else np.asarray(derivative.contiguous().numpy())

@@ -13,6 +13,7 @@ from ballfg.estimation.noise.linear_tracks import linearise
 from ballfg.estimation.noise.parameters import parameters_of, tensors_of
 from ballfg.simulation import MeasurementNoise
 from ballfg.state import POSITION, STATE_DIM
+from tests.estimation.noise import in_torch
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +32,7 @@ def noise_of(settings, linear, shift=0.0):
 def dense(linear, forecaster, noise, track):
     """Mean (3 n,) and covariance of all measured positions of a track, as deviations, from the joint Gaussian."""
     n, own, width = linear.times.shape[1], forecaster.filter.own, forecaster.filter.width
-    transitions, gathered = (x[track].numpy() for x in forecaster.filter.motion(noise))
+    transitions, gathered = (x[track].numpy() for x in in_torch.motion(forecaster.filter, noise))
     prior = linear.prior_variances(
         noise.spin_prior, noise.spin_label, noise.coefficients, forecaster.filter.velocity_prior
     )
@@ -46,7 +47,7 @@ def dense(linear, forecaster, noise, track):
         cov[now, : k * width] = step @ cov[last, : k * width]
         cov[: k * width, now] = cov[now, : k * width].T
         cov[now, now] = step @ cov[last, last] @ step.T + gathered[k - 1]
-    observe = np.kron(np.eye(n), forecaster.filter.measure.numpy())
+    observe = np.kron(np.eye(n), in_torch.measure(forecaster.filter).numpy())
     spread = observe @ cov @ observe.T
     for k in range(n):
         spread[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += forecaster.filter.measured(noise)[track, k].numpy()
@@ -76,9 +77,8 @@ def test_score_is_that_of_the_joint_gaussian(case):
                 z = np.abs(errors[k] - known[rows]) / np.sqrt(left[rows])
                 loss = np.where(z < 3.0, z**2 / 2, 3 * z - 4.5)
                 total, count = total + float((loss + 0.5 * np.log(left[rows])).sum()), count + 1
-    transitions, gathered = forecaster.filter.motion(noise)
     measured = forecaster.filter.measured(noise)
-    filtered = forecaster.filter.run(noise, transitions, gathered, measured)
+    filtered = forecaster.filter.run(noise, measured)
     own, _, scored = forecaster._forecast(filtered, noise, measured)
     assert scored == count
     np.testing.assert_allclose(float(own.sum()) / scored, total / count, rtol=1e-6)
@@ -112,16 +112,17 @@ def test_forecast_has_the_sigmas_of_a_prediction(case):
         find_events=False,
     )
     assert {p.name for p in parameters} >= {"position", "memory", "acceleration"}
-    transitions, gathered = forecaster.filter.motion(noise)
+    transitions, gathered = in_torch.motion(forecaster.filter, noise)
     measured = forecaster.filter.measured(noise)
-    covariances = forecaster.filter.run(noise, transitions, gathered, measured).covariances
+    observe = in_torch.measure(forecaster.filter)
+    covariances = forecaster.filter.run(noise, measured).covariances
     for track in range(len(tracks)):
         start = int(np.searchsorted(linear.times[track].numpy(), 0.25))
         end = int(np.searchsorted(linear.times[track].numpy(), 0.35))
         covariance = covariances[track, start]
         for k in range(start, end):
             covariance = transitions[track, k] @ covariance @ transitions[track, k].T + gathered[track, k]
-        spread = forecaster.filter.measure @ covariance @ forecaster.filter.measure.T + measured[track, end]
+        spread = observe @ covariance @ observe.T + measured[track, end]
         seen = float(linear.times[track, start]) + 1e-6
         (prediction,) = predict_tracks(Smoother(model, surfaces, own), [tracks[track]], 1, seen)
         if prediction.estimate.contacts:

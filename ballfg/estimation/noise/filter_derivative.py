@@ -1,0 +1,149 @@
+"""Machine code for the derivative of a Kalman filter over linearised tracks, from the last sample to the first.
+
+A gain K is that of the least covariance: what moves it does not, to first order, move the covariance after it. So with
+A = 1 - K H, S = H P H' + R and the innovation e = y - H m, an update moves
+
+    the covariance by A dP A' + K dR K',    the mean by A dm + (A dP H' - K dR) S^-1 e,
+    e' S^-1 e by -2 (S^-1 e)' H dm - (S^-1 e)' dS S^-1 e,    log det S by trace(S^-1 dS).
+"""
+
+import math
+
+import numpy as np
+
+from ballfg.dynamics.compiled.build import machine_code
+from ballfg.dynamics.compiled.signatures import COUNT, FIVE, FLAG, FOUR, INDEX, NOTHING, ONE, REAL, THREE, TWO
+from ballfg.estimation.noise.filter_code import GATE, NEXT_FROM, NEXT_TAIL
+from ballfg.estimation.noise.transition_code import is_something, pull, transpose
+from ballfg.state import STATE_DIM
+
+
+@machine_code(NOTHING(COUNT, REAL, ONE, ONE))
+def _lift(d, scale, y, m):
+    """Add scale H' y to m (w,): to the rows of positions and of biases."""
+    for a in range(3):
+        for i in range(a, len(m), d):
+            m[i] += scale * y[a]
+
+
+@machine_code(NOTHING(COUNT, TWO, TWO, TWO))
+def _lift_both(d, rows, block, p):
+    """Add H' X + X' H + H' Y H to p (w, w), of rows X (3, w) and a block Y (3, 3)."""
+    w = len(p)
+    for a in range(3):
+        for i in range(a, w, d):
+            for j in range(w):
+                p[i, j] += rows[a, j]
+                p[j, i] += rows[a, j]
+            for b in range(3):
+                for j in range(b, w, d):
+                    p[i, j] += block[a, b]
+
+
+@machine_code(NOTHING(COUNT, TWO, TWO, ONE, REAL, FLAG, REAL, ONE, TWO, TWO))
+def _before_update(d, gain, root, told, square, updated, share, m, p, to_measured):
+    """From derivatives m (w,), p (w, w) by mean and covariance after an update to those before it, and (3, 3) by R.
+
+    Args:
+        gain, root, told, square, updated: of the update, as the filter wrote them.
+        share: derivative by the negative logarithm of the sample's density.
+    """
+    w = len(m)
+    slope = share * (0.5 if square < NEXT_TAIL * NEXT_TAIL else 0.5 * NEXT_TAIL / math.sqrt(square))  # by e' S^-1 e
+    rows, along, half, block = np.zeros((3, w)), np.zeros(3), np.zeros(3), np.zeros((3, 3))
+    if updated:
+        half[:] = 0.5 * told
+        for i in range(w):
+            for a in range(3):
+                along[a] += gain[i, a] * m[i]
+                for j in range(w):
+                    rows[a, i] -= p[i, j] * gain[j, a]
+    for a in range(3):
+        for b in range(3):
+            for i in range(w):
+                block[a, b] -= gain[i, a] * rows[b, i]
+            for c in range(max(a, b), 3):
+                block[a, b] += 0.5 * share * root[c, a] * root[c, b]
+            block[a, b] -= slope * told[a] * told[b]
+            to_measured[a, b] = block[a, b] - along[a] * half[b] - along[b] * half[a]
+    _lift(d, -1.0, along, m)
+    for a in range(3):
+        rows[a] += half[a] * m
+    _lift_both(d, rows, block, p)
+    _lift(d, -2.0 * slope, told, m)
+
+
+@machine_code(REAL(TWO, REAL, THREE, ONE, ONE, TWO, ONE, TWO, ONE, ONE, THREE))
+def _before_prediction(transition, decay, kicks, memory, before, spread, m, p, to_process, to_memory, work):
+    """From derivatives by mean and covariance after an interval to those before it; adds those by its noise.
+
+    Args: before (w,), spread (w, w): mean and covariance at its begin.  work (2, w, w) is written to.
+    Returns: the derivative by the decay.
+    """
+    d, w, to_decay = len(transition), len(m), 0.0
+    for q in range(len(to_process)):
+        if is_something(kicks[q]):
+            for i in range(STATE_DIM):
+                for j in range(STATE_DIM):
+                    to_process[q] += kicks[q, i, j] * p[i, j]
+    pull(transition, decay, p, work[0])
+    transpose(work[0], work[1])
+    for i in range(d, w):
+        to_memory[i - d] += p[i, i] * (1.0 - decay * decay)
+        to_decay += m[i] * before[i] - 2.0 * decay * memory[i - d] * p[i, i]
+        for s in range(w):
+            to_decay += 2.0 * work[1, i, s] * spread[s, i]
+    pull(transition, decay, work[1], p)
+    for i in range(w):  # rounding would make it lopsided, and more so from step to step
+        for j in range(i):
+            p[i, j] = p[j, i] = 0.5 * (p[i, j] + p[j, i])
+    after = m.copy()
+    for i in range(w):
+        m[i] = 0.0 if i < STATE_DIM else after[i] if i < d else decay * after[i]
+    for s in range(STATE_DIM):
+        for i in range(d):
+            m[i] += transition[s, i] * after[s]
+    return to_decay
+
+
+@machine_code(
+    NOTHING(
+        FOUR, FIVE, TWO, TWO, INDEX, THREE, FOUR, FOUR, FOUR, THREE, TWO,
+        THREE, FOUR, ONE, TWO, TWO, TWO, TWO, FOUR,
+    )
+)  # fmt: skip
+def pull_back(
+    transitions, kicks, decays, memory, used, means, covariances, gains, roots, told, squares,
+    by_mean, by_covariance, by_following, to_process, to_decays, to_memory, to_priors, to_measured,
+):  # fmt: skip
+    """The derivatives by the noise of a function of what `filter_tracks` writes.
+
+    Args:
+        transitions, kicks, decays, memory, used: what the filter took.
+        means, covariances, gains, roots, told, squares: what it wrote.
+        by_mean (t, n, w), by_covariance (t, n, w, w), by_following (t,): derivatives of the function by these; the
+            first two with n = 0 where it does not depend on them.
+    Writes: to_process (t, 7), to_decays (t, n - 1), to_memory (t, 3), to_priors (t, w), to_measured (t, n, 3, 3).
+    """
+    count, samples, w = means.shape
+    d = transitions.shape[2]
+    m, p, work = np.empty(w), np.empty((w, w)), np.empty((2, w, w))
+    for t in range(count):
+        m[:], p[:], to_process[t], to_memory[t] = 0.0, 0.0, 0.0, 0.0
+        for k in range(samples - 1, -1, -1):
+            if by_mean.shape[1]:
+                for i in range(w):
+                    m[i] += by_mean[t, k, i]
+                    for j in range(w):
+                        p[i, j] += 0.5 * (by_covariance[t, k, i, j] + by_covariance[t, k, j, i])
+            seen, square = used[t, k] != 0, squares[t, k]
+            share = by_following[t] if seen and k >= NEXT_FROM else 0.0
+            updated = seen and square < GATE
+            _before_update(d, gains[t, k], roots[t, k], told[t, k], square, updated, share, m, p, to_measured[t, k])
+            if k:
+                to_decays[t, k - 1] = _before_prediction(
+                    transitions[t, k - 1], decays[t, k - 1], kicks[t, k - 1], memory[t], means[t, k - 1],
+                    covariances[t, k - 1], m, p, to_process[t], to_memory[t], work,
+                )  # fmt: skip
+        for i in range(w):
+            to_priors[t, i] = p[i, i]

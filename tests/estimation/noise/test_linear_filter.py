@@ -1,0 +1,86 @@
+"""Machine code of the filter over linearised tracks, and its derivative by hand, against torch."""
+
+from dataclasses import fields, replace
+
+import numpy as np
+import pytest
+import torch
+
+from ballfg.estimation import Smoother
+from ballfg.estimation.noise.filter_code import GATE, NEXT_TAIL
+from ballfg.estimation.noise.linear_filter import LinearFilter, Noise
+from ballfg.estimation.noise.linear_tracks import linearise
+from ballfg.simulation import MeasurementNoise
+from tests.estimation.noise import in_torch
+
+NUMBERS = {
+    "position": (1.0, 1.3, 0.8),
+    "memory": (4e-6, 1e-6, 2e-6),
+    "memory_time": 0.03,
+    "stamp_jitter": 1e-8,
+    "process": (0.2, 0.1, 0.3, 5.0, 0.01, 0.4, 0.2),
+    "spin_label": 20.0,
+    "spin_prior": 60.0,
+    "coefficients": 1.1,
+}
+
+
+@pytest.fixture(scope="module")
+def linear(recorded):
+    """Four tracks of different lengths with bounces; coefficients; a few samples left out, far off, further off."""
+    model, surfaces, settings, tracks = recorded(MeasurementNoise(position=0.003, memory=0.002), tracks=4)
+    parts = [t.until(float(t.times[0]) + 0.5 + 0.1 * k) for k, t in enumerate(tracks)]
+    found = linearise(Smoother(model, surfaces, settings), parts)
+    errors, used = found.errors.clone(), found.used.clone()
+    errors[0, 20] += 0.010  # its loss grows linearly
+    errors[1, 25] += 0.4  # it does not update
+    used[2, 10:13] = False
+    assert not found.used.all()
+    assert len(found.coefficient_sigmas)
+    assert bool((found.kicks[:, :, 1:] != 0.0).any())
+    return replace(found, errors=errors, used=used, labelled=torch.tensor([True, False, True, False]))
+
+
+def noise_of(rows):
+    """Leaves with a row for each track, each a little different, or one for all."""
+    factors = np.linspace(1.0, 1.2, rows)
+    values = {n: np.multiply.outer(factors, np.array(v)) for n, v in NUMBERS.items()}
+    return Noise(**{n: torch.tensor(v, requires_grad=True) for n, v in values.items()})
+
+
+@pytest.mark.parametrize("rows", [1, 4])
+@pytest.mark.parametrize("biased", [True, False])
+def test_values_and_derivatives_are_those_of_torch(linear, biased, rows):
+    tracks, noise = LinearFilter(linear, 10.0, biased=biased), noise_of(rows)
+    own = tracks.run(noise, tracks.measured(noise))
+    results = (own.means, own.covariances, own.following), in_torch.run(tracks, noise)[:3]
+    for mine, theirs in zip(*results, strict=True):
+        size = float(theirs.detach().abs().max())
+        np.testing.assert_allclose(mine.detach().numpy(), theirs.detach().numpy(), rtol=1e-7, atol=1e-9 * size)
+    rng, leaves = np.random.default_rng(0), [getattr(noise, f.name) for f in fields(noise)]
+    for kept in ((0,), (1,), (2,), (0, 1, 2)):  # functions of means, of covariances, of the densities, of all
+        weights = {k: torch.from_numpy(rng.standard_normal(results[0][k].shape)) for k in kept}
+        gradients = []
+        for result in results:
+            total = sum((result[k] * w / (result[k].detach().abs().max())).sum() for k, w in weights.items())
+            gradients.append(torch.autograd.grad(total, leaves, retain_graph=True, allow_unused=True))
+        for mine, theirs in zip(*gradients, strict=True):
+            if theirs is None:
+                assert mine is None or not mine.any()
+                continue
+            size = float(theirs.abs().max())
+            np.testing.assert_allclose(mine.numpy(), theirs.numpy(), rtol=1e-6, atol=1e-8 * size)
+
+
+def test_the_case_has_all_that_can_happen_to_a_sample(linear):
+    """Updates, a sample beyond the tail, and one beyond the gate; `linear` has some that are not used."""
+    tracks, noise = LinearFilter(linear, 10.0), noise_of(1)
+    squares = in_torch.run(tracks, noise)[-1].detach()
+    assert NEXT_TAIL**2 < squares[0, 20] < GATE < squares[1, 25]
+    assert (squares[linear.used] < NEXT_TAIL**2).sum() > 100
+
+
+def test_a_covariance_that_is_none_is_refused(linear):
+    tracks, noise = LinearFilter(linear, 10.0), noise_of(1)
+    with pytest.raises(torch.linalg.LinAlgError, match="not positive definite"):
+        tracks.run(noise, -tracks.measured(noise))
