@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Final, TypeVar
 
 import numpy as np
@@ -28,6 +29,7 @@ from ballfg.estimation.noise.parameters import (
 )
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.parallel.work import on_one_thread
 from ballfg.progress import Watch, unwatched
 from ballfg.tracks import Track, TrackNoise
 
@@ -106,11 +108,24 @@ def estimate_noise(
     linear = linearised(model, surfaces, settings, parts, watch, jobs=jobs)
     if linear is None:
         return None
-    biased = settings.has_memory or not tracker_known
-    forecaster = _forecaster(linear, parts, settings, biased)
+    known = (position_known or own_sigmas, tracker_known)
+    # the batches are small: threads cost more than they bring, and where others compute they wait for each other
+    return on_one_thread(partial(_searched, parts, settings, known, errors, watch), linear)
+
+
+def _searched(
+    parts: Sequence[Track],
+    settings: Settings,
+    known: tuple[bool, bool],
+    errors: bool,
+    watch: Watch,
+    linear: LinearTracks,
+) -> NoiseEstimate | None:
+    """The noise of linearised parts of tracks; known: its white part, and what the tracker adds."""
+    forecaster = _forecaster(linear, parts, settings, settings.has_memory or not known[1])
     if not len(forecaster.starts):
         return None
-    parameters = parameters_of(settings, linear, position_known or own_sigmas, tracker_known)
+    parameters = parameters_of(settings, linear, *known)
     search = _Search(forecaster, parameters, settings)
     watched = watch(range(2 * MOST_ITERATIONS), 2 * MOST_ITERATIONS, "steps of the noise")
     with closing(step for step in watched) as steps:

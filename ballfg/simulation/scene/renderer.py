@@ -50,6 +50,7 @@ class Renderer:
     def __init__(self, config: SceneConfig, camera: Camera, number: int) -> None:
         self._config = config
         self._camera = camera
+        self._radius = config.ball.ball.radius
         still = backdrop(camera, config.ball, generator(config.seed, Purpose.SCENE_TEXTURE))
         self._distance = still.distance
         self._still_sharp = still.image
@@ -92,7 +93,7 @@ class Renderer:
         return image
 
     def _draw_ball(self, path: Array) -> Rect | None:
-        ball = ball_image(self._camera, path, self._config.ball.ball.radius)
+        ball = ball_image(self._camera, path, self._radius)
         if ball is None:
             return None
         left, top, right, bottom = ball.rect
