@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import AnalyticModel
+from ballfg.dynamics import AnalyticModel, Surfaces
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.dynamics.compiled.functions import compiled
 from ballfg.dynamics.effect import Coefficient, FlightEffect
-from ballfg.prediction import apex, next_contact, plane_crossing
+from ballfg.prediction import Propagator, apex, next_contact, plane_crossing
+from tests.prediction.conftest import NEARLY_EXACT
 
 START = [0.0, 0.0, 0.25, 4.0, 0.3, -1.0, 10.0, 30.0, 5.0]
 TIMES = torch.arange(1, 16, dtype=torch.float64) / 50
@@ -56,6 +57,21 @@ def test_crossings_are_those_of_machine_code(model, slow, table, beliefs):
         assert abs(one.time - other.time) < 1e-9
         np.testing.assert_allclose(one.state, other.state, rtol=0, atol=1e-7)
         np.testing.assert_allclose(one.covariance, other.covariance, rtol=1e-6, atol=1e-9)
+
+
+@pytest.mark.parametrize("end", [0.535, 0.545])
+def test_crossings_of_what_may_fall_past_an_edge_are_those_of_machine_code(model, slow, beliefs, end):
+    """The mean comes down at 0.54 m, just beside the table or just on it; in both cases some balls do the other."""
+    edge = Propagator(Surfaces(0.0, -5.0, (-np.inf, end, -np.inf, np.inf), (0.0, 0.01, 0.0, 0.0)), NEARLY_EXACT)
+    endless = Propagator(Surfaces(0.0 if end > 0.54 else -4.0, -5.0), NEARLY_EXACT)
+    found, known, sure = (
+        plane_crossing(place, beliefs(ball, START), [1.0, 0.0, 0.0], 0.8, 1.0)
+        for place, ball in ((edge, slow), (edge, model), (endless, model))
+    )
+    assert abs(found.time - known.time) < 1e-8
+    np.testing.assert_allclose(known.state, found.state, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(known.covariance, found.covariance, rtol=1e-4, atol=1e-8)
+    assert known.covariance[5, 5] > 4.0 * sure.covariance[5, 5]  # it bounces, or it does not
 
 
 def events(table):

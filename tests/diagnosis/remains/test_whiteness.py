@@ -52,6 +52,14 @@ def test_the_moments_of_the_statistic_are_those_of_its_quadratic_form():
     np.testing.assert_allclose([total, variance, third], moments, rtol=1e-9)
 
 
+@pytest.mark.parametrize("freedom", [2, 7, 40])
+def test_p_values_of_a_chi_square_are_exact(freedom):
+    """Its first three moments decide; here all others follow from them."""
+    for value in (0.3, 1.0, 2.5):
+        expected = stats.chi2.sf(value * freedom, freedom)
+        assert _p_value((value - 1.0) * freedom, 2.0 * freedom, 8.0 * freedom) == pytest.approx(expected, rel=1e-9)
+
+
 def test_a_memory_is_an_alarm_until_it_is_known(lasting):
     system = lasting.linearised()
     assert whiteness(lasting, system).p_value < 1e-6
