@@ -125,8 +125,13 @@ class Moving:
 
 
 def functions_of(model: BallModel) -> CompiledModel | None:
-    """The functions of a model, with or without coefficients that travel with the state."""
-    return compiled(model.model if isinstance(model, AugmentedModel) else model)
+    """The functions of a model, with or without coefficients that travel with the state.
+
+    A subclass of `AugmentedModel` may compute anything, or draw random numbers: torch asks it itself.
+    """
+    if isinstance(model, AugmentedModel):
+        return compiled(model.model) if type(model) is AugmentedModel else None
+    return compiled(model)
 
 
 def fly(model: BallModel, functions: CompiledModel, state: Tensor, dt: Tensor) -> Tensor:

@@ -62,6 +62,12 @@ def advance(model: BallModel, state: Tensor, dt: Tensor, surfaces: Surfaces) -> 
     Raises: ValueError: if a dt is negative or not a number.
     """
     _check_durations(dt)
+    moved = _by_machine_code(model, state, dt[:, None], surfaces)
+    return _advance(model, state, dt, surfaces) if moved is None else moved[:, 0]
+
+
+def _advance(model: BallModel, state: Tensor, dt: Tensor, surfaces: Surfaces) -> Tensor:
+    """`advance` in torch's own operations."""
     dt = dt.clamp_max(LONGEST_MOTION)
     steps = step_count(dt)
     for _ in range(steps):
@@ -151,28 +157,33 @@ def rollout(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) 
     steps = torch.diff(times, dim=-1, prepend=torch.zeros_like(times[:, :1]))
     if not bool((steps >= 0).all()):
         raise ValueError("times must start at 0 or later and must not decrease. Sort them.")
-    if steps.numel() and not followed(state, steps):
-        from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
-
-        functions = motion.functions_of(model)
-        if functions is not None:
-            _check_durations(steps)
-            return _rolled_out(
-                model, state, steps, surfaces, *motion.roll_out(model, functions, state, steps, surfaces)
-            )
+    moved = _by_machine_code(model, state, steps, surfaces)
+    if moved is not None:
+        return moved
     states = []
     for dt in steps.unbind(-1):
-        state = advance(model, state, dt, surfaces)
+        _check_durations(dt)
+        state = _advance(model, state, dt, surfaces)
         states.append(state)
     return torch.stack(states, dim=1)
 
 
-def _rolled_out(
-    model: BallModel, state: Tensor, steps: Tensor, surfaces: Surfaces, states: Tensor, reached: Tensor
-) -> Tensor:
-    """States (n, k, 9), the first (n,) of each ball from machine code; balls that come to rest go on from there."""
+def _by_machine_code(model: BallModel, state: Tensor, steps: Tensor, surfaces: Surfaces) -> Tensor | None:
+    """The states (n, k, 9) after each of the steps (n, k) s; None where only torch can tell.
+
+    Balls that come to rest go on in torch from there.
+    """
+    if not steps.numel() or followed(state, steps):
+        return None
+    from ballfg.dynamics.compiled import motion  # which needs the models, and these this file
+
+    functions = motion.functions_of(model)
+    if functions is None:
+        return None
+    _check_durations(steps)
+    states, reached = motion.roll_out(model, functions, state, steps, surfaces)
     for k in range(int(reached.min()), steps.shape[1]):
         rows = reached <= k
         before = states[rows, k - 1] if k else state[rows]
-        states[rows, k] = advance(take_rows(model, rows, len(state)), before, steps[rows, k], surfaces)
+        states[rows, k] = _advance(take_rows(model, rows, len(state)), before, steps[rows, k], surfaces)
     return states

@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 
-from ballfg.dynamics import BallModel, Surfaces, advance, nominal_model
+from ballfg.dynamics import BallModel, Surfaces, nominal_model, rollout
 
 TABLE = 0.75
 SIGMA = 0.0015
@@ -35,17 +36,17 @@ def fly(
 ) -> Truth:
     """A ball from a state (9,) on; at the stamps in `hits` its velocity becomes another."""
     hits = hits or {}
-    states = [torch.tensor([start], dtype=torch.float64)]
-    contacts = []
-    for i, dt in enumerate(np.diff(times).tolist()):
-        state = states[-1].clone()
-        if i in hits:
-            state[0, 3:6] = torch.tensor(hits[i], dtype=torch.float64)
+    path = np.tile(np.array(start, dtype=np.float64), (len(times), 1))
+    after = path.copy()  # what each stamp goes on from: the state there, with another velocity where it is hit
+    for begin, end in pairwise([0, *sorted(set(hits) - {0, len(times) - 1}), len(times) - 1]):
+        after[begin] = path[begin]
+        after[begin, 3:6] = hits.get(begin, after[begin, 3:6])
+        stamps = torch.from_numpy(times[begin + 1 : end + 1] - times[begin])
         with torch.no_grad():
-            states.append(advance(model, state, torch.tensor([dt], dtype=torch.float64), surfaces))
-        if states[-1][0, 5] > state[0, 5] + 0.05:
-            contacts.append(i)
-    return Truth(times, torch.cat(states).numpy(), contacts, sorted(hits))
+            flown = rollout(model, torch.from_numpy(after[None, begin]), stamps, surfaces)
+        path[begin + 1 : end + 1] = after[begin + 1 : end + 1] = flown[0].numpy()
+    contacts = np.flatnonzero(path[1:, 5] > after[:-1, 5] + 0.05).tolist()
+    return Truth(times, path, contacts, sorted(hits))
 
 
 def rally(seed: int, rate: float = 180.0, duration: float = 2.0, hits: int = 1) -> Truth:
