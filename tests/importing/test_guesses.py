@@ -104,6 +104,17 @@ def test_positions_alone_need_a_rate() -> None:
     np.testing.assert_allclose(bf.import_tracks(p, rate=100.0)["000"].times, t, atol=1e-12)
 
 
+def test_files_with_positions_in_different_columns_are_named(tmp_path: Path) -> None:
+    t, p = thrown()
+    for name, header in (("ours.csv", "t,x,y,z"), ("theirs.csv", "time,ball_x,ball_y,ball_z")):
+        lines = [",".join(map(repr, row)) for row in np.column_stack((t, p)).tolist()]
+        (tmp_path / name).write_text("\n".join([header, *lines]), encoding="utf-8")
+    with pytest.raises(UndecidedError, match="hold positions in different columns") as refused:
+        bf.import_tracks(tmp_path)
+    assert refused.value.option == "key"
+    assert all(name in str(refused.value) for name in ("ours", "theirs"))
+
+
 def test_nothing_falls() -> None:
     t = np.arange(0.0, 1.0, 0.01)
     rolling = np.column_stack([t, t, 0.1 * t, 0.0 * t])

@@ -36,9 +36,9 @@ class FilterRecord:
         measurement_noise: (n, 3, 3) m^2, covariance of the sample's white error and of that of its stamp.
         whitened: (n, 3), innovations divided by their standard deviations; NaN where there is none.
         quality: (n,) `Quality`.
+        least: (d,) standard deviations that rounding takes none of them below.
         contacts: for each interval that has any.
         hits: intervals.
-        least: (d,) standard deviations that rounding takes none of them below.
     """
 
     prior_mean: Array
@@ -50,10 +50,10 @@ class FilterRecord:
     measurement_noise: Array
     whitened: Array
     quality: NDArray[np.int8]
+    least: Array
     start: int = 0
     contacts: dict[int, tuple[Contact, ...]] = field(default_factory=dict)
     hits: list[int] = field(default_factory=list)
-    least: Array = field(default_factory=lambda: np.zeros(0))
 
     @classmethod
     def empty(cls, n: int, d: int) -> FilterRecord:
@@ -69,6 +69,7 @@ class FilterRecord:
             measurement_noise=np.zeros((n, 3, 3)),
             whitened=np.full((n, 3), np.nan),
             quality=np.full(n, Quality.GOOD, dtype=np.int8),
+            least=np.zeros(d),
         )
 
     @property

@@ -42,7 +42,7 @@ class Measurement:
         A tracker's bias may stand behind the state; the measurement does not look at it.
         A robust loss gets the weight that the innovation gives it. The innovation is kept the first time.
         """
-        found = FilterInnovation.of(self.batch, state, covariance, biases=len(state) - STATE_DIM)
+        found = FilterInnovation.of(self.batch, state, covariance)
         if np.isnan(self.innovation).any():
             self.innovation = found.whitened
         gain = np.linalg.solve(found.spread + found.R, found.H @ covariance).T

@@ -9,7 +9,7 @@ import pytest
 
 from ballfg.benchmarks.cameras.clocks import FACTORS, NAIVE, clocks, compare
 from ballfg.benchmarks.cameras.scenes import Filmed, Scenario, judge, scenarios, truth_at
-from ballfg.benchmarks.cameras.suite import add_points, add_velocities
+from ballfg.benchmarks.cameras.suite import add_points, add_turns, add_velocities
 from ballfg.benchmarks.cameras.turned import TURN, turned, turns
 from ballfg.benchmarks.results import Results
 from ballfg.simulation.scene import Clock, Recording
@@ -129,3 +129,7 @@ def test_turned_cameras_are_named(together) -> None:
     assert len(found) == 9
     assert [turn.named for turn in found] == [turn.camera for turn in found]
     assert max(abs(turn.found - TURN) for turn in found) < 0.1
+    results = Results("cameras", 0)
+    add_turns(results, found, together)
+    assert results.value("no camera turned", "agreement", "named") == 0.0
+    assert results.value("a camera turned by 0.5 degrees", "agreement", "named") == 1.0

@@ -63,3 +63,5 @@ def test_simulated_trackers_differ_and_are_fixed() -> None:
     assert len({config.seed for config in made}) == 20
     assert all(config.noise.jitter * config.rate <= 0.15 + 1e-12 for config in made)
     assert len({config.rate for config in made}) > 1
+    assert all(0.001 <= config.noise.position <= 0.006 for config in made)
+    assert all(config.noise.memory == 0.0 or 0.001 <= config.noise.memory <= 0.004 for config in made)

@@ -149,3 +149,12 @@ def test_impact_speeds_are_found_with_heights_that_lag_behind_the_stamps(
     # from 0.3 m above the table, less the ball's radius; two balls bounce a second time
     assert 1.9 < scene_of(fit).impact_speed < 2.8
     assert scene_of(fit).contacts == 8
+
+
+def test_regions_of_a_gust_lie_evenly_over_the_data() -> None:
+    """A quarter of the longest side across, four by two by two of them."""
+    shapes = GustRegion.shapes(SCENE)
+    assert {shape["size"] for shape in shapes} == {0.25 * 3.2}
+    assert sorted({shape["center_x"] for shape in shapes}) == pytest.approx([0.2, 1.0, 1.8, 2.6])
+    assert sorted({shape["center_z"] for shape in shapes}) == pytest.approx([0.8 + 0.175, 0.8 + 0.525])
+    assert len(shapes) == 16

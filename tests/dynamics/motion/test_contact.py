@@ -10,7 +10,7 @@ import torch
 from scipy.integrate import solve_ivp
 
 from ballfg.dynamics import contact_time, fly, fly_through, fly_through_jacobian
-from ballfg.dynamics.motion.contact import LONGEST_FALL, _newton_step
+from ballfg.dynamics.motion.contact import LONGEST_FALL, MAX_STEP, _newton_step, _scan
 from ballfg.dynamics.motion.integrate import batch_jacobian, derivative
 
 R = 0.02
@@ -18,6 +18,17 @@ R = 0.02
 
 def rows(*states):
     return torch.tensor(states, dtype=torch.float64)
+
+
+def test_small_steps_end_within_one_of_the_contact(build):
+    """Forwards to where it comes down, back to where it went through, and the first of these where there are two."""
+    model, g = build(gravity={"g": 9.81}), 9.81
+    gaps, speeds = np.array([0.3, 0.3, -0.2]), np.array([-1.0, 2.0, -3.0])
+    state = rows(*((0, 0, gap + R, 1, 0, vz, 0, 0, 0) for gap, vz in zip(gaps, speeds, strict=True)))
+    exact = (speeds + np.sqrt(speeds**2 + 2 * g * gaps)) / g
+    found = _scan(model, state, 0.0, torch.tensor([True, True, True]), 2.0)
+    assert np.abs(found.numpy() - exact).max() <= MAX_STEP
+    assert _scan(model, state, 0.0, torch.tensor([False, True, False]), 2.0).isnan().tolist() == [True, False, True]
 
 
 @pytest.mark.parametrize("g", [9.81, 1.6, 25.0])

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from ballfg.estimation.noise import tracker
 from ballfg.estimation.noise.estimate import linearised
 from ballfg.estimation.noise.linear_filter import LinearFilter
 from ballfg.estimation.noise.marginal import MarginalFit
@@ -60,6 +61,15 @@ def test_a_white_noise_that_tracks_contradict_is_not_believed(lasting):
     found = tracker_noise(linear, every_second(linear), settings, np.sqrt(WHITE**2 + LASTING**2))
     np.testing.assert_allclose(found.noise.position, WHITE, rtol=0.2)
     np.testing.assert_allclose(found.noise.memory, LASTING, rtol=0.3)
+
+
+def test_a_part_of_hardly_known_size_has_no_name(lasting, monkeypatch):
+    monkeypatch.setattr(tracker, "KNOWN", 100.0)  # sizes of fewer standard deviations do not count
+    settings, linear = lasting
+    found = tracker_noise(linear, every_second(linear), settings, WHITE)
+    assert found.parts == ()
+    assert found.noise.memory is None
+    assert max(found.noise.position) < 1.5 * np.hypot(WHITE, LASTING)
 
 
 def test_jitter_has_a_name_and_its_size(shots):

@@ -3,6 +3,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,11 +12,13 @@ import pytest
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Status
 from ballfg.learning.calibration import calibrate as module
+from ballfg.learning.calibration import run
 from ballfg.learning.calibration.calibrate import Problem, Step, TooManyFailures, calibrate, has_converged, pose
 from ballfg.learning.calibration.coefficients import choose, values_of, with_values
 from ballfg.learning.config.calibration import CalibrationConfig
-from ballfg.learning.evaluation import judge_track, summary
+from ballfg.learning.evaluation import TrackScore, judge_track, summary
 from ballfg.learning.split import split_tracks
+from ballfg.progress import unwatched
 from ballfg.tracks import read_dataset
 from tests.learning.conftest import PLANTED
 
@@ -144,3 +147,25 @@ def test_a_track_with_nothing_left_is_not_judged(few_tracks: Path) -> None:
     assert judge_track(estimator, track, 0.9999, np.inf) is not None
     assert judge_track(estimator, track, 0.4, 1e-6) is None
     assert summary([]) is None
+
+
+def test_a_summary_weighs_tracks_by_their_samples() -> None:
+    few = TrackScore(name="a", samples=10, rmse=0.01, covered=1.0, prediction_nis=2.0, nis=3.0)
+    found = summary([few, TrackScore(name="b", samples=30, rmse=0.03, covered=0.5, prediction_nis=4.0, nis=5.0)])
+    assert found is not None
+    assert (found.tracks, found.rmse_median) == (2, 0.02)
+    assert found.rmse_pooled == pytest.approx(np.sqrt((10 * 0.01**2 + 30 * 0.03**2) / 40))
+    assert (found.coverage_90, found.prediction_nis, found.nis) == pytest.approx((0.625, 3.5, 4.0))
+
+
+def test_the_time_left_is_that_of_the_steps_left(
+    few_tracks: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each step takes ten seconds of this clock."""
+    moments = iter(range(1000, 10**6, 10))
+    monkeypatch.setattr(run, "time", SimpleNamespace(monotonic=lambda: float(next(moments))))
+    problem = posed(few_tracks, max_iterations=4)
+    run._steps(problem, [], tmp_path, unwatched)
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].startswith("iteration 1: ")
+    assert lines[1].endswith("; at most about 30 s left")
