@@ -40,6 +40,7 @@ def test_small_steps_end_within_one_of_the_contact(build):
         (0.0, 1.0),  # has just left the surface
         (0.0, -1.0),  # touches now
         (-0.02, 2.0),  # comes up through the surface and down again
+        (-0.001, 0.5),  # so slowly that it is near its apex
         (-0.02, -2.0),  # went through the surface a moment ago
         (1e-9, 0.0),  # grazes
         (60.0, 0.0),  # a long fall
