@@ -22,6 +22,8 @@ from ballfg.tracks import TrackNoise
 
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
 VARIATIONS: Final = "variations"
+BASE: Final = "base"
+"""Where a learned model has the model that it corrects."""
 SECTIONS = (*KINDS, VARIATIONS, "learned")
 LONGEST_NAME: Final = 255
 """Characters of a folder's name."""
@@ -173,9 +175,13 @@ def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
         content[kind] = {name: cast(Effect, effect).values() for name, effect in group.items()}
     if model.noise is not None:
         content["measurement"][NOISE] = model.noise.to_mapping()
-    if model.variations:
-        content[VARIATIONS] = {name: variation.to_mapping() for name, variation in model.variations.items()}
-    return content | {"learned": None}
+    return content | _listed(model.variations) | {"learned": None}
+
+
+def _listed(variations: Mapping[str, Variation]) -> dict[str, Any]:
+    """The section of coefficients that differ between tracks, if any do; those of a learned model are its base's."""
+    section = {name.removeprefix(f"{BASE}."): variation.to_mapping() for name, variation in variations.items()}
+    return {VARIATIONS: section} if section else {}
 
 
 def save_model(model: BallModel, path: str | Path) -> None:
@@ -186,7 +192,7 @@ def save_model(model: BallModel, path: str | Path) -> None:
     Raises: TypeError: if the model is neither analytic nor learned, or corrects one that is not analytic.
     """
     path = Path(path)
-    content = model_to_dict(_analytic_part(model))
+    content = model_to_dict(_analytic_part(model)) | _listed(model.variations)
     if model.noise is not None:
         content["measurement"][NOISE] = model.noise.to_mapping()
     if has_learned_part(model):

@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 
+import numpy as np
 import pytest
 import safetensors.torch
 import torch
@@ -18,12 +19,14 @@ from ballfg.dynamics import (
     LearnedModel,
     SpinEmbedding,
     Trained,
+    Variation,
     build,
     load_model,
     model_to_dict,
     nominal_model,
     save_model,
 )
+from ballfg.tracks import Track
 
 KINDS = ("mlp", "mlp+gs", "skip+gs", "mnn+gs")
 
@@ -72,6 +75,16 @@ def test_round_trip(kind, residual, every_effect, tmp_path):
     content = yaml.safe_load((tmp_path / "m.yaml").read_text())
     assert sorted(p.name for p in tmp_path.iterdir()) == sorted(["m.yaml", content["learned"]])
     assert content["flight"] == (model_to_dict(every_effect)["flight"] if residual else {})
+
+
+def test_values_of_groups_stay_those_of_the_model_it_corrects(every_effect, tmp_path):
+    model = small(KINDS[0], every_effect)
+    model.variations = {"base.bounce.restitution.e": Variation("group", {"old": 0.8})}
+    save_model(model, tmp_path / "m.yaml")
+    again = load_model(tmp_path / "m.yaml", radius=0.02)
+    assert again.variations == model.variations
+    track = Track(np.array([0.0, 0.1]), np.zeros((2, 3)), labels={"group": "old"})
+    assert float(again.for_track(track).base.bounce["restitution"].e.detach()) == 0.8
 
 
 def test_round_trip_of_what_was_learned_beside(learned, tmp_path):
