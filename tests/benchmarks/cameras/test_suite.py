@@ -9,7 +9,7 @@ import pytest
 
 from ballfg.benchmarks.cameras.clocks import FACTORS, NAIVE, clocks, compare
 from ballfg.benchmarks.cameras.scenes import Filmed, Scenario, judge, scenarios, truth_at
-from ballfg.benchmarks.cameras.suite import add_points, add_turns, add_velocities
+from ballfg.benchmarks.cameras.suite import add_clocks, add_points, add_turns, add_velocities
 from ballfg.benchmarks.cameras.turned import TURN, turned, turns
 from ballfg.benchmarks.results import Results
 from ballfg.simulation.scene import Clock, Recording
@@ -107,12 +107,17 @@ def test_camera_factors_beat_what_pretends_to_be_synchronised(apart) -> None:
     assert share is not None
     assert share < 0.25
     assert (found[FACTORS].counts > 0).all()
+    assert results.value("unsynchronised", FACTORS, "states") == found[FACTORS].counts.sum()
 
 
 def test_late_clock_is_found(apart) -> None:
     late = replace(apart.scenario, config=replace(apart.scenario.config, clocks={"right": Clock(offset=0.004)}))
-    found = clocks(filmed(late))
-    np.testing.assert_allclose(found.offsets, [0.0, 0.004, 0.0], atol=1e-4)
+    seen = filmed(late)
+    np.testing.assert_allclose(clocks(seen).offsets, [0.0, 0.004, 0.0], atol=1e-4)
+    results = Results("cameras", 0)
+    add_clocks(results, [seen])
+    errors = [results.value("time offset", row, "largest_error") for row in ("right, late by 4 ms", "far, on time")]
+    assert all(error is not None and 0.0 < error < 0.1 for error in errors)
 
 
 def test_turned_camera_stands_where_it_stood(together) -> None:

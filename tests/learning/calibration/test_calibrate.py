@@ -15,6 +15,7 @@ from ballfg.learning.calibration import calibrate as module
 from ballfg.learning.calibration import run
 from ballfg.learning.calibration.calibrate import Problem, Step, TooManyFailures, calibrate, has_converged, pose
 from ballfg.learning.calibration.coefficients import choose, values_of, with_values
+from ballfg.learning.calibration.report import compare, table
 from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import TrackScore, judge_track, summary
 from ballfg.learning.split import split_tracks
@@ -43,6 +44,15 @@ def test_planted_coefficients_come_back(steps: list[Step]) -> None:
     assert np.all(np.abs(np.array(last.mean) - [0.12, 0.93, -0.003]) > 5.0 * np.array(last.sigma))
     # all balls are one ball: less spread than half a prior
     assert np.all(np.array(last.spread) < 0.5 * np.array([0.035, 0.02, 0.004]))
+
+
+def test_the_table_has_a_row_for_each_coefficient(steps: list[Step], many_tracks: Path) -> None:
+    problem, last = posed(many_tracks), steps[-1]
+    judged = table(problem, last, compare(steps[0].scores, *[last.scores] * 3)).splitlines()
+    for k, name in enumerate(PLANTED):
+        (row,) = (line.split() for line in judged if line.split()[:1] == [name])
+        values = (problem.chosen.start[k], last.mean[k], last.sigma[k], last.spread[k])
+        assert row[-4:] == [f"{value:.4g}" for value in values]
 
 
 def test_other_tracks_are_predicted_better(steps: list[Step]) -> None:
