@@ -9,8 +9,17 @@ import math
 import numpy as np
 
 from ballfg.dynamics.compiled.build import machine_code
-from ballfg.dynamics.compiled.signatures import FLAG, NOTHING, REAL, TWO
+from ballfg.dynamics.compiled.signatures import COUNT, FLAG, NOTHING, REAL, TWO
 from ballfg.state import STATE_DIM
+
+
+@machine_code(NOTHING(COUNT, REAL, TWO, TWO))
+def _keep(d, decay, x, result):
+    """The rows of x (w, w) that only ones and decays act on; zero for those of the state."""
+    for i in range(len(x)):
+        own = 0.0 if i < STATE_DIM else 1.0 if i < d else decay
+        for j in range(len(x)):
+            result[i, j] = own * x[i, j]
 
 
 @machine_code(NOTHING(TWO, REAL, TWO, TWO))
@@ -20,10 +29,7 @@ def move(transition, decay, x, result):
     Args: transition (d, d): of state and coefficients.  decay: of biases.
     """
     d, w = len(transition), len(x)
-    for i in range(w):
-        own = 0.0 if i < STATE_DIM else 1.0 if i < d else decay
-        for j in range(w):
-            result[i, j] = own * x[i, j]
+    _keep(d, decay, x, result)
     for i in range(STATE_DIM):
         for s in range(d):
             factor = transition[i, s]
@@ -36,10 +42,7 @@ def move(transition, decay, x, result):
 def pull(transition, decay, x, result):
     """The product F' x of a transition, as `move` takes it, and x (w, w)."""
     d, w = len(transition), len(x)
-    for i in range(w):
-        own = 0.0 if i < STATE_DIM else 1.0 if i < d else decay
-        for j in range(w):
-            result[i, j] = own * x[i, j]
+    _keep(d, decay, x, result)
     for s in range(STATE_DIM):
         for i in range(d):
             factor = transition[s, i]
