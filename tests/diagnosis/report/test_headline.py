@@ -101,6 +101,17 @@ def test_a_pattern_without_a_name() -> None:
     assert where("In flight: something") == "in flight: something"
 
 
+@pytest.mark.parametrize(
+    ("p_value", "word"), [(1e-8, "practically certain"), (1e-4, "very likely"), (0.02, "likely"), (0.2, "possible")]
+)
+def test_how_sure_it_is_that_something_is_left(p_value: float, word: str) -> None:
+    left = unexplained().unexplained
+    assert left.tests
+    tests = tuple(replace(test, p_value=p_value) for test in left.tests)
+    said = list(certainty(replace(unexplained(), unexplained=replace(left, tests=tests))))
+    assert any(line.startswith(f"That something is left: {word}. ") for line in said)
+
+
 def test_every_effect_of_the_catalogue_has_plain_words_with_its_numbers() -> None:
     own = {name: effect for name, effect in EFFECTS.items() if effect.__module__.startswith("ballfg.")}
     assert set(own) | set(NUMBERS) == set(PLAIN)
