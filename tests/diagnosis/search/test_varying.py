@@ -172,6 +172,21 @@ def test_groups_steps_and_lines():
     assert line.weights["31"]["31"] == 1.0
 
 
+def test_what_differs_is_said_of_groups_and_of_the_recording():
+    names = [f"{i:02d}" for i in range(32)]
+    ways = groupings(tracks(names, [{"group": "ab"[i % 4 // 2]} for i in range(32)]), names[::2])
+    group, drift = (
+        Varying.of(EFFECTS["restitution"], ("e",), next(w for w in ways if (w.by == "group") is own))
+        for own in (True, False)
+    )
+    assert (group.name, drift.name) == ("restitution_by_group", "restitution_drift")
+    assert group.sentence == "The coefficients of restitution differ between the tracks' values of 'group'."
+    assert drift.sentence.startswith("The coefficients of restitution change along the recording")
+    assert group.decide.startswith("Shoot the groups in turns")
+    assert drift.decide.startswith("Repeat shots of the first part")
+    assert (group.strengths, drift.strengths[0][:7]) == (("e[a]", "e[b]"), "e[from ")
+
+
 def test_the_place_of_a_step_is_looked_for_between_its_neighbours():
     names = [f"{i:02d}" for i in range(32)]
     way = next(w for w in groupings(tracks(names), names[::2]) if "16" in w.weights)
