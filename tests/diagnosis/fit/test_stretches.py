@@ -97,6 +97,9 @@ def test_a_hit_ends_a_stretch_and_begins_another(found):
     assert float(found.ends[after]) == pytest.approx(0.38, abs=0.025)
     assert float(found.starts[after, 3]) == pytest.approx(-6.0, abs=0.3)
     assert bool((found.times[after][found.used[after]] >= 0.0).all())
+    last, first = found.positions[before][found.used[before]][-1], found.positions[after][found.used[after]][0]
+    assert not torch.equal(last, first)  # no sample is in both
+    assert 97 <= int(found.used[[before, after]].sum()) <= 99
 
 
 def test_a_short_track_tells_nothing(found):
