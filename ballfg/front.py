@@ -29,6 +29,7 @@ from ballfg.estimation import (
     read,
 )
 from ballfg.estimation.batch import check_device, estimate_together
+from ballfg.parallel.work import on_one_thread
 from ballfg.prediction import Ahead, BallState
 from ballfg.tracks import TABLE_TENNIS, Dataset, Track
 
@@ -200,7 +201,8 @@ def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) 
     data = read(measured) if isinstance(measured, str | PathLike) else measured
     if not isinstance(data, Dataset):
         raise ValueError("measured must have a table of positions; a diagnosis of detections alone is not possible")
-    return diagnose_dataset(data, _model(model, data), jobs=jobs)
+    # as the commands do: threads gain nothing with such small batches, and beside other work wait for each other
+    return on_one_thread(partial(diagnose_dataset, data, jobs=jobs), _model(model, data))
 
 
 def estimator_for(
