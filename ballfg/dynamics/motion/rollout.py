@@ -157,19 +157,19 @@ def rollout(model: BallModel, state: Tensor, times: Tensor, surfaces: Surfaces) 
     steps = torch.diff(times, dim=-1, prepend=torch.zeros_like(times[:, :1]))
     if not bool((steps >= 0).all()):
         raise ValueError("times must start at 0 or later and must not decrease. Sort them.")
+    _check_durations(steps)
     moved = _by_machine_code(model, state, steps, surfaces)
     if moved is not None:
         return moved
     states = []
     for dt in steps.unbind(-1):
-        _check_durations(dt)
         state = _advance(model, state, dt, surfaces)
         states.append(state)
     return torch.stack(states, dim=1)
 
 
 def _by_machine_code(model: BallModel, state: Tensor, steps: Tensor, surfaces: Surfaces) -> Tensor | None:
-    """The states (n, k, 9) after each of the steps (n, k) s; None where only torch can tell.
+    """The states (n, k, 9) after each of the steps (n, k) s, which are durations; None where only torch can tell.
 
     Balls that come to rest go on in torch from there.
     """
@@ -180,7 +180,6 @@ def _by_machine_code(model: BallModel, state: Tensor, steps: Tensor, surfaces: S
     functions = motion.functions_of(model)
     if functions is None:
         return None
-    _check_durations(steps)
     states, reached = motion.roll_out(model, functions, state, steps, surfaces)
     for k in range(int(reached.min()), steps.shape[1]):
         rows = reached <= k
