@@ -13,7 +13,7 @@ from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import effect_class
 from ballfg.dynamics.model import THIN_SHELL, BallModel
 from ballfg.dynamics.networks.learned import LearnedModel
-from ballfg.dynamics.networks.learned_file import has_learned_part, read_learned, remove_others, write_learned
+from ballfg.dynamics.networks.learned_file import BASE, has_learned_part, read_learned, remove_others, write_learned
 from ballfg.dynamics.variation import Variation
 from ballfg.files.moving import settle
 from ballfg.files.strict_yaml import read_yaml
@@ -22,8 +22,6 @@ from ballfg.tracks import TrackNoise
 
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")
 VARIATIONS: Final = "variations"
-BASE: Final = "base"
-"""Where a learned model has the model that it corrects."""
 SECTIONS = (*KINDS, VARIATIONS, "learned")
 LONGEST_NAME: Final = 255
 """Characters of a folder's name."""
@@ -180,7 +178,7 @@ def model_to_dict(model: AnalyticModel) -> dict[str, Any]:
 
 def _listed(variations: Mapping[str, Variation]) -> dict[str, Any]:
     """The section of coefficients that differ between tracks, if any do; those of a learned model are its base's."""
-    section = {name.removeprefix(f"{BASE}."): variation.to_mapping() for name, variation in variations.items()}
+    section = {name.removeprefix(BASE): variation.to_mapping() for name, variation in variations.items()}
     return {VARIATIONS: section} if section else {}
 
 

@@ -30,7 +30,7 @@ from ballfg.files.whole_folder import whole_folder
 from ballfg.tracks import TrackNoise
 
 CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
-_MODEL, _LAUNCHER, _BASE = "model.", "launcher.", "base."
+_MODEL, _LAUNCHER, BASE = "model.", "launcher.", "base."
 """What the names of tensors start with: those of the networks and of the spin embedding; those of the base, which
 stand in the model file itself."""
 
@@ -168,7 +168,7 @@ def _tensors(model: BallModel) -> dict[str, Tensor]:
     """The weights of the learned part by name; they share the model's memory."""
     tensors: dict[str, Tensor] = {}
     if isinstance(model, LearnedModel):
-        tensors |= {_MODEL + n: t for n, t in model.state_dict().items() if not n.startswith(_BASE)}
+        tensors |= {_MODEL + n: t for n, t in model.state_dict().items() if not n.startswith(BASE)}
     if model.trained is not None and model.trained.launcher is not None:
         tensors |= {_LAUNCHER + n: t for n, t in model.trained.launcher.state_dict().items()}
     return tensors
@@ -202,7 +202,7 @@ def _empty_model(config: _Config, analytic: AnalyticModel, folder: Path) -> Ball
             model.fading = Fading.empty(config.fading.flight_centres, config.fading.contact_centres, analytic.radius)
     model.noise = analytic.noise
     if model is not analytic:
-        model.variations = {f"base.{name}": variation for name, variation in analytic.variations.items()}
+        model.variations = {f"{BASE}{name}": variation for name, variation in analytic.variations.items()}
     if config.trained is not None:
         model.trained = _trained(config.trained, folder)
     return model
