@@ -1,0 +1,146 @@
+"""The online estimator finds contacts, hits, outliers and gaps as samples come."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ballfg.dynamics import nominal_model
+from ballfg.estimation.online.events import EventTracker, contact_step
+from ballfg.estimation.online.online import Online
+from ballfg.estimation.segmentation import Contact, Segmentation, physics_of
+from ballfg.estimation.settings import Settings
+from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.tracks import Track
+from tests.estimation.online.streams import (
+    BOUNCING,
+    FLYING,
+    NOWHERE,
+    SAME,
+    SIGMA,
+    TABLE,
+    distance,
+    feed,
+    make_track,
+    settings,
+)
+
+
+def test_contact_is_taken_as_it_comes():
+    track, truth = make_track(BOUNCING, n=45)
+    online = Online(nominal_model(), TABLE, settings())
+    states = feed(online, track)
+    (k,) = [i for i, s in enumerate(online._samples) if s.motion.heights]
+    assert truth[k - 1, 5] < 0.0 < truth[k, 5]
+    assert all(s.revised <= i - k + 1 for i, s in enumerate(states[k:], k))
+    assert all(s.revised == 0 for s in states[k + 4 :])
+    assert np.abs((states[-1].state - truth[-1]) / np.sqrt(np.diag(states[-1].covariance))).max() < 4.0
+
+
+def test_contact_moves_to_where_the_estimate_puts_it():
+    track, truth = make_track(BOUNCING, n=45)
+    online = Online(nominal_model(), TABLE, settings())
+    k = int(np.flatnonzero(truth[:, 5] > 0.5)[-1])
+    feed(online, track.until(float(track.times[20])))
+    right = Smoother(online.model, TABLE, online.settings).estimate(track).contacts[0].interval
+    original = online.events.moved
+
+    def shifted(segmentation, first):
+        """The segmenter, one interval late."""
+        moved = original(segmentation, first)
+        late = [replace(c, interval=c.interval + 1) if not online.events._moves else c for c in moved.contacts]
+        return replace(moved, contacts=tuple(c for c in late if c.interval < online.events.segmenter.count - 1))
+
+    online.events.moved = shifted
+    for t, z in zip(track.times[21:].tolist(), track.positions[21:], strict=True):
+        online.push(t, z)
+    assert k > 21
+    assert [i for i, s in enumerate(online._samples) if s.motion.heights] == [right + 1]
+
+
+def test_contact_step():
+    falling = np.array([0, 0, 0.05, 0, 0, -3.0, 0, 0, 0])
+    assert contact_step(falling, 0.02, 0.02) == 0
+    assert contact_step(falling, 0.02, 0.005) == 1
+    assert contact_step(falling - 0.05 * np.eye(9)[2], 0.02, 0.02) == -1
+    assert contact_step(falling, 10.0, 0.02) == 0
+
+
+def test_a_contact_moves_six_times_at_most():
+    """A contact that flaps between intervals stays in the end; others, on the floor say, may still move."""
+    events = EventTracker(TABLE, physics_of(nominal_model()), True)
+    assert all(events.move(10 + k % 2, 0.0, 1 - 2 * (k % 2)) for k in range(6))
+    assert not events.move(10, 0.0, 1)
+    assert events.move(10, -0.76, 1)
+    none, good = np.zeros(0, dtype=np.int64), np.zeros(20, dtype=np.int8)
+    found = Segmentation((Contact(10, 0.1, 0.0), Contact(10, 0.1, -0.76)), none, none, (), good)
+    assert [contact.interval for contact in events.moved(found, 0).contacts] == [10, 11]
+
+
+def hit_track():
+    before, _ = make_track(FLYING, n=30, surfaces=NOWHERE)
+    middle = before.positions[-1]
+    after, truth = make_track((*middle, -6.0, 1.0, 2.0, 0.0, -50.0, 0.0), n=31, surfaces=NOWHERE, seed=5)
+    times = np.arange(60) * 0.01
+    return Track(times, np.concatenate((before.positions, after.positions[1:])), name="hit"), truth[-1]
+
+
+def test_hit_is_found_some_samples_late():
+    track, end = hit_track()
+    online = Online(nominal_model(), NOWHERE, settings())
+    states = feed(online, track)
+    hits = [i for i, s in enumerate(online._samples) if s.motion.hit]
+    assert len(hits) == 1
+    assert 29 <= hits[0] <= 31
+    assert max(s.revised for s in states[30:40]) > 0
+    assert np.abs((states[-1].state - end) / np.sqrt(np.diag(states[-1].covariance)))[:6].max() < 4.5
+    expected = Smoother(online.model, NOWHERE, online.settings).estimate(track)
+    assert distance(online.estimate(track).states, expected) < SAME
+
+
+def test_without_events_a_hit_stays_unseen():
+    track, _ = hit_track()
+    online = Online(nominal_model(), NOWHERE, settings(find_events=False))
+    feed(online, track)
+    assert not any(s.motion.hit for s in online._samples)
+    assert all(s.factor == 1.0 for s in online._samples)
+
+
+@pytest.mark.parametrize("bad", [0, 1, 20])
+def test_outlier(bad):
+    clean, truth = make_track(FLYING, n=40, surfaces=NOWHERE)
+    positions = clean.positions.copy()
+    positions[bad] += (0.2, -0.15, 0.25)
+    track = Track(clean.times, positions, name="outlier")
+    online = Online(nominal_model(), NOWHERE, settings())
+    states = feed(online, track)
+    assert bad == 1 or online._samples[bad].factor > 10.0  # one in the second sample is left to the robust loss
+    assert np.abs((states[-1].state - truth[-1]) / np.sqrt(np.diag(states[-1].covariance))).max() < 4.0
+    expected = Smoother(online.model, NOWHERE, online.settings).estimate(track)
+    assert distance(online.estimate(track).states, expected) < SAME
+
+
+def test_label_and_dropped_frames():
+    labels = {"spin_x": 0.0, "spin_y": 80.0, "spin_z": 20.0}
+    full, truth = make_track(FLYING, n=60, surfaces=NOWHERE, labels=labels)
+    keep = np.r_[0:15, 35:60]
+    track = Track(full.times[keep], full.positions[keep], labels=labels, name="gap")
+    online = Online(nominal_model(), NOWHERE, settings())
+    result = online.estimate(track)
+    expected = Smoother(online.model, NOWHERE, online.settings).estimate(track)
+    assert distance(result.states, expected) < SAME
+    assert np.abs((result.states - truth[keep]) / result.sigmas).max() < 5.0
+
+
+def test_long_gap_starts_anew():
+    first, _ = make_track(FLYING, n=20, surfaces=NOWHERE)
+    second, truth = make_track(FLYING, n=30, surfaces=NOWHERE, seed=2)
+    times = np.concatenate((first.times, second.times + 1.5))
+    track = Track(times, np.concatenate((first.positions, second.positions)), name="two")
+    for chosen in (settings(), Settings.for_measured(nominal_model(), position_noise=(SIGMA,) * 3)):
+        online = Online(nominal_model(), NOWHERE, chosen)
+        last = feed(online, track)[-1]
+        assert not online._samples[20].motion.linked
+        assert np.abs((last.state - truth[-1]) / np.sqrt(np.diag(last.covariance))).max() < 4.0
+        expected = Smoother(online.model, NOWHERE, chosen).estimate(track)
+        assert distance(online.estimate(track).states, expected) < SAME

@@ -1,0 +1,151 @@
+"""The online estimator's window: what a cut forgets, how much memory it holds, how it is built anew after failures."""
+
+import gc
+
+import gtsam
+import numpy as np
+import pytest
+import torch
+
+from ballfg.dynamics import nominal_model
+from ballfg.estimation.online.online import Online
+from ballfg.estimation.result import Status
+from ballfg.estimation.settings import Settings
+from ballfg.estimation.smoother.smoother import Smoother
+from ballfg.factors.bridge import STATE_KEY, Bridge
+from ballfg.factors.loss import Loss
+from tests.estimation.online.streams import (
+    BOUNCING,
+    FLYING,
+    LIVE,
+    LIVE_BOUNCE,
+    NOWHERE,
+    SIGMA,
+    TABLE,
+    NetworkModel,
+    feed,
+    make_track,
+    settings,
+)
+
+
+@pytest.mark.parametrize("start", [FLYING, BOUNCING])
+@pytest.mark.parametrize("coefficients", [False, True])
+def test_a_cut_window_forgets_nothing_that_matters(start, coefficients):
+    model = nominal_model()
+    chosen = (
+        Settings.for_measured(model, position_noise=(SIGMA,) * 3, loss=Loss())
+        if coefficients
+        else settings(loss=Loss())
+    )
+    surfaces, allowed = (NOWHERE, LIVE) if start is FLYING else (TABLE, LIVE_BOUNCE)
+    track, _ = make_track(start, n=70, surfaces=surfaces)
+    expected = Smoother(model, surfaces, chosen).estimate(track)
+    online = Online(model, surfaces, chosen, lag=20)
+    feed(online, track)
+    assert online.window.first >= 40
+    late = online.window.first
+    off = (online.window.states - expected.states[late:]) / expected.sigmas[late:]
+    assert np.abs(off[-1]).max() < allowed
+    result = online.estimate(track)
+    assert result.states.shape == (70, 9)
+    assert np.abs((result.states[-1] - expected.states[-1]) / expected.sigmas[-1]).max() < allowed
+    assert result.sigmas[-1] == pytest.approx(expected.sigmas[-1], rel=0.01 if start is FLYING else 0.2)
+    assert len(result.contacts) == len(expected.contacts)
+    assert [c.interval for c in result.contacts] == [c.interval for c in expected.contacts]
+    assert len(result.quality) == 70
+
+
+def count_objects():
+    """Bridges alive, and all objects."""
+    gc.collect()
+    objects = gc.get_objects()
+    return sum(type(o) is Bridge for o in objects), len(objects)
+
+
+def test_memory_is_flat_on_an_endless_stream():
+    """Shot after shot, half of them after a gap that restarts: nothing grows once the window is full.
+
+    What the window holds goes up and down and repeats itself after eight shots, which are 240 samples.
+    """
+    track, _ = make_track(FLYING, n=30, surfaces=NOWHERE)
+    online = Online(
+        nominal_model(), NOWHERE, Settings.for_measured(nominal_model(), position_noise=(SIGMA,) * 3), lag=15
+    )
+    sizes, clock = [], 0.0
+    for shot in range(19):
+        for t, z in zip(track.times, track.positions, strict=True):
+            assert not online.push(clock + float(t), z).rebuilt
+            assert len(online.window) <= 30
+        clock += 0.4 + (0.05 if shot % 2 else 1.0)
+        sizes.append(count_objects())
+    bridges, counts = np.array(sizes[3:]).T
+    assert bridges.max() < 4 * 30
+    assert abs(counts[8:].max() - counts[:8].max()) < 100  # less than one object in two samples
+    assert online.window.isam.getFactorsUnsafe().size() < 4 * 30
+    assert online.window.isam.size() < 2 * 30
+
+
+def test_rebuilds_after_gtsam_failed():
+    """An update that throws leaves iSAM2 half-updated: the same keys cannot be added again."""
+    track, _ = make_track(FLYING, n=40, surfaces=NOWHERE)
+    online, undisturbed = (Online(nominal_model(), NOWHERE, settings(loss=Loss())) for _ in range(2))
+    feed(undisturbed, track)
+    for k, (t, z) in enumerate(zip(track.times.tolist(), track.positions, strict=True)):
+        if k == 25:
+            graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
+            loose = gtsam.noiseModel.Isotropic.Sigma(1, 1.0)
+            graph.push_back(gtsam.CustomFactor(loose, [STATE_KEY + 25], _one_row))
+            values.insert(STATE_KEY + 25, np.zeros(9))
+            with pytest.raises(RuntimeError, match="Indetermin"):
+                online.window.isam.update(graph, values)
+        state = online.push(t, z)
+        assert state.rebuilt == (k == 25)
+        assert state.status is (Status.OK if k else Status.NO_VELOCITY)
+    assert len(online.window) == 40
+    assert online.window.states[-1] == pytest.approx(undisturbed.window.states[-1], abs=1e-3)
+
+
+def _one_row(_, values, jacobians):
+    if jacobians is not None:
+        jacobians[0] = np.eye(1, 9)
+    return np.zeros(1)
+
+
+def test_rebuilds_after_cut_and_failure():
+    track, _ = make_track(BOUNCING, n=60)
+    model = nominal_model()
+    chosen = Settings.for_measured(model, position_noise=(SIGMA,) * 3)
+    online = Online(model, TABLE, chosen, lag=15)
+    feed(online, track)
+    before = online.window.states.copy()
+    sigma = np.sqrt(np.diag(online.window.newest_covariance))[:9]
+    online.window.start_anew(online._samples)
+    assert np.abs((online.window.states[-1] - before[-1]) / sigma).max() < 0.1
+
+
+class Broken(NetworkModel):
+    """A model that gives nonsense from some speed on."""
+
+    limit = np.inf
+
+    def rates(self, state):
+        acceleration, spin = super().rates(state)
+        return acceleration * torch.nan if bool((state[..., 3].abs() > self.limit).any()) else acceleration, spin
+
+
+@pytest.mark.filterwarnings("ignore:Broken runs in torch")
+def test_a_window_that_cannot_be_solved_says_so():
+    track, _ = make_track(FLYING, n=20, surfaces=NOWHERE)
+    model = Broken()
+    online = Online(model, NOWHERE, settings())
+    states = feed(online, track.until(0.1))
+    model.limit = 1.0
+    state = online.push(0.11, track.positions[11])
+    assert states[-1].status is Status.OK
+    assert state.rebuilt
+    assert state.status is Status.FAILED
+    assert state.state[:3] == pytest.approx(track.positions[11])
+    assert len(online.window) == 1
+    model.limit = np.inf
+    assert online.push(0.12, track.positions[12]).status is Status.OK
