@@ -97,7 +97,7 @@ def _path(name: str, error: float) -> PredictedPath:
     times = np.linspace(0.0, 0.6, 40)
     places = np.stack((5.0 * times, 0.2 * times, 1.0 + 2.0 * times - 4.9 * times**2), axis=-1)
     rest = places[16:]
-    return PredictedPath(name, places[:16], times[16:] - times[16], rest + np.array([0.0, error, 0.0]), rest)
+    return PredictedPath(name, places[:16], times[16:] - times[15], rest + np.array([0.0, error, 0.0]), rest)
 
 
 def _candidate(

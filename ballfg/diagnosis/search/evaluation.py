@@ -115,9 +115,9 @@ def error_of_mean(by_track: Sequence[Array]) -> float:
 
 
 def _path(track: Track, prediction: TrackPrediction) -> PredictedPath:
-    first = prediction.times[0]
-    seen = track.positions[track.times < first]
-    return PredictedPath(track.name, seen, prediction.times - first, prediction.positions, prediction.measured)
+    seen = track.times < prediction.times[0]
+    since = prediction.times - track.times[seen][-1]
+    return PredictedPath(track.name, track.positions[seen], since, prediction.positions, prediction.measured)
 
 
 def _apex_distances(evaluated: EvaluationTrack, prediction: TrackPrediction) -> Array:

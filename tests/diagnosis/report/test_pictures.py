@@ -11,8 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from ballfg.diagnosis.report import pictures
 from ballfg.diagnosis.report.binned import binned, in_flight, motion_axes, slip_speed, turned
+from ballfg.diagnosis.report.shots import Shot, shot_picture
 from ballfg.diagnosis.report.wording import change, fixed, joined, listed, number, plus_minus, probability
-from ballfg.diagnosis.result import Errors, Value
+from ballfg.diagnosis.result import Errors, PredictedPath, Value
 from tests.diagnosis.made_diagnosis import WIND, errors, found, residuals, rounds
 
 
@@ -127,6 +128,23 @@ def test_histogram_of_whitened_residuals() -> None:
         assert density.sum() * 0.25 == pytest.approx((abs(whitened) <= 6).mean())
         middle = abs(np.asarray(line.get_xdata())) < 1.0
         assert density[middle].sum() * 0.25 == pytest.approx((abs(whitened) < 1).mean(), rel=1e-9)
+
+
+def test_a_shot_is_seen_along_its_own_direction() -> None:
+    """From (1, 2) towards (3, 4) on the table, 1 m up on each 5 m; predicted 0.1 m too far to the left."""
+    along = np.arange(6.0)[:, None]
+    points = np.array([1.0, 2.0, 0.5]) + along * [0.6, 0.8, 0.2]
+    left = np.array([-0.08, 0.06, 0.0])
+    path = PredictedPath("a", points[:3], 0.1 * np.arange(1.0, 4.0), points[3:] + left, points[3:])
+    figure = shot_picture(Shot(path, path), changed=False)
+    side, top, error = figure.axes
+    for axes, up in ((side, [0.5, 0.7, 0.9, 1.1, 1.3, 1.5]), (top, np.zeros(6))):
+        seen, later, predicted = axes.lines
+        assert_allclose(seen.get_xydata(), np.column_stack((along[:3], up[:3])), atol=1e-12)
+        assert_allclose(later.get_xydata(), np.column_stack((along[3:], up[3:])), atol=1e-12)
+        off = 0.1 if axes is top else 0.0
+        assert_allclose(predicted.get_xydata(), np.column_stack((along[3:], np.add(up[3:], off))), atol=1e-12)
+    assert_allclose(error.lines[0].get_xydata(), [[0.1, 100.0], [0.2, 100.0], [0.3, 100.0]], atol=1e-9)
 
 
 def test_errors_by_track_leaves_out_what_could_not_be_judged() -> None:

@@ -13,6 +13,7 @@ from ballfg.diagnosis.fit.stretches import joined
 from ballfg.diagnosis.search import evaluation
 from ballfg.diagnosis.search.candidates import refit, score_all
 from ballfg.diagnosis.search.evaluation import (
+    OBSERVED,
     QUIET,
     error_of_mean,
     held_out_gain,
@@ -165,6 +166,12 @@ def test_errors_of_predictions(make_ball, make_launches, make_shots, surfaces):
     assert wrong.log_likelihood < right.log_likelihood
     assert min(right.by_track) <= right.prediction_rmse_mm <= max(right.by_track)
     assert right.apex_rmse_mm < 20.0 or np.isnan(right.apex_rmse_mm)
+    for path, one in zip(right.paths, tracks, strict=True):
+        seen = len(path.seen)
+        assert one.track.times[seen - 1] <= OBSERVED * one.track.duration < one.track.times[seen]
+        np.testing.assert_array_equal(path.seen, one.track.positions[:seen])
+        np.testing.assert_array_equal(path.measured, one.track.positions[seen:])
+        np.testing.assert_allclose(path.times, one.track.times[seen:] - one.track.times[seen - 1], atol=1e-12)
 
 
 def labels_of(spin):
