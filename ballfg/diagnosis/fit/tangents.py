@@ -32,7 +32,7 @@ class RepeatedMotion:
         parts: 3; or 1 where nobody asks for velocities and spins, and states are (n, k, 3).
     """
 
-    def __init__(self, arcs: Sequence[MovedArc], balls: int, directions: int, parts: int = 3) -> None:
+    def __init__(self, arcs: Sequence[MovedArc], balls: int, directions: int, parts: int) -> None:
         self.arcs, self.balls, self.directions, self.parts = arcs, balls, directions, parts
 
     def states(self, times: Tensor) -> tuple[Tensor, Tensor]:

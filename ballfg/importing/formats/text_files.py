@@ -1,6 +1,7 @@
 """Tables of text: CSV, TSV and their kin, with any separator, decimal sign, header and comments."""
 
 import csv
+import math
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -81,8 +82,8 @@ def text_table(text: str, name: str, source: str) -> RawTable:
 
 
 def _separator(lines: Sequence[str]) -> str:
-    """The separator that gives most lines the same number of cells."""
-    best, most = ",", (0.0, 0)
+    """The separator that gives most lines the same number of cells, and most of these cells a number."""
+    best, most = ",", (0.0, -math.inf)
     for separator in SEPARATORS:
         widths = Counter(len(row) for row in _cells(lines[-_LOOK:], separator))
         if not widths:
@@ -94,12 +95,14 @@ def _separator(lines: Sequence[str]) -> str:
     return best
 
 
-def _numbers(lines: Sequence[str], separator: str) -> int:
-    """How many cells are numbers; a comma that separates makes two of 1,5, so whole columns of zeros do not count."""
-    rows = _cells(lines, separator)
-    found = sum(1 for row in rows for cell in row if _NUMBER.match(cell) or _DECIMAL_COMMA.match(cell))
-    other = sum(1 for row in rows for cell in row if not (_NUMBER.match(cell) or _DECIMAL_COMMA.match(cell)))
-    return found - 4 * other if len(rows[0]) > 1 else 0
+def _numbers(lines: Sequence[str], separator: str) -> float:
+    """How many cells are numbers, less four times those that are text: a comma that separates makes both of 1,5.
+
+    Text is worth nothing by itself: a separator counts that leaves at least as many numbers as there are lines.
+    """
+    cells = [cell for row in _cells(lines, separator) for cell in row if cell.lower() not in MISSING]
+    found = sum(1 for cell in cells if _NUMBER.match(cell) or _DECIMAL_COMMA.match(cell))
+    return found - 4 * (len(cells) - found) if found >= len(lines) else -math.inf
 
 
 def _cells(lines: Sequence[str], separator: str) -> list[list[str]]:

@@ -1,0 +1,156 @@
+"""Columns of all kinds: standard deviations, times of day, stamps in two parts, headers in comments, ragged lines."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+import ballfg as bf
+from ballfg.importing import Choices, UndecidedError, propose
+
+
+def thrown(duration: float = 0.7) -> tuple[np.ndarray, np.ndarray]:
+    """Times and positions, m, of a ball that bounces when its centre is 0.8 m high."""
+    t = np.arange(0.0, duration, 0.01)
+    up = 9.81 * 0.35 / 2
+    since = np.where(t < 0.35, t, t - 0.35)
+    z = 0.8 + np.where(t < 0.35, up, 0.9 * up) * since - 9.81 / 2 * since**2
+    return t, np.stack([5.0 * t, 0.3 * t, z], axis=1)
+
+
+def written(path: Path, header: str, rows: Sequence[Sequence[object]], separator: str = ",") -> Path:
+    lines = [separator.join(str(cell) for cell in row) for row in rows]
+    path.write_text("\n".join([header, *lines]) + "\n", encoding="utf-8")
+    return path
+
+
+def test_sigmas_turn_with_the_axes_and_have_the_unit_of_the_positions(tmp_path: Path) -> None:
+    t, p = thrown()
+    sigmas = np.full_like(p, 2.0)  # mm
+    sigmas[:, 1], sigmas[:, 2] = 3.0, np.linspace(4.0, 5.0, len(t))
+    seen = 1e3 * p @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # x, up, -y
+    path = written(tmp_path / "a.csv", "t,x,y,z,sigma_x,sigma_y,sigma_z", np.column_stack((t, seen, sigmas)).tolist())
+    proposal = propose(path, Choices())
+    (track,) = proposal.tracks
+    np.testing.assert_allclose(track.positions, p, atol=1e-9)
+    np.testing.assert_allclose(track.sigmas, 1e-3 * sigmas[:, [0, 2, 1]], atol=1e-12)
+    assert proposal.info.imported["column sigmas"].startswith("sigma_x, sigma_y, sigma_z (sure")
+
+
+@pytest.mark.parametrize("bad", ["0", "-2", "", "1e16"])
+def test_a_sample_whose_sigma_is_none_is_missing(tmp_path: Path, bad: str) -> None:
+    t, p = thrown()
+    rows = np.column_stack((t, p, np.full_like(p, 0.002))).tolist()
+    rows[7][5] = bad
+    proposal = propose(written(tmp_path / "a.csv", "t,x,y,z,sigma_x,sigma_y,sigma_z", rows), Choices())
+    np.testing.assert_allclose(proposal.tracks[0].times, np.delete(t, 7), atol=1e-12)
+    assert "1 rows without a time or a position left out" in proposal.notes
+
+
+@pytest.mark.parametrize(("separator", "sign"), [(",", "."), (";", "."), (";", ","), ("\t", "."), ("|", ",")])
+def test_times_of_day_count_from_midnight(tmp_path: Path, separator: str, sign: str) -> None:
+    t, p = thrown()
+    clock = [f"12:59:{59.5 + s:06.3f}" if s < 0.495 else f"13:00:{abs(s - 0.5):06.3f}" for s in t]
+    rows = [
+        [str(cell).replace(".", sign) for cell in (stamp, *point)]
+        for stamp, point in zip(clock, p.tolist(), strict=True)
+    ]
+    (track,) = bf.import_tracks(written(tmp_path / "a.csv", separator.join(("time", *"xyz")), rows, separator))
+    np.testing.assert_allclose(track.times, 13 * 3600 - 0.5 + t, atol=1e-9)
+
+
+@pytest.mark.parametrize(("separator", "sign"), [(",", "."), (";", ","), ("\t", ",")])
+def test_more_text_than_numbers(tmp_path: Path, separator: str, sign: str) -> None:
+    """Dates, words and empty cells beside four numbers: none of them hides what separates the cells."""
+    t, p = thrown()
+    rows = []
+    for k, row in enumerate(np.column_stack((t, p)).tolist()):
+        numbers = [str(cell).replace(".", sign) for cell in row]
+        rows.append(["2026-03-01", "court 1", f"seen by {k % 3}", *numbers, "", ""])
+    header = separator.join(("day", "where", "note", "t", "x", "y", "z", "remark", "by hand"))
+    (track,) = bf.import_tracks(written(tmp_path / "a.csv", header, rows, separator))
+    np.testing.assert_allclose(track.positions, p, atol=1e-9)
+
+
+def test_stamps_in_seconds_and_nanoseconds(tmp_path: Path) -> None:
+    t, p = thrown()
+    ns = np.round(1e9 * t).astype(np.int64) + 1_763_800_000_700_000_000
+    rows = [(n // 10**9, n % 10**9, *q) for n, q in zip(ns.tolist(), p.tolist(), strict=True)]
+    path = written(tmp_path / "a.csv", "header.stamp.sec,header.stamp.nanosec,x,y,z", rows)
+    np.testing.assert_allclose(bf.import_tracks(path)["000"].times, t, atol=1e-9)
+
+
+@pytest.mark.parametrize("header", ["# z y x t", "% z,y,x,t", "// z;y;x;t"])
+def test_a_header_in_a_comment(tmp_path: Path, header: str) -> None:
+    t, p = thrown()
+    rows = np.column_stack((p[:, ::-1], t)).tolist()
+    lines = [header[-2].join(map(str, row)) for row in rows]
+    (tmp_path / "a.txt").write_text("\n".join(["# made by a tracker", header, *lines]), encoding="utf-8")
+    proposal = propose(tmp_path / "a.txt", Choices())
+    np.testing.assert_allclose(proposal.tracks[0].positions, p, atol=1e-9)
+    assert proposal.info.imported["column x, y, z"] == "x, y, z (sure: names)"
+
+
+def test_lines_of_another_width_are_left_out_and_counted(tmp_path: Path) -> None:
+    t, p = thrown()
+    lines = [",".join(map(str, row)) for row in np.column_stack((t, p)).tolist()]
+    lines[20:20] = ["lost the ball", "1.0,2.0"]
+    (tmp_path / "a.csv").write_text("\n".join(["t,x,y,z", *lines]), encoding="utf-8")
+    proposal = propose(tmp_path / "a.csv", Choices())
+    assert len(proposal.tracks[0]) == len(t)
+    assert "2 lines without 4 cells left out" in proposal.notes
+
+
+def test_whole_numbers_and_names_of_a_parquet_file(tmp_path: Path) -> None:
+    t, p = thrown()
+    frames = np.arange(len(t))
+    columns = {
+        "frame": np.tile(frames, 2),
+        "shot": ["a"] * len(t) + ["b"] * len(t),
+        **{axis: np.tile(1e3 * p[:, i], 2) for i, axis in enumerate("xyz")},
+    }
+    pq.write_table(pa.table(columns), tmp_path / "a.parquet")
+    data = bf.import_tracks(tmp_path / "a.parquet", rate=100.0)
+    assert data.names == ["a", "b"]
+    for track in data:
+        np.testing.assert_allclose(track.times, t, atol=1e-12)
+        np.testing.assert_allclose(track.positions, p, atol=1e-9)
+
+
+def test_a_column_is_named_in_any_case_and_without_its_unit(tmp_path: Path) -> None:
+    t, p = thrown()
+    rows = np.column_stack((t, p, p + 9.0)).tolist()
+    path = written(tmp_path / "a.csv", "T [s],Left_X,Left_Y,Left_Z,x,y,z", rows)
+    chosen = {"t": "T", "x": "left_x", "y": "left_y", "z": "LEFT_Z"}
+    np.testing.assert_allclose(propose(path, Choices(columns=chosen)).tracks[0].positions, p, atol=1e-9)
+    with pytest.raises(ValueError, match="has no 'left' but"):
+        propose(path, Choices(columns=chosen | {"x": "left"}))
+
+
+def test_two_clocks_that_tell_different_times_are_asked_about(tmp_path: Path) -> None:
+    t, p = thrown()
+    header = "host_time,camera_time,x,y,z"
+    path = written(tmp_path / "a.csv", header, np.column_stack((t + 5.0, 1e3 * t, p)).tolist())
+    (track,) = propose(path, Choices()).tracks  # one clock, in s and in ms with another origin
+    np.testing.assert_allclose(np.diff(track.times), np.diff(t), atol=1e-9)
+    own = t + 0.003 * np.sin(9.0 * t)
+    path = written(tmp_path / "b.csv", header, np.column_stack((own, 1e3 * t, p)).tolist())
+    with pytest.raises(UndecidedError, match="host_time and camera_time may both be the time"):
+        propose(path, Choices())
+
+
+def test_shots_of_one_sample_and_late_samples_are_counted(tmp_path: Path) -> None:
+    t, p = thrown()
+    rows = [("a", *row) for row in np.column_stack((t, p)).tolist()]
+    rows[30], rows[31] = rows[31], rows[30]
+    rows += [("b", *rows[0][1:])]
+    proposal = propose(written(tmp_path / "a.csv", "shot,t,x,y,z", rows), Choices())
+    (track,) = proposal.tracks
+    np.testing.assert_allclose(track.positions, p, atol=1e-9)
+    assert "1 rows put in the order of their times" in proposal.notes
+    assert "1 shots of fewer than two samples left out" in proposal.notes
