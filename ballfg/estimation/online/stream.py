@@ -80,16 +80,16 @@ class SightingStream:
         self._last = true
         ray = Rays.of(row, np.array([true]), tuple(self.cameras.values()))
         self._rays = ray if self._rays is None else self._rays.joined(ray, MOST_RAYS, self._period(true))
-        joins = self._newest is not None and true - self._newest.time <= SAME_MOMENT
-        base = self._newest.time if joins and self._newest is not None else true
-        sighting = self._measurement(row, true - base)
-        if joins and self._newest is not None:
-            if not self._held:
-                return [], sighting
-            self._newest.measurements.append(sighting)
-        else:
-            self._newest = Sample(true, np.zeros(3), np.ones(3), measured=False, measurements=[sighting])
+        newest = self._newest
+        if newest is None or true - newest.time > SAME_MOMENT:
+            found = [self._measurement(row, 0.0)]
+            self._newest = Sample(true, np.zeros(3), np.ones(3), measured=False, measurements=found)
             self._held.append(self._newest)
+            return self._placed(), None
+        sighting = self._measurement(row, true - newest.time)
+        if not self._held:
+            return [], sighting
+        newest.measurements.append(sighting)
         return self._placed(), None
 
     def _measurement(self, row: Sightings, delay: float) -> Measurement:

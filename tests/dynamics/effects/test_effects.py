@@ -205,6 +205,7 @@ def test_surfaces():
     surfaces = Surfaces.table_tennis(0.7)
     assert surfaces.heights() == (0.7, pytest.approx(-0.06))
     assert Surfaces(0.1).heights() == (0.1,)
+    assert Surfaces() == Surfaces(0.0, None, None)  # the frame's origin lies on it
     state = torch.zeros((3, 9), dtype=torch.float64)
     state[:, 2] = torch.tensor((1.0, 0.71, 0.69))
     assert surfaces.height_below(state).tolist() == [0.7, 0.7, pytest.approx(-0.06)]

@@ -15,7 +15,7 @@ from ballfg.dynamics.motion.integrate import fly_jacobian
 from ballfg.dynamics.networks.density import FeatureDensity
 from ballfg.dynamics.networks.fading import ABROAD, Fading, states_before_contacts
 from ballfg.dynamics.surfaces import Surfaces
-from ballfg.estimation.configure import dataset_settings, with_usual_noise
+from ballfg.estimation.configure import dataset_settings, widened, with_usual_noise
 from ballfg.estimation.outside import outside_of, outside_share
 from ballfg.estimation.settings import MEASURED
 from ballfg.factors.noise import ProcessNoise
@@ -195,6 +195,10 @@ def test_coefficients_are_estimated_in_foreign_rooms_only(model):
     assert (abroad.process.acceleration, abroad.spin_prior) == (0.06, 25.0)
     assert with_usual_noise(abroad, model, 0.0).process == abroad.process
     assert with_usual_noise(abroad, model, 1.0).process.acceleration == pytest.approx(MEASURED.acceleration)
+    kick = 0.5 * model.fading.velocity.item() / np.sqrt(3.0)
+    bounces = np.hypot(abroad.process.contact_velocity, kick)
+    assert widened(abroad.process, model, 0.5) == replace(abroad.process, contact_velocity=pytest.approx(bounces))
+    assert widened(abroad.process, nominal_model(), 0.5) == abroad.process  # of which nothing was trained
 
 
 def test_the_share_outside_is_one_less_the_weight(model):

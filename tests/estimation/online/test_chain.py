@@ -103,10 +103,28 @@ def test_sightings_that_join_a_sample(ball: World) -> None:
             same(*states)
 
 
+def test_a_window_that_begins_where_a_shot_begins_knows_nothing_of_the_shot_before(track: Track) -> None:
+    """The cut after 25 samples leaves the 12 of the next shot; a window that keeps all says the same of them."""
+    model, states = nominal_model(), {}
+    settings = own(model, memory=(0.002,) * 3, coefficients={}, loss=Loss())
+    times = np.concatenate((track.times[:13], track.times[:20] + 3.0))
+    positions = np.concatenate((track.positions[:13], track.positions[:20]))
+    for name, lag in (("cut", 12), ("whole", 128)):
+        one, other = both(model, 0.0, settings, lag=lag)
+        for time, position in zip(times, positions, strict=True):
+            states[name] = one.push(time, position)
+            same(states[name], other.push(time, position))
+        assert one.window is not None
+        assert one.window.first == (13 if name == "cut" else 0)
+    sigma = np.sqrt(np.diag(states["whole"].joint))
+    assert (np.abs(states["cut"].mean - states["whole"].mean) / sigma).max() < 0.02
+
+
 @pytest.mark.parametrize("lag", [12, 128])
-def test_estimates_of_whole_tracks(track: Track, lag: int) -> None:
+@pytest.mark.parametrize("changes", [{}, {"coefficients": {}}], ids=["coefficients", "none"])
+def test_estimates_of_whole_tracks(track: Track, lag: int, changes: dict[str, Any]) -> None:
     model = nominal_model()
-    one, other = (online.estimate(track) for online in both(model, 0.0, own(model), lag=lag))
+    one, other = (online.estimate(track) for online in both(model, 0.0, own(model, **changes), lag=lag))
     assert one.status is other.status is Status.OK
     sigmas = one.sigmas
     assert (np.abs(one.states - other.states) / sigmas).max() < 1e-4  # the minimum within the smoother's tolerance

@@ -127,6 +127,16 @@ def test_innovations_are_standard_normal():
     assert values.var() == pytest.approx(1.0, abs=0.2)  # 306 numbers: 0.08 is one standard deviation
 
 
+def test_stamps_that_jitter_widen_positions_along_the_velocity():
+    track, _ = make_track(FLYING, n=20, surfaces=NOWHERE)
+    chosen = settings(stamp_jitter=2e-3, loss=Loss())
+    last = feed(Online(nominal_model(), NOWHERE, chosen), track)[-1]
+    expected = Smoother(nominal_model(), NOWHERE, chosen).estimate(track)
+    assert np.sqrt(np.diag(last.covariance)) == pytest.approx(expected.sigmas[-1], rel=0.05)
+    plain = feed(Online(nominal_model(), NOWHERE, settings(loss=Loss())), track)[-1]
+    assert last.covariance[0, 0] > 4.0 * plain.covariance[0, 0]  # it flies along x
+
+
 def test_few_samples():
     track, _ = make_track(FLYING, n=5, surfaces=NOWHERE)
     model = nominal_model()

@@ -10,8 +10,10 @@ import pytest
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.filters.ekf import ExtendedKalmanFilter
 from ballfg.estimation.filters.sliding_window import SlidingWindow
+from ballfg.estimation.observations.sightings import SAME_MOMENT
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.online.state import OnlineState
+from ballfg.estimation.online.stream import SightingStream
 from ballfg.estimation.result import Status
 from ballfg.estimation.settings import Settings
 from ballfg.estimation.smoother.smoother import Smoother
@@ -96,6 +98,22 @@ def test_cameras_of_one_moment_join(ball: World) -> None:
     assert np.linalg.norm((states[-1].state - made.truth[-1])[:3]) < 2e-3
     last = [np.trace(state.covariance[:3, :3]) for state in states[-3:]]
     assert last[0] > last[1] > last[2]  # each of them tells more of the same moment
+
+
+def test_sightings_that_join_a_sample_know_how_much_later_they_were(ball: World) -> None:
+    """Before the ball is found, while samples are held back, and after; the first of each moment makes the sample."""
+    made = scene(2, ball, phases=(0.0, 0.0, 0.0), duration=0.15).sightings
+    stream, placed, late = SightingStream(RIG, Settings().sighting_loss), [], 0.9 * SAME_MOMENT
+    for k, time in enumerate(made.times):
+        own = time + (late if k % 3 else 0.0)
+        samples, joined = stream.take(own, made.cameras[made.camera[k]], made.pixels[k], made.covariances[k])
+        placed += samples
+        if joined is not None:
+            placed[-1].measurements.append(joined)
+    assert [len(sample.measurements) for sample in placed] == [3] * (len(made) // 3)
+    for sample in placed:
+        delays = [measurement.batch.delay.item() for measurement in sample.measurements]
+        assert delays == pytest.approx([0.0, late, late], abs=1e-12)
 
 
 def test_one_camera_is_carried_on_then_held_back(ball: World) -> None:

@@ -1,9 +1,15 @@
-"""Events put together: which intervals of a track a rest holds."""
+"""Events put together: which intervals of a track a rest holds, and what is left of a ball after a restart."""
 
+import numpy as np
 import pytest
 
+from ballfg.dynamics import Surfaces
+from ballfg.estimation.segmentation import SegmentationPhysics, SegmentationSettings
 from ballfg.estimation.segmentation.assembly import rests_of
+from ballfg.estimation.segmentation.bank import FLYING, HYPOTHESIS
+from ballfg.estimation.segmentation.branches import _forget
 from ballfg.estimation.segmentation.events import Event, EventKind
+from ballfg.estimation.segmentation.scene import Scene
 
 HEIGHT = 0.76
 
@@ -25,3 +31,17 @@ def test_a_rest_holds_the_whole_intervals_on_the_surface(end, index, last) -> No
         events += [Event(end, index, 0.01 * index), Event(EventKind.OUTLIER, 13, 0.13)]
     found = [(rest.first, rest.last, rest.height) for rest in rests_of(events, 20)]
     assert found == ([] if last is None else [(5, last, HEIGHT)])
+
+
+def test_a_forgotten_ball_is_at_a_place_and_moves_in_any_way() -> None:
+    bank = np.zeros(1, HYPOTHESIS)
+    for name in ("mean", "cov", "shift", "age", "surface"):
+        bank[name] = 7.0
+    settings = SegmentationSettings()
+    scene = Scene(SegmentationPhysics(), Surfaces(0.0), settings)
+    _forget(bank[0], np.array([1.0, -2.0, 0.5]), 0.04, scene.numbers)
+    np.testing.assert_array_equal(bank[0]["mean"], [[1.0, 0.0, 0.0], [-2.0, 0.0, 0.0], [0.5, 0.0, 0.0]])
+    spread = np.diag([0.04, settings.velocity_spread**2, settings.slack**2])
+    np.testing.assert_allclose(bank[0]["cov"], np.stack([spread] * 3), rtol=1e-12)
+    assert not bank[0]["shift"].any()
+    assert (bank[0]["surface"], bank[0]["age"]) == (FLYING, 0)
