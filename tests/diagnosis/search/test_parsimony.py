@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
-from ballfg.diagnosis.fit.fit import fit_problem, values_of
+from ballfg.diagnosis.fit.fit import covariance_of, fit_problem, values_of
 from ballfg.diagnosis.result import Value
+from ballfg.diagnosis.search import parsimony
 from ballfg.diagnosis.search.candidates import with_hypothesis
 from ballfg.diagnosis.search.hypothesis import Hypothesis, hypotheses, scene_of
-from ballfg.diagnosis.search.parsimony import halves_differ, insignificant, own_scores
+from ballfg.diagnosis.search.parsimony import halves_differ, insignificant, own_scores, significance
 from ballfg.diagnosis.search.plausible import RANGES, implausible
 from ballfg.dynamics import EFFECTS
 
@@ -43,6 +45,28 @@ def test_an_effect_that_is_there_differs_from_zero(with_wind, windy_fit):
 
 def test_an_effect_that_is_not_there_does_not(calm_fit):
     assert insignificant(fit_with(calm_fit, WIND), [WIND], calm_fit) == [WIND]
+
+
+def test_the_likelihood_alone_may_tell_of_a_single_strength(
+    calm_fit, make_ball, make_launches, make_shots, make_fit, monkeypatch
+):
+    """Where scores say nothing: without an effect that is there the fit is worse by far, without another it is not."""
+    effect = Hypothesis(EFFECTS["drag_spin"], {}, ("gain",))
+    shots = make_shots(make_ball(drag_spin={"gain": 0.4}), make_launches(16, 9), 9).stretches
+    before = make_fit(make_ball(), shots, settle_noise=False)
+    fit = fit_with(before, effect)
+    monkeypatch.setattr(parsimony, "CHANCE", -1.0)
+    found = significance(fit, effect, before)
+    assert found.differs
+    assert found.sigmas == pytest.approx(np.sqrt(np.diag(covariance_of(fit, effect.columns))))  # no less than the noise
+    assert not significance(fit_with(calm_fit, effect), effect, calm_fit).differs
+
+
+def test_an_effect_without_strengths_has_none_that_halves_could_differ_in(
+    with_wind, make_launches, make_ball, make_shots
+):
+    held = Hypothesis(EFFECTS["wind"], dict(zip("xyz", TRUTH, strict=True)), ())
+    assert not halves_differ(with_wind, held, make_shots(make_ball(), make_launches(4, 5), 5).stretches)
 
 
 def test_two_names_for_one_pattern_are_idle_beside_each_other(with_wind, windy_fit):
