@@ -11,7 +11,7 @@ import ballfg as bf
 from ballfg.dynamics import Surfaces, nominal_model, rollout
 from ballfg.dynamics.surfaces import TABLE_LENGTH, TABLE_WIDTH
 from ballfg.estimation import dataset_surfaces, table_note
-from ballfg.estimation.table_extent import find_table_extent
+from ballfg.estimation.table_extent import _falls, find_table_extent
 from ballfg.tracks import TABLE_TENNIS, TENNIS, DatasetInfo, Track, read_dataset, write_dataset
 from tests.places import DATA
 
@@ -79,6 +79,17 @@ def test_one_ball_beside_the_table_is_enough():
     found = find_table_extent([*tracks, *past], HEIGHT, RADIUS)
     assert found.falls == 1
     assert found.sides[1] == pytest.approx(sides(LONG_X)[1], abs=0.3)
+
+
+def test_a_fall_is_where_the_ball_was_a_quarter_of_the_depth_below_contact():
+    """From 0.3 m above at 2 m/s along x; what is below by the whole depth did not touch the table."""
+    t = np.arange(40) / 200.0
+    falling = np.stack((2.0 * t, 0.5 - t, HEIGHT + 0.3 - 4.0 * t - 9.81 / 2 * t**2), axis=1)
+    depth = 0.08
+    when = (-4.0 + math.sqrt(16.0 + 2 * 9.81 * (0.3 + depth / 4))) / 9.81
+    (place,) = _falls(t, falling, HEIGHT, depth)
+    assert_allclose(place, [2.0 * when, 0.5 - when, HEIGHT - depth / 4], atol=1e-4)
+    assert len(_falls(t, falling, HEIGHT - 1.0, depth)) == 0
 
 
 def test_outliers_do_not_move_the_ends():

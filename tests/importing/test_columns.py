@@ -122,6 +122,13 @@ def test_whole_numbers_and_names_of_a_parquet_file(tmp_path: Path) -> None:
         np.testing.assert_allclose(track.positions, p, atol=1e-9)
 
 
+def test_a_point_beside_columns_is_no_column() -> None:
+    t, p = thrown()
+    columns = {axis: p[:, i].tolist() for i, axis in enumerate("xyz")}
+    (track,) = bf.import_tracks({"t": t.tolist(), "ball": columns, "camera": {"x": 1.0, "y": -4.0, "z": 2.0}})
+    np.testing.assert_allclose(track.positions, p, atol=1e-12)
+
+
 def test_a_column_is_named_in_any_case_and_without_its_unit(tmp_path: Path) -> None:
     t, p = thrown()
     rows = np.column_stack((t, p, p + 9.0)).tolist()

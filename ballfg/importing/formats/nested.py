@@ -84,11 +84,8 @@ def _vectors(key: str, value: Any) -> dict[str, Any]:
     """The columns (n,) in a value: itself, the columns of points (n, 2..4), or the parts of a dict of vectors."""
     if isinstance(value, Mapping):
         parts = {str(k): v for k, v in value.items()}
-        if not parts or not all(isinstance(v, list | np.ndarray) for v in parts.values()):
-            return {}
-        if set(parts) <= {"x", "y", "z", "X", "Y", "Z"}:
-            return {f"{key}.{k}": v for k, v in parts.items()}
-        return {}
+        vectors = all(isinstance(v, list | np.ndarray) for v in parts.values())
+        return {f"{key}.{k}": v for k, v in parts.items()} if vectors and set(parts) <= set("xyzXYZ") else {}
     try:
         array = value if isinstance(value, np.ndarray) else np.array(value)
     except ValueError:

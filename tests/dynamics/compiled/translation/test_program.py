@@ -4,12 +4,13 @@ import math
 
 import numpy as np
 import pytest
+import torch
 
 from ballfg.dynamics.compiled.build import built
 from ballfg.dynamics.compiled.translation.arrays import Arrays
 from ballfg.dynamics.compiled.translation.program import Program
 from ballfg.dynamics.compiled.translation.source import function_source
-from ballfg.dynamics.compiled.translation.trace import Traced
+from ballfg.dynamics.compiled.translation.trace import Traced, trace
 
 UNARY = {
     "neg": lambda a: -a,
@@ -101,3 +102,43 @@ def test_source_does_not_depend_on_what_else_a_program_holds() -> None:
         a, b = program.input(), program.input()
         sources.append(function_source(whole(program, [program.apply("mul", a, b)]), [a], [b]))
     assert sources[0] == sources[1]
+
+
+def test_shapes_of_all_kinds() -> None:
+    def shapes(x):
+        rows = (2.0 * x[:6]).view(2, 3)
+        same = (rows + 1.0).squeeze_(0) * rows.unsqueeze(1).squeeze(0).squeeze_(1)  # only sides of one are taken away
+        turned = torch.stack((same, rows.flip([1]))).permute(2, 0, 1)
+        long, short = turned.split(2)
+        first, middle, last = x.split_with_sizes([2, 3, 4])
+        ends = torch.cat([one.unsqueeze(0).expand(2, -1).reshape(-1) for one in middle.view(3, 1).unbind(0)])
+        return torch.cat((long.reshape(-1), short.sum((0, 1)), first.select(0, 1).view(1), last[1:3], ends))
+
+    traced, x = trace(shapes, [9]), np.linspace(0.5, 1.3, 9)
+    y, yt = run(traced.program, traced.outputs, traced.inputs[0], [], x, [])
+    point = torch.from_numpy(x)
+    np.testing.assert_allclose(y, shapes(point).numpy(), rtol=1e-14)
+    np.testing.assert_allclose(yt, torch.autograd.functional.jacobian(shapes, point).numpy(), rtol=1e-12, atol=1e-13)
+
+
+def test_sums_norms_and_choices_of_all_kinds() -> None:
+    def numbers(x):
+        a, b = x[:3] - 0.67, x[3:6]
+        m = x.view(3, 3)
+        one = torch.where(a < 0.1, a.clamp(-0.05, 0.08), a.clamp_max(0.2)) + torch.where(b >= 1.0, b, b.clamp_min(0.95))
+        two = torch.linalg.vector_norm(m, dim=1) + m.mean(0) + m.mean() * torch.sign(a) + torch.abs(a)
+        cross = torch.linalg.cross(a, b) * b.rsqrt() + torch.minimum(a, b).square() - torch.maximum(a, -b).reciprocal()
+        three = torch.addcmul(a, b, cross) + torch.where(a > b - 0.6, torch.zeros_like(a), torch.ones_like(a))
+        four = torch.nn.functional.pad(a, (1, 0)) + torch.cat((m.index_select(1, torch.tensor([2, 0]))[0], a[:2] ** 3))
+        five = (
+            torch.where(a <= 0.0, (m @ b.view(3, 1)).squeeze(1), torch.tan(b))
+            + torch.log(b) / torch.cos(a)
+            - torch.sin(a) * torch.tanh(b)
+        )
+        return torch.cat((one, two, cross, three, four, five, (a.sum() + m.t().sum(1, keepdim=True)).flatten()))
+
+    traced, x = trace(numbers, [9]), np.linspace(0.5, 1.3, 9)
+    y, yt = run(traced.program, traced.outputs, traced.inputs[0], [], x, [])
+    point = torch.from_numpy(x)
+    np.testing.assert_allclose(y, numbers(point).numpy(), rtol=1e-13)
+    np.testing.assert_allclose(yt, torch.autograd.functional.jacobian(numbers, point).numpy(), rtol=1e-11, atol=1e-12)
