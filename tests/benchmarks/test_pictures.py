@@ -9,7 +9,7 @@ from matplotlib.figure import Figure
 
 from ballfg.benchmarks.diagnosis.pictures import ALL, repair_picture
 from ballfg.benchmarks.estimators.measured import Measured
-from ballfg.benchmarks.estimators.pictures import calibration_picture
+from ballfg.benchmarks.estimators.pictures import calibration_picture, observations_picture
 from ballfg.benchmarks.results import Row
 
 
@@ -59,3 +59,23 @@ def test_each_effect_has_a_line_of_its_own_before_and_after(closed: list[Figure]
     assert [label.get_text() for label in figure.axes[0].get_yticklabels()] == ["wind", "scale"]
     assert points(figure, "before / true") == [(1.8, 0.0), (3.0, 1.0)]
     assert points(figure, "after / true") == [(1.02, 0.0), (0.99, 1.0)]
+
+
+def test_errors_by_observations_stand_on_an_axis_of_plain_numbers(closed: list[Figure], tmp_path: Path) -> None:
+    means = {"ekf": (2.0, 0.5, 0.04), "smoother": (1.0, 0.3, 0.02)}
+    rows = [
+        Row("paper", method, f"velocity_{what}_{when}@{n}", "m/s", share * mean, None, None, 9)
+        for method, values in means.items()
+        for n, mean in zip((2, 10, 50), values, strict=True)
+        for what, share in (("mean", 1.0), ("sd", 0.3))
+        for when in ("newest", "whole")
+    ]
+    observations_picture(rows, "paper", "a title", tmp_path / "a.png")
+    (figure,) = closed
+    figure.draw_without_rendering()
+    for axes in figure.axes:
+        for line, values in zip(axes.get_lines(), means.values(), strict=True):
+            np.testing.assert_allclose(line.get_xydata(), np.stack(((2, 10, 50), values), axis=-1))
+    labels = [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    assert {"0.05", "0.1", "1"} <= set(labels), labels
+    assert not any("10^" in label for label in labels)

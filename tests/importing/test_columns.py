@@ -12,6 +12,8 @@ import pytest
 
 import ballfg as bf
 from ballfg.importing import Choices, UndecidedError, propose
+from ballfg.importing.writing import _drawing
+from ballfg.tracks import Track
 
 
 def thrown(duration: float = 0.7) -> tuple[np.ndarray, np.ndarray]:
@@ -161,3 +163,10 @@ def test_shots_of_one_sample_and_late_samples_are_counted(tmp_path: Path) -> Non
     np.testing.assert_allclose(track.positions, p, atol=1e-9)
     assert "1 rows put in the order of their times" in proposal.notes
     assert "1 shots of fewer than two samples left out" in proposal.notes
+
+
+def test_the_drawing_of_a_long_shot_has_few_points(tmp_path: Path) -> None:
+    t, p = np.arange(3000) / 1000.0, np.zeros((3000, 3))
+    p[:, 0], p[:, 2] = t, 1.0 + np.sin(3.0 * t)
+    counts = [str(_drawing([Track(t[::step], p[::step])], 0.76)).count("<use") for step in (1, 20)]
+    assert counts[0] < 2.5 * counts[1]  # of 3,000 samples no more than 300 are drawn, of 150 each one

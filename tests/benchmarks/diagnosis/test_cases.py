@@ -59,6 +59,23 @@ def test_every_effect_of_the_catalogue_is_planted() -> None:
     assert {name for pair in PAIRS for name in pair} <= set(PLANTS)
 
 
+def test_typical_sizes_are_those_of_the_documents() -> None:
+    text = (ROOT / "docs" / "benchmarks_loop.md").read_text(encoding="utf-8")
+    table = text[text.index("| effect | size 1 |") : text.index("**Right** is")]
+    units = {"ms": 1e-3, "mm": 1e-3, "%": 1e-2}
+    told = {
+        name: float(number) * units.get(unit, 1.0)
+        for name, number, unit in re.findall(r"`(\w+\.\w+)`(?: \(hidden\))? \| ([\d.]+) ?([%\w]*)", table)
+    }
+    planted = {
+        f"{plant.name}.{name}": plant.base + amount
+        for plant in PLANTS.values()
+        if plant.sized and not plant.left_out
+        for name, amount in plant.amounts
+    }
+    assert told == pytest.approx(planted)
+
+
 @pytest.mark.parametrize("name", PLANTS)
 def test_size_zero_is_the_declared_model_and_size_one_is_not(name: str) -> None:
     plant = PLANTS[name]

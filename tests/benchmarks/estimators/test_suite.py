@@ -1,5 +1,6 @@
 """A small run of a comparison that takes minutes in earnest."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -54,4 +55,6 @@ def test_settings_are_stated() -> None:
     text = describe_settings(fair_protocol(2, 0).settings)
     assert text.startswith("position noise 3 / 3 / 3 mm; process noise acceleration ")
     assert "spin label 4 rad/s" in text
-    assert "squared loss" in text
+    assert text.endswith("squared loss")
+    learned = replace(fair_protocol(2, 0).settings, coefficients={"flight.drag.k": 0.02, "bounce.restitution.e": 0.03})
+    assert describe_settings(learned) == f"{text}; coefficients per track: flight.drag.k, bounce.restitution.e"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ballfg.estimation import Smoother
+from ballfg.estimation import Smoother, SpinReading
 from ballfg.factors.graph import LevenbergMarquardt
 from ballfg.learning.augment import augmentation
 from ballfg.learning.end_to_end.learnables import Learnables, NoiseScales
@@ -170,3 +170,21 @@ def test_sigmas_of_a_turned_shot_do_not_depend_on_the_axes() -> None:
         np.testing.assert_allclose(root, np.tile((200.0, 200.0, 500.0), (OBSERVED, 1)), rtol=1e-12)
         found.append(pose.states(one.solution.minimum.values.states, back=True))
     np.testing.assert_allclose(found[0], found[1], rtol=1e-7, atol=1e-7)
+
+
+def test_measurements_beside_the_positions_turn_along() -> None:
+    """A spin is turned and not shifted; an observation is told the shift in space, which has no part along z."""
+    told: list[tuple[torch.Tensor, torch.Tensor]] = []
+
+    class Heard(SpinReading):
+        def turned(self, rotation, shift):
+            told.append((rotation, shift))
+            return super().turned(rotation, shift)
+
+    track = measured(usual_ball())[0]
+    quarter = Pose(torch.tensor(np.pi / 2, dtype=torch.float64), torch.tensor([10.0, 20.0], dtype=torch.float64))
+    seen = quarter.track(track.observed(Heard(3, [[10.0, 20.0, 30.0]], 1.0)))
+    np.testing.assert_allclose(seen.observations[0].values, [[-20.0, 10.0, 30.0]], atol=1e-12)
+    ((rotation, shift),) = told
+    np.testing.assert_allclose(rotation.numpy(), [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]], atol=1e-12)
+    np.testing.assert_array_equal(shift.numpy(), [10.0, 20.0, 0.0])

@@ -18,6 +18,7 @@ from safetensors.torch import load_file
 from ballfg.learning.cli import run
 from ballfg.learning.config.config_file import read_config
 from ballfg.learning.config.training import TrainConfig
+from ballfg.learning.run import launch as launching
 from ballfg.learning.run.checkpoint import read_checkpoint
 from ballfg.learning.run.launch import launch
 from ballfg.learning.run.metrics import read_metrics
@@ -157,6 +158,23 @@ def test_ranks_talk_and_end_together(tmp_path: Path) -> None:
     quiet = ("input", "fault", "writing", "interrupt", "late interrupt")
     assert [second[name] for name in quiet] == [["SystemExit", "1"]] * len(quiet)
     assert "gloo" not in "".join(first["threads"] + second["threads"])  # else ending the process is a race
+
+
+def test_trainings_at_the_same_time_meet_at_ports_of_their_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each holds its port while its processes start; none of them is one that only the system may take."""
+    ports: list[int] = []
+
+    def started(_: object, arguments: tuple[int, int], **__: object) -> None:
+        ports.append(arguments[1])
+        if len(ports) < 2:
+            launch(2, die)
+        raise ChildProcessError("both have met")
+
+    monkeypatch.setattr(launching, "start_processes", started)
+    with pytest.raises(ChildProcessError, match="both have met"):
+        launch(2, die)
+    assert len(set(ports)) == 2
+    assert min(ports) > 1023
 
 
 def test_a_killed_process_is_told() -> None:

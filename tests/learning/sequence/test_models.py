@@ -120,3 +120,18 @@ def test_a_saved_diffusion_model_has_weights_of_these_shapes(tracks: list[Track]
     assert shapes["denoiser.inward.weight"] == (16, 3 + 17, 1)
     assert shapes["denoiser.blocks.7.modulate.weight"] == (2 * 16, 2 * 16)
     assert "denoiser.blocks.8.modulate.weight" not in shapes
+
+
+def test_the_decoder_tells_strides_from_its_hidden_state(tracks: list[Track]) -> None:
+    """The first from the state that the encoder leaves, each further one from the cell's output; positions add up."""
+    model = untrained("lstm", tracks)
+    batch = collate(examples_of(tracks[:3]))
+    heard: dict[str, list[torch.Tensor]] = {"head": [], "cell": []}
+    model.head.register_forward_pre_hook(lambda _, given: heard["head"].append(given[0]))
+    model.cell.register_forward_hook(lambda _, given, found: heard["cell"].append(found[0]))
+    with torch.no_grad():
+        first, _ = model._read(batch, model.frame.settings(batch).float())
+        model.predict(batch)
+    assert float(first.abs().max()) < 1.0
+    for asked, wanted in zip(heard["head"], [first, *heard["cell"]], strict=True):
+        torch.testing.assert_close(asked, wanted, rtol=0, atol=0)
