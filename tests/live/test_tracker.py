@@ -149,6 +149,59 @@ def test_a_stamp_astray_costs_no_ball_and_a_clock_that_begins_anew_no_more_than_
     same_state(live.balls[2], online(second[2:])[-1])
 
 
+def test_a_sample_that_the_ball_took_too_early_is_taken_back() -> None:
+    """One comes 0.15 s before its time: the ball was expected there. Then the stream goes on from before."""
+    samples = rows(shots(1)[0])[:30]
+    early = np.concatenate((samples[:20], samples[29:], samples[20:]))
+    live = tracker(lag=0.05)
+    updates = fed(live, early)
+    assert (live.counts.stray, live.counts.lost, live.counts.failed) == (1, 0, 0)
+    assert [u.ball for u in updates if u.kind == "state"] == [1] * 29  # the first of all begins nothing
+    same_state(updates[-1].state, online(samples)[-1])
+    assert updates[-1].samples == 30
+
+
+def test_without_a_lag_a_ball_that_took_a_sample_too_early_is_lost() -> None:
+    """Its earlier samples are not kept: nothing is left to go back to."""
+    samples = rows(shots(1)[0])[:30]
+    live = tracker(lag=0.0)
+    updates = fed(live, np.concatenate((samples[:20], samples[29:], samples[20:])))
+    assert (live.counts.stray, live.counts.lost) == (1, 1)
+    (gone,) = (u for u in updates if u.kind == "lost")
+    assert gone.ball == 1
+    assert sorted(live.balls) == [2]
+    assert np.abs(live.balls[2].position - samples[-1, 1:]).max() < 0.02
+
+
+def test_a_ball_of_which_nothing_can_be_made_begins_anew_and_is_lost_if_that_fails_too(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    samples, pushed = rows(shots(1)[0])[:24], Online.push
+    fails = {12: 1, 18: 2}
+    """How often the estimator raises at a sample."""
+
+    def push(self: Online, time: float, *rest: object) -> object:
+        number = int(np.argmin(np.abs(samples[:, 0] - time)))
+        if fails.get(number):
+            fails[number] -= 1
+            raise RuntimeError("no minimum\nwas found")
+        return pushed(self, time, *rest)
+
+    monkeypatch.setattr(Online, "push", push)
+    live = tracker()
+    updates = fed(live, samples)
+    anew, gone = (next(u for u in updates if u.time == samples[k, 0]) for k in (12, 18))
+    reason = "the estimator began anew: no minimum was found"
+    assert (anew.kind, anew.ball, anew.reason) == ("state", 1, reason)
+    assert (gone.kind, gone.ball, gone.reason) == ("refused", 1, reason)
+    monkeypatch.undo()
+    (before,) = (u.state for u in updates if u.time == samples[17, 0])
+    same_state(before, online(samples[12:18])[-1])
+    assert live.counts.failed == 2
+    assert sorted(live.balls) == [2]
+    same_state(live.balls[2], online(samples[19:])[-1])
+
+
 def test_outliers_begin_no_ball_and_clutter_stays_bounded() -> None:
     samples, random = rows(shots(1)[0]), np.random.default_rng(1)
     live = tracker()
