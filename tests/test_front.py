@@ -16,6 +16,7 @@ import ballfg as bf
 from ballfg.cli.main import run
 from ballfg.dynamics import save_model
 from ballfg.estimation import ConformalScales, TrackPrediction, dataset_settings
+from ballfg.estimation.segmentation import Contact
 from ballfg.factors.loss import Loss
 from ballfg.prediction import Belief, Propagator, apex, next_contact, plane_crossing
 from ballfg.simulation import MeasurementNoise, SimulationConfig, tennis, write_simulation
@@ -267,6 +268,11 @@ def test_the_picture_has_units_and_the_numbers(estimate: bf.Estimate) -> None:
     for k, axes in enumerate(figure.axes):
         for axis, line in enumerate(axes.lines[:3]):
             np.testing.assert_array_equal(line.get_ydata(), estimate.states[:, 3 * k + axis])
+    turned = replace(estimate, hits=np.array([1]), contacts=(Contact(3, 0.5 * estimate.times[[3, 4]].sum(), 0.0),))
+    for axes in turned.plot().axes:
+        contact, hit = axes.lines[3:]
+        assert (contact.get_linestyle(), set(contact.get_xdata())) == ("--", {turned.contacts[0].time})
+        assert (hit.get_linestyle(), set(hit.get_xdata())) == (":", {estimate.times[[1, 2]].mean()})
 
 
 def test_reprs_are_short_and_say_what_a_thing_holds(shots: bf.Dataset, track: bf.Track, estimate: bf.Estimate) -> None:

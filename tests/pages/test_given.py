@@ -69,8 +69,12 @@ def test_what_cannot_be_shown_says_what_could_be(made: Made, tmp_path: Path) -> 
 
 def test_cells_that_are_no_numbers_are_refused(made: Made, tmp_path: Path) -> None:
     head, first, *_ = made.predictions.read_text().splitlines()
-    for cells, message in ((["a", "x"], "number in each cell"), (["a", ""], "finite number of seconds"), ([], "rows")):
+    bad = ((["a", "x"], "number in each cell"), (["a", ""], "finite number of seconds"), ([], "rows"))
+    far = (["a", "0.5", "3e12"], "x must be at most 1e[+]12 in SI units; row 1 has 3e[+]12")
+    for cells, message in (*bad, far):
         path = tmp_path / "bad.csv"
-        path.write_text("\n".join([head, ",".join([*cells, *first.split(",")[2:]])] if cells else [head]) + "\n")
+        path.write_text(
+            "\n".join([head, ",".join([*cells, *first.split(",")[len(cells) :]])] if cells else [head]) + "\n"
+        )
         with pytest.raises(ValueError, match=message):
             recognise([path])

@@ -1,5 +1,6 @@
 import pytest
 
+from ballfg.checks import MAX_LISTED
 from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball, DatasetInfo, read_dataset
 from ballfg.tracks.info import read_info, write_info
 
@@ -52,6 +53,12 @@ def test_unknown_fields_are_noted_with_the_nearest_name(make_folder):
         "dataset.yaml: field 'position_nois' ignored. Did you mean 'position_noise'?",
         "dataset.yaml: field 'colour' ignored",
     ]
+
+
+def test_of_many_unknown_fields_the_first_are_named(make_folder):
+    dataset = read_dataset(make_folder(yaml=_yaml(rest="\n".join(f"own_{k}: {k}" for k in range(MAX_LISTED + 3)))))
+    assert len(dataset.notes) == MAX_LISTED + 1
+    assert dataset.notes[-1] == "dataset.yaml: 3 more fields ignored"
 
 
 @pytest.mark.parametrize(

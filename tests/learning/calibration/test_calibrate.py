@@ -20,7 +20,7 @@ from ballfg.learning.config.calibration import CalibrationConfig
 from ballfg.learning.evaluation import TrackScore, judge_track, summary
 from ballfg.learning.split import split_tracks
 from ballfg.progress import unwatched
-from ballfg.tracks import read_dataset
+from ballfg.tracks import read_dataset, write_dataset
 from tests.learning.conftest import PLANTED
 
 
@@ -125,13 +125,20 @@ def test_values_go_into_a_copy() -> None:
     assert values_of(model, ["flight.drag.k"]).tolist() == [0.12]
 
 
-def test_splits(few_tracks: Path) -> None:
+def test_splits(few_tracks: Path, tmp_path: Path) -> None:
     dataset = read_dataset(few_tracks)
     one, other = (split_tracks(dataset, "random", seed, needs_spin=False) for seed in (0, 1))
     assert len(one.fit) == len(one.judge) == 3
     assert sorted(one.fit + one.judge) == dataset.names
     assert one.fit != other.fit
     assert one.digest == other.digest
+    rough = [replace(track, sigmas=np.full((len(track), 3), 0.002)) for track in dataset]
+    digests = set()
+    for name, scale in (("plain", None), ("rough", 1.0), ("rougher", 2.0)):
+        given = dataset if scale is None else (replace(t, sigmas=scale * t.sigmas) for t in rough)
+        write_dataset(tmp_path / name, dataset.info, given, "csv")
+        digests.add(split_tracks(read_dataset(tmp_path / name), "random", 0, needs_spin=False).digest)
+    assert len(digests) == 3  # a training on the same positions with other errors is another one
     with pytest.raises(ValueError, match="needs a column 'split'"):
         split_tracks(dataset, "label", 0, needs_spin=False)
 

@@ -10,7 +10,16 @@ import pytest
 
 from ballfg.vision import Camera
 from ballfg.vision.calibration.boards import Charuco, Chessboard, View
-from ballfg.vision.calibration.intrinsics import _FLAGS, RAYS, Intrinsics, _fit, calibrate_intrinsics, coverage, turn
+from ballfg.vision.calibration.intrinsics import (
+    _FLAGS,
+    RAYS,
+    Intrinsics,
+    _fit,
+    _has_pole,
+    calibrate_intrinsics,
+    coverage,
+    turn,
+)
 from ballfg.vision.calibration.lens_covariance import covariance_of_lens, pixel_grid, sigma_of_rays
 from tests.vision.calibration.board_scenes import CHARUCO, CHESSBOARD, TRUE, exact_views, image_of, poses
 
@@ -136,6 +145,16 @@ def test_ray_sigma_is_the_scatter_of_rays() -> None:
         expected.append(sigma_of_rays(found.camera, found.covariance))
     ratio = np.sqrt(np.mean(squares)) / np.sqrt(np.mean(np.square(expected)))
     assert 0.8 < ratio < np.sqrt(2.0)
+
+
+def test_a_denominator_that_is_zero_within_the_image_is_a_pole() -> None:
+    """1 + k4 q + k5 q^2 + k6 q^3 = (1 - 4 q)(1 + q + q^2): zero at a squared radius q of 0.25."""
+    rational = [0.1, 0.0, 0.0, 0.0, 0.0, -3.0, -3.0, -4.0]
+    camera = replace(TRUE, distortion=np.array(rational))
+    assert _has_pole(camera, 0.26)
+    assert not _has_pole(camera, 0.24)
+    assert not _has_pole(replace(TRUE, distortion=np.array(rational[:5])), 10.0)
+    assert not _has_pole(replace(TRUE, distortion=-np.array(rational)), 0.2)  # zeros where no lens is
 
 
 def test_coefficients_that_the_views_cannot_tell_are_refused() -> None:
