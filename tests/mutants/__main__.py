@@ -225,6 +225,16 @@ def report(verdicts: Sequence[Verdict], path: Path) -> str:
     return "\n".join([*lines, f"Table: {path}"])
 
 
+def unreached(recorded: Recording, rooms: Sequence[str]) -> str:
+    """The lines of functions that no test reaches, for a reader; machine code, whose lines are not seen, left out."""
+    lines = []
+    for name in source_files():
+        text = (ROOT / name).read_text(encoding="utf-8")
+        if (not rooms or room_of(name) in rooms) and not has_machine_code(text):
+            lines += [f"{name}:{line} {text.splitlines()[line - 1].strip()}" for line in recorded.unreached(name)]
+    return "\n".join([*lines, f"{len(lines)} statements that no test reaches"])
+
+
 def main() -> None:
     """Read the options, record where it is needed, try, report."""
     parser = argparse.ArgumentParser(prog="python -m tests.mutants", description=(__doc__ or "").split("\n")[0])
@@ -239,6 +249,7 @@ def main() -> None:
     )
     parser.add_argument("--refresh", action="store_true", help="record which test reaches which line anew")
     parser.add_argument("--keep", action="store_true", help="do not try again what a test noticed in the last run")
+    parser.add_argument("--unreached", action="store_true", help="list the lines that no test reaches, and end")
     options = parser.parse_args()
     mutations = sample(options.count, options.seed, options.rooms)
     recording = options.folder / "recording"
@@ -247,6 +258,9 @@ def main() -> None:
         record(recording, options.tests, options.jobs)
     recorded = Recording(recording)
     print(f"{len(recorded.seconds)} tests; {len(recorded.failed)} that fail or are skipped judge nothing", flush=True)
+    if options.unreached:
+        print(unreached(recorded, options.rooms))
+        return
     killed = Killed(options.folder / "killed.jsonl", begin=not options.keep)
     verdicts = run_all(mutations, recorded, options.folder, killed, options.jobs, options.budget)
     print(report(verdicts, options.folder / "results.csv"))

@@ -97,6 +97,19 @@ class Recording:
                 found.add(context)
         return found
 
+    def unreached(self, name: str) -> list[int]:
+        """First lines of the statements within a file's functions that no test reaches in its own process."""
+        seen = self.lines(name)
+        inside = (f for f in ast.walk(self.known.trees[name]) if isinstance(f, ast.FunctionDef))
+        found = {part for f in inside for top in f.body for part in ast.walk(top) if isinstance(part, ast.stmt)}
+        return sorted(
+            part.lineno
+            for part in found
+            if not isinstance(part, ast.Continue | ast.Pass)  # which Python leaves out where it can
+            and not (isinstance(part, ast.Expr) and isinstance(part.value, ast.Constant))
+            and not any(line in seen for line in range(part.lineno, (part.end_lineno or part.lineno) + 1))
+        )
+
     def reaching(self, name: str, first: int, last: int) -> dict[str, float]:
         """Seconds of the tests that reach some lines of a file.
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.mutants.__main__ import Killed, Verdict
+from tests.mutants.__main__ import Killed, Verdict, unreached
 from tests.mutants.mutations import Mutation, mutations_of
 from tests.mutants.reach import Recording, record, recorded_tests
 from tests.mutants.trial import Workshop
@@ -35,6 +35,13 @@ def test_a_run_tells_which_test_reaches_a_line(tmp_path: Path, change: Mutation)
     assert 0 < len(reaching) < len(recording.seconds)
     assert all(seconds > 0.0 for seconds in reaching.values())
     assert recording.reaching("ballfg/estimation/filters/ekf.py", 100, 100) == {}
+    lines, text = recording.unreached(FILE), (ROOT / FILE).read_text(encoding="utf-8").splitlines()
+    assert change.line not in lines
+    told = unreached(recording, ["files"]).splitlines()
+    assert {f"{FILE}:{line} {text[line - 1].strip()}" for line in lines} <= set(told)
+    assert all(line.startswith("ballfg/files/") for line in told[:-1])
+    assert any(line.endswith("time.sleep(0.01)") for line in told)  # it waits for nobody here
+    assert told[-1] == f"{len(told) - 1} statements that no test reaches"
 
 
 def test_a_change_is_noticed_in_a_copy_and_taken_back(tmp_path: Path, change: Mutation) -> None:
