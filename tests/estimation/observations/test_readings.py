@@ -9,8 +9,10 @@ from scipy.stats import chi2
 
 from ballfg.dynamics import AnalyticModel, Surfaces, nominal_model
 from ballfg.estimation import Context, ExtendedKalmanFilter, Online, RadarSpeed, Smoother, SpinReading
+from ballfg.estimation.observations.innovation import FilterInnovation
 from ballfg.estimation.observations.reading import FARTHEST, Reading
-from ballfg.factors.batch import Values
+from ballfg.estimation.online.windows.linear import LinearFactors
+from ballfg.factors.batch import COEFFICIENTS, Values
 from ballfg.factors.check import check_factor
 from ballfg.factors.graph import LevenbergMarquardt
 from ballfg.tracks import Track
@@ -99,6 +101,28 @@ def test_readings_find_their_sample() -> None:
     np.testing.assert_array_equal(found.sigma[:, 0], [0.1, 0.2, 0.3])
     with pytest.raises(ValueError, match=f"must lie within {FARTHEST:g} s of a sample; the one at t=1.08 s is 0.06 s"):
         RadarSpeed.at(track, [1.08], [3.0], 0.1)
+
+
+def test_readings_go_to_the_nearest_samples_of_another_track() -> None:
+    old = Track(np.array([0.0, 0.1, 0.2]), np.zeros((3, 3)), name="old")
+    new = Track(np.array([0.02, 0.09, 0.14, 0.21]), np.zeros((4, 3)), name="new")
+    moved = SpinReading([0, 2], [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]], 0.5, delay=[0.01, -0.07]).onto(old, new)
+    assert moved.state.tolist() == [0, 2]
+    np.testing.assert_allclose(moved.delay, [-0.01, -0.01], atol=1e-12)
+    np.testing.assert_array_equal(moved.values, [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]])
+    assert (moved.sigma == 0.5).all()
+
+
+def test_an_innovation_sees_the_coefficients_and_not_the_biases() -> None:
+    rng = np.random.default_rng(4)
+    A, B, b = rng.normal(size=(2, 9)), rng.normal(size=(2, 3)), rng.normal(size=2)
+    mean, root = rng.normal(size=15), rng.normal(size=(15, 15))
+    factor = LinearFactors([0, COEFFICIENTS], [np.zeros((1, 9)), np.zeros((1, 3))], [A, B], b, False)
+    found = FilterInnovation.of(factor, mean, root @ root.T, biases=3)
+    H = np.concatenate((A, B, np.zeros((2, 3))), axis=1)
+    np.testing.assert_allclose(found.H, H)
+    np.testing.assert_allclose(found.residual, H @ mean - b)
+    np.testing.assert_allclose(found.spread, H @ root @ root.T @ H.T)
 
 
 def test_a_part_of_a_track_keeps_the_right_readings() -> None:
