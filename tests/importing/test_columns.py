@@ -79,6 +79,19 @@ def test_more_text_than_numbers(tmp_path: Path, separator: str, sign: str) -> No
     np.testing.assert_allclose(track.positions, p, atol=1e-9)
 
 
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+@pytest.mark.parametrize("header", ["t{0}x{0}y{0}z", ""])
+def test_units_in_the_cells(tmp_path: Path, separator: str, header: str) -> None:
+    t, p = thrown()
+    values = np.column_stack((1e3 * t, p)).tolist()
+    rows = [[f"{v:.9g} {unit}" for v, unit in zip(row, ("ms", "m", "m", "m"), strict=True)] for row in values]
+    lines = [header.format(separator)] * bool(header) + [separator.join(row) for row in rows]
+    (tmp_path / "a.csv").write_text("\n".join(lines), encoding="utf-8")
+    (track,) = propose(tmp_path / "a.csv", Choices()).tracks
+    np.testing.assert_allclose(track.positions, p, atol=1e-7)
+    np.testing.assert_allclose(track.times, t, atol=1e-9)
+
+
 def test_stamps_in_seconds_and_nanoseconds(tmp_path: Path) -> None:
     t, p = thrown()
     ns = np.round(1e9 * t).astype(np.int64) + 1_763_800_000_700_000_000

@@ -101,7 +101,7 @@ def _numbers(lines: Sequence[str], separator: str) -> float:
     Text is worth nothing by itself: a separator counts that leaves at least as many numbers as there are lines.
     """
     cells = [cell for row in _cells(lines, separator) for cell in row if cell.lower() not in MISSING]
-    found = sum(1 for cell in cells if _NUMBER.match(cell) or _DECIMAL_COMMA.match(cell))
+    found = sum(1 for cell in cells if _NUMBER.match(cell) or _DECIMAL_COMMA.match(cell) or WITH_UNIT.match(cell))
     return found - 4 * (len(cells) - found) if found >= len(lines) else -math.inf
 
 
