@@ -96,9 +96,9 @@ def _separator(lines: Sequence[str]) -> str:
 
 
 def _numbers(lines: Sequence[str], separator: str) -> float:
-    """How many cells are numbers, less four times those that are text: a comma that separates makes both of 1,5.
+    """How many cells are numbers, less four for each that is text: of 0,1;0,2 a comma would leave the cell 1;0.
 
-    Text is worth nothing by itself: a separator counts that leaves at least as many numbers as there are lines.
+    A separator that leaves fewer numbers than there are lines does not count.
     """
     cells = [cell for row in _cells(lines, separator) for cell in row if cell.lower() not in MISSING]
     found = sum(1 for cell in cells if _NUMBER.match(cell) or _DECIMAL_COMMA.match(cell) or WITH_UNIT.match(cell))
