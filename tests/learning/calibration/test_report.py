@@ -42,8 +42,8 @@ def compared(before: float, after: float, spread: float, noise: float) -> Compar
 def test_whether_it_predicts_better_is_said_with_numbers(problem: Problem, after: float, word: str) -> None:
     assert verdict(problem, step(problem), compared(0.020, after, 0.011, 0.012)) == (
         f"The calibrated model predicts {word}: median RMSE 20.0 mm before, {1e3 * after:.1f} mm after, on 3 tracks "
-        "that were not fitted; it fell on 2 of them. With the population as each track's prior it has 11.0 mm. With the "
-        "noise that the fitted tracks show, 12.0 mm, and 90 % intervals hold 88 %."
+        "that were not fitted; it fell on 2 of them. With the population as each track's prior it has 11.0 mm. With "
+        "the noise that the fitted tracks show, 12.0 mm, and 90 % intervals hold 88 %."
     )
 
 
