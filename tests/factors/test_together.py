@@ -10,7 +10,7 @@ from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.factors.batch import Values
 from ballfg.factors.dynamics import FlightFactors
 from ballfg.factors.graph import BallGraph, LinearSolution
-from ballfg.factors.linear.covariance import marginal_covariances
+from ballfg.factors.linear.covariance import SquareRootInformation, marginal_covariances
 from ballfg.factors.linear.step import Root, Step
 from ballfg.factors.linear.together import solve_together
 from ballfg.factors.noise import ProcessNoise
@@ -71,6 +71,18 @@ def test_the_triangles_hold_the_same_covariances(problems) -> None:
         scale = sigmas[:, :, None] * sigmas[:, None, :]
         np.testing.assert_allclose(found.states / scale, expected.states / scale, atol=1e-9)
         np.testing.assert_allclose(found.coefficients, expected.coefficients, rtol=1e-9)
+
+
+def test_covariances_of_tracks_of_many_lengths_are_those_of_each(model) -> None:
+    roots = [problem(model, length, length).answer().root for length in (7, 40, 1, 23)]
+    found = SquareRootInformation(roots).covariances()
+    assert found.states.shape[:2] == (4, 40)
+    for k, root in enumerate(roots):
+        alone = SquareRootInformation([root]).covariances()
+        n = len(root.states)
+        np.testing.assert_array_equal(found.states[k, :n], alone.states[0])
+        np.testing.assert_array_equal(found.cross[k, :n], alone.cross[0])
+        assert not found.states[k, n:].any()
 
 
 def test_a_singular_system_has_no_step_and_spoils_no_other(model) -> None:

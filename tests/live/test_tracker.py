@@ -43,6 +43,7 @@ def same_state(one, other) -> None:
 def test_states_are_those_of_the_estimator_and_a_new_ball_follows_the_old() -> None:
     first, second = (rows(track, later) for track, later in zip(shots(2), (0.0, 1.5), strict=True))
     live = tracker()
+    assert not any(vars(live.counts).values())
     updates = fed(live, np.concatenate((first, second)))
     for number, samples in ((1, first), (2, second)):
         states, expected = of_ball(updates, number), online(samples)
@@ -101,6 +102,10 @@ def test_out_of_order_within_the_lag_equals_sorted() -> None:
     live = tracker()
     updates = fed(live, samples[order])
     same_state(live.balls[1], online(samples)[-1])
+    newest = -math.inf
+    for update in updates:  # a late sample moves the newest state, which its update shows
+        newest = max(newest, update.time)
+        assert update.state is None or update.state.time == newest
     assert live.counts.balls == 1
     assert live.counts.late == sum(u.late for u in updates) > 10
     assert live.counts.old == live.counts.repeated == 0

@@ -60,7 +60,7 @@ def final_estimate(
         frozen: the states that left the window, oldest first.
     """
     first = window.first
-    part = track if first == 0 else track.between(float(track.times[first]), float(track.times[-1]))
+    part = track.between(float(track.times[first]), float(track.times[-1]))
     problem = smoother.problem(part, found)
     late = smoother.result(problem, smoother.solve(problem, Earlier(window.values, window.summaries())))
     if not frozen:

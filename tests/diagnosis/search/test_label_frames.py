@@ -17,6 +17,9 @@ GENERAL = Hypothesis(SpinLabelFrame, {}, tuple(c.name for c in SpinLabelFrame.co
 MIRROR = np.diag([1.0, -1.0, 1.0])
 EXCHANGE = np.array([[0.0, 1.0, 0.0], [0.0, 0.0, -1.0], [1.0, 0.0, 0.0]])
 
+FIRST = np.diag([1.0, 1.0, -1.0])
+"""The one after the identity in the list of all."""
+
 
 def matrix(hypothesis):
     return np.array([hypothesis.shape[c.name] for c in SpinLabelFrame.coefficients]).reshape(3, 3)
@@ -29,7 +32,7 @@ def data(make_ball, make_launches, make_shots):
     return make_shots(make_ball(), starts, 41, duration=0.5, rate=50.0).stretches
 
 
-@pytest.fixture(scope="module", params=[MIRROR, EXCHANGE], ids=["mirrored", "exchanged"])
+@pytest.fixture(scope="module", params=[MIRROR, EXCHANGE, FIRST], ids=["mirrored", "exchanged", "first"])
 def wrong(request, data, make_fit, make_ball):
     """A frame and the fit to labels in it."""
     labels = data.labels @ torch.from_numpy(request.param).T

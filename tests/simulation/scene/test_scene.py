@@ -42,6 +42,17 @@ def test_rig_sees_the_table_and_the_flights() -> None:
     assert abs(np.linalg.det(rays)) > 0.1  # the three look from no common plane
 
 
+def test_lenses_are_barrels() -> None:
+    for camera in table_rig():
+        wide, high = camera.size
+        corners = np.array([[0.0, 0.0], [wide - 1.0, 0.0], [0.0, high - 1.0], [wide - 1.0, high - 1.0]])
+        rays = np.linalg.solve(camera.matrix, np.column_stack((corners, np.ones(4))).T).T
+        moved = camera.project((rays - camera.tvec) @ camera.rotation) - corners
+        inwards = (np.array([wide, high]) / 2 - corners) / np.hypot(wide / 2, high / 2)
+        assert (np.abs(np.linalg.norm(moved, axis=1) - 50.0) < 15.0).all(), camera.name
+        assert ((moved * inwards).sum(axis=1) > 0.99 * np.linalg.norm(moved, axis=1)).all(), camera.name
+
+
 def test_a_smaller_rig_sees_the_same() -> None:
     point = [1.0, 0.3, 1.1]
     for large, small in zip(table_rig(), table_rig(SMALL), strict=True):
