@@ -69,7 +69,7 @@ ESTIMATORS = {
     "ekf": (ExtendedKalmanFilter, {}),
     "ekf+rts": (ExtendedKalmanFilter, {"smooth": True}),
     "ekf from a window": (ExtendedKalmanFilter, {"initialise": "window"}),
-    "online": (Online, {"solver": "chain"}),
+    "online": (Online, {}),
 }
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,21 +13,7 @@ import ballfg as bf
 from ballfg.importing import Choices, UndecidedError, propose
 from ballfg.importing.writing import _drawing
 from ballfg.tracks import Track
-
-
-def thrown(duration: float = 0.7) -> tuple[np.ndarray, np.ndarray]:
-    """Times and positions, m, of a ball that bounces when its centre is 0.8 m high."""
-    t = np.arange(0.0, duration, 0.01)
-    up = 9.81 * 0.35 / 2
-    since = np.where(t < 0.35, t, t - 0.35)
-    z = 0.8 + np.where(t < 0.35, up, 0.9 * up) * since - 9.81 / 2 * since**2
-    return t, np.stack([5.0 * t, 0.3 * t, z], axis=1)
-
-
-def written(path: Path, header: str, rows: Sequence[Sequence[object]], separator: str = ",") -> Path:
-    lines = [separator.join(str(cell) for cell in row) for row in rows]
-    path.write_text("\n".join([header, *lines]) + "\n", encoding="utf-8")
-    return path
+from tests.importing.throws import thrown, write_rows
 
 
 def test_sigmas_turn_with_the_axes_and_have_the_unit_of_the_positions(tmp_path: Path) -> None:
@@ -36,7 +21,9 @@ def test_sigmas_turn_with_the_axes_and_have_the_unit_of_the_positions(tmp_path: 
     sigmas = np.full_like(p, 2.0)  # mm
     sigmas[:, 1], sigmas[:, 2] = 3.0, np.linspace(4.0, 5.0, len(t))
     seen = 1e3 * p @ np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])  # x, up, -y
-    path = written(tmp_path / "a.csv", "t,x,y,z,sigma_x,sigma_y,sigma_z", np.column_stack((t, seen, sigmas)).tolist())
+    path = write_rows(
+        tmp_path / "a.csv", "t,x,y,z,sigma_x,sigma_y,sigma_z", np.column_stack((t, seen, sigmas)).tolist()
+    )
     proposal = propose(path, Choices())
     (track,) = proposal.tracks
     np.testing.assert_allclose(track.positions, p, atol=1e-9)
@@ -49,7 +36,7 @@ def test_a_sample_whose_sigma_is_none_is_missing(tmp_path: Path, bad: str) -> No
     t, p = thrown()
     rows = np.column_stack((t, p, np.full_like(p, 0.002))).tolist()
     rows[7][5] = bad
-    proposal = propose(written(tmp_path / "a.csv", "t,x,y,z,sigma_x,sigma_y,sigma_z", rows), Choices())
+    proposal = propose(write_rows(tmp_path / "a.csv", "t,x,y,z,sigma_x,sigma_y,sigma_z", rows), Choices())
     np.testing.assert_allclose(proposal.tracks[0].times, np.delete(t, 7), atol=1e-12)
     assert "1 rows without a time or a position left out" in proposal.notes
 
@@ -62,7 +49,7 @@ def test_times_of_day_count_from_midnight(tmp_path: Path, separator: str, sign: 
         [str(cell).replace(".", sign) for cell in (stamp, *point)]
         for stamp, point in zip(clock, p.tolist(), strict=True)
     ]
-    (track,) = bf.import_tracks(written(tmp_path / "a.csv", separator.join(("time", *"xyz")), rows, separator))
+    (track,) = bf.import_tracks(write_rows(tmp_path / "a.csv", separator.join(("time", *"xyz")), rows, separator))
     np.testing.assert_allclose(track.times, 13 * 3600 - 0.5 + t, atol=1e-9)
 
 
@@ -75,7 +62,7 @@ def test_more_text_than_numbers(tmp_path: Path, separator: str, sign: str) -> No
         numbers = [str(cell).replace(".", sign) for cell in row]
         rows.append(["2026-03-01", "court 1", f"seen by {k % 3}", *numbers, "", ""])
     header = separator.join(("day", "where", "note", "t", "x", "y", "z", "remark", "by hand"))
-    (track,) = bf.import_tracks(written(tmp_path / "a.csv", header, rows, separator))
+    (track,) = bf.import_tracks(write_rows(tmp_path / "a.csv", header, rows, separator))
     np.testing.assert_allclose(track.positions, p, atol=1e-9)
 
 
@@ -85,9 +72,7 @@ def test_units_in_the_cells(tmp_path: Path, separator: str, header: str) -> None
     t, p = thrown()
     values = np.column_stack((1e3 * t, p)).tolist()
     rows = [[f"{v:.9g} {unit}" for v, unit in zip(row, ("ms", "m", "m", "m"), strict=True)] for row in values]
-    lines = [header.format(separator)] * bool(header) + [separator.join(row) for row in rows]
-    (tmp_path / "a.csv").write_text("\n".join(lines), encoding="utf-8")
-    (track,) = propose(tmp_path / "a.csv", Choices()).tracks
+    (track,) = propose(write_rows(tmp_path / "a.csv", header.format(separator), rows, separator), Choices()).tracks
     np.testing.assert_allclose(track.positions, p, atol=1e-7)
     np.testing.assert_allclose(track.times, t, atol=1e-9)
 
@@ -96,7 +81,7 @@ def test_stamps_in_seconds_and_nanoseconds(tmp_path: Path) -> None:
     t, p = thrown()
     ns = np.round(1e9 * t).astype(np.int64) + 1_763_800_000_700_000_000
     rows = [(n // 10**9, n % 10**9, *q) for n, q in zip(ns.tolist(), p.tolist(), strict=True)]
-    path = written(tmp_path / "a.csv", "header.stamp.sec,header.stamp.nanosec,x,y,z", rows)
+    path = write_rows(tmp_path / "a.csv", "header.stamp.sec,header.stamp.nanosec,x,y,z", rows)
     np.testing.assert_allclose(bf.import_tracks(path)["000"].times, t, atol=1e-9)
 
 
@@ -147,7 +132,7 @@ def test_a_point_beside_columns_is_no_column() -> None:
 def test_a_column_is_named_in_any_case_and_without_its_unit(tmp_path: Path) -> None:
     t, p = thrown()
     rows = np.column_stack((t, p, p + 9.0)).tolist()
-    path = written(tmp_path / "a.csv", "T [s],Left_X,Left_Y,Left_Z,x,y,z", rows)
+    path = write_rows(tmp_path / "a.csv", "T [s],Left_X,Left_Y,Left_Z,x,y,z", rows)
     chosen = {"t": "T", "x": "left_x", "y": "left_y", "z": "LEFT_Z"}
     np.testing.assert_allclose(propose(path, Choices(columns=chosen)).tracks[0].positions, p, atol=1e-9)
     with pytest.raises(ValueError, match="has no 'left' but"):
@@ -157,11 +142,11 @@ def test_a_column_is_named_in_any_case_and_without_its_unit(tmp_path: Path) -> N
 def test_two_clocks_that_tell_different_times_are_asked_about(tmp_path: Path) -> None:
     t, p = thrown()
     header = "host_time,camera_time,x,y,z"
-    path = written(tmp_path / "a.csv", header, np.column_stack((t + 5.0, 1e3 * t, p)).tolist())
+    path = write_rows(tmp_path / "a.csv", header, np.column_stack((t + 5.0, 1e3 * t, p)).tolist())
     (track,) = propose(path, Choices()).tracks  # one clock, in s and in ms with another origin
     np.testing.assert_allclose(np.diff(track.times), np.diff(t), atol=1e-9)
     own = t + 0.003 * np.sin(9.0 * t)
-    path = written(tmp_path / "b.csv", header, np.column_stack((own, 1e3 * t, p)).tolist())
+    path = write_rows(tmp_path / "b.csv", header, np.column_stack((own, 1e3 * t, p)).tolist())
     with pytest.raises(UndecidedError, match="host_time and camera_time may both be the time"):
         propose(path, Choices())
 
@@ -171,14 +156,14 @@ def test_shots_of_one_sample_and_late_samples_are_counted(tmp_path: Path) -> Non
     rows = [("a", *row) for row in np.column_stack((t, p)).tolist()]
     rows[30], rows[31] = rows[31], rows[30]
     rows += [("b", *rows[0][1:])]
-    proposal = propose(written(tmp_path / "a.csv", "shot,t,x,y,z", rows), Choices())
+    proposal = propose(write_rows(tmp_path / "a.csv", "shot,t,x,y,z", rows), Choices())
     (track,) = proposal.tracks
     np.testing.assert_allclose(track.positions, p, atol=1e-9)
     assert "1 rows put in the order of their times" in proposal.notes
     assert "1 shots of fewer than two samples left out" in proposal.notes
 
 
-def test_the_drawing_of_a_long_shot_has_few_points(tmp_path: Path) -> None:
+def test_the_drawing_of_a_long_shot_has_few_points() -> None:
     t, p = np.arange(3000) / 1000.0, np.zeros((3000, 3))
     p[:, 0], p[:, 2] = t, 1.0 + np.sin(3.0 * t)
     counts = [str(_drawing([Track(t[::step], p[::step])], 0.76)).count("<use") for step in (1, 20)]

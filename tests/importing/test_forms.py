@@ -20,6 +20,7 @@ from ballfg.importing import Choices, propose
 from ballfg.simulation import SimulationConfig, simulate
 from ballfg.tracks import Track, read_dataset
 from tests.commands import status
+from tests.importing.throws import write_rows
 
 TABLE = 0.76
 Y_UP = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
@@ -44,11 +45,6 @@ def one_after_the_other(shots: Sequence[Track]) -> list[np.ndarray]:
         found.append(start + shot.times)
         start = float(found[-1][-1]) + GAP
     return found
-
-
-def write_rows(path: Path, header: str, rows: Sequence[Sequence[object]], separator: str = ",") -> None:
-    lines = [separator.join(str(cell) for cell in row) for row in rows]
-    path.write_text("\n".join(([header] if header else []) + lines) + "\n", encoding="utf-8")
 
 
 def csv_millimetres_y_up(folder: Path, shots: list[Track]) -> Path:

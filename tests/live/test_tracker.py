@@ -182,8 +182,7 @@ def test_a_ball_of_which_nothing_can_be_made_begins_anew_and_is_lost_if_that_fai
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     samples, pushed = rows(shots(1)[0])[:24], Online.push
-    fails = {12: 1, 18: 2}
-    """How often the estimator raises at a sample."""
+    fails = {12: 1, 18: 2}  # how often the estimator raises at a sample
 
     def push(self: Online, time: float, *rest: object) -> object:
         number = int(np.argmin(np.abs(samples[:, 0] - time)))

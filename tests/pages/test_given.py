@@ -73,8 +73,7 @@ def test_cells_that_are_no_numbers_are_refused(made: Made, tmp_path: Path) -> No
     far = (["a", "0.5", "3e12"], "x must be at most 1e[+]12 in SI units; row 1 has 3e[+]12")
     for cells, message in (*bad, far):
         path = tmp_path / "bad.csv"
-        path.write_text(
-            "\n".join([head, ",".join([*cells, *first.split(",")[len(cells) :]])] if cells else [head]) + "\n"
-        )
+        rows = [",".join([*cells, *first.split(",")[len(cells) :]])] if cells else []
+        path.write_text("\n".join([head, *rows]) + "\n")
         with pytest.raises(ValueError, match=message):
             recognise([path])

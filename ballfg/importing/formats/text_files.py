@@ -85,24 +85,25 @@ def _separator(lines: Sequence[str]) -> str:
     """The separator that gives most lines the same number of cells, and most of these cells a number."""
     best, most = ",", (0.0, -math.inf)
     for separator in SEPARATORS:
-        widths = Counter(len(row) for row in _cells(lines[-_LOOK:], separator))
+        rows = _cells(lines[-_LOOK:], separator)
+        widths = Counter(len(row) for row in rows)
         if not widths:
             continue
         width, count = widths.most_common(1)[0]
-        score = (count / sum(widths.values()) if width > 1 else 0.0, _numbers(lines[-_LOOK:], separator))
+        score = (count / sum(widths.values()) if width > 1 else 0.0, _numbers(rows))
         if score[1] > most[1] or (score[1] == most[1] and score[0] > most[0]):
             best, most = separator, score
     return best
 
 
-def _numbers(lines: Sequence[str], separator: str) -> float:
+def _numbers(rows: Sequence[Sequence[str]]) -> float:
     """How many cells are numbers, less four for each that is text: of 0,1;0,2 a comma would leave the cell 1;0.
 
-    A separator that leaves fewer numbers than there are lines does not count.
+    A separator that leaves fewer numbers than there are rows does not count.
     """
-    cells = [cell for row in _cells(lines, separator) for cell in row if cell.lower() not in MISSING]
+    cells = [cell for row in rows for cell in row if cell.lower() not in MISSING]
     found = sum(1 for cell in cells if _NUMBER.match(cell) or _DECIMAL_COMMA.match(cell) or WITH_UNIT.match(cell))
-    return found - 4 * (len(cells) - found) if found >= len(lines) else -math.inf
+    return found - 4 * (len(cells) - found) if found >= len(rows) else -math.inf
 
 
 def _cells(lines: Sequence[str], separator: str) -> list[list[str]]:

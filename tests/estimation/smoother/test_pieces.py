@@ -113,7 +113,7 @@ def test_a_ball_that_lies_still_across_many_pieces():
 
 def test_results_do_not_depend_on_the_number_of_processes(monkeypatch):
     monkeypatch.setattr(smoother_module, "LONG", 1000)
-    smoother, track = Smoother(MODEL, TABLE, Settings.for_measured(MODEL)), rally(4500, seed=2)
+    smoother, track = Smoother(MODEL, TABLE, Settings.for_measured(MODEL)), rally(6500, seed=2)
     one, two = (with_jobs(jobs, smoother.estimate, track) for jobs in (1, 2))
     assert one.states.tobytes() == two.states.tobytes()
     assert one.covariances.tobytes() == two.covariances.tobytes()

@@ -123,7 +123,7 @@ def test_a_saved_diffusion_model_has_weights_of_these_shapes(tracks: list[Track]
 
 
 def test_the_decoder_tells_strides_from_its_hidden_state(tracks: list[Track]) -> None:
-    """The first from the state that the encoder leaves, each further one from the cell's output; positions add up."""
+    """The first from the state that the encoder leaves, each further one from the cell's output."""
     model = untrained("lstm", tracks)
     batch = collate(examples_of(tracks[:3]))
     heard: dict[str, list[torch.Tensor]] = {"head": [], "cell": []}
