@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 import tests.learning.run.falling_ball  # noqa: F401 - registers its kind
-from ballfg.dynamics.compiled.build import cache_folder
+from ballfg.dynamics.compiled.kept import cache_folder
 from ballfg.files.whole_file import whole_file
 from ballfg.files.whole_folder import reserved
 from ballfg.learning.config.training import OptimizerConfig, TrainConfig
@@ -86,20 +86,24 @@ def test_a_folder_that_is_read_only_is_refused_in_one_line(tmp_path: Path, capsy
 
 
 def test_a_home_in_which_nothing_can_be_written(tmp_path: Path) -> None:
-    """Compiled functions then go to a temporary folder; /proc refuses root too."""
+    """Compiled functions then go to a temporary folder, where the next start finds them; /proc refuses root too."""
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
     words = ["simulate", "--out", str(tmp_path / "shots"), *map(str, TRACKS)]
     code = f"from ballfg.cli.main import run; run({words!r})"
     environment = {key: value for key, value in os.environ.items() if key not in ("BALLFG_CACHE", "XDG_CACHE_HOME")}
     said = subprocess.run(
         [sys.executable, "-c", code],
         cwd=ROOT,
-        env=environment | {"HOME": "/proc/nowhere", "PYTHONPATH": str(ROOT)},
+        env=environment | {"HOME": "/proc/nowhere", "PYTHONPATH": str(ROOT), "TMPDIR": str(temporary)},
         capture_output=True,
         text=True,
         check=False,
     )
     assert said.returncode == 0, said.stderr
     assert (tmp_path / "shots" / "truth.yaml").is_file()
+    assert [path.name for path in temporary.iterdir()] == [f"ballfg-{os.getuid()}"]
+    assert list(temporary.rglob("*.nbc"))
 
 
 def test_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
@@ -112,6 +116,6 @@ def test_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     cache_folder.cache_clear()
     try:
-        assert cache_folder().parent == tmp_path
+        assert cache_folder() == tmp_path / f"ballfg-{os.getuid()}"
     finally:
         cache_folder.cache_clear()

@@ -56,6 +56,15 @@ def test_a_change_is_noticed_in_a_copy_and_taken_back(tmp_path: Path, change: Mu
     assert (ROOT / FILE).read_bytes() == source
 
 
+def test_tests_that_are_not_there_notice_nothing(tmp_path: Path, change: Mutation) -> None:
+    """As after a test was renamed: pytest ends with an error, with the change and without it."""
+    with (
+        Workshop(tmp_path / "machine_code") as workshop,
+        pytest.raises(RuntimeError, match=r"must run the recorded tests; got .*Record anew"),
+    ):
+        workshop.attempt(change, [f"{TEST}_and_yet_not"], 1.0, compile_anew=False)
+
+
 def test_what_was_noticed_is_kept_for_a_file_as_it_is(tmp_path: Path, change: Mutation) -> None:
     killed = Killed(tmp_path / "killed.jsonl", begin=True)
     killed.add(Verdict(change, "killed", TEST, 1.0))

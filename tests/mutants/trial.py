@@ -34,6 +34,10 @@ COMPILING: Final = 240.0
 MEMORY: Final = 16 * 2**30
 """Bytes of address space: a wrong size of an array ends its process, not the machine."""
 FAILURE: Final = re.compile(r"^(?:FAILED|ERROR) (\S.*?)(?: - .*)?$", re.MULTILINE)
+ENDED: Final = (0, 1)
+"""Exit statuses of pytest after all its tests: none failed, or some did."""
+NOT_BEGUN: Final = (4, 5)
+"""Exit statuses of pytest that could not run what it was given, or found no test in it."""
 
 
 @dataclass(frozen=True)
@@ -44,11 +48,13 @@ class Outcome:
         killed: a test failed, or the run ended in another way than by passing tests.
         by: the test that failed, or in words what happened.
         seconds: it took.
+        code: pytest's exit status; None where it was stopped.
     """
 
     killed: bool
     by: str
     seconds: float
+    code: int | None
 
 
 class Workshop:
@@ -75,20 +81,30 @@ class Workshop:
         """Run tests, the first failure ends it, with a change in place; the tree is then as it was.
 
         Args: expected: s that the tests take.  compile_anew: machine code on disk does not know of the change.
+        Raises: RuntimeError: if the tests cannot be run without the change either; then nothing noticed it.
         """
         path = self.tree / mutation.file
         source, stamp = path.read_bytes(), path.stat()
         path.write_bytes(mutation.applied(source))
         try:
-            return self._run(tests, _limit(expected, compile_anew), compile_anew)
+            outcome = self._run(tests, _limit(expected, compile_anew), compile_anew)
         finally:
             path.write_bytes(source)
             os.utime(path, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))  # what was compiled from it stays good
+        if outcome.code in NOT_BEGUN and self.failing(tests, expected, compile_anew=compile_anew) == list(tests):
+            raise RuntimeError(f"pytest must run the recorded tests; got {self._last_line()} Record anew: --refresh.")
+        return outcome
 
     def failing(self, tests: Sequence[str], expected: float, *, compile_anew: bool) -> list[str]:
-        """Those tests that fail without any change."""
-        self._run(tests, _limit(expected, compile_anew), compile_anew, stop=False)
-        return FAILURE.findall((self.folder / "said").read_text(encoding="utf-8", errors="replace"))
+        """Those tests that fail without any change; all where the run did not come to its end."""
+        outcome = self._run(tests, _limit(expected, compile_anew), compile_anew, stop=False)
+        return FAILURE.findall(self._said()) if outcome.code in ENDED else list(tests)
+
+    def _said(self) -> str:
+        return (self.folder / "said").read_text(encoding="utf-8", errors="replace")
+
+    def _last_line(self) -> str:
+        return (self._said().strip().splitlines() or ["nothing."])[-1]
 
     def _run(self, tests: Sequence[str], limit: float, compile_anew: bool, *, stop: bool = True) -> Outcome:
         wanted, said = self.folder / "wanted", self.folder / "said"
@@ -97,6 +113,7 @@ class Workshop:
         environment = {
             **os.environ,
             "PYTHONPATH": str(self.tree),
+            "PYTEST_ADDOPTS": "",
             "PYTHONDONTWRITEBYTECODE": "1",
             "OMP_NUM_THREADS": "1",
             "BALLFG_DATA": str(DATA),
@@ -125,11 +142,11 @@ class Workshop:
         shutil.rmtree(fresh, ignore_errors=True)
         seconds = time.monotonic() - begin
         if code == 0:
-            return Outcome(False, "", seconds)
+            return Outcome(False, "", seconds, code)
         if code is None:
-            return Outcome(True, f"no end after {limit:.0f} s", seconds)
-        failures = FAILURE.findall(said.read_text(encoding="utf-8", errors="replace"))
-        return Outcome(True, failures[0] if failures else f"pytest's exit status {code}", seconds)
+            return Outcome(True, f"no end after {limit:.0f} s", seconds, code)
+        failures = FAILURE.findall(self._said())
+        return Outcome(True, failures[0] if failures else f"pytest's exit status {code}", seconds, code)
 
 
 def _limit(expected: float, compile_anew: bool) -> float:

@@ -31,7 +31,7 @@ def compile_ahead(
     Example: ballfg compile --model model.yaml
     """
     from ballfg.dynamics import load_model, nominal_model
-    from ballfg.dynamics.compiled.build import cache_folder
+    from ballfg.dynamics.compiled.kept import cache_folder
     from ballfg.dynamics.known_balls import KNOWN_BALLS
 
     inputs.know_effects(effects_file)

@@ -5,21 +5,18 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import json
-import os
 import sys
-import tempfile
 from collections.abc import Callable, Mapping
-from contextlib import suppress
-from functools import cache, lru_cache
+from functools import cache
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Final
 
 from numba import njit
-from numba.core.caching import FunctionCache
 from numba.core.types import WrapperAddressProtocol
 from numba.extending import typeof_impl
 
+from ballfg.dynamics.compiled.kept import Kept, keep, readable
 from ballfg.dynamics.compiled.signatures import FUNCTION
 from ballfg.files.json_file import read_json
 from ballfg.progress import doing
@@ -42,24 +39,8 @@ HELPERS: Final = ("add_product", "tanh_all")
 """Functions of `layers.py` that generated ones may call."""
 
 
-class _Kept(FunctionCache):
-    """Machine code on disk. What cannot be read, as after a power failure, is made again; a full disk costs time."""
-
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
-        try:
-            return super().load_overload(sig, target_context)
-        except Exception:  # pickle's, of any class, at a file that is empty or cut
-            with suppress(OSError):
-                self.flush()
-            return None
-
-    def save_overload(self, sig: Any, data: Any) -> None:
-        with suppress(OSError):
-            super().save_overload(sig, data)
-
-
 def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Numba's compiler for one signature; kept on disk where any folder for that can be written to.
+    """Numba's compiler for one signature; kept on disk for other processes.
 
     A function is compiled, or loaded, when it is first called or built into another one: a process pays for what it
     uses.
@@ -67,8 +48,7 @@ def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
 
     def declared(function: Callable[..., Any]) -> Any:
         dispatcher: Any = njit(error_model="numpy")(function)  # numba's own would look for a zero in every division
-        with suppress(RuntimeError):  # no folder: compiled anew by every process
-            dispatcher._cache = _Kept(function)
+        dispatcher._cache = Kept(function)
 
         def for_call(*_: Any, **__: Any) -> Any:
             """The machine code, which numba asks for at the first call from Python."""
@@ -127,10 +107,8 @@ def built(source: str) -> Code:
 @cache
 def _built(text: str) -> Code:
     name = f"ballfg_compiled_{hashlib.sha256(text.encode()).hexdigest()[:20]}"
-    path = cache_folder() / f"{name}.py"
-    if not _holds(path, text):
-        _write(path, text)
-    compute = _imported(name, path).compute
+    found = [path for path in readable(f"{name}.py") if _holds(path, text)]
+    compute = _imported(name, found[0] if found else keep(f"{name}.py", text)).compute
     compute._compile_for_args()
     return Code(compute)
 
@@ -151,13 +129,17 @@ def digest(file: Path) -> str:
 
 def write_note(about: str, note: Mapping[str, Any]) -> None:
     """Keep a note on disk for other processes."""
-    _write(_note_path(about), json.dumps({"note": note, "digest": _digest_of(note)}))
+    keep(_note_name(about), json.dumps({"note": note, "digest": _digest_of(note)}))
 
 
 def read_note(about: str) -> Any | None:
     """A note that was kept; None where there is none, or a damaged one."""
+    return next((note for note in map(_note_of, readable(_note_name(about))) if note is not None), None)
+
+
+def _note_of(path: Path) -> Any | None:
     try:
-        kept = read_json(_note_path(about))
+        kept = read_json(path)
     except (OSError, ValueError):
         return None
     whole = isinstance(kept, dict) and "note" in kept and kept.get("digest") == _digest_of(kept["note"])
@@ -168,29 +150,8 @@ def _digest_of(note: Any) -> str:
     return hashlib.sha256(json.dumps(note).encode()).hexdigest()
 
 
-def _note_path(about: str) -> Path:
-    return cache_folder() / f"{hashlib.sha256(about.encode()).hexdigest()[:20]}.json"
-
-
-@lru_cache(maxsize=1)
-def cache_folder() -> Path:
-    """The folder of compiled functions: `BALLFG_CACHE`, else the user's cache, else a temporary one."""
-    try:
-        base = os.environ.get("BALLFG_CACHE") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        folder = Path(base) / "ballfg"
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            pass
-    except (OSError, RuntimeError):  # RuntimeError: the user has no home
-        folder = Path(tempfile.mkdtemp(prefix="ballfg-"))
-    return folder
-
-
-def _write(path: Path, text: str) -> None:
-    """At once: another process never reads half a file."""
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, suffix=".part", delete=False) as file:
-        file.write(text)
-    os.replace(file.name, path)
+def _note_name(about: str) -> str:
+    return f"{hashlib.sha256(about.encode()).hexdigest()[:20]}.json"
 
 
 def _imported(name: str, path: Path) -> ModuleType:

@@ -11,8 +11,9 @@ import torch
 from ballfg.diagnosis.search.hypothesis import has_effect, with_effects
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces, nominal_model, rollout, substitute
 from ballfg.dynamics.compiled import functions
-from ballfg.dynamics.compiled.build import built, cache_folder
+from ballfg.dynamics.compiled.build import built
 from ballfg.dynamics.compiled.functions import compiled
+from ballfg.dynamics.compiled.kept import cache_folder
 from ballfg.dynamics.compiled.motion import fly_jacobian, fly_through_jacobian, functions_of
 from ballfg.dynamics.effect import Coefficient, FlightEffect
 from ballfg.dynamics.effects.registry import GENERIC

@@ -1,0 +1,175 @@
+"""Folders of machine code: which are written to, which are read, and what is made again."""
+
+from __future__ import annotations
+
+import errno
+import importlib.util
+import os
+import stat
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from ballfg.dynamics.compiled import kept
+from ballfg.dynamics.compiled.build import read_note, write_note
+from ballfg.dynamics.compiled.kept import cache_folder
+from tests.places import ROOT
+
+FUNCTION_FILE = """
+from numba import types
+from ballfg.dynamics.compiled.build import machine_code
+
+@machine_code(types.float64(types.float64))
+def twice(x):
+    return 2.0 * x
+"""
+
+
+@pytest.fixture(autouse=True)
+def _asked_anew() -> Iterator[None]:
+    cache_folder.cache_clear()
+    yield
+    cache_folder.cache_clear()
+
+
+@pytest.fixture
+def function(tmp_path: Path) -> Callable[[], Any]:
+    """Machine code of a file, as each process declares it anew."""
+    file = tmp_path / "source" / "some_function.py"
+    file.parent.mkdir()
+    file.write_text(FUNCTION_FILE)
+
+    def declared() -> Any:
+        spec = importlib.util.spec_from_file_location("some_function", file)
+        assert spec is not None
+        assert spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+        return module.twice
+
+    return declared
+
+
+@pytest.fixture
+def nowhere_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Neither in the package nor in the cache; the folder for temporary files."""
+    monkeypatch.setenv("BALLFG_CACHE", "/proc/nowhere")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    monkeypatch.setattr(kept._Written, "_locator_classes", (kept._Temporary,))
+    return tmp_path / f"ballfg-{os.getuid()}"
+
+
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+def test_a_damaged_file_is_replaced(tmp_path: Path, function: Callable[[], Any], ending: str) -> None:
+    assert function()(2.0) == 4.0
+    (file,) = tmp_path.rglob(f"*.{ending}")
+    size = file.stat().st_size
+    for content in (b"", file.read_bytes()[:-5]):
+        file.write_bytes(content)
+        assert function()(2.0) == 4.0
+        assert file.stat().st_size == size
+
+
+def full(*_: Any, **__: Any) -> None:
+    raise OSError(errno.ENOSPC, "No space left on device")
+
+
+def test_a_full_disk_only_costs_the_machine_code_of_the_next_process(
+    tmp_path: Path, function: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("numba.core.caching.IndexDataCacheFile.save", full)
+    assert function()(2.0) == 4.0
+    assert not list(tmp_path.rglob("*.nbc"))
+
+
+def test_without_a_folder_to_write_to_the_next_process_finds_it_among_temporary_files(
+    nowhere_to_write: Path, function: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert function()(2.0) == 4.0
+    assert cache_folder() == nowhere_to_write
+    assert stat.S_IMODE(nowhere_to_write.stat().st_mode) == 0o700
+    (code,) = nowhere_to_write.rglob("*.nbc")
+    stamp = code.stat().st_mtime_ns
+    monkeypatch.setattr("numba.core.caching.IndexDataCacheFile.save", full)  # what is compiled anew is not kept
+    twice = function()
+    assert twice(2.0) == 4.0
+    assert twice.stats.cache_hits
+    assert code.stat().st_mtime_ns == stamp
+
+
+def test_what_was_compiled_beside_the_source_is_found_where_nothing_can_be_written(
+    tmp_path: Path, function: Callable[[], Any], request: pytest.FixtureRequest
+) -> None:
+    """As by an administrator, for users without rights."""
+    assert function()(2.0) == 4.0
+    made = set(tmp_path.rglob("*.nb*"))
+    assert made
+    request.getfixturevalue("nowhere_to_write")
+    twice = function()
+    assert twice(2.0) == 4.0
+    assert twice.stats.cache_hits
+    assert set(tmp_path.rglob("*.nb*")) == made
+
+
+def test_the_folder_that_numba_is_told_is_the_only_one(
+    tmp_path: Path, function: Callable[[], Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert function()(2.0) == 4.0
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "told"))
+    twice = function()
+    assert twice(2.0) == 4.0
+    assert not twice.stats.cache_hits
+    assert list((tmp_path / "told").rglob("*.nbc"))
+
+
+def test_notes_in_a_folder_that_is_only_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BALLFG_CACHE", str(tmp_path / "filled"))
+    write_note("a", {"size": 3})
+    assert stat.S_IMODE(next((tmp_path / "filled").rglob("*.json")).stat().st_mode) & 0o444 == 0o444
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    monkeypatch.setattr("tempfile.TemporaryFile", full)
+    cache_folder.cache_clear()
+    assert cache_folder().parent == tmp_path / "temporary"
+    assert read_note("a") == {"size": 3}
+    write_note("b", {"size": 4})
+    assert read_note("b") == {"size": 4}
+    assert len(list((tmp_path / "filled").rglob("*.json"))) == 1
+
+
+@pytest.mark.parametrize("kind", ["open to others", "a link", "a file"])
+def test_a_temporary_folder_that_others_may_have_filled_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
+) -> None:
+    """Its name is known beforehand, and what machine code lies in it would be run."""
+    taken, mine = tmp_path / f"ballfg-{os.getuid()}", tmp_path / "mine"
+    if kind == "open to others":
+        taken.mkdir()
+        taken.chmod(0o777)
+    elif kind == "a link":
+        mine.mkdir(mode=0o700)
+        taken.symlink_to(mine)
+    else:
+        taken.touch()
+    monkeypatch.setenv("BALLFG_CACHE", "/proc/nowhere")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    used = cache_folder()
+    assert used.parent == tmp_path
+    assert used not in (taken, mine)
+    assert stat.S_IMODE(used.stat().st_mode) == 0o700
+
+
+def test_the_folder_of_one_process_goes_with_it(tmp_path: Path) -> None:
+    taken = tmp_path / f"ballfg-{os.getuid()}"
+    taken.touch()
+    code = "from ballfg.dynamics.compiled.kept import keep; path = keep('a.py', ''); print(path, path.is_file())"
+    environment = os.environ | {"BALLFG_CACHE": "/proc/nowhere", "TMPDIR": str(tmp_path), "PYTHONPATH": str(ROOT)}
+    said = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    path, was_there = said.stdout.split()
+    assert Path(path).parents[1] == tmp_path
+    assert was_there == "True"
+    assert list(tmp_path.iterdir()) == [taken]
