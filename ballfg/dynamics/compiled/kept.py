@@ -13,8 +13,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
-from numba import config
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator, UserProvidedCacheLocator
 
 PRIVATE: Final = 0o700
 
@@ -83,12 +82,16 @@ class _Beside(InTreeCacheLocator):
         """Nothing is needed to read."""
 
 
+WRITTEN: Final[list[type[object]]] = [*CompileResultCacheImpl._locator_classes, _Temporary]
+READ: Final[list[type[object]]] = [_Beside]
+
+
 class _Written(CompileResultCacheImpl):
-    _locator_classes = (*CompileResultCacheImpl._locator_classes, _Temporary)
+    _locator_classes = WRITTEN
 
 
 class _Read(CompileResultCacheImpl):
-    _locator_classes = (_Beside,)
+    _locator_classes = READ
 
 
 class _KeptBeside(FunctionCache):
@@ -108,8 +111,8 @@ class Kept(FunctionCache):
     def __init__(self, function: Any) -> None:
         super().__init__(function)
         beside = _KeptBeside(function)
-        elsewhere = beside.cache_path != self.cache_path and not config.CACHE_DIR  # who names a folder wants no other
-        self._beside = beside if elsewhere else None
+        told = isinstance(self._impl.locator, UserProvidedCacheLocator)
+        self._beside = None if told or beside.cache_path == self.cache_path else beside
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The code that was kept; None where there is none."""

@@ -59,7 +59,7 @@ def nowhere_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Neither in the package nor in the cache; the folder for temporary files."""
     monkeypatch.setenv("BALLFG_CACHE", "/proc/nowhere")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    monkeypatch.setattr(kept._Written, "_locator_classes", (kept._Temporary,))
+    monkeypatch.setattr(kept._Written, "_locator_classes", [kept._Temporary])
     return tmp_path / f"ballfg-{os.getuid()}"
 
 
