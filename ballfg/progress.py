@@ -59,8 +59,8 @@ def unwatched(items: Iterable[T], total: int, what: str, /) -> Iterator[T]:
 
 
 def is_quiet() -> bool:
-    """Whether nobody wants to see progress."""
-    return bool(os.environ.get(VARIABLE))
+    """Whether nobody wants to see progress, or nobody can: programs without a window have no stderr."""
+    return bool(os.environ.get(VARIABLE)) or sys.stderr is None
 
 
 def be_quiet() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 
 import pytest
@@ -105,3 +106,10 @@ def test_items_that_take_long_are_alive_too(hurried: None, capsys: pytest.Captur
     lines = capsys.readouterr().err.splitlines()
     assert lines.count("tracks estimated: 0 s so far") >= 2
     assert lines.count("1 of 2 tracks estimated: 0 s so far") >= 2
+
+
+def test_a_program_without_stderr_sees_no_progress(clock: Clock, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As one with a window on Windows: a message would go to stdout, and a bar would fail."""
+    monkeypatch.setattr(sys, "stderr", None)
+    for _ in progress(range(3), 3, "things"):
+        clock.now += 10.0

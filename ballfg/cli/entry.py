@@ -1,5 +1,9 @@
-"""The entry points of the installed programs: Ctrl-C is one line even while they are being imported."""
+"""The entry points of the installed programs: what they need of their process, before anything large is imported.
 
+Ctrl-C is one line even while they are being imported.
+"""
+
+import os
 import sys
 from importlib import import_module
 
@@ -22,9 +26,34 @@ def train() -> None:
 
 
 def _run(module: str) -> None:
+    _open_streams()
+    _check_folder()
     collect_rarely()
     try:
         import_module(module).run()
     except KeyboardInterrupt:
         print("ballfg: interrupted", file=sys.stderr)
         sys.exit(130)
+
+
+def _open_streams() -> None:
+    """Let streams that whoever started the process has closed lead nowhere.
+
+    Else `print` would find none, messages for stderr would go to stdout, among the data, and the next file to be opened
+    would take the number of one, so that what a library prints would go into it.
+    """
+    while (number := os.open(os.devnull, os.O_RDWR)) <= 2:  # the lowest that is free
+        os.set_inheritable(number, True)
+    os.close(number)
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, mode, encoding="utf-8"))  # noqa: SIM115  it stays open
+
+
+def _check_folder() -> None:
+    """Where the current folder has been removed, libraries end the process on import, with words of their own."""
+    try:
+        os.getcwd()
+    except OSError as error:
+        print(f"ballfg: error: the current folder: {error.strerror}. Go to one that exists.", file=sys.stderr)
+        sys.exit(2)

@@ -1,7 +1,7 @@
 """What a user sees when something is wrong: one line on stderr and an exit status."""
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 import typer
@@ -15,8 +15,13 @@ INTERRUPTED = 130
 
 _LONGEST: Final = 2000
 """Characters of a message; a file of one endless line would fill the terminal."""
-USER_ERRORS = (ValueError, TypeError, OSError)
-"""What a user can mend: input, paths, a full disk. Anything else is a fault of the program and keeps its traceback."""
+_NAME: Final = 200
+"""Characters of a name that is no text; Linux has no longer ones in a folder than 255 bytes."""
+USER_ERRORS = (ValueError, TypeError, OSError, MemoryError)
+"""What a user can mend: input, paths, a full disk, too little memory. Anything else is a fault of the program and keeps
+its traceback."""
+NO_MEMORY: Final = "can't allocate memory"
+"""What torch says where Python and numpy raise MemoryError."""
 
 
 def guarded(command: Callable[[], object]) -> int:
@@ -39,6 +44,8 @@ def guarded(command: Callable[[], object]) -> int:
     except Exception as error:
         # errors in the use of a command: typer's own base class has moved between versions, their method has not
         message = getattr(error, "format_message", None)
+        if message is None and NO_MEMORY in str(error):
+            return _bad_input(_in_words(MemoryError(f"torch {NO_MEMORY}")))
         if message is None:
             raise
         return _bad_input(message(), getattr(error, "ctx", None))
@@ -47,7 +54,21 @@ def guarded(command: Callable[[], object]) -> int:
     return result if isinstance(result, int) else 0
 
 
+def check_words(words: Sequence[str]) -> None:
+    """Refuses words of a command that no line of text can hold, names of files above all, before anything is done.
+
+    Raises: UnicodeEncodeError.
+    """
+    for word in words:
+        word.encode()
+
+
 def _in_words(error: Exception) -> str:
+    if isinstance(error, MemoryError):
+        why = f" ({error})" if str(error) else ""
+        return f"memory ran out{why}. Use fewer --jobs, fewer or shorter tracks at a time, or more memory."
+    if isinstance(error, UnicodeEncodeError):
+        return f"names and texts must be UTF-8; got {error.object[:_NAME]!a}. Rename the file or folder."
     if not isinstance(error, OSError) or error.errno is None:
         return str(error)
     where = "a file could not be read or written" if error.filename is None else str(error.filename)

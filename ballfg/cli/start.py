@@ -7,7 +7,7 @@ from typing import Annotated, Any, NoReturn
 
 import typer
 
-from ballfg.cli.errors import guarded
+from ballfg.cli.errors import check_words, guarded
 from ballfg.progress import alive, be_quiet
 
 
@@ -21,6 +21,7 @@ def start(app: typer.Typer, name: str, arguments: Sequence[str] | None) -> NoRet
     given = sys.argv[1:] if arguments is None else list(arguments)
 
     def work() -> object:
+        check_words(given)
         with alive(" ".join([name, *given[:1]])):
             return command.main(given, prog_name=name, standalone_mode=False)
 

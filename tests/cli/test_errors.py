@@ -1,10 +1,16 @@
 """What a user sees when something is wrong."""
 
 import errno
+import os
+import subprocess
+import sys
 
 import pytest
+import torch
 
-from ballfg.cli.errors import BAD_INPUT, guarded
+from ballfg.cli.errors import BAD_INPUT, NO_MEMORY, guarded
+from tests.commands import status
+from tests.places import ROOT
 
 
 @pytest.mark.parametrize(
@@ -14,6 +20,16 @@ from ballfg.cli.errors import BAD_INPUT, guarded
         (FileNotFoundError("folder must exist; x does not."), "folder must exist; x does not."),
         (OSError(errno.ENOSPC, "No space left on device"), "a file could not be read or written: No space left"),
         (PermissionError(errno.EACCES, "Permission denied", "a.csv"), "a.csv: Permission denied. Check the path"),
+        (MemoryError(), "memory ran out. Use fewer --jobs"),
+        (MemoryError("Unable to allocate 3 GiB"), "memory ran out (Unable to allocate 3 GiB). Use fewer --jobs"),
+        (
+            RuntimeError("DefaultCPUAllocator: can't allocate memory: 3 bytes"),
+            "memory ran out (torch can't allocate memory).",
+        ),
+        (
+            UnicodeEncodeError("utf-8", "b\udcff", 1, 2, "surrogates not allowed"),
+            r"names and texts must be UTF-8; got 'b\udcff'. Rename",
+        ),
     ],
 )
 def test_what_a_user_can_mend_is_one_line(capsys, error, message):
@@ -24,6 +40,61 @@ def test_what_a_user_can_mend_is_one_line(capsys, error, message):
     said = capsys.readouterr().err
     assert said.startswith(f"ballfg: error: {message}")
     assert said.count("\n") == 1
+
+
+def test_torch_is_refused_more_memory_than_there_is():
+    """What it says has changed between versions."""
+    with pytest.raises(RuntimeError, match=NO_MEMORY):
+        torch.empty(2**58, dtype=torch.uint8)
+
+
+def test_a_name_that_is_no_text_is_refused_before_anything_is_done(tmp_path, capsys):
+    name = os.fsdecode(bytes(tmp_path / "shots") + b"\xff")
+    assert status("simulate", "--out", name, "--tracks", "2") == BAD_INPUT
+    assert r"shots\udcff'. Rename" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+CLOSED = """
+import os, sys
+for number in (0, 1, 2):
+    os.close(number)
+sys.stdin = sys.stdout = sys.stderr = None  # as Python starts where somebody has closed them
+from ballfg.cli import entry
+entry._run("program_of_a_test")
+"""
+PROGRAM = """
+import os, sys
+def run():
+    with open("result", "w") as file:
+        print("to nobody", file=sys.stderr)
+        os.write(1, b"a library speaks")
+        os.write(2, b"and complains")
+        file.write(f"{sys.stdin.read()!r} {sys.stdout.isatty()}")
+"""
+
+
+def test_closed_streams_lead_nowhere(tmp_path):
+    """Not into the next file that is opened."""
+    (tmp_path / "program_of_a_test.py").write_text(PROGRAM)
+    subprocess.run([sys.executable, "-c", CLOSED], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True)
+    assert (tmp_path / "result").read_text() == "'' False"
+
+
+def test_a_current_folder_that_is_gone_is_one_line(tmp_path):
+    code = "import os, sys; os.rmdir(os.getcwd()); from ballfg.cli.entry import ballfg; ballfg()"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (
+        BAD_INPUT,
+        "ballfg: error: the current folder: No such file or directory. Go to one that exists.\n",
+    )
 
 
 def test_a_fault_of_the_program_keeps_its_traceback():
