@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import json
 import sys
 from collections.abc import Callable, Mapping
@@ -108,7 +107,7 @@ def built(source: str) -> Code:
 def _built(text: str) -> Code:
     name = f"ballfg_compiled_{hashlib.sha256(text.encode()).hexdigest()[:20]}"
     found = [path for path in readable(f"{name}.py") if _holds(path, text)]
-    compute = _imported(name, found[0] if found else keep(f"{name}.py", text)).compute
+    compute = _module(name, found[0] if found else keep(f"{name}.py", text), text).compute
     compute._compile_for_args()
     return Code(compute)
 
@@ -154,11 +153,8 @@ def _note_name(about: str) -> str:
     return f"{hashlib.sha256(about.encode()).hexdigest()[:20]}.json"
 
 
-def _imported(name: str, path: Path) -> ModuleType:
-    spec = importlib.util.spec_from_file_location(name, path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
-    spec.loader.exec_module(module)
+def _module(name: str, path: Path, text: str) -> ModuleType:
+    """The module of a file, without Python's own cache: a damaged one would be an error at each start."""
+    module = sys.modules[name] = ModuleType(name)
+    exec(compile(text, path, "exec"), module.__dict__)
     return module

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import atexit
+import hashlib
 import os
+import pickle
 import shutil
 import stat
 import tempfile
@@ -13,9 +15,16 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
-from numba.core.caching import CompileResultCacheImpl, FunctionCache, InTreeCacheLocator, UserProvidedCacheLocator
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    InTreeCacheLocator,
+    UserProvidedCacheLocator,
+)
 
 PRIVATE: Final = 0o700
+DIGEST_SIZE: Final = hashlib.sha256().digest_size
 
 
 def configured_folder() -> Path:
@@ -94,19 +103,46 @@ class _Read(CompileResultCacheImpl):
     _locator_classes = READ
 
 
-class _KeptBeside(FunctionCache):
-    _impl_class = _Read
+class _Digested(IndexDataCacheFile):
+    """Files of machine code, each with the digest of the rest: damaged code ends the process, or computes nonsense."""
+
+    def _save_data(self, name: str, data: Any) -> None:
+        content = self._dump(data)
+        with self._open_for_write(self._data_path(name)) as file:
+            file.write(_digest(content) + content)
+
+    def _load_data(self, name: str) -> Any:
+        content = Path(self._data_path(name)).read_bytes()
+        digest, code = content[:DIGEST_SIZE], content[DIGEST_SIZE:]
+        if digest != _digest(code):
+            raise ValueError(f"{name} must hold what was written; its digest is another. It is compiled again.")
+        return pickle.loads(code)
 
 
-class Kept(FunctionCache):
+def _digest(content: bytes) -> bytes:
+    return hashlib.sha256(content).digest()
+
+
+class _Cache(FunctionCache):
+    def __init__(self, function: Any) -> None:
+        super().__init__(function)
+        stamp = self._impl.locator.get_source_stamp()
+        self._cache_file = _Digested(self.cache_path, self._impl.filename_base, stamp)
+
+
+class _KeptBeside(_Cache):
+    _impl_class: Any = _Read
+
+
+class Kept(_Cache):
     """Machine code of a function on disk.
 
     It is written to the first folder that numba can write to, and read from beside the source too, where whoever
     installed the package may have compiled it; `NUMBA_CACHE_DIR` is the only folder where it is set. What cannot be
-    read, as after a power failure, is made again; a full disk costs time.
+    read, or is damaged, as after a power failure, is made again; a full disk costs time.
     """
 
-    _impl_class = _Written
+    _impl_class: Any = _Written
 
     def __init__(self, function: Any) -> None:
         super().__init__(function)
@@ -124,7 +160,7 @@ class Kept(FunctionCache):
     def _loaded(self, cache: Any, sig: Any, target_context: Any) -> Any:
         try:
             return cache.load_overload(sig, target_context)
-        except Exception:  # pickle's, of any class, at a file that is empty or cut
+        except Exception:  # pickle's, of any class, at an index that is empty or cut; that of the digest
             with suppress(OSError):
                 cache.flush()
             return None
