@@ -15,8 +15,8 @@ def whole_file(path: Path, argument: str = "out") -> Iterator[Path]:
 
     After an exception, Ctrl-C or a kill what was there before is untouched.
 
-    Raises: FileNotFoundError: the folder of the path does not exist. ValueError: the path is a folder, or another
-        process is writing it.
+    Raises: FileNotFoundError: the folder of the path does not exist. ValueError: the path is a folder or a device, or
+        another process is writing it.
     """
     check_file(path, argument)
     target = Path(os.path.realpath(path.parent)) / path.name
@@ -60,11 +60,14 @@ def flush_folder(path: Path) -> None:
 def check_file(path: Path, argument: str = "out") -> None:
     """Refuses a path to which no file can be written.
 
-    Raises: FileNotFoundError: its folder does not exist. ValueError: it is a folder.
+    Raises: FileNotFoundError: its folder does not exist. ValueError: it is a folder, or a device such as /dev/null,
+        whose place a file would take.
     """
     check_parent(path, argument)
     if path.is_dir():
         raise ValueError(f"{argument} must be a file; {path} is a folder. Give the name of a file in it.")
+    if path.exists() and not path.is_file():
+        raise ValueError(f"{argument} must be a file; {path} is a device or a pipe. Give the name of a file.")
 
 
 def check_parent(path: Path, argument: str) -> None:

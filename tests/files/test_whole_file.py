@@ -59,6 +59,10 @@ def test_places_that_are_refused(tmp_path: Path) -> None:
         write_text(tmp_path / "no" / "a.txt", "")
     with pytest.raises(ValueError, match=r"table must be a file; .* is a folder"), whole_file(tmp_path, "table"):
         pass
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(ValueError, match=r"out must be a file; .*pipe is a device or a pipe\. Give the name of a file"):
+        write_text(tmp_path / "pipe", "")
+    assert (tmp_path / "pipe").is_fifo()  # root would have put a file in the place of /dev/null
 
 
 def test_content_is_on_the_disk_before_the_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -170,6 +171,12 @@ def no_such_file(f: Path, s: list[Track]) -> Path:
     return f / "shots.csv"
 
 
+def a_pipe(f: Path, s: list[Track]) -> Path:
+    """As of `ballfg import <(zcat shots.csv.gz)`."""
+    os.mkfifo(f / "shots.csv")
+    return f / "shots.csv"
+
+
 def a_folder_of_pictures(f: Path, s: list[Track]) -> Path:
     (f / "pictures").mkdir()
     (f / "pictures" / "a.png").write_bytes(b"\x89PNG")
@@ -194,6 +201,7 @@ REFUSED: dict[Mistake, str] = {
     two_balls_in_columns: "--columns x=left_x,y=left_y,z=left_z (or x=right_x,y=right_y,z=right_z)",
     no_bounce: "--table-height",
     no_such_file: "source must exist",
+    a_pipe: "is a pipe or a device. Write what comes to a file",
     a_folder_of_pictures: "must hold files of measurements",
 }
 """What the one line says; most name an option, the others a file that holds no measurements."""

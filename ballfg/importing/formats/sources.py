@@ -69,6 +69,10 @@ def _of_path(path: Path, topic: str | None) -> list[RawTable]:
         raise FileNotFoundError(f"source must exist; {path} does not. Give a file or a folder.")
     if path.is_file():
         return _of_file(path, topic)
+    if not path.is_dir():
+        raise ValueError(
+            f"source must be a file or a folder; {path} is a pipe or a device. Write what it gives to a file."
+        )
     if (path / "metadata.yaml").is_file() or any(path.glob("*.db3")):
         return read_bag(path, topic)
     files = sorted(file for file in path.rglob("*") if file.is_file() and _is_table(file))
