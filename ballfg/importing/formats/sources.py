@@ -71,7 +71,7 @@ def _of_path(path: Path, topic: str | None) -> list[RawTable]:
         return _of_file(path, topic)
     if not path.is_dir():
         raise ValueError(
-            f"source must be a file or a folder; {path} is a pipe or a device. Write what it gives to a file."
+            f"source must be a file or a folder; {path} is a pipe or a device. Write what comes to a file."
         )
     if (path / "metadata.yaml").is_file() or any(path.glob("*.db3")):
         return read_bag(path, topic)
