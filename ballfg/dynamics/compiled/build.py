@@ -12,6 +12,7 @@ from types import ModuleType
 from typing import Any, Final
 
 from numba import njit
+from numba.core.compiler_lock import global_compiler_lock
 from numba.core.types import WrapperAddressProtocol
 from numba.extending import typeof_impl
 
@@ -51,11 +52,14 @@ def machine_code(signature: Any) -> Callable[[Callable[..., Any]], Any]:
 
         def for_call(*_: Any, **__: Any) -> Any:
             """The machine code, which numba asks for at the first call from Python."""
-            del dispatcher._compile_for_args, dispatcher.get_call_template
-            with doing("compiling machine code, once on this machine"):
-                entry = dispatcher.compile(signature)
-            dispatcher.disable_compile()  # as of a function whose signature numba is given at once
-            return entry
+            with global_compiler_lock:  # another thread may be here too, and have made it meanwhile
+                if "_compile_for_args" in vars(dispatcher):
+                    with doing("compiling machine code, once on this machine"):
+                        entry = dispatcher.compile(signature)
+                    dispatcher.disable_compile()  # as of a function whose signature numba is given at once
+                    del dispatcher._compile_for_args, dispatcher.get_call_template
+                    return entry
+                return next(iter(dispatcher.overloads.values())).entry_point
 
         def for_caller(args: Any, kwargs: Any) -> Any:
             """What numba asks for when it compiles a function that calls this one."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import warnings
 import weakref
 from collections.abc import Callable, Hashable, Sequence
@@ -116,6 +117,7 @@ class NotComparableError(Exception):
 
 _by_model: weakref.WeakKeyDictionary[BallModel, tuple[Numbers, CompiledModel | None]] = weakref.WeakKeyDictionary()
 _by_structure: dict[Hashable, CompiledModel | None] = {}
+_LOOKING: Final = threading.RLock()  # threads that want the same functions wait for one of them
 
 
 def compiled(model: BallModel) -> CompiledModel | None:
@@ -128,16 +130,14 @@ def compiled(model: BallModel) -> CompiledModel | None:
         return known[1]
     if model.random or is_substituted(model):
         return None
-    numbers = numbers_of(model)
-    try:
-        key = _structure(model)
-    except NotComparableError:
-        found = _compiled(model, None)
-    else:
-        if key not in _by_structure:
-            _by_structure[key] = _compiled(model, key)
-        found = _by_structure[key]
-    _by_model[model] = numbers, found
+    with _LOOKING:
+        try:
+            if (key := _structure(model)) not in _by_structure:
+                _by_structure[key] = _compiled(model, key)
+            found = _by_structure[key]
+        except NotComparableError:
+            found = _compiled(model, None)
+        _by_model[model] = numbers_of(model), found
     return found
 
 

@@ -5,6 +5,7 @@ They serve models that cannot be compiled: prediction then runs the same code fo
 
 from __future__ import annotations
 
+import threading
 import weakref
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,7 +29,16 @@ SIZES: Final = (6, 9, 3)
 """Numbers that rates, impact and surface give."""
 
 _asked: dict[int, Callable[[Tensor, Tensor], Tensor]] = {}
-_failed: list[Exception] = []
+
+
+class _Failed(threading.local):
+    """Errors that the machine code of this thread has met."""
+
+    def __init__(self) -> None:
+        self.errors: list[Exception] = []
+
+
+_failed = _Failed()
 
 
 def _answer(number, x, c, xt, ct, y, yt):  # type: ignore[no-untyped-def]
@@ -50,7 +60,7 @@ def _answer(number, x, c, xt, ct, y, yt):  # type: ignore[no-untyped-def]
             if slope is not None:
                 yt += slope.numpy() @ moved
     except Exception as error:
-        _failed.append(error)
+        _failed.errors.append(error)
         y[:], yt[:] = np.nan, np.nan
 
 
@@ -109,7 +119,7 @@ def _value(
 
 def raise_errors() -> None:
     """Raise what torch raised while machine code was running."""
-    if _failed:
-        first = _failed[0]
-        _failed.clear()
+    if _failed.errors:
+        first = _failed.errors[0]
+        _failed.errors.clear()
         raise first

@@ -1,0 +1,100 @@
+"""Threads of one process, such as one for each camera or ball: they may share models and estimators."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+
+import numpy as np
+import pytest
+
+from ballfg.arrays import Array
+from ballfg.dynamics import nominal_model
+from ballfg.estimation import ExtendedKalmanFilter, Online, Settings, Smoother
+from ballfg.simulation import SimulationConfig, simulate
+from ballfg.simulation.balls import table_tennis
+from ballfg.tracks import Track
+from tests.places import ROOT
+
+THREADS = 6
+FIRST_CALLS = """
+import sys
+from concurrent.futures import ThreadPoolExecutor
+from threading import Barrier
+import numpy as np
+from ballfg.dynamics import Surfaces, nominal_model
+from ballfg.estimation import Settings, Smoother
+from ballfg.tracks import Track
+
+sys.setswitchinterval(1e-5)
+times = np.arange(20) / 100.0
+track = Track(times, np.stack((-1.0 + 3.0 * times, 0.1 * times, 0.4 + times - 4.9 * times**2), axis=1))
+begin = Barrier(6)
+
+def estimated(_):
+    model = nominal_model()
+    smoother = Smoother(model, Surfaces.table_tennis(0.0), Settings.for_measured(model, position_noise=(0.003,) * 3))
+    begin.wait()
+    return smoother.estimate(track).states[-1, 0]
+
+with ThreadPoolExecutor(6) as pool:
+    print(len(set(pool.map(estimated, range(6)))))
+"""
+
+
+@pytest.fixture
+def restless() -> Iterator[None]:
+    """Threads that take turns a thousand times as often as usual."""
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(5e-6)
+    yield
+    sys.setswitchinterval(interval)
+
+
+@pytest.fixture(scope="module")
+def tracks() -> list[Track]:
+    return [shot.track for shot in simulate(SimulationConfig(tracks=THREADS, rate=60.0, seed=8))]
+
+
+def estimates() -> dict[str, Callable[[Track], Array]]:
+    """Results of a track by objects that all threads share."""
+    model = nominal_model()
+    table = table_tennis().surfaces
+    settings = Settings.for_measured(model, position_noise=(0.003,) * 3)
+    smoother, ekf = Smoother(model, table, settings), ExtendedKalmanFilter(model, table, settings)
+
+    def streamed(track: Track) -> Array:
+        online = Online(model, table, settings)
+        return np.array([online.push(t, p).covariance for t, p in zip(track.times, track.positions, strict=True)])
+
+    return {
+        "smoother": lambda track: smoother.estimate(track).covariances,
+        "ekf": lambda track: ekf.estimate(track).covariances,
+        "stream": streamed,
+    }
+
+
+@pytest.mark.parametrize("method", ["smoother", "ekf", "stream"])
+@pytest.mark.usefixtures("restless")
+def test_threads_get_what_one_gets(tracks: list[Track], method: str) -> None:
+    estimated = estimates()[method]
+    alone = [estimated(track) for track in tracks]
+    begin = Barrier(THREADS)
+
+    def together(track: Track) -> Array:
+        begin.wait()
+        return estimated(track)
+
+    with ThreadPoolExecutor(THREADS) as pool:
+        for one, other in zip(alone, pool.map(together, tracks), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_the_first_estimates_of_a_process_may_begin_together() -> None:
+    """Each function is compiled, or loaded, by the first that needs it, while the others wait."""
+    command = [sys.executable, "-W", "error", "-c", FIRST_CALLS]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "1\n", "")
