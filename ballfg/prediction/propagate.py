@@ -21,8 +21,7 @@ from ballfg.arrays import Array
 from ballfg.dynamics.compiled.beliefs.course import BOUNCES, Carrier, Course, density_of
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.advance_jacobian import advance_jacobian
-from ballfg.dynamics.motion.integrate import fly_jacobian
-from ballfg.dynamics.motion.limits import MAX_STEP
+from ballfg.dynamics.motion.integrate import fly_jacobian, steps_over_each
 from ballfg.dynamics.motion.rollout import LONGEST_MOTION
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.factors.noise import ProcessNoise
@@ -175,9 +174,9 @@ class Propagator:
         staying, elapsed = durations - moving, durations.cumsum(1)
         course, first = Course.start(belief.mean.detach().numpy(), belief.covariance.detach().numpy()), 0
         for last in sorted({*(staying > 0).any(0).nonzero()[:, 0].tolist(), durations.shape[1] - 1}):
-            part = moving[:, first : last + 1]
-            counts = (part.amax(0) / MAX_STEP - 1e-9).ceil().clamp_min(1).long()
-            steps, ends = (part / counts).repeat_interleave(counts, dim=1).numpy(), counts.cumsum(0).numpy()
+            part = moving[:, first : last + 1].numpy()
+            counts = steps_over_each(part.max(0))
+            steps, ends = np.repeat(part / counts, counts, axis=1), counts.cumsum()
             done = 0
             while done < steps.shape[1]:
                 flown = self._steps(carrier, belief.model, course, steps[:, done : done + AT_ONCE])
