@@ -6,6 +6,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from types import ModuleType
@@ -131,8 +132,9 @@ def digest(file: Path) -> str:
 
 
 def write_note(about: str, note: Mapping[str, Any]) -> None:
-    """Keep a note on disk for other processes."""
-    keep(_note_name(about), json.dumps({"note": note, "digest": _digest_of(note)}))
+    """Keep a note on disk for other processes; a full disk costs them the time to find it out themselves."""
+    with suppress(OSError):
+        keep(_note_name(about), json.dumps({"note": note, "digest": _digest_of(note)}))
 
 
 def read_note(about: str) -> Any | None:

@@ -71,8 +71,11 @@ def keep(name: str, text: str) -> Path:
     """Write a file to the cache at once: another process never reads half of it. Returns: its path."""
     path = cache_folder() / name
     part = path.with_name(f"{name}.{uuid.uuid4().hex}.part")  # tempfile's would be closed to other users
-    part.write_text(text, encoding="utf-8")
-    os.replace(part, path)
+    try:
+        part.write_text(text, encoding="utf-8")
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)  # of a disk that is full
     return path
 
 

@@ -170,6 +170,14 @@ def test_notes_in_a_folder_that_is_only_read(tmp_path: Path, monkeypatch: pytest
     assert len(list((tmp_path / "filled").rglob("*.json"))) == 1
 
 
+def test_a_note_that_finds_a_full_disk_leaves_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("BALLFG_CACHE", str(tmp_path))
+    monkeypatch.setattr("os.replace", full)
+    write_note("a", {"size": 3})
+    assert read_note("a") is None
+    assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
 @pytest.mark.parametrize("kind", ["open to others", "a link", "a file"])
 def test_a_temporary_folder_that_others_may_have_filled_is_not_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: str
