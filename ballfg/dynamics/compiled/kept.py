@@ -15,16 +15,14 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Final
 
-from numba.core.caching import (
-    CompileResultCacheImpl,
-    FunctionCache,
-    IndexDataCacheFile,
-    InTreeCacheLocator,
-    UserProvidedCacheLocator,
-)
+from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
 PRIVATE: Final = 0o700
 DIGEST_SIZE: Final = hashlib.sha256().digest_size
+_LOCATORS: Final[dict[str, Any]] = {
+    locator.__name__.lstrip("_"): locator for locator in CompileResultCacheImpl._locator_classes
+}  # their own names begin with a line in numba before 0.62
+_InTree: Any = _LOCATORS["InTreeCacheLocator"]
 
 
 def configured_folder() -> Path:
@@ -79,7 +77,7 @@ def keep(name: str, text: str) -> Path:
     return path
 
 
-class _Temporary(InTreeCacheLocator):
+class _Temporary(_InTree):
     """A place in `cache_folder`, for code whose own folder and whose user's cache cannot be written to."""
 
     def __init__(self, function: Any, file: str) -> None:
@@ -87,7 +85,7 @@ class _Temporary(InTreeCacheLocator):
         self._cache_path = str(cache_folder() / self.get_suitable_cache_subpath(file))
 
 
-class _Beside(InTreeCacheLocator):
+class _Beside(_InTree):
     """The folder beside the source, which need not be one that can be written to."""
 
     def ensure_cache_path(self) -> None:
@@ -150,7 +148,7 @@ class Kept(_Cache):
     def __init__(self, function: Any) -> None:
         super().__init__(function)
         beside = _KeptBeside(function)
-        told = isinstance(self._impl.locator, UserProvidedCacheLocator)
+        told = isinstance(self._impl.locator, _LOCATORS["UserProvidedCacheLocator"])
         self._beside = None if told or beside.cache_path == self.cache_path else beside
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
