@@ -7,6 +7,7 @@ READY  := $(VENV)/.ready
 SOURCES := ballfg factors learning benchmarks tests
 TOOLS  := build/tools/bin/pip-audit
 OLDEST := tests/factors tests/files tests/importing/test_forms.py tests/live/test_bag.py tests/dynamics/test_model_file.py \
+	tests/dynamics/compiled/test_kept.py \
 	tests/dynamics/networks/test_learned_file.py tests/estimation/smoother tests/prediction tests/pages tests/tracks \
 	tests/vision/test_camera_file.py tests/cli/test_estimate.py tests/cli/test_show.py tests/simulation tests/test_front.py
 

@@ -21,7 +21,7 @@ PRIVATE: Final = 0o700
 DIGEST_SIZE: Final = hashlib.sha256().digest_size
 _LOCATORS: Final[dict[str, Any]] = {
     locator.__name__.lstrip("_"): locator for locator in CompileResultCacheImpl._locator_classes
-}  # their own names begin with a line in numba before 0.62
+}  # some versions of numba begin these names with a line
 _InTree: Any = _LOCATORS["InTreeCacheLocator"]
 
 
