@@ -162,5 +162,5 @@ def _note_name(about: str) -> str:
 def _module(name: str, path: Path, text: str) -> ModuleType:
     """The module of a file, without Python's own cache: a damaged one would be an error at each start."""
     module = sys.modules[name] = ModuleType(name)
-    exec(compile(text, path, "exec"), module.__dict__)
+    exec(compile(text, path, "exec", dont_inherit=True), module.__dict__)
     return module
