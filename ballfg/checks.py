@@ -8,12 +8,16 @@ import difflib
 import itertools
 import math
 import reprlib
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 from numbers import Real
-from typing import Any
+from os import PathLike
+from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+T = TypeVar("T")
 
 _SYNONYMS = {
     "t": ("time", "timestamp", "stamp", "times", "time_s", "t_s"),
@@ -52,7 +56,7 @@ def shown(value: object) -> str:
     short.maxstring = short.maxother = short.maxlong = MAX_SHOWN
     short.maxlevel = 3
     short.maxdict = short.maxlist = short.maxtuple = 8
-    return short_text(short.repr(value))
+    return short_text(" ".join(short.repr(value).split("\n")))
 
 
 def short_text(text: str, most: int = MAX_SHOWN) -> str:
@@ -124,8 +128,8 @@ def did_you_mean(name: str, candidates: Iterable[str]) -> str:
 
 
 def is_number(value: object) -> bool:
-    """Whether a value is a real number; a bool is none."""
-    return isinstance(value, Real) and not isinstance(value, bool)
+    """Whether a value is a real number; a bool is none, and for all of numpy a difference of dates is none."""
+    return isinstance(value, Real) and not isinstance(value, bool | np.timedelta64)
 
 
 def check_number(
@@ -150,11 +154,7 @@ def check_number(
         instead: the unit that a larger value is probably in.
     Raises: TypeError: not a number. ValueError: not finite, or out of range.
     """
-    _check_type(label, value, unit)
-    try:
-        number = float(value)
-    except OverflowError:  # a whole number of 400 digits
-        number = math.inf
+    number = as_float(label, value, unit)
     if not math.isfinite(number) or (above is not None and number <= above):
         rule = "finite" if above is None else f"finite and above {above:g}"
         raise ValueError(f"{label} must be {rule}; got {number:g}. Correct it{f' (unit: {unit})' if unit else ''}.")
@@ -173,31 +173,101 @@ def check_range(label: str, value: Any, low: float, high: float) -> float:
 
     Raises: TypeError: not a number. ValueError: out of range, as NaN is.
     """
-    _check_type(label, value)
-    if not low <= value <= high:
+    number = as_float(label, value)
+    if not low <= number <= high:
         top = "" if math.isinf(high) else f", at most {high:g}"
-        raise ValueError(f"{label} must be at least {low:g}{top}; got {value:g}. Correct it (SI units).")
-    return float(value)
+        raise ValueError(f"{label} must be at least {low:g}{top}; got {number:g}. Correct it (SI units).")
+    return number
 
 
-def check_count(label: str, value: Any, low: int, high: int) -> int:
-    """A whole number within [low, high].
+def check_count(label: str, value: Any, low: int, high: int | None = None) -> int:
+    """A whole number within [low, high]; without a high one, of any size from low on.
 
     Raises: TypeError: not a whole number. ValueError: out of range.
     """
-    if isinstance(value, bool) or not isinstance(value, int | np.integer):
+    if not is_number(value) or not isinstance(value, int | np.integer):
         raise TypeError(f"{label} must be a whole number; got {shown(value)}. Write it without a point.")
-    if not low <= value <= high:
-        raise ValueError(f"{label} must lie in {low} .. {high}; got {value}. Choose another.")
+    if value < low or (high is not None and value > high):
+        rule = f"be at least {low}" if high is None else f"lie in {low} .. {high}"
+        raise ValueError(f"{label} must {rule}; got {shown(value)}. Choose another.")
     return int(value)
 
 
-def _check_type(label: str, value: object, unit: str = "") -> None:
+def check_instance(label: str, value: Any, kind: type[Any], remedy: str) -> Any:
+    """The value, if it is of a type.
+
+    Raises: TypeError: naming both types.
+    """
+    if not isinstance(value, kind):
+        raise TypeError(f"{label} must be {_article(kind)}; got {type_name(value)} {shown(value)}. {remedy}")
+    return value
+
+
+def _article(kind: type) -> str:
+    return f"{'an' if kind.__name__[0] in 'AEIOaeio' else 'a'} {kind.__name__}"
+
+
+def as_float(label: str, value: Any, unit: str = "") -> float:
+    """A real number as a float, which may be NaN or infinite; a truth value is no number.
+
+    Raises: TypeError: naming the type.
+    """
     if not is_number(value):
         rule, got = (
             (f"a number in {unit}", f"{type_name(value)} {shown(value)}") if unit else ("a number", shown(value))
         )
         raise TypeError(f"{label} must be {rule}; got {got}. Write it like 0.02 or 2.0e-2.")
+    try:
+        return float(value)
+    except OverflowError:  # a whole number of 400 digits
+        return math.inf if value > 0 else -math.inf
+
+
+def check_iterable(label: str, value: object) -> None:
+    """Refuses a single thing, and a text.
+
+    Raises: TypeError: naming the type.
+    """
+    if not isinstance(value, Iterable) or isinstance(value, str | bytes):
+        raise TypeError(f"{label} must be a list or tuple; got {type_name(value)} {shown(value)}. Put it in a list.")
+
+
+def check_each(label: str, values: Iterable[T], kind: type[Any], remedy: str) -> Iterator[T]:
+    """The values one by one, each checked when it is taken.
+
+    Raises: TypeError: at once a single thing; later a value of another type.
+    """
+    check_iterable(label, values)
+    return (check_instance(f"each of {label}", value, kind, remedy) for value in values)
+
+
+def check_flag(label: str, value: object) -> bool:
+    """True or False.
+
+    Raises: TypeError: anything else.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{label} must be True or False; got {type_name(value)} {shown(value)}. Give one of them.")
+    return bool(value)
+
+
+def check_choice(label: str, value: object, known: Collection[str]) -> None:
+    """Refuses what is none of the known names.
+
+    Raises: ValueError: listing them.
+    """
+    if not isinstance(value, str) or value not in known:
+        raise ValueError(f"{label} must be one of {', '.join(known)}; got {shown(value)}. Choose one of them.")
+
+
+def check_path(label: str, value: object) -> Path:
+    """The place of a file or folder.
+
+    Raises: TypeError: neither text nor a path.
+    """
+    if not isinstance(value, str | PathLike):
+        raise TypeError(f"{label} must be a path; got {type_name(value)} {shown(value)}. Give it as text or Path.")
+    return Path(value)
 
 
 def check_array(
@@ -207,12 +277,41 @@ def check_array(
 
     Args: label: what the message calls the array.  value: to check.  shape: the right one, if it is fixed.
         remedy: last sentence of the message.
-    Raises: ValueError: not numbers, or another shape.
+    Raises: ValueError: not numbers, numbers under a mask or beyond `LARGEST`, or another shape.
     """
     try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{label} must be an array of numbers; {error}. {remedy}") from None
+        given = np.asanyarray(value)
+        problem = _no_numbers(given)
+        array = np.array(value if isinstance(value, list | tuple) else given, dtype=None if problem else np.float64)
+    except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # the last: a tensor with a gradient
+        raise ValueError(f"{label} must be an array of numbers; {one_line(error)}. {remedy}") from None
+    if problem:
+        raise ValueError(f"{label} must be an array of numbers; {problem}")
     if shape is not None and array.shape != shape:
         raise ValueError(f"{label} must have shape {shape}; got {array.shape}. {remedy}")
+    beyond = np.isfinite(array) & (np.abs(array) > LARGEST)
+    if beyond.any():
+        raise ValueError(f"{label} must be within {LARGEST:g}; got {array[beyond][0]:g}. {remedy}")
     return array
+
+
+LARGEST = 1e100
+"""Of a measured number, in any unit. The squares of much larger ones overflow; memory that nobody filled holds such."""
+
+
+_NO_NUMBERS = {
+    "b": ("truth values", "Convert them yourself if they are meant."),
+    "c": ("complex numbers", "Take their real parts if they are meant."),
+    "m": ("time differences", "Divide them by np.timedelta64(1, 's')."),
+    "M": ("dates", "Subtract the first one and divide by np.timedelta64(1, 's')."),
+}
+"""What numpy turns into numbers without a word, by kind of array: what it is, and what to do."""
+
+
+def _no_numbers(array: NDArray[Any]) -> str:
+    """Why an array holds no numbers though numpy would make some of it, and what to do; empty if it holds numbers."""
+    if array.dtype.kind in _NO_NUMBERS:
+        what, instead = _NO_NUMBERS[array.dtype.kind]
+        return f"got {what}. {instead}"
+    masked = int(np.ma.count_masked(array)) if isinstance(array, np.ma.MaskedArray) else 0
+    return f"{masked} of them are masked. Drop those rows." if masked else ""

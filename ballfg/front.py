@@ -9,6 +9,7 @@ from typing import TypeAlias, TypedDict, Unpack, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ballfg.checks import as_float, check_instance
 from ballfg.diagnosis import Diagnosis
 from ballfg.diagnosis import diagnose as diagnose_dataset
 from ballfg.dynamics import BallModel, Surfaces, inertia_factor, load_model, nominal_model
@@ -31,11 +32,11 @@ from ballfg.estimation import (
 from ballfg.estimation.batch import check_device, estimate_together
 from ballfg.parallel.work import on_one_thread
 from ballfg.prediction import Ahead, BallState
-from ballfg.tracks import TABLE_TENNIS, Dataset, Track
+from ballfg.tracks import TABLE_TENNIS, Ball, Dataset, Track
 
 Folder: TypeAlias = str | PathLike[str]
 Tracks: TypeAlias = Dataset | SightedDataset
-Model: TypeAlias = BallModel | Folder | None
+Model: TypeAlias = BallModel | Ball | Folder | None
 Conformal: TypeAlias = Tracks | ConformalScales | Folder | None
 OneTrack: TypeAlias = Track | NDArray[np.float64] | tuple[ArrayLike, ArrayLike]
 """A track; or an array (n, 4) of t (s), x, y, z (m); or times (n,) s and positions (n, 3) m."""
@@ -82,7 +83,7 @@ def estimate(
         measured: a track or its arrays, (n, 4) of t, x, y, z in s and m or times (n,) s and positions (n, 3) m; or a
             dataset or its folder for all tracks.
         method: "smoother", "online", "ekf", "sliding-window", or the name of a registered estimator.
-        model: of the ball, or its file; the nominal model of the ball where None.
+        model: of the ball, or its file; the nominal model of the ball where None, or of a `Ball` that is given.
         surfaces: that the ball may bounce on; a number is the height of the table, m.
         settings: noise and priors; those of measured tracks where None.
         jobs: processes for a dataset.
@@ -149,6 +150,7 @@ def predict(
         _refuse(conformal)
         estimator = estimator_for(data, method, model, surfaces, settings)
         return estimate_together(estimator, [data], device)[0].predict(horizon)
+    observe = as_float("observe", observe, "s")
     estimator = estimator_for(data, method, model, surfaces, settings, observe)
     predicted = partial(predict_tracks, estimator, observe=observe, horizon=horizon, jobs=jobs, device=device)
     scales = _scales(conformal, data, predicted, method, observe)
@@ -190,11 +192,11 @@ def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) 
 
     Args:
         measured: a dataset or its folder; one half of the tracks finds effects, the other half judges them.
-        model: the analytic model to diagnose, or its file; the nominal model of the ball where None.
+        model: the analytic model to diagnose, or its file; the nominal model of the ball where None, or of a `Ball`.
         jobs: processes.
     Returns: the effects found, how sure that is, and the corrected model.
     Raises:
-        TypeError: if the model is a learned one.
+        TypeError: if the model is a learned one, or none.
         ValueError: if there are too few tracks, or none with a flight that is long enough.
         FileNotFoundError: a folder or model file that is not there.
     """
@@ -228,9 +230,10 @@ def estimator_for(
 
 def _model(model: Model, source: Tracks | None) -> BallModel:
     ball = TABLE_TENNIS if source is None else source.ball
-    if model is None:
-        return nominal_model(ball)
+    if model is None or isinstance(model, Ball):
+        return nominal_model(ball if model is None else model)
     if not isinstance(model, str | PathLike):
+        check_instance("model", model, BallModel, "Load one with load_model, or give its file.")
         return model
     room = None if source is None else source.info.name
     return load_model(Path(model), radius=ball.radius, inertia_factor=inertia_factor(ball), room=room)

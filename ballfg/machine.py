@@ -37,9 +37,10 @@ def usable_device(name: str) -> torch.device:
     try:
         device = torch.device(name)
         torch.zeros(1, dtype=torch.float64, device=device).cpu()
-    except (RuntimeError, AssertionError, NotImplementedError, TypeError) as error:  # torch's, for all it cannot use
-        reason = str(error).splitlines()[0]
-        raise ValueError(f"device must be one that torch computes on; got {name!r}: {reason}") from None
+    # torch's, for all that it cannot use
+    except (RuntimeError, AssertionError, NotImplementedError, TypeError, ValueError) as error:
+        reason, got = str(error).splitlines()[0], " ".join(repr(name)[:80].split())
+        raise ValueError(f"device must be one that torch computes on; got {got}: {reason}") from None
     return device
 
 

@@ -61,6 +61,8 @@ class Registry(Mapping[str, type[T]], Generic[T]):
     _loaded: bool = field(init=False, default=False)
 
     def __getitem__(self, name: str) -> type[T]:
+        if not isinstance(name, str):
+            raise KeyError(name)
         if name not in self._classes:
             self.load_entry_points()
         return self._classes[name]
@@ -91,7 +93,8 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         if not (isinstance(cls, type) and issubclass(cls, self.base)):
             names = [base.__name__ for base in (self.base if isinstance(self.base, tuple) else (self.base,))]
             bases = " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-            raise TypeError(f"{self.sort} must be a subclass of {bases}; got {cls!r}. {self.remedy}")
+            got = repr(cls) if isinstance(cls, type) else type(cls).__name__
+            raise TypeError(f"{self.sort} must be a subclass of {bases}; got {got}. {self.remedy}")
         name = getattr(cls, "name", None)
         if not (isinstance(name, str) and name.strip()):
             raise ValueError(f"{cls.__qualname__}.name must be a text; it is missing. {self.remedy}")

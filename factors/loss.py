@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from ballfg.arrays import Array
+from ballfg.checks import check_choice, check_number
 
 LEAST_STRETCH = 0.05
 """Where the loss is straight or concave along the residual, this much curvature keeps the step finite."""
@@ -24,17 +25,15 @@ class Loss:
         name: `squared`, `huber` (linear beyond `scale`) or `cauchy` (logarithmic: a far outlier pulls less and less).
         scale: in standard deviations.
 
-    Raises: ValueError: another name, or a scale that is not positive.
+    Raises: ValueError: another name, or a scale that is not positive and finite. TypeError: a scale that is no number.
     """
 
     name: Literal["squared", "huber", "cauchy"] = "squared"
     scale: float = 3.0
 
     def __post_init__(self) -> None:
-        if self.name not in ("squared", "huber", "cauchy"):
-            raise ValueError(f"loss must be 'squared', 'huber' or 'cauchy'; got '{self.name}'")
-        if not self.scale > 0.0:
-            raise ValueError(f"scale must be positive; got {self.scale}")
+        check_choice("loss", self.name, ("squared", "huber", "cauchy"))
+        check_number("scale", self.scale, "standard deviations", above=0.0)
 
     @property
     def convex(self) -> Loss:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ballfg.arrays import Array
+from ballfg.checks import as_float
 from ballfg.state import STATE_DIM
 
 
@@ -45,7 +46,8 @@ class ProcessNoise:
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
-            if not (np.isfinite(value) and (value > 0.0 or (value == 0.0 and name == "contact_tangential"))):
+            number = as_float(name, value)
+            if not (np.isfinite(number) and (number > 0.0 or (number == 0.0 and name == "contact_tangential"))):
                 raise ValueError(
                     f"{name} must be positive and finite; got {value}. Use a small number for a nearly exact model."
                 )

@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from ballfg.checks import (
+    as_float,
     check_array,
+    check_choice,
     check_count,
+    check_each,
+    check_flag,
+    check_instance,
     check_keys,
     check_number,
+    check_path,
     check_range,
     check_text,
     did_you_mean,
@@ -36,6 +44,18 @@ def test_what_is_right_comes_back() -> None:
     assert copy.dtype == np.float64
     assert not np.shares_memory(copy, array)
     assert not is_number(True)
+    assert not is_number(np.timedelta64(1, "s"))
+    assert as_float("k", -(10**400)) == -math.inf
+    assert math.isnan(as_float("k", math.nan))
+    assert check_flag("k", np.bool_(True)) is True
+    check_choice("k", "a", ("a", "b"))
+    assert check_path("k", "a/b") == Path("a/b")
+    assert check_instance("k", 1, int, "") == 1
+    assert list(check_each("k", iter((1, 2)), int, "")) == [1, 2]
+    masked = np.ma.masked_array([1.0, 2.0], [False, False])
+    assert type(check_array("k", masked)) is np.ndarray
+    np.testing.assert_array_equal(check_array("k", torch.tensor([1.0, 2.0])), [1.0, 2.0])
+    np.testing.assert_array_equal(check_array("k", [math.nan, -math.inf]), [math.nan, -math.inf])
 
 
 @pytest.mark.parametrize(
@@ -76,6 +96,37 @@ def test_what_is_right_comes_back() -> None:
             lambda: check_array("k", [["a"]]),
             ValueError,
             "k must be an array of numbers; could not convert string to float: 'a'. Correct it.",
+        ),
+        (
+            lambda: check_array("k", torch.zeros(1, requires_grad=True)),
+            ValueError,
+            "k must be an array of numbers; Can't call numpy() on Tensor that requires grad. Use "
+            "tensor.detach().numpy() instead. Correct it.",
+        ),
+        (
+            lambda: check_array("k", 10**400),
+            ValueError,
+            "k must be an array of numbers; int too large to convert to float. Correct it.",
+        ),
+        (lambda: check_array("k", [0.0, -1e101]), ValueError, "k must be within 1e+100; got -1e+101. Correct it."),
+        (lambda: check_count("k", 0, 1), ValueError, "k must be at least 1; got 0. Choose another."),
+        (
+            lambda: check_choice("k", ["a"], ("a", "b")),
+            ValueError,
+            "k must be one of a, b; got ['a']. Choose one of them.",
+        ),
+        (lambda: check_flag("k", 1), TypeError, "k must be True or False; got int 1. Give one of them."),
+        (lambda: check_path("k", None), TypeError, "k must be a path; got nothing None. Give it as text or Path."),
+        (lambda: check_instance("k", "a", int, "Count."), TypeError, "k must be an int; got str 'a'. Count."),
+        (
+            lambda: check_each("k", "ab", str, ""),
+            TypeError,
+            "k must be a list or tuple; got str 'ab'. Put it in a list.",
+        ),
+        (
+            lambda: list(check_each("k", [1, "a"], int, "Count.")),
+            TypeError,
+            "each of k must be an int; got str 'a'. Count.",
         ),
         (
             lambda: check_array("k", [1.0], (2,), "Pass two."),

@@ -236,9 +236,9 @@ def test_events_ahead_are_those_of_the_room_prediction(shots: bf.Dataset) -> Non
 @pytest.mark.parametrize(("horizon", "step"), [(0.0, 0.01), (-1.0, 0.01), (float("nan"), 0.01), (0.3, 0.0)])
 def test_horizons_are_checked(estimate: bf.Estimate, folder: Path, horizon: float, step: float) -> None:
     if step > 0.0:
-        with pytest.raises(ValueError, match="horizon must be a positive"):
+        with pytest.raises(ValueError, match="horizon must be a positive number of seconds"):
             bf.predict(folder, horizon)
-    with pytest.raises(ValueError, match="horizon and step must be positive numbers of seconds"):
+    with pytest.raises(ValueError, match=r"(horizon|step) must be finite and above 0"):
         estimate.predict(horizon, step)
 
 
@@ -367,6 +367,30 @@ def test_tennis_balls_get_their_own_model(tmp_path: Path) -> None:
     table_tennis = dict(bf.nominal_model().named_parameters())
     assert float(found["flight.drag.k"].detach()) < 0.5 * float(table_tennis["flight.drag.k"].detach())
     assert estimate.world.model.radius == pytest.approx(0.033, abs=2e-3)
+
+
+def test_a_ball_stands_for_its_nominal_model(track: bf.Track) -> None:
+    found = bf.estimate(track, model=bf.Ball(0.033, 0.057)).world
+    assert found is not None
+    assert found.model.radius == 0.033
+
+
+def test_a_track_that_was_changed_is_refused_by_every_estimator() -> None:
+    changed = bf.Track([0.0, 0.01, 0.02], np.zeros((3, 3)), name="mine")
+    changed.positions[1, 2] = np.nan
+    for method in ("smoother", "online", "ekf", "sliding-window"):
+        with pytest.raises(ValueError, match="track 'mine': times and positions must be finite; they were"):
+            bf.estimate(changed, method=method)
+
+
+def test_states_are_equal_to_themselves_alone(estimate: bf.Estimate) -> None:
+    first, second = estimate[0], estimate[0]
+    assert first == first
+    assert first != second
+    assert first not in [second, estimate[1]]
+    assert len({first, second, estimate}) == 3
+    with pytest.raises(TypeError, match="slice"):
+        estimate[1:3]  # type: ignore[index]
 
 
 def test_a_model_beside_the_data_is_offered_where_it_is_another(

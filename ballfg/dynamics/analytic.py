@@ -6,6 +6,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
+from ballfg.checks import check_each
 from ballfg.dynamics.effect import BounceEffect, Coefficient, Effect, Flight, FlightEffect, Impact, per_row
 from ballfg.dynamics.measurement import Later, MeasurementEffect
 from ballfg.dynamics.model import THIN_SHELL, BallModel, Rates
@@ -143,7 +144,7 @@ def after_needs(effects: Iterable[Effect]) -> list[Effect]:
 
     Raises: ValueError: if one is given twice, or needs one that is not there.
     """
-    waiting = list(effects)
+    waiting = list(check_each("effects", effects, Effect, "Give Gravity(), Drag() or another one."))
     names = [effect.name for effect in waiting]
     for name in names:
         if names.count(name) > 1:

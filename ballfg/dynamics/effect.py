@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
+from ballfg.checks import as_float
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 
@@ -212,7 +213,7 @@ class Effect(nn.Module, ABC):
                 f"effect '{self.name}' has no coefficient '{unknown[0]}'; it has {', '.join(known) or 'none'}"
             )
         for c in self.coefficients:
-            value = float(values.get(c.name, c.default))
+            value = as_float(f"{self.name}.{c.name}", values.get(c.name, c.default), c.unit)
             if not c.low <= value <= c.high:  # also refuses NaN
                 raise ValueError(
                     f"{self.name}.{c.name} must lie in [{c.low:g}, {c.high:g}] {c.unit}; got {value:g}. Check its unit."

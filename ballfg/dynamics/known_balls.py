@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Final
 
-from ballfg.checks import did_you_mean
+from ballfg.checks import check_text, did_you_mean
 from ballfg.dynamics.model import THIN_SHELL
 from ballfg.tracks import TABLE_TENNIS, TENNIS, Ball
 
@@ -85,6 +85,7 @@ def known_ball(name: str) -> str:
 
     Raises: ValueError: no such ball, or a badminton shuttle.
     """
+    check_text("ball", name)
     key = name.strip().lower().replace("-", "_").replace(" ", "_")
     key = ALIASES.get(key, key)
     if key in ("badminton", "shuttle", "shuttlecock"):

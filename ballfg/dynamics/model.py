@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, ClassVar, Final, Self, TypeVar
 import torch
 from torch import Tensor, nn
 
+from ballfg.checks import as_float
 from ballfg.dynamics.effect import Coefficient
 from ballfg.dynamics.measurement import Later
 from ballfg.dynamics.motion.impact import slip_velocity
@@ -60,14 +61,15 @@ class BallModel(nn.Module, ABC):
 
     def __init__(self, radius: float, inertia_factor: float = THIN_SHELL) -> None:
         super().__init__()
-        if not 0.001 <= radius <= 1.0:
-            raise ValueError(f"radius must be 0.001 to 1 m; got {radius:g}. Is it in millimetres?")
-        if not 0.0 < inertia_factor <= 1.0:
+        self.radius = as_float("radius", radius, "m")
+        self.inertia_factor = as_float("inertia_factor", inertia_factor)
+        if not 0.001 <= self.radius <= 1.0:
+            raise ValueError(f"radius must be 0.001 to 1 m; got {self.radius:g}. Is it in millimetres?")
+        if not 0.0 < self.inertia_factor <= 1.0:
             raise ValueError(
-                f"inertia_factor must lie in (0, 1]; got {inertia_factor:g}. A thin shell has 2/3, a solid ball 0.4."
+                f"inertia_factor must lie in (0, 1]; got {self.inertia_factor:g}. A thin shell has 2/3, a solid ball "
+                "0.4."
             )
-        self.radius = float(radius)
-        self.inertia_factor = float(inertia_factor)
         self.trained: Trained | None = None
         self.noise: TrackNoise | None = None
         self.variations: Mapping[str, Variation] = {}

@@ -7,7 +7,7 @@ from typing import Any, Final, cast
 
 import yaml
 
-from ballfg.checks import check_range, shown
+from ballfg.checks import check_path, check_range, shown
 from ballfg.dynamics.analytic import AnalyticModel, after_needs
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import effect_class
@@ -48,7 +48,7 @@ def load_model(
         ValueError: if it is not YAML, or names a section, effect or coefficient that does not exist, or a value
             outside its bounds; or if the folder does not hold a learned part of this version.
     """
-    path = Path(path)
+    path = check_path("path", path)
     settle(path.parent)
     if not path.is_file():
         raise FileNotFoundError(f"model file {path} does not exist; a model is one YAML file")
@@ -189,7 +189,7 @@ def save_model(model: BallModel, path: str | Path) -> None:
 
     Raises: TypeError: if the model is neither analytic nor learned, or corrects one that is not analytic.
     """
-    path = Path(path)
+    path = check_path("path", path)
     content = model_to_dict(_analytic_part(model)) | _listed(model.variations)
     if model.noise is not None:
         content["measurement"][NOISE] = model.noise.to_mapping()

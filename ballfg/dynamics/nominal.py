@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from importlib import resources
 from typing import Final, cast
 
+from ballfg.checks import is_number, shown, type_name
 from ballfg.dynamics.analytic import AnalyticModel
 from ballfg.dynamics.effect import Effect
 from ballfg.dynamics.known_balls import KNOWN_BALLS, known_ball
@@ -39,12 +40,15 @@ def nominal_model(ball: Ball | float | str = TABLE_TENNIS) -> AnalyticModel:
         ball, such as "basketball" (`ballfg balls` lists them).
     Returns: a model of its own, which the caller may change.
     Raises: ValueError: if the radius is not one of a ball (0.001 to 1 m), the ball so light that its drag leaves
-        the bounds of the effect, or the name not known.
+        the bounds of the effect, or the name not known. TypeError: neither a ball nor a number nor a name.
     """
     if isinstance(ball, str):
         chosen = known_ball(ball)
         return _known_model(chosen, KNOWN_BALLS[chosen].ball.radius)
     if not isinstance(ball, Ball):
+        if not is_number(ball):
+            got = f"{type_name(ball)} {shown(ball)}"
+            raise TypeError(f"ball must be a Ball, a radius in m or a name; got {got}. Give one of them.")
         return _known_model("table_tennis", ball)
     name = known_name(ball)
     return _guessed_model(ball) if name is None else _known_model(name, ball.radius)

@@ -9,6 +9,7 @@ from typing import Final
 import torch
 from torch import Tensor
 
+from ballfg.checks import check_array, check_number
 from ballfg.dynamics.motion.limits import DEEPEST
 from ballfg.state import Z
 
@@ -40,15 +41,15 @@ class Surfaces:
     edge_sigmas: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not math.isfinite(self.table_height):
-            raise ValueError(f"table_height must be finite; got {self.table_height}")
-        if self.floor_height is not None and not self.floor_height < self.table_height:
-            raise ValueError(
-                f"floor_height must lie below table_height {self.table_height:g} m; got {self.floor_height:g} m"
-            )
-        if self.extent is not None and not (self.extent[0] < self.extent[1] and self.extent[2] < self.extent[3]):
+        check_number("table_height", self.table_height, "m")
+        floor = None if self.floor_height is None else check_number("floor_height", self.floor_height, "m")
+        if floor is not None and not floor < self.table_height:
+            raise ValueError(f"floor_height must lie below table_height {self.table_height:g} m; got {floor:g} m")
+        ends = None if self.extent is None else check_array("extent", self.extent, (4,), "Give four numbers in m.")
+        if ends is not None and not (ends[0] < ends[1] and ends[2] < ends[3]):
             raise ValueError(f"extent must be (x_low, x_high, y_low, y_high); got {self.extent}")
-        if not all(0.0 <= sigma < math.inf for sigma in self.edge_sigmas):
+        sigmas = check_array("edge_sigmas", self.edge_sigmas, (4,), "Give four numbers in m.")
+        if not ((sigmas >= 0.0) & (sigmas < math.inf)).all():
             raise ValueError(f"edge_sigmas must be finite and not negative, in m; got {self.edge_sigmas}")
 
     @classmethod

@@ -44,7 +44,7 @@ TABLE_TOLERANCE: Final = 1e-3
 FILE_SECTION: Final = "conformal"
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class ConformalScales:
     """Factors on predicted sigmas, after which mean +- 1.645 sigma are conformal 90 % intervals.
 

@@ -4,7 +4,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from typing import ClassVar
 
-from ballfg.checks import shown
+import numpy as np
+
+from ballfg.checks import as_float, check_instance, is_number, shown
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
@@ -29,7 +31,8 @@ class Estimator(ABC):
         surfaces: that it may bounce on; of a number (m), a table of that height with the floor below it.
         settings: noise and priors; those of measured tracks (`Settings.for_measured`) where None.
 
-    Raises: ValueError: if the model has measurement effects and the estimator does not undo them.
+    Raises: ValueError: if the model has measurement effects and the estimator does not undo them. TypeError: an
+        argument of another type.
     """
 
     name: ClassVar[str]
@@ -38,17 +41,21 @@ class Estimator(ABC):
 
     def __init__(self, model: BallModel | Ball, surfaces: Surfaces | float, settings: Settings | None = None) -> None:
         model = nominal_model(model) if isinstance(model, Ball) else model
-        surfaces = Surfaces.table_tennis(surfaces) if isinstance(surfaces, int | float) else surfaces
-        settings = Settings.for_measured(model) if settings is None else settings.renamed(model)
+        check_instance("model", model, BallModel, "Load one with load_model, or give the Ball.")
+        table = Surfaces.table_tennis(as_float("surfaces", surfaces, "m")) if is_number(surfaces) else surfaces
+        known: Surfaces = check_instance("surfaces", table, Surfaces, "Give the height of the table in m, or Surfaces.")
+        settings = Settings.for_measured(model) if settings is None else settings
+        check_instance("settings", settings, Settings, "Make them with Settings.for_measured(model).")
+        settings = settings.renamed(model)
         if not (model.measures_plainly or self.undoes_measurement):
             raise ValueError(
                 f"model must have no measurement effects for the estimator '{self.name}' by itself. "
                 "Use make_estimator, which undoes them, or leave the model's section measurement empty."
             )
         self.model = model
-        self.surfaces = surfaces
+        self.surfaces = known
         self.settings = settings
-        self.world = World(model, surfaces, settings.process)
+        self.world = World(model, known, settings.process)
 
     def __repr__(self) -> str:
         effects = type(self.model).__name__
@@ -95,12 +102,18 @@ class Estimator(ABC):
 
         Raises:
             TypeError: if track is not a `Track`.
-            ValueError: if its numbers cannot be metres and seconds, or a factor ties several states.
+            ValueError: if its numbers cannot be metres and seconds, were changed to something that is no number after
+                the track was made, or a factor ties several states.
         """
         if not hasattr(track, "observations"):
             raise TypeError(
                 f"track must be a Track; got {type(track).__name__}. Make one with Track(times, positions): (n,) s and "
                 "(n, 3) m."
+            )
+        if not (np.isfinite(track.positions).all() and np.isfinite(track.times).all()):
+            raise ValueError(
+                f"track {shown(track.name)}: times and positions must be finite; they were changed after the track was "
+                "made. Make a new one of the samples that are known."
             )
         if len(track) >= LEAST_CHECKED and not track.part:
             check_scale(f"track {shown(track.name)}", track.times, track.positions, track.sigmas, None)

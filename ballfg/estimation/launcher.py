@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from ballfg.checks import check_number
 from ballfg.dynamics.networks.spin_embedding import SpinEmbedding
 from ballfg.estimation.filters.window_velocity import window_velocities
 from ballfg.tracks import SPIN_LABELS, Track
@@ -42,8 +43,7 @@ class Launcher:
     defaults: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.sigma) and self.sigma > 0.0):
-            raise ValueError(f"sigma must be positive and finite; got {self.sigma}. Leave the launcher out instead.")
+        check_number("sigma", self.sigma, "rad/s", above=0.0)
 
     @classmethod
     def of_levels(cls, topspin: float, sidespin: float, sigma: float) -> Launcher:

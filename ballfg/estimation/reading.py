@@ -3,6 +3,7 @@
 from os import PathLike
 from pathlib import Path
 
+from ballfg.checks import check_path
 from ballfg.dynamics import model_to_dict, nominal_model
 from ballfg.estimation.observations.files import read_readings
 from ballfg.estimation.observations.sighted_dataset import SightedDataset, read_sighted
@@ -25,7 +26,7 @@ def read(folder: str | PathLike[str]) -> Dataset | SightedDataset:
         FileNotFoundError: the folder or one of its files is missing.
         ValueError: the content breaks a rule; the message names file, line, column and remedy.
     """
-    settle(Path(folder))
+    settle(check_path("folder", folder))
     dataset = with_readings(read_dataset(folder)) if has_positions(folder) else read_sighted(folder)
     dataset.notes = [*dataset.notes, *unused_model(folder, dataset.ball)]
     return dataset

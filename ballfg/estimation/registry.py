@@ -3,6 +3,7 @@
 from functools import partial
 from typing import Final
 
+from ballfg.checks import check_instance, shown
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.each_its_model import EachItsModel
@@ -36,7 +37,8 @@ def make_estimator(name: str, model: BallModel, surfaces: Surfaces | float, sett
     Raises: ValueError: if there is none of that name; the message lists those there are.
     """
     if name not in ESTIMATORS:
-        raise ValueError(f"method must be one of {', '.join(ESTIMATORS)}; got '{name}'")
+        raise ValueError(f"method must be one of {', '.join(ESTIMATORS)}; got {shown(name)}")
+    check_instance("model", model, BallModel, "Load one with load_model.")
     make = partial(_estimator, ESTIMATORS[name], surfaces, settings)
     return EachItsModel(make, model, surfaces, settings) if model.variations else make(model)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import operator
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
@@ -30,8 +31,8 @@ class Status(enum.Enum):
         "noise settings, or look at the track for events that the model cannot explain"
     )
     NO_VELOCITY = (
-        "there are too few samples to tell a velocity: the states are the measured positions and the priors. "
-        "Observe at least three samples of each flight"
+        "there are too few samples to tell a velocity, or too long gaps between them: the states are the measured "
+        "positions and the priors. Observe at least three samples of each flight, and check the unit of the stamps"
     )
     FAILED = (
         "the objective is not finite at the start; the states are the measured positions and the priors. Check the "
@@ -49,7 +50,7 @@ class Status(enum.Enum):
         return self in (Status.FAILED, Status.IMPLAUSIBLE)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Estimate:
     """The states of one track.
 
@@ -117,7 +118,13 @@ class Estimate:
         )
 
     def __getitem__(self, sample: int) -> BallState:
-        """The state at a sample, with the coefficients and what is known of them."""
+        """The state at a sample, with the coefficients and what is known of them.
+
+        Args: sample: its index; a negative one counts from the end.
+        Raises: IndexError: a sample that the track does not have. TypeError: a slice, or anything else that is no
+            index; `states` and `covariances` hold several samples.
+        """
+        sample = operator.index(sample)
         joint = np.zeros((STATE_DIM + len(self.coefficients),) * 2)
         joint[:STATE_DIM, :STATE_DIM] = self.covariances[sample]
         if self.coefficient_names:

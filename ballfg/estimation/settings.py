@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.checks import check_array, check_flag, check_instance, check_number, check_range, shown, type_name
 from ballfg.dynamics.analytic import coefficient_sigmas
 from ballfg.dynamics.earlier_names import todays_name
 from ballfg.dynamics.model import BallModel
@@ -22,7 +23,8 @@ from ballfg.tracks import Track
 class Settings:
     """Noise and priors, the same for all estimators, so that a comparison compares the estimators.
 
-    Raises: ValueError: a standard deviation that is not positive and finite.
+    Raises: ValueError: a standard deviation that is not positive and finite, or that no measurement has.
+        TypeError: a field of another type.
     """
 
     position_noise: tuple[float, float, float] = (0.0015, 0.0015, 0.0015)
@@ -83,34 +85,35 @@ class Settings:
     model explains."""
 
     def __post_init__(self) -> None:
-        if np.shape(self.position_noise) != (3,) or not all(np.isfinite(s) and s > 0 for s in self.position_noise):
-            raise ValueError(
-                f"position_noise must be three positive numbers in m; got {self.position_noise}. Give one per axis."
-            )
-        for name in ("position_scale", "spin_prior", "spin_label_noise", "velocity_prior"):
-            if not (np.isfinite(getattr(self, name)) and getattr(self, name) > 0):
-                raise ValueError(f"{name} must be positive and finite; got {getattr(self, name)}")
-        self._check_widths()
-        if np.shape(self.memory) != (3,) or not (np.isfinite(self.memory).all() and min(self.memory) >= 0.0):
-            raise ValueError(f"memory must be three numbers in m, zero or more; got {self.memory}. Give one per axis.")
-        if not (np.isfinite(self.memory_time) and self.memory_time > 0.0):
-            raise ValueError(f"memory_time must be positive and finite, in s; got {self.memory_time}")
-        if not (np.isfinite(self.stamp_jitter) and self.stamp_jitter >= 0.0):
-            raise ValueError(f"stamp_jitter must be zero or more and finite, in s; got {self.stamp_jitter}")
-        for name, sigma in self.coefficients.items():
-            if not (np.isfinite(sigma) and sigma > 0):
-                raise ValueError(f"coefficients['{name}'] must be a positive standard deviation; got {sigma}")
-        for name, sigma in self.time_offsets.items():
-            if not (np.isfinite(sigma) and sigma > 0):
-                raise ValueError(f"time_offsets['{name}'] must be a positive standard deviation in s; got {sigma}")
-
-    def _check_widths(self) -> None:
+        self._check_types()
+        for name, least in (("position_noise", "positive numbers"), ("memory", "numbers, zero or more,")):
+            given = check_array(name, getattr(self, name), remedy="Give one number in m per axis.")
+            right = given.shape == (3,) and np.isfinite(given).all() and (given >= 0.0).all()
+            if not right or (name == "position_noise" and not given.all()):
+                raise ValueError(f"{name} must be three {least} in m; got {getattr(self, name)}. Give one per axis.")
+        check_number("position_scale", self.position_scale, above=0.0)
+        check_number("memory_time", self.memory_time, "s", above=0.0)
+        if max(self.memory) > MOST_NOISE:
+            raise ValueError(f"memory must be at most {MOST_NOISE:g} m; got {max(self.memory):g}. Give it in m.")
+        check_range("stamp_jitter", self.stamp_jitter, 0.0, MOST_JITTER)
         for name in ("spin_prior", "spin_label_noise", "velocity_prior"):
-            if getattr(self, name) > WIDEST_PRIOR:
-                raise ValueError(
-                    f"{name} must be at most {WIDEST_PRIOR:g}, in m/s or rad/s; got {getattr(self, name):g}. "
-                    f"{WIDEST_PRIOR:g} says nothing of a ball already."
-                )
+            check_range(name, getattr(self, name), NARROWEST_PRIOR, WIDEST_PRIOR)
+        for name, sigma in self.coefficients.items():
+            check_range(f"coefficients[{shown(name)}]", sigma, NARROWEST_COEFFICIENT, WIDEST_COEFFICIENT)
+        for name, sigma in self.time_offsets.items():
+            check_range(f"time_offsets[{shown(name)}]", sigma, NARROWEST_COEFFICIENT, WIDEST_COEFFICIENT)
+
+    def _check_types(self) -> None:
+        """Refuses fields of another type.
+
+        Raises: TypeError: naming the field.
+        """
+        for name, kind in _TYPES.items():
+            check_instance(name, getattr(self, name), kind, "Give one, or leave it out.")
+        check_flag("find_events", self.find_events)
+        if self.launcher is not None and not callable(getattr(self.launcher, "label", None)):
+            got = f"{type_name(self.launcher)} {shown(self.launcher)}"
+            raise TypeError(f"launcher must be a Launcher or None; got {got}. Read one from its file.")
 
     @classmethod
     def for_measured(cls, model: BallModel, **changes: Any) -> Settings:
@@ -152,8 +155,27 @@ class Settings:
         return None if self.launcher is None else self.launcher.label(track)
 
 
+_TYPES: dict[str, type] = {
+    "process": ProcessNoise,
+    "loss": Loss,
+    "sighting_loss": Loss,
+    "spin_loss": Loss,
+    "label_loss": Loss,
+    "coefficients": Mapping,
+    "time_offsets": Mapping,
+}
+
 WIDEST_PRIOR = 1e5
-"""m/s or rad/s, widest spread of an unknown velocity or spin."""
+"""m/s or rad/s, widest spread of an unknown velocity or spin; it says nothing of a ball already."""
+NARROWEST_PRIOR = 1e-6
+"""m/s or rad/s. What is known better than that is known; double precision does not hold less beside free states."""
+WIDEST_COEFFICIENT = 1e9
+"""Widest prior of a coefficient, in its own unit, and of a time offset, s."""
+NARROWEST_COEFFICIENT = 1e-12
+"""Narrowest prior of a coefficient, in its own unit, and of a time offset, s: squares of less are lost beside others.
+Leave a coefficient out that is known."""
+MOST_JITTER = 1.0
+"""s. Over a second a ball goes and comes back: stamps of such an error say nothing."""
 
 LEAST_BIAS = 1e-6
 """m. Errors of this size are none; the linear algebra needs a number above zero."""

@@ -12,6 +12,7 @@ import torch
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
+from ballfg.checks import as_float
 from ballfg.estimation.batch import TOGETHER, estimate_together, map_blocks
 from ballfg.estimation.estimator import Estimator
 from ballfg.estimation.measurement.as_measured import measured_positions, true_times
@@ -34,7 +35,7 @@ STAMP_TOLERANCE = 1e-9
 """s. A stamp this little after the end of the observed part belongs to it."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TrackPrediction:
     """Where the ball of one track will be measured: as the model measures it, at written stamps.
 
@@ -99,6 +100,7 @@ def predict_tracks(
     """
     if not callable(observe):
         check_observe(observe)
+    horizon = as_float("horizon", horizon, "s")
     if not horizon > 0.0:
         raise ValueError(f"horizon must be a positive number of seconds; got {horizon:g}. Leave it out for all stamps.")
     seconds = observe if callable(observe) else lambda track: observe
@@ -111,7 +113,7 @@ def check_observe(observe: float) -> None:
     Args: observe: s.
     Raises: ValueError: if it is not positive.
     """
-    if not observe > 0.0:
+    if not as_float("observe", observe, "s") > 0.0:
         raise ValueError(
             f"observe must be a positive number of seconds; got {observe:g}. A quarter of a second is 0.25."
         )

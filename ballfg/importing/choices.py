@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
-from ballfg.checks import short_text
+from ballfg.checks import check_choice, check_instance, check_number, check_text, short_text, shown
 from ballfg.importing.fall import AXES, LENGTHS, TIMES
 
 ROLES: Final = ("t", "frame", "trajectory", "x", "y", "z", "sigma_x", "sigma_y", "sigma_z")
@@ -59,16 +59,23 @@ class Choices:
             ("up", self.up, AXES),
             ("flip", self.flip, ("x", "y", "z")),
         ):
-            if value is not None and value not in known:
-                raise ValueError(f"--{option} must be one of {', '.join(known)}; got {value!r}. Choose one of them.")
-        for role in self.columns:
+            if value is not None:
+                check_choice(f"--{option}", value, known)
+        check_instance("--columns", self.columns, Mapping, "Write --columns t=stamp,x=X.")
+        for role, column in self.columns.items():
+            check_text(f"the column of {shown(role)} in --columns", column)
             if role not in ROLES:
                 raise ValueError(
-                    f"--columns must name roles among {', '.join(ROLES)}; got {role!r}. Write --columns t=stamp,x=X."
+                    f"--columns must name roles among {', '.join(ROLES)}; got {shown(role)}. Write --columns "
+                    "t=stamp,x=X."
                 )
         for option, number in (("rate", self.rate), ("split-gap", self.split_gap)):
-            if number is not None and not number > 0.0:
-                raise ValueError(f"--{option} must be positive; got {number:g}. Correct it.")
+            if number is not None:
+                check_number(f"--{option}", number, above=0.0)
+        if self.table_height is not None:
+            check_number("--table-height", self.table_height, "m")
+        for option, text in (("ball", self.ball), ("key", self.key), ("topic", self.topic), ("name", self.name)):
+            check_text(f"--{option}", text, optional=True)
 
     def decided(self) -> dict[str, Any]:
         """The options that were given."""

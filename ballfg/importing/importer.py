@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping
 from os import PathLike
-from pathlib import Path
 from typing import Any, Literal
 
+from ballfg.checks import check_choice, check_flag, check_path
 from ballfg.importing.choices import Choices
 from ballfg.importing.proposal import propose
 from ballfg.importing.writing import write_import
@@ -59,12 +59,15 @@ def import_tracks(
         ValueError: unreadable data, or an argument that breaks its rule.
         FileNotFoundError: a file that is not there.
     """
+    check_choice("file_format", file_format, ("csv", "parquet"))
+    check_flag("force", force)
+    folder = None if out is None else check_path("out", out)
     choices = Choices(
-        columns or {}, length, time, up, flip, table_height, split_gap, ball, rate, key, topic,
-        name or (Path(out).name if out is not None else None),
+        {} if columns is None else columns, length, time, up, flip, table_height, split_gap, ball, rate, key, topic,
+        folder.name if name is None and folder is not None else name,
     )  # fmt: skip
     proposal = propose(data, choices)
-    if out is None:
+    if folder is None:
         return dataset_in_memory(proposal.info, proposal.tracks, proposal.notes)
-    write_import(Path(out), proposal, file_format, force)
-    return read_dataset(out)
+    write_import(folder, proposal, file_format, force)
+    return read_dataset(folder)

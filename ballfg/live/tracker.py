@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array
-from ballfg.checks import check_count, check_range
+from ballfg.checks import as_float, check_array, check_count, check_range
 from ballfg.dynamics import BallModel, Surfaces
 from ballfg.estimation.online.online import Online
 from ballfg.estimation.online.state import OnlineState
@@ -32,7 +32,7 @@ FARTHEST = 1000.0
 """m, of a coordinate. Beyond it the unit is another one."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BallUpdate:
     """What became of one position, or of one ball.
 
@@ -166,18 +166,18 @@ class Tracker:
             sigmas: (3,) or (n, 3) m, their standard deviations; the settings' where None.
         Returns: balls that were lost until then, and one update a position, in their order. A position that is not
             usable is refused: nothing is raised for what a sender can get wrong.
-        Raises: ValueError: positions or sigmas of another shape.
+        Raises: ValueError: positions or sigmas of another shape. TypeError: a time that is no number.
         """
-        points = np.atleast_2d(np.asarray(positions, dtype=np.float64))
+        points = np.atleast_2d(check_array("positions", positions, remedy="Give x, y and z in m."))
         if points.shape[-1] != 3 or points.ndim != 2:
             raise ValueError(f"positions must be (3,) or (n, 3) m; got {np.shape(positions)}. Give x, y and z.")
         spreads: Sequence[Array | None] = [None] * len(points)
         if sigmas is not None:
-            given = np.asarray(sigmas, dtype=np.float64)
+            given = check_array("sigmas", sigmas, remedy="Give one number in m per axis.")
             if given.shape not in ((3,), points.shape):
                 raise ValueError(f"sigmas must be (3,) or as positions, {points.shape}; got {given.shape}.")
             spreads = list(np.broadcast_to(given, points.shape))
-        frame = _Frame(float(time), False, points, spreads, [None] * len(points))
+        frame = _Frame(as_float("time", time, "s"), False, points, spreads, [None] * len(points))
         self.counts.positions += len(points)
         self._refuse_unusable(frame)
         gone = self._turn_clock(frame) if frame.open else []

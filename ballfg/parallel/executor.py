@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from typing import Any, Protocol
 
-from ballfg.checks import shown
+from ballfg.checks import check_count, shown
 from ballfg.parallel.work import is_inside
 
 CLUSTERS = ("dask", "ray")
@@ -55,6 +55,10 @@ class Executor(Protocol):
         ...
 
 
+MOST_JOBS = 10_000
+"""Processes. No machine has cores for more."""
+
+
 def executor(jobs: int, *, helped: bool = True) -> Executor | None:
     """Where work goes: to the cluster of `on_cluster`, else to `jobs` processes; None where it stays in this process.
 
@@ -62,6 +66,7 @@ def executor(jobs: int, *, helped: bool = True) -> Executor | None:
 
     Args: jobs: number of processes.  helped: whether this one is one of them; else it only waits.
     """
+    check_count("jobs", jobs, 1, MOST_JOBS)
     if is_inside():
         return None
     cluster = _CLUSTER.get()

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.checks import check_number
 from ballfg.factors.linear.definite import definite
 from ballfg.prediction.belief import Belief
 from ballfg.prediction.crossing import Crossing, apex, next_contact, plane_crossing
@@ -22,9 +23,11 @@ if TYPE_CHECKING:
 
 
 AXES = ("x", "y", "z")
+MOST_STEPS = 100_000
+"""Times of one path. They take some seconds and 100 MB; the longest flight of a ball lasts 10 s."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Ahead:
     """Where a ball will be.
 
@@ -112,10 +115,15 @@ def look_ahead(start: BallState, horizon: float, step: float = 0.01) -> Ahead:
     """The path of a ball from a state on.
 
     Args: start: a state with its model.  horizon: s.  step: s between the times of the path.
-    Raises: ValueError: a horizon or step that is not positive, or a state without a model.
+    Raises: ValueError: a horizon or step that is not positive, more than `MOST_STEPS` steps, or a state without a
+        model. TypeError: a horizon or step that is no number.
     """
-    if not (np.isfinite(horizon) and horizon > 0.0 and np.isfinite(step) and step > 0.0):
-        raise ValueError(f"horizon and step must be positive numbers of seconds; got {horizon!r} and {step!r}")
+    horizon, step = check_number("horizon", horizon, "s", above=0.0), check_number("step", step, "s", above=0.0)
+    if horizon > MOST_STEPS * step:
+        raise ValueError(
+            f"horizon / step must be at most {MOST_STEPS}; got {horizon:g} s in steps of {step:g} s. Look less far "
+            "ahead, or in longer steps."
+        )
     propagator, belief = carried_by(start)
     count = max(int(np.ceil(horizon / step - 1e-9)), 1)
     times = start.time + np.minimum(step * np.arange(1, count + 1), horizon)

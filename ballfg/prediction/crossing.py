@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike
 from torch import Tensor
 
 from ballfg.arrays import Array
+from ballfg.checks import check_number
 from ballfg.dynamics.compiled.beliefs.events import FOUND, LOOKS, NONE, TIME_TOLERANCE
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.contact import contact_time
@@ -33,7 +34,7 @@ JUST_NOW = 1e-9
 """s. An event no later than this after the time from which events count is not a new one."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Crossing:
     """One event of one ball.
 
@@ -112,8 +113,7 @@ def plane_crossing(
     direction = torch.as_tensor(normal, dtype=torch.float64)
     if direction.shape != (3,) or not bool(direction.isfinite().all()) or not bool(direction.any()):
         raise ValueError(f"normal must be three finite numbers, not all zero; got {direction.tolist()}")
-    if not math.isfinite(offset):
-        raise ValueError(f"offset must be finite; got {offset:g}")
+    offset = check_number("offset", offset, "m")
     length = float(direction.square().sum().sqrt())
     line = np.zeros(STATE_DIM)
     line[POSITION] = direction.numpy() / length
@@ -208,8 +208,7 @@ def _span(belief: Belief, horizon: float, after: float) -> tuple[float, float]:
     """End of a search, and the time (s) after which events count; the arguments are checked."""
     if len(belief) != 1:
         raise ValueError(f"belief must hold one ball; got {len(belief)}. Take them one by one.")
-    if not 0.0 < horizon < math.inf:
-        raise ValueError(f"horizon must be a positive, finite number of seconds; got {horizon:g}")
+    horizon = check_number("horizon", horizon, "s", above=0.0)
     start = float(belief.time)
     return start + horizon, max(start, after) + JUST_NOW
 

@@ -32,7 +32,7 @@ class World:
     process: ProcessNoise = field(default_factory=ProcessNoise)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class BallState:
     """The state of a ball at one time, with the coefficients of its model that were estimated along, and covariance.
 

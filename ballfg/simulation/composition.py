@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ballfg.checks import check_each
 from ballfg.dynamics import AnalyticModel, BallModel, Effect
 from ballfg.dynamics.model import Rates
 from ballfg.dynamics.motion.limits import REST_SPEED
@@ -25,7 +26,7 @@ def true_model(declared: AnalyticModel, undeclared: Iterable[Effect]) -> Analyti
     groups = (declared.flight, declared.bounce, declared.measurement)
     effects = {name: cast(Effect, effect) for group in groups for name, effect in group.items()}
     seen: set[str] = set()
-    for effect in undeclared:
+    for effect in check_each("undeclared", undeclared, Effect, "Give Wind() or another one."):
         if effect.name in seen:
             raise ValueError(f"undeclared effects must differ; '{effect.name}' was given twice. Remove one.")
         seen.add(effect.name)

@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from ballfg.checks import check_flag, check_instance
 from ballfg.dynamics import Effect
 from ballfg.simulation.balls import BallKind, table_tennis
 from ballfg.simulation.bounded import bounded, check_bounds
@@ -121,6 +122,10 @@ class SimulationConfig:
 
     def __post_init__(self) -> None:
         check_bounds(self)
+        check_instance("noise", self.noise, MeasurementNoise, "Give MeasurementNoise(position=0.003).")
+        check_instance("process", self.process, MotionNoise, "Give MotionNoise(acceleration=0.1).")
+        check_instance("ball", self.ball, BallKind, "Give table_tennis() or another one.")
+        check_flag("spin_labels", self.spin_labels)
         check_jitter(self.noise.jitter, self.rate)
         self.combinations()
 

@@ -20,7 +20,7 @@ LEAST_SAMPLES = 2
 """A track of fewer samples is refused by every reader."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SimulatedTrack:
     """A track as it was measured, and what really happened at its samples."""
 

@@ -7,6 +7,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.checks import check_instance, check_iterable, is_number, shown
 from ballfg.simulation.streams import Purpose, generator
 
 SETTING_LEVELS: Final[Mapping[str, range]] = {"topspin": range(-3, 6), "sidespin": range(-5, 6), "speed": range(8, 15)}
@@ -23,13 +24,16 @@ def all_settings(chosen: Mapping[str, Sequence[int]] | None = None) -> Settings:
     Raises: ValueError: an unknown setting, a level that the launcher does not have, or no level at all.
     """
     levels: dict[str, Sequence[int]] = dict(SETTING_LEVELS)
-    for name, values in (chosen or {}).items():
+    given = {} if chosen is None else chosen
+    check_instance("settings", given, Mapping, "Write them like {'topspin': [0, 3]}.")
+    for name, values in given.items():
         if name not in SETTING_LEVELS:
-            raise ValueError(f"settings must be {', '.join(SETTING_LEVELS)}; got '{name}'. Rename it.")
+            raise ValueError(f"settings must be {', '.join(SETTING_LEVELS)}; got {shown(name)}. Rename it.")
         offered = SETTING_LEVELS[name]
-        wrong = [value for value in values if value not in offered]
+        check_iterable(name, values)
+        wrong = [value for value in values if not is_number(value) or value not in offered]
         if wrong or not values:
-            got = wrong[0] if wrong else "nothing"
+            got = shown(wrong[0]) if wrong else "nothing"
             raise ValueError(f"{name} must lie in {offered[0]} .. {offered[-1]}; got {got}. Choose whole levels.")
         levels[name] = list(dict.fromkeys(values))
     return np.array(list(itertools.product(*(levels[name] for name in SETTING_LEVELS))), dtype=np.int64)

@@ -3,6 +3,7 @@
 import itertools
 from collections.abc import Iterator
 
+from ballfg.checks import check_instance
 from ballfg.dynamics import AnalyticModel, BallModel
 from ballfg.simulation.composition import KickedModel, true_model
 from ballfg.simulation.config import SimulationConfig
@@ -23,6 +24,7 @@ def simulate(config: SimulationConfig) -> Iterator[SimulatedTrack]:
     Returns: an iterator over the tracks in the order of their names, "000", "001" ...
     Raises: ValueError: at once, if an undeclared effect does not go with the model.
     """
+    check_instance("config", config, SimulationConfig, "Make one with SimulationConfig(tracks=10).")
     model = true_model(config.ball.model, config.undeclared)
     starts = range(0, config.tracks, config.block)
     return itertools.chain.from_iterable(_block(config, model, block, first) for block, first in enumerate(starts))

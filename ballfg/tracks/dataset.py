@@ -111,7 +111,7 @@ class Dataset(TrackFolder):
         Returns: the track.
         Raises: ValueError: if there is no track of that name.
         """
-        if name in self._index.names:
+        if isinstance(name, str) and name in self._index.names:
             for track in self:
                 if track.name == name:
                     return track

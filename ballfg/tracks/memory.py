@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ballfg.checks import shown
+from ballfg.checks import check_each, check_instance, check_iterable, shown
 from ballfg.tracks.checks import Findings
 from ballfg.tracks.dataset import Dataset, check_group
 from ballfg.tracks.grouping import groups, scan
@@ -51,6 +51,9 @@ def dataset_in_memory(info: DatasetInfo, tracks: Sequence[Track], notes: Sequenc
         notes: on where they come from, one sentence each.
     Raises: ValueError: no tracks, a name twice, or a track whose numbers cannot be metres and seconds.
     """
+    check_instance("info", info, DatasetInfo, "Make one with DatasetInfo(name, table_height, ball).")
+    tracks = tuple(check_each("tracks", tracks, Track, "Make one with Track(times, positions)."))
+    check_iterable("notes", notes)
     if not tracks:
         raise ValueError("tracks must hold at least one track; got none. Pass the tracks.")
     if len({track.sigmas is None for track in tracks}) > 1:

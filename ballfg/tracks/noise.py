@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Final
 
-from ballfg.checks import check_number, did_you_mean, shown, type_name
+from ballfg.checks import check_instance, check_number, did_you_mean, shown, type_name
 
 LARGEST: Final[Mapping[str, float]] = {
     "position": 1.0,
@@ -85,6 +85,7 @@ class TrackNoise:
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, _checked(name, value))
+        check_instance("noise.coefficients", self.coefficients, Mapping, "Write them like {'flight.drag.k': 0.01}.")
         for name, value in self.coefficients.items():
             check_number(f"noise.coefficients.{name}", value, "its own unit", above=0.0)
 

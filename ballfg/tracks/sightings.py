@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import check_array, shown
+from ballfg.checks import check_array, check_iterable, check_text, shown
 
 ROUNDING = 1e-6
 """Relative to the trace: a covariance that was computed in single precision is symmetric up to this."""
@@ -41,11 +41,14 @@ class Sightings:
     """(m, 2, 2) px^2."""
 
     def __post_init__(self) -> None:
+        check_iterable("cameras", self.cameras)
         names = tuple(self.cameras)
+        for name in names:
+            check_text("a name of cameras", name)
         if not names or len(set(names)) < len(names):
             raise ValueError(f"cameras must be different names, at least one; got {list(names)}. Rename or add some.")
         object.__setattr__(self, "cameras", names)
-        times = _floats("times", self.times, np.asarray(self.times).shape)
+        times = check_array("times", self.times, remedy="Pass one row per sighting.")
         if times.ndim != 1 or len(times) == 0:
             raise ValueError(f"times must have shape (m,) with m >= 1; got {times.shape}. Pass one stamp per sighting.")
         m = len(times)

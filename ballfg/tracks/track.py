@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, Protocol, Self
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import check_array, shown
+from ballfg.checks import as_float, check_array, check_flag, shown, type_name
 
 SPIN_LABELS = ("spin_x", "spin_y", "spin_z")
 
@@ -43,7 +43,8 @@ class Track:
     Two tracks are equal only if they are the same object.
 
     Raises: ValueError: a wrong shape, a value that is not finite, a stamp that does not increase, a sigma that
-        is not positive, or a bad label; the message names the index. TypeError: a name that is not a str.
+        is not positive, or a bad label; the message names the index. TypeError: a name that is not a str, labels that
+        are no mapping, or something else in place of an observation.
     """
 
     times: Array
@@ -101,8 +102,10 @@ class Track:
         labels = _checked_labels(self.name, self.labels)
         for key, value in {"times": times, "positions": positions, "sigmas": sigmas, "labels": labels}.items():
             object.__setattr__(self, key, value)
-        object.__setattr__(self, "observations", tuple(self.observations))
-        _check_observations(self.name, self.observations, self.rough)
+        check_flag("rough", self.rough)
+        check_flag("part", self.part)
+        observations = _checked_observations(self.name, self.observations, len(times), self.rough)
+        object.__setattr__(self, "observations", observations)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "dataset": None}
@@ -143,8 +146,9 @@ class Track:
         Args:
             start: s, in the track's own time.
             end: s, in the track's own time.
-        Raises: ValueError: if no sample lies there.
+        Raises: ValueError: if no sample lies there. TypeError: a start or end that is no number.
         """
+        start, end = as_float("start", start, "s"), as_float("end", end, "s")
         inside = (self.times >= start) & (self.times <= end)
         if not inside.any():
             raise ValueError(
@@ -173,8 +177,21 @@ class Track:
         return self.between(-np.inf, end)
 
 
-def _check_observations(track: str, observations: tuple[Measurements, ...], rough: bool) -> None:
-    names = [observation.name for observation in observations]
+def _checked_observations(track: str, observations: object, samples: int, rough: bool) -> tuple[Any, ...]:
+    found = tuple(observations) if isinstance(observations, Iterable) else (observations,)
+    for observation in found:
+        if not isinstance(getattr(observation, "name", None), str) or not hasattr(observation, "taken"):
+            raise TypeError(
+                f"track {shown(track)}: observations must be a tuple of Observations; got "
+                f"{type_name(observation)} {shown(observation)}. Give RadarSpeed or another one of ballfg.estimation."
+            )
+        last = int(np.max(observation.state, initial=0))
+        if last >= samples:
+            raise ValueError(
+                f"track {shown(track)}: state of {shown(observation.name)} must be the index of a sample, at most "
+                f"{samples - 1}; got {last}. Readings with times of their own: {type(observation).__name__}.at."
+            )
+    names = [observation.name for observation in found]
     if len(set(names)) < len(names):
         raise ValueError(
             f"track {shown(track)}: observations must have different names; got {names}. Join those of one name."
@@ -183,6 +200,7 @@ def _check_observations(track: str, observations: tuple[Measurements, ...], roug
         raise ValueError(
             f"track {shown(track)}: rough positions must come with the observations that they were made from."
         )
+    return found
 
 
 def _check_name(name: object) -> None:
@@ -206,6 +224,11 @@ def _finite(track: str, argument: str, value: ArrayLike, shape: tuple[int, ...] 
 
 
 def _checked_labels(track: str, labels: Mapping[str, Label]) -> dict[str, Label]:
+    if not isinstance(labels, Mapping):
+        raise TypeError(
+            f"track {shown(track)}: labels must be a mapping of names to numbers or text; got {type_name(labels)} "
+            f"{shown(labels)}. Write them like {{'spin_y': 120.0}}."
+        )
     checked: dict[str, Label] = {}
     for key, value in labels.items():
         if not isinstance(key, str) or not key.strip() or not key.isprintable() or key == "trajectory":

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Final, Literal, TextIO
 
 from ballfg.arrays import Array
-from ballfg.checks import shown
+from ballfg.checks import check_choice, check_each, check_instance, check_path, shown
 from ballfg.files.whole_folder import whole_folder
 from ballfg.tracks.checks import check_scale
 from ballfg.tracks.dataset import TRACK_FILES
@@ -50,9 +50,9 @@ def write_dataset(
         ValueError: another format, no tracks, or a track that breaks a rule; the message names it.
         FileNotFoundError: the folder's parent does not exist.
     """
-    if file_format not in ("csv", "parquet"):
-        raise ValueError(f"file_format must be 'csv' or 'parquet'; got {file_format!r}. Choose one of them.")
-    path = Path(folder)
+    check_choice("file_format", file_format, ("csv", "parquet"))
+    check_instance("info", info, DatasetInfo, "Make one with DatasetInfo(name, table_height, ball).")
+    path = check_path("folder", folder)
     with whole_folder(path, earlier=DATASET_FILES, argument="folder") as stage:
         write_info(stage / INFO_FILE, info)
         with (stage / _SPOOL).open("x", encoding="utf-8") as spool:
@@ -68,7 +68,7 @@ def _write_tracks(path: Path, info: DatasetInfo, tracks: Iterable[Track], spool:
     label_names: dict[str, None] = {}
     has_sigmas: bool | None = None
     with TableWriter(path) as table:
-        for track in tracks:
+        for track in check_each("tracks", tracks, Track, "Make one with Track(times, positions)."):
             has_sigmas = track.sigmas is not None if has_sigmas is None else has_sigmas
             _check_track(track, names, info, has_sigmas)
             names.add(track.name)

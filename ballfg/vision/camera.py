@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array, Mask
-from ballfg.checks import shown
+from ballfg.checks import check_array, check_number, shown
 
+MOST_PIXELS: Final = 1_000_000
+"""px, of one side of an image."""
 DISTORTIONS: Final = (0, 4, 5, 8, 12, 14)
 """Lengths of distortion vectors in OpenCV: none; k1 k2 p1 p2; k3; k4 k5 k6; thin prism s1-s4; tilt tau_x tau_y."""
 _PRECISELY: Final = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 60, 1e-12)
@@ -60,9 +62,11 @@ class Camera:
             raise TypeError(f"a camera's name must be text; got {shown(self.name)}. Put it in quotes.")
         if not self.name.strip() or not self.name.isprintable():
             raise ValueError(f"a camera's name must be printable text; got {shown(self.name)}. Rename it.")
-        width, height = (int(side) for side in self.size)
-        if not (width > 0 and height > 0 and (width, height) == tuple(self.size)):
-            raise ValueError(f"camera {shown(self.name)}: size must be width and height in pixels; got {self.size}")
+        where = f"camera {shown(self.name)}"
+        sides = check_array(f"{where}: size", self.size, (2,), "Give width and height in px.")
+        if not ((sides > 0.0) & (sides <= MOST_PIXELS) & (sides % 1.0 == 0.0)).all():
+            raise ValueError(f"{where}: size must be width and height in pixels; got {shown(self.size)}")
+        width, height = int(sides[0]), int(sides[1])
         object.__setattr__(self, "size", (width, height))
         count = np.asarray(self.distortion).size
         if count not in DISTORTIONS:
@@ -79,17 +83,10 @@ class Camera:
                 f"camera {shown(self.name)}: matrix must be [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] with fx, fy > 0; "
                 f"got {k.tolist()}"
             )
-        if not np.isfinite(self.time_offset):
-            raise ValueError(f"camera {shown(self.name)}: time_offset must be finite, in s; got {self.time_offset}")
-        object.__setattr__(self, "time_offset", float(self.time_offset))
+        object.__setattr__(self, "time_offset", check_number(f"{where}: time_offset", self.time_offset, "s"))
 
     def _checked(self, field: str, value: ArrayLike, shape: tuple[int, ...]) -> Array:
-        try:
-            array = np.array(value, dtype=np.float64)
-        except (TypeError, ValueError):
-            raise ValueError(
-                f"camera {shown(self.name)}: {field} must be numbers of shape {shape}; got {shown(value)}"
-            ) from None
+        array = check_array(f"camera {shown(self.name)}: {field}", value, remedy=f"Give {shape} numbers.")
         if array.size != np.prod(shape, dtype=int):
             raise ValueError(f"camera {shown(self.name)}: {field} must have shape {shape}; got {array.shape}")
         if not np.isfinite(array).all():

@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ballfg.checks import check_each
 from ballfg.vision.camera import Camera
 
 
@@ -20,6 +21,7 @@ class CameraBank:
     """
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
+        cameras = tuple(check_each("cameras", cameras, Camera, "Read them with read_cameras."))
         if not cameras:
             raise ValueError("cameras must hold at least one camera; got none")
         self.names = tuple(camera.name for camera in cameras)

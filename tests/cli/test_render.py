@@ -60,7 +60,7 @@ def test_options_reach_the_scene(tmp_path: Path) -> None:
         (["--offset", "left=soon"], "--offset must read CAMERA=SECONDS; got 'left=soon'"),
         (["--size", "large"], "--size must read WIDTHxHEIGHT; got 'large'"),
         (["--distance", "9"], "must stand in the room"),
-        (["--colour", "pink"], "colour must be white or orange"),
+        (["--colour", "pink"], "colour must be one of white, orange"),
         (["--exposure", "0.1"], "exposure must be at most 0.95 of the frame interval"),
         (["--settings", "speed=99"], "speed must lie in 8 .. 14"),
         (["--effect", "wnd.x=1"], "Did you mean 'wind'"),

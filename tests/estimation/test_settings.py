@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 
 from ballfg.dynamics import EFFECTS, AnalyticModel, nominal_model
+from ballfg.estimation import make_estimator
 from ballfg.estimation.configure import dataset_settings, dataset_surfaces
 from ballfg.estimation.segmentation import Quality, Segmentation
 from ballfg.estimation.settings import MEASURED, Settings, sample_sigmas
 from ballfg.estimation.smoother.problem import QUALITY_SIGMA, effective_sigmas
+from ballfg.simulation import SimulationConfig, simulate
 from ballfg.tracks import Track, read_dataset
 
 NONE = np.zeros(0, dtype=np.int64)
@@ -26,14 +28,30 @@ def test_position_noise_is_three_positive_numbers(noise) -> None:
 @pytest.mark.parametrize("name", ["spin_prior", "spin_label_noise", "velocity_prior"])
 @pytest.mark.parametrize("value", [0.0, -3.0, np.inf, np.nan])
 def test_priors_are_positive(name, value) -> None:
-    with pytest.raises(ValueError, match=f"{name} must be positive and finite"):
+    with pytest.raises(ValueError, match=f"{name} must be at least 1e-06, at most 100000; got"):
         Settings(**{name: value})
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan])
+@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, 1e-200, 1e200])
 def test_coefficients_have_a_spread(value) -> None:
-    with pytest.raises(ValueError, match=r"coefficients\['flight.drag.k'\] must be a positive standard deviation"):
+    """Squares of 1e-200 are zero: the covariance of the coefficients was singular."""
+    with pytest.raises(ValueError, match=r"coefficients\['flight.drag.k'\] must be at least 1e-12, at most"):
         Settings(coefficients={"flight.drag.k": value})
+
+
+def test_what_is_at_the_bounds_is_estimated() -> None:
+    """Wider ones ended in errors of the linear algebra."""
+    least = {"spin_prior": 1e-6, "velocity_prior": 1e-6, "coefficients": {"flight.drag.k": 1e-12}, "memory_time": 1e-9}
+    most = {"spin_prior": 1e5, "velocity_prior": 1e5, "coefficients": {"flight.drag.k": 1e9}, "stamp_jitter": 1.0}
+    track = next(iter(simulate(SimulationConfig(tracks=1, seed=4)))).track.until(0.3)
+    for bounds in (least, most, {"memory": (1e4, 1e4, 1e4)}):
+        chosen = Settings(**bounds)
+        for method in ("smoother", "online", "ekf", "sliding-window"):
+            found = make_estimator(method, nominal_model(), 0.0, chosen).estimate(track)
+            assert np.isfinite(found.states).all(), (method, bounds)
+            spread = np.sqrt(np.diagonal(found.covariances, axis1=1, axis2=2))
+            correlations = found.covariances / spread[:, :, None] / spread[:, None, :]
+            assert (np.linalg.eigvalsh(correlations) > 0.0).all(), (method, bounds)
 
 
 def test_uncertain_takes_the_coefficients_that_vary() -> None:

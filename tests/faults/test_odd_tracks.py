@@ -86,7 +86,7 @@ def test_a_speed_that_no_ball_has_is_refused():
 
 @pytest.mark.parametrize("name", ["velocity_prior", "spin_prior", "spin_label_noise"])
 def test_a_prior_wider_than_numbers_hold_is_refused(name):
-    with pytest.raises(ValueError, match=f"{name} must be at most 100000"):
+    with pytest.raises(ValueError, match=f"{name} must be at least 1e-06, at most 100000"):
         Settings(**{name: 1e150})
 
 

@@ -268,7 +268,7 @@ def test_the_option_does_it(mistake: Mistake, shots: list[Track], tmp_path: Path
         (["--columns", "t"], "--columns must be written role=name"),
         (["--key", "second"], "--key must name a table"),
         (["--format", "xlsx"], "--format must be csv or parquet"),
-        (["--rate", "-5"], "--rate must be positive"),
+        (["--rate", "-5"], "--rate must be finite and above 0"),
     ],
 )
 def test_bad_options(

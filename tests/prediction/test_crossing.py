@@ -234,7 +234,7 @@ def test_wrong_arguments(model, beliefs, table):
     with pytest.raises(ValueError, match="belief must hold one ball; got 2"):
         apex(table, beliefs(model, FALLING, RISING))
     for horizon in (0.0, -1.0, math.inf, math.nan):
-        with pytest.raises(ValueError, match="horizon must be a positive, finite"):
+        with pytest.raises(ValueError, match="horizon must be finite and above 0"):
             next_contact(table, beliefs(model, FALLING), horizon)
     for normal in ([0.0, 0.0, 0.0], [1.0, 0.0], [math.nan, 0.0, 1.0]):
         with pytest.raises(ValueError, match="normal must be three finite numbers"):

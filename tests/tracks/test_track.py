@@ -3,6 +3,7 @@ import pickle
 import numpy as np
 import pytest
 
+from ballfg.estimation import RadarSpeed
 from ballfg.tracks import Track
 
 T = np.array([0.0, 0.1, 0.3])
@@ -62,6 +63,14 @@ NAN = np.where(np.arange(9).reshape(3, 3) == 5, np.nan, P)
         ({"positions": P[:, :2]}, "positions must have shape (3, 3); got (3, 2)"),
         ({"positions": NAN}, "positions must be finite; positions[1, 2]=nan. Drop that sample."),
         ({"positions": [[0, 0, 0], [1, 1], [2, 2, 2]]}, "positions must be an array of numbers;"),
+        ({"positions": np.ma.masked_array(P, P > 2.0)}, "an array of numbers; 6 of them are masked. Drop those rows."),
+        ({"positions": P + 0j}, "positions must be an array of numbers; got complex numbers."),
+        ({"positions": P > 1.0}, "positions must be an array of numbers; got truth values."),
+        ({"positions": 1e200 * (P + 1)}, "positions must be within 1e+100; got 1e+200."),
+        (
+            {"times": np.arange(3).astype("datetime64[s]")},
+            "Subtract the first one and divide by np.timedelta64(1, 's').",
+        ),
         ({"positions": [["a"] * 3] * 3}, "positions must be an array of numbers; could not convert"),
         ({"sigmas": P[0]}, "sigmas must have shape (3, 3); got (3,)"),
         ({"sigmas": P}, "sigmas must be positive; sigmas[0, 0]=0.0. Give a standard deviation in m"),
@@ -81,6 +90,36 @@ def test_bad_fields_are_named(arguments, message):
 def test_name_must_be_text():
     with pytest.raises(TypeError, match=r"track name must be a str; got int 3\. Pass str\(3\)"):
         Track(T, P, name=3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"labels": [("speed", 1.0)]}, "labels must be a mapping of names to numbers or text; got list"),
+        ({"observations": "ab"}, "observations must be a tuple of Observations; got str 'a'"),
+        ({"observations": None}, "observations must be a tuple of Observations; got nothing None"),
+        ({"rough": "no"}, "rough must be True or False; got str 'no'"),
+    ],
+)
+def test_fields_of_another_type_are_named(arguments, message):
+    with pytest.raises(TypeError) as caught:
+        Track(**({"name": "a", "times": T, "positions": P} | arguments))
+    assert message in str(caught.value)
+
+
+def test_one_observation_may_stand_without_a_tuple_and_must_name_a_sample():
+    assert Track(T, P, observations=RadarSpeed(2, 5.0, 0.1)).observations[0].state.tolist() == [2]
+    with pytest.raises(
+        ValueError, match=r"state of 'speed' must be the index of a sample, at most 2; got 3\. Readings"
+    ):
+        Track(T, P).observed(RadarSpeed(3, 5.0, 0.1))
+
+
+def test_an_interval_between_numbers():
+    track = Track(T, P, name="a")
+    assert len(track.between(np.float32(-1), 10**400)) == 3
+    with pytest.raises(TypeError, match=r"end must be a number in s; got str '0\.1'"):
+        track.until("0.1")
 
 
 def test_an_empty_interval_is_refused():

@@ -112,7 +112,7 @@ def test_tracks_that_could_not_be_read_are_refused(tmp_path, info, make_tracks, 
 
 
 def test_bad_arguments_are_named(tmp_path, info, make_tracks):
-    with pytest.raises(ValueError, match="file_format must be 'csv' or 'parquet'; got 'hdf5'"):
+    with pytest.raises(ValueError, match="file_format must be one of csv, parquet; got 'hdf5'"):
         write_dataset(tmp_path / "d", info, make_tracks(1), "hdf5")
     with pytest.raises(FileNotFoundError, match=r"folder must be in an existing folder; .*nowhere is none"):
         write_dataset(tmp_path / "nowhere" / "d", info, make_tracks(1))

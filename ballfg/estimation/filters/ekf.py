@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import LinAlgWarning
 
 from ballfg.arrays import Array
-from ballfg.checks import shown
+from ballfg.checks import check_choice, check_flag
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.advance_jacobian import Motion
 from ballfg.dynamics.surfaces import Surfaces
@@ -83,8 +83,8 @@ class ExtendedKalmanFilter(Estimator):
         initialise: Literal["prior", "window"] = "prior",
     ) -> None:
         super().__init__(model, surfaces, settings)
-        if initialise not in ("prior", "window"):
-            raise ValueError(f"initialise must be 'prior' or 'window'; got {shown(initialise)}")
+        check_choice("initialise", initialise, ("prior", "window"))
+        check_flag("smooth", smooth)
         self.ball = trackwise_model(self.model, self.settings)
         self.smooth = smooth
         self.initialise = initialise

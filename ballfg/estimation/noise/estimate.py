@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
+from ballfg.checks import check_each, check_flag, check_instance
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.batch import map_tracks
@@ -103,7 +104,12 @@ def estimate_noise(
         jobs: processes.
     Returns: None where no track is long enough.
     """
-    parts = [part for track in tracks if len(part := _first_part(track)) >= LEAST_SAMPLES]
+    check_instance("model", model, BallModel, "Load one with load_model.")
+    check_instance("settings", settings, Settings, "Make them with Settings.for_measured(model).")
+    for name, flag in (("position_known", position_known), ("tracker_known", tracker_known), ("errors", errors)):
+        check_flag(name, flag)
+    measured = check_each("tracks", tracks, Track, "Make one with Track(times, positions).")
+    parts = [part for track in measured if len(part := _first_part(track)) >= LEAST_SAMPLES]
     own_sigmas = any(part.sigmas is not None for part in parts)
     linear = linearised(model, surfaces, settings, parts, watch, jobs=jobs)
     if linear is None:

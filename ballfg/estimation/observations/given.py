@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from ballfg.checks import check_each
 from ballfg.estimation.observations.observation import Context, Observation
 from ballfg.factors.batch import FactorBatch
 
@@ -38,9 +39,9 @@ class GivenFactors(Observation):
 def given(factors: Sequence[FactorBatch]) -> list[GivenFactors]:
     """Each batch as an observation.
 
-    Raises: ValueError: if a factor ties several states.
+    Raises: ValueError: if a factor ties several states. TypeError: something else than factors.
     """
-    for batch in factors:
+    for batch in check_each("factors", factors, FactorBatch, "Write one as docs/custom_factors.md shows."):
         if (batch.variables[:, 0] < 0).any() or (batch.variables[:, 1:] >= 0).any():
             raise ValueError(
                 f"factors must be on one state each, and on the coefficients beside it at most; {type(batch).__name__} "

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from torch import Tensor
 
 from ballfg.arrays import Array, Index
-from ballfg.checks import shown
+from ballfg.checks import check_array, check_instance, shown
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.motion.integrate import batch_jacobian, rk4_step
 from ballfg.estimation.observations.observation import Context, Observation
@@ -46,7 +46,8 @@ class Reading(Observation):
         columns: of the values in that table; `dim` of them.
         loss: on the norm of a whitened reading.
 
-    Raises: ValueError: a wrong shape, a value that is not finite, a sigma that is not positive.
+    Raises: ValueError: a wrong shape, an index that is no whole number, a value that is not finite, a sigma that is not
+        positive.
     """
 
     file: ClassVar[str | None]
@@ -54,15 +55,19 @@ class Reading(Observation):
 
     def __init__(self, state: ArrayLike, values: ArrayLike, sigma: ArrayLike, delay: ArrayLike | None = None) -> None:
         m, dim = np.size(state), len(self.columns)
-        self.state: Index = np.asarray(state, dtype=np.int64).reshape(m)
-        given = np.asarray(values, dtype=np.float64)
+        self.state: Index = _checked_index(self.name, state).reshape(m)
+        given = check_array(f"values of '{self.name}'", values)
         given = given[None] if given.ndim == 0 and np.ndim(state) == 0 else given  # one reading, as a plain number
         if given.shape not in ((m, dim), (m,) if dim == 1 else (m, dim)):
             raise ValueError(f"values of '{self.name}' must have shape ({m}, {dim}); got {given.shape}")
         self.values: Array = given.reshape(m, dim)
-        spread = np.asarray(sigma, dtype=np.float64)
+        spread = check_array(f"sigma of '{self.name}'", sigma)
+        if spread.shape not in ((), (m,), (m, dim)):
+            raise ValueError(f"sigma of '{self.name}' must be one number, ({m},) or ({m}, {dim}); got {spread.shape}")
         self.sigma: Array = np.broadcast_to(spread[:, None] if spread.ndim == 1 else spread, (m, dim)).copy()
-        self.delay: Array = np.zeros(m) if delay is None else np.asarray(delay, dtype=np.float64).reshape(m)
+        self.delay: Array = np.zeros(m) if delay is None else check_array(f"delay of '{self.name}'", delay).reshape(-1)
+        if len(self.delay) != m:
+            raise ValueError(f"delay of '{self.name}' must have shape ({m},); got ({len(self.delay)},)")
         if not np.isfinite(self.values).all() or not np.isfinite(self.delay).all():
             raise ValueError(f"values of '{self.name}' must be finite; leave out readings that are not")
         if (np.abs(self.values) > self.largest).any():
@@ -90,10 +95,18 @@ class Reading(Observation):
             sigma: as for the class.
         Raises: ValueError: a reading that is farther than `FARTHEST` from every sample, or as for the class.
         """
-        when = np.asarray(times, dtype=np.float64)
+        check_instance("track", track, Track, "Make one with Track(times, positions).")
+        when, given = check_array("times", times), check_array("values", values)
+        spread = check_array("sigma", sigma)
+        if when.ndim != 1 or given.shape[:1] != when.shape or spread.shape[:1] not in ((), when.shape):
+            raise ValueError(
+                f"times, values and sigma must have one row a reading; got {when.shape}, {given.shape} and "
+                f"{spread.shape}. One reading has rows too: at(track, [0.1], [6.2], 0.1)."
+            )
+        if not np.isfinite(when).all():
+            raise ValueError(f"times of '{cls.name}' must be finite; leave out readings without a time")
         order = np.argsort(when, kind="stable")
-        when, given = when[order], np.asarray(values, dtype=np.float64)[order]
-        spread = np.asarray(sigma, dtype=np.float64)
+        when, given = when[order], given[order]
         after = np.clip(np.searchsorted(track.times, when), 1 if len(track) > 1 else 0, len(track) - 1)
         before = np.maximum(after - 1, 0)
         state = np.where(when - track.times[before] < track.times[after] - when, before, after)
@@ -134,6 +147,20 @@ class Reading(Observation):
             raise ValueError(f"sigma of '{self.name}' must be one number a reading in a table; got several.")
         values = dict(zip(self.columns, self.values.T, strict=True))
         return {"t": track.times[self.state] + self.delay, **values, "sigma": self.sigma[:, 0]}
+
+
+def _checked_index(name: str, state: ArrayLike) -> Index:
+    """The indices of samples as whole numbers.
+
+    Raises: ValueError: a negative or broken number, as where times are given in place of indices.
+    """
+    given = check_array(f"state of '{name}'", state)
+    if not np.isfinite(given).all() or (given < 0.0).any() or (given % 1.0).any():
+        raise ValueError(
+            f"state of '{name}' must be indices of samples, whole numbers from 0 on; got {shown(given.tolist())}. Make "
+            "readings with times of their own by the class's method at."
+        )
+    return given.astype(np.int64)
 
 
 class RadarSpeed(Reading):

@@ -9,7 +9,16 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ballfg.checks import shown
+from ballfg.checks import (
+    as_float,
+    check_array,
+    check_choice,
+    check_count,
+    check_each,
+    check_iterable,
+    is_number,
+    shown,
+)
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
@@ -77,16 +86,15 @@ class Online(Estimator):
         solver: Solver = "isam2",
     ) -> None:
         super().__init__(model, surfaces, settings)
-        if solver not in WINDOWS:
-            raise ValueError(f"solver must be one of {', '.join(WINDOWS)}; got {shown(solver)}")
-        if lag < 2:
-            raise ValueError(f"lag must be at least 2 states; got {lag}")
+        check_choice("solver", solver, WINDOWS)
+        check_count("lag", lag, 2)
         if self.settings.time_offsets:
             raise ValueError(
                 "settings.time_offsets must be empty for the estimator 'online': it cannot move stamps that have "
                 "passed. Find the offsets beforehand with estimate_time_offsets and give the cameras that it returns."
             )
-        self.cameras, self.solver = tuple(cameras), solver
+        self.cameras = tuple(check_each("cameras", cameras, Camera, "Read them with read_cameras."))
+        self.solver = solver
         self.ball = trackwise_model(self.model, self.settings)
         self.physics = physics_of(self.model)
         self.lag = lag
@@ -147,18 +155,21 @@ class Online(Estimator):
         Returns: the newest state. It is valid for good; the window's own arrays move on.
         Raises: ValueError: if the time does not increase, or a number is not finite.
         """
-        own = None if sigma is None else np.asarray(sigma, dtype=np.float64)[None]
+        own = None if sigma is None else check_array("sigma", sigma, remedy="Give one number in m per axis.")[None]
         if own is not None and not (np.isfinite(own) & (own > 0.0)).all():
             raise ValueError(
                 f"sigma must be positive and finite, in m; got {shown(sigma)}. Leave it out if it is unknown."
             )
         spread = sample_sigmas(self.settings, 1, own)[0]
-        point = np.array(position, dtype=np.float64)
+        point = check_array("position", position, remedy="Drop samples without a position.")
+        stamp = as_float("time", time) if is_number(time) else float(check_array("time", time, (), "Give it in s."))
         if self._samples and not self._samples[-1].measured:
             raise ValueError("push must not follow push_sighting in one stream; call reset in between.")
-        sample = Sample(float(time), point, spread)
-        if observations:
-            moment = Track(np.array([sample.time]), point[None], spread[None], name="stream").observed(*observations)
+        sample = Sample(stamp, point, spread)
+        check_iterable("observations", observations)
+        others = tuple(observations)
+        if others:
+            moment = Track(np.array([sample.time]), point[None], spread[None], name="stream", observations=others)
             beside = measurements_beside(moment, self.model, self.settings, spread[None])
             sample.measurements += [measurement for found in beside.values() for _, measurement in found]
         return self._observe(sample)
@@ -179,7 +190,7 @@ class Online(Estimator):
             raise ValueError("cameras must be given to use push_sighting; got none. Pass them to Online.")
         if self._samples and self._samples[-1].measured:
             raise ValueError("push_sighting must not follow push in one stream; call reset in between.")
-        samples, joined = self._stream.take(float(time), camera, pixel, covariance)
+        samples, joined = self._stream.take(as_float("time", time, "s"), camera, pixel, covariance)
         if joined is not None:
             return self._join(joined)
         state = None
@@ -202,7 +213,10 @@ class Online(Estimator):
         except (RuntimeError, ValueError) as error:  # GTSAM's, the bridge's or the model's
             rebuilt, revised = True, len(self._samples) - 1
             status, update = self._repair(error, status)
-        return self._state(self.window, self._samples[-1], update, revised, rebuilt, status)
+        newest = self._samples[-1]
+        if status is Status.OK and not newest.motion.linked:  # a long gap before it
+            status = Status.NO_VELOCITY
+        return self._state(self.window, newest, update, revised, rebuilt, status)
 
     def _new_window(self, sample: Sample) -> StreamWindow:
         """A window that begins with a sample; only measured positions have a tracker's bias."""

@@ -8,7 +8,7 @@ from ballfg.estimation.smoother.motion import Motion
 from ballfg.prediction.state import BallState
 
 
-@dataclass(frozen=True, kw_only=True, repr=False)
+@dataclass(frozen=True, eq=False, kw_only=True, repr=False)
 class OnlineState(BallState):
     """The state of the ball after a measurement, and what the update did.
 

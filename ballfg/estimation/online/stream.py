@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ballfg.checks import listed, shown
+from ballfg.checks import check_array, check_choice, shown
 from ballfg.estimation.observations.ray_path import AROUND, BEFORE, Path, Rays, rough_path
 from ballfg.estimation.observations.sightings import LOOSE, SAME_MOMENT, filled
 from ballfg.estimation.online.measurement import Measurement
@@ -61,14 +61,10 @@ class SightingStream:
             sample that was given out.
         Raises: ValueError: an unknown camera, a wrong shape, a number that is not finite, a time before the last.
         """
-        if camera not in self.cameras:
-            raise ValueError(
-                f"camera must be one of {listed(self.cameras)}; got {shown(camera)}. Name them to `Online`."
-            )
+        check_choice("camera", camera, self.cameras)
+        pixel, covariance = check_array("pixel", pixel, (2,)), check_array("covariance", covariance, (2, 2))
         own, number = self.cameras[camera], list(self.cameras).index(camera)
-        row = Sightings(
-            tuple(self.cameras), np.array([number]), np.array([time]), np.array([pixel]), np.array([covariance])
-        )
+        row = Sightings(tuple(self.cameras), np.array([number]), np.array([time]), pixel[None], covariance[None])
         true = float(row.times[0]) - own.time_offset
         stamps = self._stamps[camera]
         if true < self._last or (stamps and true <= stamps[-1]):

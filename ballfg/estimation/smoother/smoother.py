@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.checks import check_instance
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.surfaces import Surfaces
 from ballfg.estimation.estimator import Estimator
@@ -102,7 +103,8 @@ class Smoother(Estimator):
         optimizer: LevenbergMarquardt | None = None,
     ) -> None:
         super().__init__(model, surfaces, settings)
-        self.optimizer = optimizer or LevenbergMarquardt()
+        self.optimizer = LevenbergMarquardt() if optimizer is None else optimizer
+        check_instance("optimizer", self.optimizer, LevenbergMarquardt, "Leave it out for the usual one.")
 
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = (), *, move_stamps: bool = True) -> Estimate:
         """The states of a track, one per stamp, with the covariances of the Laplace approximation.
@@ -272,7 +274,7 @@ class Smoother(Estimator):
             times=track.times,
             states=values.states,
             covariances=covariances.states[:, :STATE_DIM, :STATE_DIM],
-            status=status_of(minimum, n),
+            status=status_of(minimum, n - 1 - len(np.unique(segmentation.restarts))),
             innovations=problem.innovations(values, known),
             coefficient_names=tuple(self.settings.coefficients),
             coefficients=values.coefficients[own],

@@ -106,11 +106,14 @@ def worst_break(solution: Solution) -> int | None:
     return where
 
 
-def status_of(minimum: Minimum, samples: int) -> Status:
-    """How the estimate of a track of so many samples ended."""
+def status_of(minimum: Minimum, linked: int) -> Status:
+    """How the estimate of a track ended.
+
+    Args: linked: intervals between samples over which the motion of the ball is followed.
+    """
     if minimum.convergence is Convergence.NOT_FINITE or minimum.step is None:
         return Status.FAILED
-    if samples < 2:
+    if linked < 1:
         return Status.NO_VELOCITY
     at_minimum = minimum.convergence in (Convergence.CONVERGED, Convergence.AT_KINK)
     return Status.OK if at_minimum else Status.NOT_CONVERGED

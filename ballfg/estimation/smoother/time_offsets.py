@@ -27,7 +27,7 @@ SETTLED: Final = 0.1
 """Standard deviations. Offsets that move by less are settled."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TimeOffsets:
     """The clocks of a rig.
 

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Final, Literal
 
-from ballfg.checks import shown
+from ballfg.checks import check_choice, check_flag
 from ballfg.dynamics import AnalyticModel, Effect
 from ballfg.simulation.balls import BallKind, table_tennis
 from ballfg.simulation.bounded import bounded, check_bounds
@@ -86,8 +86,8 @@ class SceneConfig:
 
     def __post_init__(self) -> None:
         check_bounds(self)
-        if self.colour not in COLOURS:
-            raise ValueError(f"colour must be {' or '.join(COLOURS)}; got {shown(self.colour)}. Choose one of them.")
+        check_choice("colour", self.colour, COLOURS)
+        check_flag("distractors", self.distractors)
         if self.exposure * self.rate > LONGEST_EXPOSURE:
             raise ValueError(
                 f"exposure must be at most {LONGEST_EXPOSURE:g} of the frame interval, "

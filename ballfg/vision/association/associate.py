@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from ballfg.arrays import Index
+from ballfg.checks import check_count, check_range
 from ballfg.tracks.sightings import Sightings
 from ballfg.vision.association.completing import complete
 from ballfg.vision.association.flights import is_ball, successions
@@ -38,10 +39,8 @@ class AssociationSettings:
     """Points of the shortest track that is kept; at least 3."""
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.least_score <= 1.0:
-            raise ValueError(f"least_score must lie in [0, 1]; got {self.least_score}. A score is a mark, 1 is a ball.")
-        if self.least_points < 3:
-            raise ValueError(f"least_points must be at least 3; got {self.least_points}. Raise it.")
+        check_range("least_score", self.least_score, 0.0, 1.0)
+        check_count("least_points", self.least_points, 3)
 
 
 def associate(

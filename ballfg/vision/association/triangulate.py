@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import chi2
 
 from ballfg.arrays import Array, Mask
+from ballfg.checks import check_array, check_each
 from ballfg.vision.camera import Camera
 
 MISSED: Final = 1e-6
@@ -86,7 +87,7 @@ def triangulate(cameras: Sequence[Camera], pixels: ArrayLike, covariances: Array
     Raises: ValueError: shapes that do not fit, fewer than two cameras, covariances that are not positive definite.
     Source: docs/derivations/triangulation.md; Hartley, Zisserman, Multiple View Geometry (2004), sections 12.2 and 5.2.
     """
-    cameras = list(cameras)
+    cameras = list(check_each("cameras", cameras, Camera, "Read them with read_cameras."))
     pixels, covariances = _checked(len(cameras), pixels, covariances)
     views = _views(cameras, pixels, covariances)
     points, used = _consensus(views)
@@ -101,8 +102,7 @@ def triangulate(cameras: Sequence[Camera], pixels: ArrayLike, covariances: Array
 
 
 def _checked(count: int, pixels: ArrayLike, covariances: ArrayLike) -> tuple[Array, Array]:
-    pixels = np.asarray(pixels, dtype=np.float64)
-    covariances = np.asarray(covariances, dtype=np.float64)
+    pixels, covariances = check_array("pixels", pixels), check_array("covariances", covariances)
     if count < 2:
         raise ValueError(f"cameras must be at least two to triangulate; got {count}. Add a camera.")
     if pixels.ndim != 3 or pixels.shape[1:] != (count, 2):

@@ -9,7 +9,9 @@ from typing import Final, Literal
 import numpy as np
 
 from ballfg.arrays import Array
+from ballfg.checks import check_array, check_choice, check_count, check_range
 from ballfg.vision.arrays import Image
+from ballfg.vision.camera import MOST_PIXELS
 from ballfg.vision.detection.background import Background
 from ballfg.vision.detection.detections import Candidates
 from ballfg.vision.detection.regions import Region, find_regions
@@ -51,15 +53,13 @@ class DetectorSettings:
     """Candidates per frame that are looked at closely."""
 
     def __post_init__(self) -> None:
-        low, high = self.diameter
+        low, high = check_array("diameter", self.diameter, (2,), "Give the smallest and the largest in px.").tolist()
         if not 0.0 < low < high < np.inf:
             raise ValueError(f"diameter must be two increasing positive numbers, px; got {self.diameter}.")
-        if not 0.0 <= self.longest_streak < np.inf:
-            raise ValueError(f"longest_streak must be positive or zero, px; got {self.longest_streak}.")
-        if self.colour not in (None, "white", "orange"):
-            raise ValueError(f"colour must be 'white', 'orange' or None; got {self.colour!r}. None takes any colour.")
-        if self.most < 1:
-            raise ValueError(f"most must be at least 1; got {self.most}.")
+        check_range("longest_streak", self.longest_streak, 0.0, MOST_PIXELS)
+        if self.colour is not None:
+            check_choice("colour", self.colour, ("white", "orange"))
+        check_count("most", self.most, 1)
 
 
 class BallDetector:

@@ -190,7 +190,7 @@ def test_printing_a_model_shows_ball_and_effects(model):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"table_height": math.nan}, "table_height must be finite; got nan"),
+        ({"table_height": math.nan}, r"table_height must be finite; got nan\. Correct it \(unit: m\)\."),
         ({"floor_height": 0.0}, "floor_height must lie below table_height 0 m; got 0 m"),
         ({"edge_sigmas": (0, -1, 0, 0)}, r"edge_sigmas must be finite and not negative, in m; got \(0, -1, 0, 0\)"),
         ({"extent": (1, 0, 0, 1)}, r"extent must be \(x_low, x_high, y_low, y_high\); got \(1, 0, 0, 1\)"),

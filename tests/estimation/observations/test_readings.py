@@ -85,6 +85,10 @@ def test_delays_carry_the_state_in_free_flight() -> None:
         (([0], [np.nan], 0.1), "values of 'speed' must be finite"),
         (([0], [5.0], 0.0), "sigma of 'speed' must be positive and finite"),
         (([1, 0], [5.0, 5.0], 0.1), "state of 'speed' must ascend"),
+        (([0.01], [5.0], 0.1), r"state of 'speed' must be indices of samples, whole numbers from 0 on; got \[0.01\]"),
+        (([-1], [5.0], 0.1), "state of 'speed' must be indices of samples, whole numbers from 0 on"),
+        (([0], [5.0], [0.1, 0.1]), r"sigma of 'speed' must be one number, \(1,\) or \(1, 1\); got \(2,\)"),
+        (([0], [5.0], 0.1, [0.0, 0.0]), r"delay of 'speed' must have shape \(1,\); got \(2,\)"),
     ],
 )
 def test_readings_that_make_no_sense_are_refused(arguments: tuple[object, ...], message: str) -> None:

@@ -170,7 +170,7 @@ def test_bad_input_is_refused_and_changes_nothing(time, position, sigma, message
 
 
 def test_lag_must_leave_something():
-    with pytest.raises(ValueError, match="lag must be at least 2 states; got 1"):
+    with pytest.raises(ValueError, match="lag must be at least 2; got 1"):
         Online(nominal_model(), NOWHERE, settings(), lag=1)
 
 

@@ -86,6 +86,17 @@ def test_memory_is_flat_on_an_endless_stream():
     assert online.window.isam.size() < 2 * 30
 
 
+def test_a_sample_that_nothing_links_to_the_last_has_no_velocity():
+    track, _ = make_track(FLYING, n=10, surfaces=NOWHERE)
+    online = Online(nominal_model(), NOWHERE, settings())
+    for t, z in zip(track.times.tolist(), track.positions, strict=True):
+        in_another_unit = online.push(1000.0 * t, z)
+        assert in_another_unit.status is Status.NO_VELOCITY
+        np.testing.assert_allclose(np.sqrt(np.diag(in_another_unit.joint))[3:6], 20.0, rtol=1e-6)
+    after = online.push(1000.0 * t + 0.01, z)
+    assert after.status is Status.OK
+
+
 def test_rebuilds_after_gtsam_failed():
     """An update that throws leaves iSAM2 half-updated: the same keys cannot be added again."""
     track, _ = make_track(FLYING, n=40, surfaces=NOWHERE)

@@ -273,6 +273,17 @@ def test_one_observation(settings) -> None:
     np.testing.assert_allclose(estimate.sigmas[0, 3:6], 20.0, rtol=1e-6)
 
 
+def test_samples_that_nothing_links(settings) -> None:
+    """Stamps in another unit: every gap is too long to follow a ball over it."""
+    states = truth(SERVE)[:10]
+    estimate = estimate_of(states, measured(states), settings, np.arange(10) * 0.6)
+    assert estimate.status is Status.NO_VELOCITY
+    assert "check the unit of the stamps" in estimate.status.value
+    np.testing.assert_allclose(estimate.sigmas[:, 3:6], 20.0, rtol=1e-6)
+    linked = estimate_of(states, measured(states), settings, np.r_[np.arange(9) * 0.6, 4.81])
+    assert linked.status is Status.OK
+
+
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("labelled", [True, False], ids=["label", "no-label"])
 def test_five_observations_around_a_bounce(seed, labelled) -> None:

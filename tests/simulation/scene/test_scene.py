@@ -263,7 +263,7 @@ def test_the_same_seed_gives_the_same_frames() -> None:
         ({"rate": 1.0}, "rate must be at least 5"),
         ({"exposure": 0.009}, "exposure must be at most 0.95 of the frame interval, 0.00792 s at 120 Hz"),
         ({"jitter": 0.002}, "jitter must be at most 0.15 frames"),
-        ({"colour": "pink"}, "colour must be white or orange; got 'pink'"),
+        ({"colour": "pink"}, "colour must be one of white, orange; got 'pink'"),
         ({"noise": -1.0}, "noise must be at least 0"),
         ({"settings": {"speed": [99]}}, "speed must lie in 8 .. 14"),
         ({"undeclared": parse_effects(["time_offset.x=0.01"])}, "changes how positions are measured"),

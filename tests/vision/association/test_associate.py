@@ -140,7 +140,7 @@ def test_refuses_what_does_not_go_together() -> None:
         associate(films[:2], CAMERAS)
     with pytest.raises(ValueError, match="two or more"):
         associate(films[:1], CAMERAS[:1])
-    with pytest.raises(ValueError, match=r"least_score must lie in \[0, 1\]; got 2"):
+    with pytest.raises(ValueError, match=r"least_score must be at least 0, at most 1; got 2"):
         AssociationSettings(least_score=2.0)
     with pytest.raises(ValueError, match="least_points must be at least 3; got 1"):
         AssociationSettings(least_points=1)
