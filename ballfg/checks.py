@@ -289,9 +289,10 @@ def check_array(
         raise ValueError(f"{label} must be an array of numbers; {problem}")
     if shape is not None and array.shape != shape:
         raise ValueError(f"{label} must have shape {shape}; got {array.shape}. {remedy}")
-    beyond = np.isfinite(array) & (np.abs(array) > LARGEST)
-    if beyond.any():
-        raise ValueError(f"{label} must be within {LARGEST:g}; got {array[beyond][0]:g}. {remedy}")
+    if not np.abs(array).max(initial=0.0) <= LARGEST:  # one of them is not finite, or too large
+        beyond = array[np.isfinite(array) & (np.abs(array) > LARGEST)]
+        if beyond.size:
+            raise ValueError(f"{label} must be within {LARGEST:g}; got {beyond[0]:g}. {remedy}")
     return array
 
 

@@ -10,6 +10,7 @@ from ballfg.checks import as_float, check_instance, is_number, shown
 from ballfg.dynamics.model import BallModel
 from ballfg.dynamics.nominal import nominal_model
 from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.measurement.position_noise import noise_doubts
 from ballfg.estimation.observations.given import given
 from ballfg.estimation.result import Estimate
 from ballfg.estimation.settings import Settings
@@ -120,5 +121,6 @@ class Estimator(ABC):
         return track.observed(*given(factors))
 
     def doubts(self, track: Track) -> tuple[str, ...]:
-        """Signs that the track is no ball above these surfaces, one sentence each; for `Estimate.notes`."""
-        return doubts_about(track.times, track.positions, self.surfaces.heights(), self.model.radius)
+        """Signs that the track is no ball above these surfaces, or noisier than stated; for `Estimate.notes`."""
+        about = doubts_about(track.times, track.positions, self.surfaces.heights(), self.model.radius)
+        return (*about, *noise_doubts(track, self.settings))

@@ -1,9 +1,14 @@
 """The noise that is read off tracks, against the noise that was put in."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from ballfg.estimation.measurement.position_noise import FALLBACK, FLOOR, estimate_position_noise
+import ballfg as bf
+from ballfg.estimation import RadarSpeed
+from ballfg.estimation.measurement.position_noise import FALLBACK, FLOOR, estimate_position_noise, noise_doubts
+from ballfg.estimation.settings import Settings
 from ballfg.tracks import Track
 
 SIGMA = np.array([0.001, 0.002, 0.0035])
@@ -21,6 +26,42 @@ def test_white_noise_is_recovered():
     rng = np.random.default_rng(0)
     estimate = estimate_position_noise([bouncing(rng) for _ in range(40)])
     assert estimate == pytest.approx(SIGMA, rel=0.06)
+
+
+@pytest.mark.parametrize(("share", "told"), [(1.0, False), (0.8, False), (0.5, True), (0.1, True)])
+@pytest.mark.parametrize("own", [False, True])
+def test_scatter_beyond_the_stated_noise_is_told(share, told, own):
+    track = bouncing(np.random.default_rng(3))
+    stated = tuple((share * SIGMA).tolist())
+    if own:
+        track = Track(track.times, track.positions, np.tile(stated, (len(track), 1)))
+    notes = noise_doubts(track, Settings() if own else Settings(position_noise=stated))
+    assert bool(notes) == told
+    if told:
+        assert f"where their noise is stated as {1e3 * share * np.sqrt((SIGMA**2).mean()):.2g} mm" in notes[0]
+
+
+def test_scatter_of_other_sources_is_no_noise_of_positions():
+    """An error that lasts, and stamps that jitter, count as stated; rough positions and short tracks tell nothing."""
+    track = bouncing(np.random.default_rng(4))
+    little = {"position_noise": (2e-4,) * 3}
+    assert noise_doubts(track, Settings(**little))
+    assert not noise_doubts(track, Settings(**little, memory=tuple(SIGMA)))
+    assert not noise_doubts(track, Settings(**little, stamp_jitter=0.002))
+    assert not noise_doubts(track.between(track.times[0], track.times[28]), Settings(**little))
+    speeds = RadarSpeed(np.arange(120), np.full(120, 4.0), 1.0)
+    assert not noise_doubts(replace(track, observations=(speeds,), rough=True), Settings(**little))
+
+
+def test_every_estimator_notes_the_scatter():
+    track = bouncing(np.random.default_rng(5))
+    for method in ("smoother", "online", "ekf", "sliding-window"):
+        good, bad = (
+            bf.estimate(track, method=method, settings=Settings(position_noise=tuple(share * SIGMA)), surfaces=0.75)
+            for share in (1.0, 0.4)
+        )
+        assert [note.split(" by")[0] for note in bad.notes] == ["the positions scatter"]
+        assert good.notes == ()
 
 
 def test_outliers_and_short_tracks_do_not_matter():
