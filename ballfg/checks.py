@@ -257,7 +257,7 @@ def check_choice(label: str, value: object, known: Collection[str]) -> None:
     Raises: ValueError: listing them.
     """
     if not isinstance(value, str) or value not in known:
-        raise ValueError(f"{label} must be one of {', '.join(known)}; got {shown(value)}. Choose one of them.")
+        raise ValueError(f"{label} must be one of {listed(known)}; got {shown(value)}. Choose one of them.")
 
 
 def check_path(label: str, value: object) -> Path:

@@ -93,7 +93,7 @@ class Registry(Mapping[str, type[T]], Generic[T]):
         if not (isinstance(cls, type) and issubclass(cls, self.base)):
             names = [base.__name__ for base in (self.base if isinstance(self.base, tuple) else (self.base,))]
             bases = " or ".join(filter(None, (", ".join(names[:-1]), names[-1])))
-            got = repr(cls) if isinstance(cls, type) else type(cls).__name__
+            got = " ".join(repr(cls)[:80].split())  # on one line, also where it is an array
             raise TypeError(f"{self.sort} must be a subclass of {bases}; got {got}. {self.remedy}")
         name = getattr(cls, "name", None)
         if not (isinstance(name, str) and name.strip()):
