@@ -28,7 +28,7 @@ MEASURED = ("aimy", "ballgun", "robot_rallies", "spindoe")
 
 
 def noted(count: int, seed: int, noise: float, rate: float, sort: dict[str, float]) -> list[float]:
-    """Share of simulated tracks with a note, for each of `SHARES`; an error that lasts is stated rightly for the first."""
+    """Share of simulated tracks with a note, for each of `SHARES`; an error that lasts is stated for the first alone."""
     model = nominal_model()
     config = SimulationConfig(tracks=count, rate=rate, seed=seed, noise=MeasurementNoise(position=noise, **sort))
     tracks = [shot.track for shot in simulate(config)]
@@ -52,9 +52,7 @@ def main() -> None:
         rows.append(noted(given.count, given.seed, noise, rate, sort))
         print(f"{1e3 * noise:g} mm, {rate:g} Hz, {sort}: {', '.join(f'{share:.1%}' for share in rows[-1])}", flush=True)
     means = ", ".join(f"{mean:.2%}" for mean in np.mean(rows, axis=0))
-    print(
-        f"noted where the noise is stated rightly, as a half, as a third: {means}; worst first: {np.max(rows, 0)[0]:.0%}"
-    )
+    print(f"noted where the noise is stated rightly, as a half, as a third: {means}; most: {np.max(rows, 0)[0]:.0%}")
     for name in MEASURED:
         dataset = read_dataset(DATA / name)
         settings = fitted_settings(dataset, nominal_model(dataset.info.ball))
