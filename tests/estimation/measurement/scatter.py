@@ -28,7 +28,7 @@ MEASURED = ("aimy", "ballgun", "robot_rallies", "spindoe")
 
 
 def noted(count: int, seed: int, noise: float, rate: float, sort: dict[str, float]) -> list[float]:
-    """Share of simulated tracks with a note, for each of `SHARES`; an error that lasts is stated for the first alone."""
+    """Share of simulated tracks with a note, for each of `SHARES`; what lasts is stated for the first alone."""
     model = nominal_model()
     config = SimulationConfig(tracks=count, rate=rate, seed=seed, noise=MeasurementNoise(position=noise, **sort))
     tracks = [shot.track for shot in simulate(config)]
