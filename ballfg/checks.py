@@ -31,6 +31,8 @@ _SYNONYMS = {
 
 MAX_SHOWN = 80
 """Characters of a value in a message."""
+LARGEST = 1e100
+"""Of a measured number, in any unit. The squares of much larger ones overflow; memory that nobody filled holds such."""
 MAX_LISTED = 12
 """Names in a list in a message."""
 _MAX_COMPARED = 200
@@ -271,13 +273,17 @@ def check_path(label: str, value: object) -> Path:
 
 
 def check_array(
-    label: str, value: ArrayLike, shape: tuple[int, ...] | None = None, remedy: str = "Correct it."
+    label: str,
+    value: ArrayLike,
+    shape: tuple[int, ...] | None = None,
+    remedy: str = "Correct it.",
+    most: float = LARGEST,
 ) -> NDArray[np.float64]:
     """A copy as float64.
 
     Args: label: what the message calls the array.  value: to check.  shape: the right one, if it is fixed.
-        remedy: last sentence of the message.
-    Raises: ValueError: not numbers, numbers under a mask or beyond `LARGEST`, or another shape.
+        remedy: last sentence of the message.  most: the largest size of a finite number.
+    Raises: ValueError: not numbers, numbers under a mask or beyond `most`, or another shape.
     """
     try:
         given = np.asanyarray(value)
@@ -289,15 +295,11 @@ def check_array(
         raise ValueError(f"{label} must be an array of numbers; {problem}")
     if shape is not None and array.shape != shape:
         raise ValueError(f"{label} must have shape {shape}; got {array.shape}. {remedy}")
-    if not np.abs(array).max(initial=0.0) <= LARGEST:  # one of them is not finite, or too large
-        beyond = array[np.isfinite(array) & (np.abs(array) > LARGEST)]
+    if not np.abs(array).max(initial=0.0) <= most:  # one of them is not finite, or too large
+        beyond = array[np.isfinite(array) & (np.abs(array) > most)]
         if beyond.size:
-            raise ValueError(f"{label} must be within {LARGEST:g}; got {beyond[0]:g}. {remedy}")
+            raise ValueError(f"{label} must be within {most:g}; got {beyond[0]:g}. {remedy}")
     return array
-
-
-LARGEST = 1e100
-"""Of a measured number, in any unit. The squares of much larger ones overflow; memory that nobody filled holds such."""
 
 
 _NO_NUMBERS = {

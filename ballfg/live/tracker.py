@@ -168,12 +168,12 @@ class Tracker:
             usable is refused: nothing is raised for what a sender can get wrong.
         Raises: ValueError: positions or sigmas of another shape. TypeError: a time that is no number.
         """
-        points = np.atleast_2d(check_array("positions", positions, remedy="Give x, y and z in m."))
+        points = np.atleast_2d(check_array("positions", positions, remedy="Give x, y and z in m.", most=np.inf))
         if points.shape[-1] != 3 or points.ndim != 2:
             raise ValueError(f"positions must be (3,) or (n, 3) m; got {np.shape(positions)}. Give x, y and z.")
         spreads: Sequence[Array | None] = [None] * len(points)
         if sigmas is not None:
-            given = check_array("sigmas", sigmas, remedy="Give one number in m per axis.")
+            given = check_array("sigmas", sigmas, remedy="Give one number in m per axis.", most=np.inf)
             if given.shape not in ((3,), points.shape):
                 raise ValueError(f"sigmas must be (3,) or as positions, {points.shape}; got {given.shape}.")
             spreads = list(np.broadcast_to(given, points.shape))

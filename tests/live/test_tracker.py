@@ -129,6 +129,7 @@ def test_older_and_repeated_stamps_are_counted_and_dropped() -> None:
         (math.nan, [0.0, 0.0, 0.3], "the stamp is not finite"),
         (0.3, [math.nan, 0.0, 0.3], "a coordinate is not finite"),
         (0.3, [2000.0, 0.0, 300.0], "a coordinate is beyond 1000 m"),
+        (0.3, [1e300, 0.0, 0.3], "a coordinate is beyond 1000 m"),
         (math.inf, [0.0, 0.0, 0.3], "the stamp is not finite"),
     ],
 )
@@ -141,6 +142,16 @@ def test_unusable_samples_change_nothing(time: float, position: list[float], rea
     fed(live, samples[18:])
     same_state(live.balls[1], online(samples)[-1])
     assert live.counts.malformed == 1
+
+
+def test_standard_deviations_out_of_this_world_raise_nothing() -> None:
+    """They say no more of a ball than metres do."""
+    samples = rows(shots(1)[0])[:24]
+    live = tracker()
+    fed(live, samples[:18])
+    for size in (1e300, 1e-300):
+        (update,) = live.push(*(samples[18, 0] + 0.001 * (size < 1.0), samples[18, 1:], [size] * 3))
+        assert (update.kind, update.ball) == ("state", 1)
 
 
 def test_a_stamp_astray_costs_no_ball_and_a_clock_that_begins_anew_no_more_than_two_samples() -> None:

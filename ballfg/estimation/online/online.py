@@ -155,7 +155,7 @@ class Online(Estimator):
         Returns: the newest state. It is valid for good; the window's own arrays move on.
         Raises: ValueError: if the time does not increase, or a number is not finite.
         """
-        own = None if sigma is None else check_array("sigma", sigma, remedy="Give one number in m per axis.")[None]
+        own = None if sigma is None else check_array("sigma", sigma, most=np.inf)[None]
         if own is not None and not (np.isfinite(own) & (own > 0.0)).all():
             raise ValueError(
                 f"sigma must be positive and finite, in m; got {shown(sigma)}. Leave it out if it is unknown."
