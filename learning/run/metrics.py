@@ -60,7 +60,7 @@ def read_metrics(path: Path) -> list[Epoch]:
         with path.open(encoding="utf-8", newline="") as file:
             rows = [{name: _number(name, text) for name, text in row.items()} for row in csv.DictReader(file)]
         return [Epoch(**row) for row in rows]
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, csv.Error) as error:
         raise ValueError(f"{path}: not a table of epochs ({short_text(one_line(error))}). Start a new run.") from None
 
 

@@ -99,6 +99,12 @@ def a_header_alone(f: Path, s: list[Track]) -> Path:
     return f / "a.csv"
 
 
+def a_cell_without_end(f: Path, s: list[Track]) -> Path:
+    """Of more characters than Python's reader of CSV takes."""
+    (f / "a.csv").write_text("t,x,y,z\n0.0,1.0,2.0," + "3" * 200_000 + "\n", encoding="utf-8")
+    return f / "a.csv"
+
+
 def rubbish(f: Path, s: list[Track]) -> Path:
     (f / "a.csv").write_bytes(np.random.default_rng(0).bytes(5000))
     return f / "a.csv"
@@ -192,6 +198,7 @@ REFUSED: dict[Mistake, str] = {
     pixels: "ballfg track DETECTIONS --cameras",
     nothing: "the file is empty",
     a_header_alone: "must hold rows of numbers",
+    a_cell_without_end: "must hold rows of numbers: a time and x, y, z; field larger than field limit (131072)",
     rubbish: "it is binary and begins with",
     json_cut_off: "as in a file that was cut off",
     parquet_cut_off: "must be a whole Parquet file",

@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
+from ballfg.checks import one_line
 from ballfg.importing.formats.raw import MISSING, WITH_UNIT, RawTable, table_of
 from ballfg.importing.names import unit_of_text
 
@@ -53,7 +54,16 @@ def _text(path: Path, content: bytes) -> str:
 
 
 def text_table(text: str, name: str, source: str) -> RawTable:
-    """The table that a text holds. Raises: ValueError: it has no rows of numbers."""
+    """The table that a text holds. Raises: ValueError: it has no rows of numbers, or a cell of a book's length."""
+    try:
+        return _text_table(text, name, source)
+    except csv.Error as error:  # more than 131,072 characters without a separator
+        raise ValueError(
+            f"{source} must hold rows of numbers: a time and x, y, z; {one_line(error)}. Export the table as CSV."
+        ) from None
+
+
+def _text_table(text: str, name: str, source: str) -> RawTable:
     lines = [line for line in text.splitlines() if line.strip()]
     comments = [line for line in lines if line.lstrip().startswith(_COMMENTS)]
     rows_of_text = [line for line in lines if not line.lstrip().startswith(_COMMENTS)]

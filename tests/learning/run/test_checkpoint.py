@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from ballfg.learning.run.checkpoint import Checkpoint, RunProgress, read_checkpoint, write_checkpoint
+from ballfg.learning.run.metrics import read_metrics
 
 
 def made(epoch: int) -> Checkpoint:
@@ -105,3 +106,9 @@ def test_what_a_killed_writer_left_is_gone_when_the_run_goes_on(tmp_path: Path) 
     (left / "lock").touch()
     assert same(read_checkpoint(tmp_path), made(1))
     assert not left.exists()
+
+
+def test_a_table_of_epochs_with_a_cell_without_end_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "metrics.csv").write_text("epoch,loss\n1," + "2" * 200_000 + "\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"not a table of epochs \(field larger than field limit"):
+        read_metrics(tmp_path / "metrics.csv")
