@@ -33,6 +33,8 @@ MAX_SHOWN = 80
 """Characters of a value in a message."""
 LARGEST = 1e100
 """Of a measured number, in any unit. The squares of much larger ones overflow; memory that nobody filled holds such."""
+MAX_SAID = 160
+"""Characters of a library's own words in a message."""
 MAX_LISTED = 12
 """Names in a list in a message."""
 _MAX_COMPARED = 200
@@ -288,9 +290,12 @@ def check_array(
     try:
         given = np.asanyarray(value)
         problem = _no_numbers(given)
-        array = np.array(value if isinstance(value, list | tuple) else given, dtype=None if problem else np.float64)
+        plain = given.tolist() if given.dtype.kind == "U" else given  # numpy's words on texts are its own
+        array = np.array(plain, dtype=None if problem else np.float64)
     except (TypeError, ValueError, OverflowError, RuntimeError) as error:  # the last: a tensor with a gradient
-        raise ValueError(f"{label} must be an array of numbers; {one_line(error)}. {remedy}") from None
+        raise ValueError(
+            f"{label} must be an array of numbers; {short_text(one_line(error), MAX_SAID)}. {remedy}"
+        ) from None
     if problem:
         raise ValueError(f"{label} must be an array of numbers; {problem}")
     if shape is not None and array.shape != shape:

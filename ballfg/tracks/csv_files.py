@@ -5,7 +5,6 @@ error to report, so that it can afford to read the file cell by cell.
 """
 
 import csv
-import math
 import re
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 
-from ballfg.checks import did_you_mean, one_line, shown
+from ballfg.checks import LARGEST, did_you_mean, one_line, shown
 
 _NUMBER = re.compile(r"\s*[+-]?(\d++\.?\d*+|\.\d++)([eE][+-]?\d+)?\s*", re.ASCII)
 _NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|infinity)\s*", re.IGNORECASE)
@@ -21,8 +20,8 @@ _HEADER_LIMIT = 1 << 16  # bytes
 
 
 def is_number(cell: str) -> bool:
-    """Whether a cell holds a finite decimal number with a point, such as 0.02 or 2e-2."""
-    return _NUMBER.fullmatch(cell) is not None and math.isfinite(float(cell))
+    """Whether a cell holds a decimal number with a point, such as 0.02 or 2e-2, that can be meant (`LARGEST`)."""
+    return _NUMBER.fullmatch(cell) is not None and abs(float(cell)) <= LARGEST
 
 
 def read_header(path: Path) -> list[str]:

@@ -12,7 +12,7 @@ import pyarrow.csv as pa_csv
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import did_you_mean, shown
+from ballfg.checks import LARGEST, did_you_mean, shown
 from ballfg.tracks import csv_files
 from ballfg.tracks.checks import check_step
 from ballfg.tracks.rows import KEY
@@ -182,8 +182,8 @@ def check_values(
     Raises: ValueError: naming line and column.
     """
     for name, column in values.items():
-        rule, holds = rules.get(name, ("finite", np.isfinite))
-        wrong = ~(np.isfinite(column) & holds(column))
+        rule, holds = rules.get(name, (f"finite, at most {LARGEST:g} in size", np.isfinite))
+        wrong = ~((np.abs(column) <= LARGEST) & holds(column))
         if wrong.any():
             raise ValueError(
                 f"{_place(path, lines[wrong], name)} must be {rule}; got {column[wrong][0]:g}. "

@@ -16,12 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import shown
+from ballfg.checks import LARGEST, shown
 from ballfg.tracks.csv_files import no_rows
 from ballfg.tracks.rows import Block, RowSource
-
-LARGEST = 1e100
-"""Any number beyond this is refused at once, so that no later step overflows."""
 
 MIN_SIGMA, MAX_SIGMA = 1e-9, 1e6
 """m: the standard deviations that a sample may have; a large one marks a sample that should hardly count."""
