@@ -1,0 +1,96 @@
+"""Folders that nobody but this user can change: for locks, and for machine code that is run as it is found."""
+
+import atexit
+import grp
+import os
+import pwd
+import shutil
+import stat
+import tempfile
+from contextlib import suppress
+from pathlib import Path
+from typing import Final
+
+PRIVATE: Final = 0o700
+_ROOT: Final = 0
+
+
+def state_folder(name: str) -> Path:
+    """The folder of this user's state under `name`, made if it is missing.
+
+    Returns: `$XDG_STATE_HOME/ballfg/name`, by default in `~/.local/state`; a folder of this user alone among the
+        temporary files where that cannot be written to, or where somebody else could.
+    """
+    try:
+        base = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+        return own_folder(Path(base) / "ballfg" / name)
+    except (OSError, RuntimeError, ValueError):  # read-only, no home, or not this user's
+        return temporary_folder(name)
+
+
+def own_folder(folder: Path) -> Path:
+    """The folder itself, made for this user alone if it is missing.
+
+    Raises: OSError: it cannot be made or written to. ValueError: somebody else may change what is in it.
+    """
+    folder.mkdir(parents=True, exist_ok=True, mode=PRIVATE)
+    if not is_own(folder):
+        raise ValueError(f"{folder} must be a folder that only this user may write to. Change its owner and its mode.")
+    with tempfile.TemporaryFile(dir=folder):
+        return folder
+
+
+def temporary_folder(name: str) -> Path:
+    """A folder among the temporary files that later processes of this user find again.
+
+    Returns: where somebody else has made a folder of that name, one for this process alone, removed at its end.
+    """
+    folder = Path(tempfile.gettempdir()) / f"ballfg-{os.getuid()}" / name
+    with suppress(OSError):
+        for each in (folder.parent, folder):
+            with suppress(FileExistsError):
+                each.mkdir(PRIVATE)
+        if is_own(folder):
+            return folder
+    folder = Path(tempfile.mkdtemp(prefix="ballfg-"))
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return folder
+
+
+def is_own(folder: Path) -> bool:
+    """Whether nobody but this user and root can change what a folder holds, or put another one in its place.
+
+    The folder belongs to this user or to root, and so do all folders around it; others may write to none of them,
+    unless its sticky bit keeps what others own, as that of /tmp does. Links are followed, and judged where they lead.
+    """
+    try:
+        real = Path(os.path.realpath(folder, strict=True))
+        return _is_closed(real.stat(), sticky=False) and all(
+            _is_closed(each.stat(), sticky=True) for each in real.parents
+        )
+    except OSError:
+        return False
+
+
+def _is_closed(found: os.stat_result, *, sticky: bool) -> bool:
+    """Whether a folder belongs to this user or root, and nobody else can rename what is in it."""
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid not in (_ROOT, os.geteuid()):
+        return False
+    if sticky and found.st_mode & stat.S_ISVTX:
+        return True
+    if found.st_mode & stat.S_IWGRP and not _is_group_of_one(found.st_gid):
+        return False
+    return not found.st_mode & stat.S_IWOTH
+
+
+def _is_group_of_one(group: int) -> bool:
+    """Whether a group has this user, or root, as its only member: many systems give each user such a group."""
+    try:
+        entry, user = grp.getgrgid(group), pwd.getpwuid(os.geteuid())
+    except KeyError:
+        return False
+    return (
+        group in (_ROOT, user.pw_gid)
+        and entry.gr_name in ("root", user.pw_name)
+        and set(entry.gr_mem) <= {user.pw_name}
+    )
