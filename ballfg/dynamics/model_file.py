@@ -13,9 +13,9 @@ from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects.registry import effect_class
 from ballfg.dynamics.model import THIN_SHELL, BallModel
 from ballfg.dynamics.networks.learned import LearnedModel
-from ballfg.dynamics.networks.learned_file import BASE, has_learned_part, read_learned, remove_others, write_learned
+from ballfg.dynamics.networks.learned_file import BASE, has_learned_part, read_learned, write_learned
 from ballfg.dynamics.variation import Variation
-from ballfg.files.moving import settle
+from ballfg.files.one_state import of_one_state
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.whole_file import write_text
 from ballfg.tracks import TrackNoise
@@ -29,6 +29,7 @@ NOISE: Final = "noise"
 """Entry of the section `measurement` that is no effect: how far tracks scatter about the model."""
 
 
+@of_one_state
 def load_model(
     path: str | Path, *, radius: float = 0.02, inertia_factor: float = THIN_SHELL, room: str | None = None
 ) -> BallModel:
@@ -49,7 +50,6 @@ def load_model(
             outside its bounds; or if the folder does not hold a learned part of this version.
     """
     path = check_path("path", path)
-    settle(path.parent)
     if not path.is_file():
         raise FileNotFoundError(f"model file {path} does not exist; a model is one YAML file")
     content = read_yaml(path)
@@ -185,7 +185,8 @@ def _listed(variations: Mapping[str, Variation]) -> dict[str, Any]:
 def save_model(model: BallModel, path: str | Path) -> None:
     """Write a model file, and beside it the folder of its learned part if it has one.
 
-    The final names appear only once file and folder are whole; the folder of an earlier model of that name is removed.
+    The final names appear only once file and folder are whole. The folder of an earlier model of that name stays:
+    copies of its file may name it.
 
     Raises: TypeError: if the model is neither analytic nor learned, or corrects one that is not analytic.
     """
@@ -196,7 +197,6 @@ def save_model(model: BallModel, path: str | Path) -> None:
     if has_learned_part(model):
         content["learned"] = write_learned(model, path.parent, path.stem)
     write_text(path, yaml.safe_dump(content, sort_keys=False))
-    remove_others(path.parent, path.stem, keep=content["learned"])
 
 
 def _analytic_part(model: BallModel) -> AnalyticModel:

@@ -7,7 +7,7 @@ from ballfg.checks import check_path
 from ballfg.dynamics import model_to_dict, nominal_model
 from ballfg.estimation.observations.files import read_readings
 from ballfg.estimation.observations.sighted_dataset import SightedDataset, read_sighted
-from ballfg.files.moving import settle
+from ballfg.files.one_state import of_one_state
 from ballfg.files.strict_yaml import read_mapping
 from ballfg.tracks import Ball, Dataset, read_dataset
 from ballfg.tracks.dataset import has_positions as has_positions
@@ -15,6 +15,7 @@ from ballfg.tracks.dataset import has_positions as has_positions
 MODEL_FILE = "model.yaml"
 
 
+@of_one_state
 def read(folder: str | PathLike[str]) -> Dataset | SightedDataset:
     """The dataset of a folder: its tracks with everything that was measured beside positions.
 
@@ -26,7 +27,7 @@ def read(folder: str | PathLike[str]) -> Dataset | SightedDataset:
         FileNotFoundError: the folder or one of its files is missing.
         ValueError: the content breaks a rule; the message names file, line, column and remedy.
     """
-    settle(check_path("folder", folder))
+    folder = check_path("folder", folder)
     dataset = with_readings(read_dataset(folder)) if has_positions(folder) else read_sighted(folder)
     dataset.notes = [*dataset.notes, *unused_model(folder, dataset.ball)]
     return dataset

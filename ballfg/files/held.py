@@ -1,134 +1,153 @@
-"""One process at a time writes a result: the hidden folder in which the result is made holds a lock.
+"""Where results are made: in a hidden folder of a random name, while a lock in the user's own state folder is held.
 
-The kernel frees the lock when the process ends, however it ends. What a killed process left is cleared by the next one
-that writes the same result.
+The kernel frees the lock when its process ends, however it ends. What a killed process left is cleared by the next
+writer of the same result, as the lock's file tells, which this user alone can write: what lies beside a result is never
+believed.
 """
 
 import errno
-import fcntl
+import hashlib
+import json
 import os
+import secrets
 import shutil
-import time
+import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 
-MARK: Final = ".ballfg-writing"
-"""Name of the hidden folder in which a result is made, or the end of its name."""
-NEW: Final = "new"
-"""In it: what is being made."""
-OLD: Final = "old"
-"""In it: what has been replaced."""
-PLAN: Final = "plan.json"
-"""In it: what moves where. While this file exists, a result is between its old and its new state."""
-LOCK: Final = "lock"
-"""In it: the file that is locked; it holds the number of the process."""
+from ballfg.files.own_folder import PRIVATE, state_folder
+
+MARK: Final = ".ballfg-"
+"""Start of the names of hidden folders."""
+NEW, OLD = "new", "old"
+"""In a hidden folder: the folder that is made, and the one that it replaces."""
 PATIENCE: Final = 0.3
 """s after which a lock counts as that of a writer."""
+_DISK: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 
-_held: ContextVar[frozenset[Path]] = ContextVar("held", default=frozenset())
-"""Hidden folders that this line of work has locked. Another thread has an empty set, and is refused."""
+_mine: ContextVar[frozenset[Path]] = ContextVar("mine", default=frozenset())
+"""Results and hidden folders that this line of work holds. Another thread has none, and is refused."""
 
 
 class BeingWrittenError(ValueError):
     """Another process, or another thread, is writing the same result."""
 
 
-def beside(path: Path) -> Path:
-    """The hidden folder of a file, or of a folder that does not exist yet."""
-    return path.with_name(f".{path.name}{MARK}")
+@contextmanager
+def held(target: Path, argument: str = "out") -> Iterator[None]:
+    """Keeps other processes of this user from writing a result until the block ends; who holds it may hold it again.
+
+    Where the state folder has no locks or no room, nothing is locked, and nothing cleared.
+
+    Args: target: the file or folder, without links.  argument: its name, for the message.
+    Raises: BeingWrittenError: another process writes it.
+    """
+    if target in _mine.get():
+        yield
+        return
+    from filelock import FileLock, Timeout
+
+    record = _record(target)
+    lock = FileLock(record, fallback_to_soft=False)
+    try:
+        lock.acquire(timeout=PATIENCE, poll_interval=0.01)
+    except Timeout:
+        process = next(iter(_read(record)), "(just starting)")
+        raise BeingWrittenError(
+            f"{argument} must not be written twice at the same time; {target} is being written by process {process}. "
+            "Wait for it, or choose another name."
+        ) from None
+    except OSError:
+        pass
+    try:
+        if lock.is_locked:
+            _clear_after(record, target)
+        _write(record, os.getpid(), "w")
+        with _as_mine(target):
+            yield
+    finally:
+        if not any(_left(record)):
+            record.unlink(missing_ok=True)  # while it is locked: whoever waits for it then makes a new one
+        lock.release()
 
 
 @contextmanager
-def held(place: Path, target: Path, argument: str = "out") -> Iterator[None]:
-    """Locks a hidden folder until the block ends; who holds it already may lock it again.
-
-    Args:
-        place: the hidden folder; it is made, and removed at the end unless an unfinished plan is in it.
-        target: what is written, for the message.
-        argument: its name, for the message.
-    Raises: BeingWrittenError: another process writes there. OSError: the folder cannot be made.
-    """
-    if place in _held.get():
-        yield
-        return
-    handle = _locked(place, target, argument)
-    _held.set(_held.get() | {place})
+def hidden(parent: Path, target: Path) -> Iterator[Path]:
+    """A new folder for this user alone, removed at the end. parent: where it is made.  target: the result, held."""
+    place = parent / f"{MARK}{secrets.token_hex(8)}"
+    _write(_record(target), str(place))
+    place.mkdir(PRIVATE)
     try:
-        if not (place / PLAN).exists():
-            clear(place)
-        yield
+        with _as_mine(place):
+            yield place
     finally:
-        _held.set(_held.get() - {place})
-        _release(place, handle)
+        _remove(place)
 
 
-def clear(place: Path) -> None:
-    """Removes what was made and what was replaced."""
-    for name in (NEW, OLD):
-        shutil.rmtree(place / name, ignore_errors=True)
+def is_hidden(path: Path) -> bool:
+    """Whether a path lies in a hidden folder of this line of work: what is written there is no result yet."""
+    return any(each.name.startswith(MARK) for each in _mine.get() & set(path.parents))
 
 
-def _locked(place: Path, target: Path, argument: str) -> int:
-    """The handle of the locked file. The folder may be removed by another process at any moment before that."""
-    begun = time.monotonic()
-    while True:
-        try:
-            place.mkdir(exist_ok=True)
-            handle = os.open(place / LOCK, os.O_RDWR | os.O_CREAT, 0o666)
-        except FileNotFoundError:
-            if not place.parent.is_dir():
-                raise
-            continue
-        try:
-            _lock(handle)
-            if _is_same(handle, place / LOCK):
-                os.ftruncate(handle, 0)
-                os.write(handle, str(os.getpid()).encode())
-                return handle
-        except BlockingIOError:
-            if time.monotonic() - begun < PATIENCE:  # whoever clears up holds it for an instant
-                os.close(handle)
-                time.sleep(0.01)
-                continue
-            process = os.pread(handle, 32, 0).decode(errors="replace").strip()
-            os.close(handle)
-            raise BeingWrittenError(
-                f"{argument} must not be written twice at the same time; {target} is being written by process "
-                f"{process or '(just starting)'}. Wait for it, or choose another name."
-            ) from None
-        except BaseException:
-            os.close(handle)
-            raise
-        os.close(handle)
-
-
-def _lock(handle: int) -> None:
-    """Locks a file; a filesystem without locks (some network disks) is used without. Raises: BlockingIOError."""
+@contextmanager
+def named(path: Path) -> Iterator[None]:
+    """Gives an error of the disk the name of what was to be written, in place of none or a hidden one."""
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
     except OSError as error:
-        if error.errno not in (errno.ENOLCK, errno.ENOTSUP, errno.ENOSYS):
+        if error.errno is None or not (MARK in str(error.filename) or (not error.filename and error.errno in _DISK)):
             raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
 
 
-def _is_same(handle: int, path: Path) -> bool:
-    """Whether the file that is open still has its name: its last holder removes it."""
+@contextmanager
+def _as_mine(path: Path) -> Iterator[None]:
+    _mine.set(_mine.get() | {path})
     try:
-        return os.path.samestat(os.fstat(handle), os.stat(path))
-    except FileNotFoundError:
-        return False
-
-
-def _release(place: Path, handle: int) -> None:
-    """Removes the folder before the lock is freed, unless something in it is still needed."""
-    try:
-        if not (place / PLAN).exists():
-            (place / LOCK).unlink(missing_ok=True)
-            place.rmdir()
-    except OSError:
-        pass  # another process is about to lock it, or the disk refuses: a folder that is left over harms nobody
+        yield
     finally:
-        os.close(handle)
+        _mine.set(_mine.get() - {path})
+
+
+def _record(target: Path) -> Path:
+    """The file that is locked for a result. Its lines: the process, and each hidden folder before it is made."""
+    return state_folder("locks") / hashlib.sha256(os.fsencode(target)).hexdigest()[:32]
+
+
+def _write(record: Path, line: int | str, mode: str = "a") -> None:
+    with suppress(OSError), record.open(mode, encoding="utf-8") as file:  # without room, nothing will be cleared
+        file.write(json.dumps(line) + "\n")
+
+
+def _read(record: Path) -> Iterator[Any]:
+    """Its whole lines. Where the last one was cut, its folder was not made yet."""
+    with suppress(OSError, ValueError), record.open(encoding="utf-8") as file:
+        yield from map(json.loads, file)
+
+
+def _left(record: Path) -> list[Path]:
+    """The hidden folders that are still there, and are this user's."""
+    places = [Path(line) for line in _read(record) if isinstance(line, str)]
+    return [place for place in places if os.path.lexists(place) and _is_own(place.lstat())]
+
+
+def _is_own(found: os.stat_result) -> bool:
+    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid()
+
+
+def _clear_after(record: Path, target: Path) -> None:
+    """Removes what a killed process made; a folder that it had moved away gets its name again."""
+    for place in _left(record):
+        with suppress(OSError):
+            if (place / OLD).is_dir() and not os.path.lexists(target):
+                os.rename(place / OLD, target)
+        _remove(place)
+
+
+def _remove(place: Path) -> None:
+    for folder, _, _ in os.walk(place):
+        os.chmod(folder, PRIVATE)  # nothing can be removed from one that is read-only
+    shutil.rmtree(place, ignore_errors=True)

@@ -2,35 +2,45 @@
 
 import errno
 import os
+import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ballfg.files.held import NEW, beside, clear, held
+from ballfg.files.held import held, hidden, is_hidden, named
 
 
 @contextmanager
 def whole_file(path: Path, argument: str = "out") -> Iterator[Path]:
     """A path in a hidden folder, with the same name, to write to; it takes its place when the block ends well.
 
-    After an exception, Ctrl-C or a kill what was there before is untouched.
+    After an exception, Ctrl-C or a kill what was there before is untouched. A file that is replaced leaves its mode to
+    the new one. A link stays, and the file that it leads to is replaced.
 
-    Raises: FileNotFoundError: the folder of the path does not exist. ValueError: the path is a folder or a device, or
-        another process is writing it.
+    Raises: FileNotFoundError: the folder of the path does not exist. ValueError: the path is a folder, a device, or a
+        link that leads nowhere, or another process is writing it. OSError: it cannot be written; the path is named.
     """
     check_file(path, argument)
-    target = Path(os.path.realpath(path.parent)) / path.name
-    place = beside(target)
-    with held(place, path, argument):
-        try:
-            (place / NEW).mkdir()
-            temporary = place / NEW / path.name
-            yield temporary
-            flush(temporary)
-            os.replace(temporary, target)
-            flush_folder(target.parent)
-        finally:
-            clear(place)
+    target = Path(os.path.realpath(path))
+    if is_hidden(target):
+        yield path
+        return
+    with named(path), held(target, argument), hidden(target.parent, target) as place:
+        temporary = place / path.name
+        yield temporary
+        _as_before(temporary, target)
+        flush(temporary)
+        os.replace(temporary, target)
+        flush_folder(target.parent)
+
+
+def _as_before(temporary: Path, target: Path) -> None:
+    """Gives a file the owner and the mode of the one that it replaces."""
+    with suppress(FileNotFoundError):
+        found = target.stat()
+        with suppress(PermissionError):
+            os.chown(temporary, found.st_uid, found.st_gid)
+        os.chmod(temporary, stat.S_IMODE(found.st_mode) & 0o777)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -60,14 +70,16 @@ def flush_folder(path: Path) -> None:
 def check_file(path: Path, argument: str = "out") -> None:
     """Refuses a path to which no file can be written.
 
-    Raises: FileNotFoundError: its folder does not exist. ValueError: it is a folder, or a device such as /dev/null,
-        whose place a file would take.
+    Raises: FileNotFoundError: its folder does not exist. ValueError: it is a folder, a device such as /dev/null, whose
+        place a file would take, or a link that leads nowhere.
     """
     check_parent(path, argument)
     if path.is_dir():
         raise ValueError(f"{argument} must be a file; {path} is a folder. Give the name of a file in it.")
     if path.exists() and not path.is_file():
         raise ValueError(f"{argument} must be a file; {path} is a device or a pipe. Give the name of a file.")
+    if path.is_symlink() and not path.exists():
+        raise ValueError(f"{argument} must be a file; {path} is a link that leads nowhere. Remove it first.")
 
 
 def check_parent(path: Path, argument: str) -> None:

@@ -1,98 +1,87 @@
 """Writing a folder as a whole: its files have their names only when all of them are complete."""
 
+import ctypes
+import errno
 import os
+import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Final
 
-from ballfg.files.held import MARK, NEW, PLAN, beside, clear, held
-from ballfg.files.moving import carry_out, move_in, settle
+from ballfg.files.held import MARK, NEW, OLD, held, hidden, is_hidden, named
 from ballfg.files.whole_file import check_parent, flush, flush_folder
+
+DEEPEST: Final = 100
+"""Folders in folders of a result."""
 
 
 @contextmanager
-def whole_folder(
-    folder: Path,
-    *,
-    earlier: Iterable[str] = (),
-    last: str | None = None,
-    merged: Collection[str] = (),
-    argument: str = "out",
-) -> Iterator[Path]:
-    """A hidden folder to write to; what it holds moves into `folder` when the block ends well.
+def whole_folder(folder: Path, *, earlier: Iterable[str] = (), argument: str = "out") -> Iterator[Path]:
+    """A hidden folder to write to; what it holds is in `folder` when the block ends well.
 
-    A new folder appears at once. In one that exists each entry is replaced in turn, and other files stay. After an
-    exception, Ctrl-C or a kill the folder holds the old result or the new one: where files were moving, the next
-    command that writes or reads it moves the rest (`settle`).
+    After an exception, Ctrl-C or a kill `folder` holds the old result or the new one: one that exists is exchanged, in
+    one step, for a new one that holds its other files too. A disk that cannot exchange folders needs two steps.
 
     Args:
         folder: its parent must exist.
-        earlier: names, or patterns of names, that an earlier result may have; those that are not written again are
-            removed.
-        last: name of the file that is moved last, for other programs that wait for it.
-        merged: names of folders in it whose entries are replaced one by one too, so that other files in them stay;
-            `earlier` names their entries as `name/entry`.
+        earlier: names of entries, or patterns of them, that an earlier result may have, such as `a` or `shots/a`;
+            those that are not written again are removed.
         argument: the folder's name in a message.
-    Raises: FileNotFoundError: the parent does not exist. ValueError: `folder` is a file, or another process writes it.
+    Raises: FileNotFoundError: the parent does not exist. ValueError: `folder` is a file, or one that cannot be
+        exchanged, or another process writes it. OSError: it cannot be written; `folder` is named.
     """
-    with reserved(folder, argument) as place:
+    target, patterns = _exchangeable(folder, argument), tuple(earlier)
+    if is_hidden(target):
+        target.mkdir(exist_ok=True)
+        yield target
+        return
+    with named(folder), held(target, argument), hidden(target.parent, target) as place:
         stage = place / NEW
-        target = Path(os.path.realpath(folder))
-        try:
-            stage.mkdir()
-            yield stage
-            for path in stage.rglob("*"):
-                (flush if path.is_file() else flush_folder)(path)
-            flush_folder(stage)
-            if place.parent == target:
-                move_in(place, target, earlier, last, merged)
-            elif target.exists():  # somebody has made it meanwhile
-                with reserved(target, argument) as inner:
-                    os.rename(stage, inner / NEW)
-                    move_in(inner, target, earlier, last, merged)
-            else:
-                os.rename(stage, target)
-                flush_folder(target.parent)
-        finally:
-            if not (place / PLAN).exists():
-                clear(place)
+        stage.mkdir()
+        yield stage
+        ours = {str(path.relative_to(stage)) for path in stage.rglob("*")}
+        for name in (*ours, ""):
+            (flush if (stage / name).is_file() else flush_folder)(stage / name)
+        if not target.exists():
+            os.rename(stage, target)
+        else:
+            for path, there, _ in _staying(target, stage, patterns):
+                if not os.path.lexists(there):
+                    _link(path, there)
+            for path, there, name in _staying(_put(place, target), target, patterns):
+                if name not in ours and not (os.path.lexists(there) and os.path.samestat(path.lstat(), there.lstat())):
+                    os.replace(path, there)  # somebody has written it meanwhile
+            os.utime(target)
+        flush_folder(target.parent)
 
 
 @contextmanager
-def reserved(folder: Path, argument: str = "out") -> Iterator[Path]:
-    """Keeps other processes from writing a folder until the block ends; `whole_folder` within it may.
+def reserved(folder: Path, argument: str = "out") -> Iterator[None]:
+    """Keeps other processes of this user from writing a folder until the block ends; `whole_folder` within it may.
 
     Long work begins with it, so that a folder that cannot be written to, or that another process writes, is refused
-    before the work and not after it. A writing that was killed while files moved is finished first.
+    before the work and not after it.
 
-    Returns: the hidden folder that is locked: in `folder`, or beside it if it does not exist.
-    Raises: FileNotFoundError: the parent does not exist. ValueError: `folder` is a file, or another process writes it.
-        OSError: nothing can be written there.
+    Raises: as `whole_folder`.
     """
-    check_folder(folder, argument)
-    target = Path(os.path.realpath(folder))
-    place = target / MARK if target.exists() else beside(target)
-    _end_first(target, folder, argument)
-    with held(place, folder, argument):
-        carry_out(place, target)
-        yield place
-
-
-def _end_first(target: Path, folder: Path, argument: str) -> None:
-    """Clears what a writing that made a new folder left beside it. Raises: ValueError: it has not ended."""
-    if target.exists() and beside(target).exists():
-        with held(beside(target), folder, argument):
+    target = check_folder(folder, argument)
+    with held(target, argument):
+        with named(folder), hidden(target if target.exists() else target.parent, target):
             pass
+        yield
 
 
-def check_folder(folder: Path, argument: str = "out") -> None:
-    """Refuses a path at which no folder can be made or written to.
+def check_folder(folder: Path, argument: str = "out") -> Path:
+    """The folder without links.
 
-    Raises: FileNotFoundError: its parent does not exist. ValueError: it is a file.
+    Raises: FileNotFoundError: its parent does not exist. ValueError: it is a file, or a link that leads nowhere.
     """
     check_parent(folder, argument)
-    if folder.exists() and not folder.is_dir():
+    if os.path.lexists(folder) and not folder.is_dir():
         raise ValueError(f"{argument} must be a folder; {folder} is a file. Choose another name.")
+    return Path(os.path.realpath(folder))
 
 
 def check_replaceable(
@@ -113,15 +102,87 @@ def check_replaceable(
         only: all names that an earlier result can have; None: other files may lie beside it.
         force: an earlier result may be replaced.
         is_mark: tells the mark from a file of that name that something else wrote.
-    Raises: ValueError: other content, or an earlier result and no `force`; else as `check_folder`.
+    Raises: ValueError: other content, or an earlier result and no `force`; else as `whole_folder`.
     """
-    check_folder(folder)
-    settle(folder)
-    _end_first(Path(os.path.realpath(folder)), folder, "out")
-    present = {entry.name for entry in folder.iterdir() if not entry.name.endswith(MARK)} if folder.exists() else set()
+    target = _exchangeable(folder, "out")
+    with held(target), named(folder), hidden(target.parent, target):  # what was left between two steps is put back
+        present = {entry.name for entry in target.iterdir()} if target.exists() else set()
+    present = {name for name in present if not name.startswith(MARK)}
     if not present:
         return
     if not is_mark(folder / mark) or (only is not None and not present <= set(only)):
         raise ValueError(f"out must be new, empty or hold {what}; {folder} holds other files. Choose another name.")
     if not force:
         raise ValueError(f"out must be new or empty; {folder} holds {what}. Replace it with --force.")
+
+
+def _exchangeable(folder: Path, argument: str) -> Path:
+    """The folder without links. Raises: ValueError: one that must keep its place; else as `check_folder`."""
+    target = check_folder(folder, argument)
+    with suppress(FileNotFoundError):  # the current folder may have been removed
+        if os.path.ismount(target) or target in (here := Path.cwd(), *here.parents):
+            raise ValueError(
+                f"{argument} must be a folder that can be exchanged for a new one; {folder} is mounted, or the current "
+                "folder is in it. Name a folder in it, or go to its parent."
+            )
+    return target
+
+
+def _staying(old: Path, new: Path, patterns: Collection[str]) -> Iterator[tuple[Path, Path, str]]:
+    """What stays of an earlier result: each file, its place in the new folder, and its name.
+
+    Folders are made in the new one, and at the end become as they were. Raises: OSError: one is mounted, or too deep.
+    """
+    folders = [""]
+    for within in folders:
+        if within.count("/") == DEEPEST or (within and os.path.ismount(old / within)):
+            raise OSError(errno.EXDEV, "a folder that is mounted or nested too deep stays here", str(old / within))
+        (new / within).mkdir(exist_ok=True)
+        for entry in list(os.scandir(old / within)):
+            name, there = os.path.join(within, entry.name), new / within / entry.name
+            if any(fnmatchcase(name, pattern) for pattern in patterns):
+                continue
+            if not entry.is_dir(follow_symlinks=False):
+                yield Path(entry), there, name
+            elif there.is_dir() or not os.path.lexists(there):
+                folders.append(name)
+    for within in reversed(folders):  # those in it first: it may be read-only
+        found = (old / within).stat()
+        with suppress(PermissionError):
+            os.chown(new / within, found.st_uid, found.st_gid)
+        shutil.copystat(old / within, new / within)
+
+
+def _link(path: Path, there: Path) -> None:
+    """Gives a file another name, or makes a copy where a disk has one name for each file."""
+    try:
+        os.link(path, there, follow_symlinks=False)
+    except OSError:
+        shutil.copy2(path, there, follow_symlinks=False)
+
+
+def _put(place: Path, target: Path) -> Path:
+    """Puts the new folder in the place of the old one. Returns: where the old one is then."""
+    try:
+        exchange(place / NEW, target)
+    except OSError:
+        os.rename(target, place / OLD)
+        try:
+            os.rename(place / NEW, target)
+        except BaseException:
+            os.rename(place / OLD, target)
+            raise
+        return place / OLD
+    return place / NEW
+
+
+def exchange(one: Path, other: Path) -> None:
+    """Exchanges two folders in one step. Raises: OSError: the system or the disk cannot."""
+    system, here, swap = ctypes.CDLL(None, use_errno=True), -100, 2  # AT_FDCWD; RENAME_EXCHANGE, RENAME_SWAP
+    first, second = os.fsencode(one), os.fsencode(other)
+    if hasattr(system, "renameat2"):
+        failed = system.renameat2(here, first, here, second, swap)
+    else:
+        failed = not hasattr(system, "renamex_np") or system.renamex_np(first, second, swap)  # macOS
+    if failed:
+        raise OSError(ctypes.get_errno(), "folders cannot be exchanged", str(other))

@@ -11,7 +11,6 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ballfg.checks import listed, short_text, shown
 from ballfg.files.json_file import read_json
-from ballfg.files.moving import settle
 from ballfg.pages.tables import Kind, ResultTable, columns_of, kind_of, read_table
 from ballfg.tracks import Ball, DatasetInfo, Track, read_dataset
 
@@ -89,7 +88,6 @@ def recognise(paths: Iterable[Path], opened: Callable[[Path], Folder] = read_dat
 def _read(path: Path, opened: Callable[[Path], Folder]) -> tuple[str, Any]:
     if not path.exists():
         raise FileNotFoundError(f"{path} does not exist; it could be {COULD_BE}. Check the path.")
-    settle(path if path.is_dir() else path.parent)
     if path.is_dir():
         if (path / "dataset.yaml").is_file():
             return "dataset", opened(path)

@@ -49,7 +49,7 @@ def write_simulation(
     """
     path = Path(folder)
     check_format(file_format)
-    with whole_folder(path, earlier=simulation_files(), last=TRUTH_FILE) as stage:
+    with whole_folder(path, earlier=simulation_files()) as stage:
         check_replaceable(path, mark=TRUTH_FILE, what="a simulated dataset", force=force)
         with TableWriter(stage / f"truth.{file_format}") as truth:
             tracks = _with_truth(watch(simulate(config), config.tracks, "tracks simulated"), truth, config)

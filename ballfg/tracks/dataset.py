@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from ballfg.checks import shown
-from ballfg.files.moving import settle
+from ballfg.files.one_state import of_one_state
 from ballfg.tracks.checks import Findings, check_scale, tidy
 from ballfg.tracks.detections_file import DETECTIONS_FILE
 from ballfg.tracks.grouping import Index, RowGroup, groups, scan
@@ -126,6 +126,7 @@ def has_positions(folder: str | PathLike[str]) -> bool:
     return any((path / name).is_file() for name in TRACK_FILES) or not (path / DETECTIONS_FILE).is_file()
 
 
+@of_one_state
 def read_dataset(folder: str | PathLike[str]) -> Dataset:
     """Opens a dataset and checks all of it, so that no error waits in the middle of the file.
 
@@ -140,7 +141,6 @@ def read_dataset(folder: str | PathLike[str]) -> Dataset:
         ValueError: the content breaks a rule; the message names file, line, column and remedy.
     """
     path = Path(folder)
-    settle(path)
     source = _open_source(path)
     info, notes = read_info(path / INFO_FILE)
     notes += [f"{source.path.name}: column {shown(name)} ignored" for name in source.ignored]

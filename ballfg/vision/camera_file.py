@@ -13,7 +13,6 @@ import yaml
 
 from ballfg.checks import check_keys, did_you_mean, is_number, listed, shown
 from ballfg.files.file_storage import ENDINGS, Tree, number, numbers, read_storage
-from ballfg.files.moving import settle
 from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.files.whole_file import whole_file, write_text
 from ballfg.vision.camera import Camera
@@ -47,7 +46,6 @@ def read_cameras(path: str | PathLike[str], *, posed: bool = True) -> list[Camer
         ValueError, TypeError: a field that is missing, not known or wrong; the message names file, camera and field.
     """
     path = Path(path)
-    settle(path.parent)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a file with cameras; there is none. Correct the path.")
     try:

@@ -8,12 +8,11 @@ from typing import Any, Self
 
 import yaml
 from pydantic import BaseModel, ConfigDict, ValidationError
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from ballfg.checks import one_line
 from ballfg.dynamics.earlier_names import todays_name
-from ballfg.files.moving import reclaim
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.weights import read_tensors
 from ballfg.files.whole_folder import whole_folder
@@ -77,7 +76,7 @@ def write_checkpoint(folder: Path, checkpoint: Checkpoint) -> None:
         for name in TENSORS:
             tensors: dict[str, Tensor] = getattr(checkpoint, name)
             owned = {key: tensor.detach().contiguous().clone() for key, tensor in tensors.items()}
-            save_file(owned, part / f"{name}.safetensors")
+            (part / f"{name}.safetensors").write_bytes(save(owned))
         state = checkpoint.progress.model_dump() | {DIGESTS: _digests(part)}
         text = yaml.safe_dump(state, sort_keys=False)
         (part / STATE).write_text(text, encoding="utf-8")
@@ -89,7 +88,6 @@ def read_checkpoint(folder: Path) -> Checkpoint | None:
     Raises: ValueError: if it is damaged.
     """
     path = folder / NAME
-    reclaim(path)
     if not path.exists():
         return None
     try:

@@ -9,7 +9,6 @@ from typing import Any
 import yaml
 
 from ballfg.checks import shown
-from ballfg.files.moving import settle
 from ballfg.files.whole_file import write_text
 from ballfg.files.whole_folder import reserved
 from ballfg.learning.config.config_file import Config, read_config
@@ -33,7 +32,6 @@ def check(folder: Path, config: Config, *, resume: bool) -> None:
         ValueError: a file, or a folder with an earlier run; to resume, a config that would change the numbers.
         FileNotFoundError: no run to resume.
     """
-    settle(folder)
     if resume:
         _check_resumable(folder, config)
         return

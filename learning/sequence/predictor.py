@@ -15,7 +15,7 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ballfg.checks import short_text, shown
-from ballfg.files.moving import settle
+from ballfg.files.one_state import of_one_state
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.weights import read_tensors
 from ballfg.files.whole_folder import whole_folder
@@ -165,9 +165,9 @@ class SequencePredictor:
         return cls(architecture, launcher, model)
 
 
+@of_one_state
 def _read(folder: Path) -> tuple[FolderConfig, dict[str, Tensor]]:
     """Config and weights of a folder."""
-    settle(folder)
     for name in (CONFIG, WEIGHTS):
         if not (folder / name).is_file():
             raise FileNotFoundError(f"{folder} must hold {CONFIG} and {WEIGHTS}; {name} is missing. Save it again.")

@@ -15,6 +15,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from ballfg.files import whole_folder
+
 KILL = 0
 """In place of an error's number."""
 ROOM = ("mkdir", "open", "write", "fsync")
@@ -41,9 +43,10 @@ class Faults:
 
     def install(self) -> None:
         """Replaces the calls in this process, for good: a process of its own should do it."""
-        for name in ("replace", "rename", "mkdir", "unlink", "rmdir", "fsync"):
+        for name in ("replace", "rename", "mkdir", "unlink", "rmdir", "link", "fsync"):
             setattr(os, name, self._wrapped(name, getattr(os, name)))
         os.remove = os.unlink
+        whole_folder.exchange = self._wrapped("exchange", whole_folder.exchange)
         real_open = os.open
 
         def created(path: Any, flags: int, *more: Any, **named: Any) -> int:

@@ -128,6 +128,7 @@ def _digest(path: Path) -> str:
 def run(scenario: Scenario, tally: Tally, most: int | None, error: int = KILL, lasting: bool = False) -> None:
     """Runs a scenario with a fault at each of its calls, or at `most` of them, evenly."""
     with tempfile.TemporaryDirectory(prefix="faults-") as place:
+        os.environ["XDG_STATE_HOME"] = str(Path(place, "state"))  # where killed commands leave their locks
         pristine, folder, said = Path(place, "pristine"), Path(place, "work"), Path(place, "said")
         pristine.mkdir()
         shutil.copytree(pristine, folder)

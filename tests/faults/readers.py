@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 from ballfg.benchmarks.diagnosis.ideal import read_ideal
 from ballfg.benchmarks.diagnosis.record import read_record as read_case
@@ -16,8 +14,6 @@ from ballfg.diagnosis.design.reported import reported_pairs
 from ballfg.dynamics import load_model
 from ballfg.estimation import load_conformal, with_readings
 from ballfg.estimation.observations.sighted_dataset import read_sighted
-from ballfg.files.held import MARK, PLAN
-from ballfg.files.moving import settle
 from ballfg.importing import Choices, propose
 from ballfg.learning.calibration.report import compare
 from ballfg.learning.calibration.run import read_checkpoint as read_steps
@@ -112,18 +108,6 @@ def _steps(folder: Path, file: Path) -> object:
     return [compare(step.scores, step.scores, step.scores, step.scores) for step in steps]
 
 
-def _moving(folder: Path, file: Path) -> object:
-    """A writing that was ended is carried out, in a copy."""
-    with TemporaryDirectory() as place:
-        copy = Path(shutil.copytree(folder, Path(place) / "moving", symlinks=True))
-        try:
-            settle(copy / "out")
-        except ValueError as error:
-            raise ValueError(str(error).replace(str(copy), str(folder))) from None
-        if (copy / "out" / MARK / PLAN).exists():
-            raise RuntimeError("a plan must be carried out or refused")
-
-
 def _import(folder: Path, file: Path) -> object:
     return propose(folder / file.relative_to(folder).parts[0], Choices())
 
@@ -153,7 +137,6 @@ READERS = {
         Reader("steps", _steps),
         Reader("records", _record),
         Reader("scene", lambda folder, file: earlier_files(file)),
-        Reader("moving", _moving),
     )
 }
 IMPORT = Reader("import", _import)

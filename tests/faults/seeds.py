@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -12,7 +11,6 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 import yaml
 
-from ballfg.files.held import MARK, NEW, PLAN
 from ballfg.simulation import SimulationConfig, simulate
 from ballfg.vision.camera_file import write_cameras, write_opencv
 from tests.estimation.observations.sighted_rig import RIG, scene, world
@@ -108,15 +106,6 @@ def _scene(folder: Path) -> None:
     (folder / "scene.yaml").write_text(yaml.safe_dump(content, sort_keys=False))
 
 
-def _moving(folder: Path) -> None:
-    """A folder whose writer was ended while files moved."""
-    place = folder / "out" / MARK
-    (place / NEW).mkdir(parents=True)
-    for name in ("tracks.csv", "dataset.yaml"):
-        (folder / "out" / name).write_text("old\n")
-    (place / PLAN).write_text(json.dumps({"stale": ["labels.csv"], "new": ["tracks.csv", "dataset.yaml"]}))
-
-
 def _cameras(folder: Path) -> None:
     write_cameras(folder / "cameras.yaml", RIG)
     for ending in ("xml", "json", "yml"):
@@ -159,5 +148,5 @@ _WRITERS = {
     "conformal": write_conformal, "ball": write_ball, "table": _table, "results": _results, "report": write_report,
     "checkpoint": write_checkpoint_folder, "sequence": write_sequence, "cameras": _cameras,
     "detections": _detections, "live": _live, "video": _video, "noise": write_noise, "steps": write_calibration_steps,
-    "records": write_records, "scene": _scene, "moving": _moving,
+    "records": write_records, "scene": _scene,
 }  # fmt: skip

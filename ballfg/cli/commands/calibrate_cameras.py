@@ -156,7 +156,7 @@ def _placed(camera: Camera, lens: Intrinsics | None, marked: TableFile | None) -
 
 
 def _write(out: Path, found: list[Calibration], shown: Mapping[str, Image], marked: TableFile | None) -> None:
-    from ballfg.files.whole_folder import whole_folder
+    from ballfg.files.whole_file import whole_file
     from ballfg.vision.calibration.report import calibration_picture, content, summary
     from ballfg.vision.calibration.table_points import TABLE_HEIGHT
     from ballfg.vision.camera_file import write_cameras, write_opencv
@@ -165,10 +165,12 @@ def _write(out: Path, found: list[Calibration], shown: Mapping[str, Image], mark
     report, picture = (out.with_name(f"{out.stem}_calibration{ending}") for ending in (".json", ".png"))
     text = json.dumps([content(one) for one in found], indent=2, allow_nan=False, ensure_ascii=False)
     write = write_cameras if out.suffix.lower() in OURS else write_opencv
-    with whole_folder(out.absolute().parent) as stage:  # the three appear together: they tell of the same calibration
-        (stage / report.name).write_text(text + "\n", encoding="utf-8")
-        figure.savefig(stage / picture.name)
-        write(stage / out.name, [one.camera for one in found], posed=marked is not None)
+    with whole_file(report) as first, whole_file(picture) as second, whole_file(out) as third:
+        first.write_text(text + "\n", encoding="utf-8")
+        figure.savefig(second)
+        write(third, [one.camera for one in found], posed=marked is not None)
+        for old in (report, picture):  # they never lie beside cameras of another calibration
+            old.unlink(missing_ok=True)
     print(*(line for one in found for line in summary(one)), sep="\n")
     print(f"{out}: {len(found)} camera{'s' if len(found) > 1 else ''}{'' if marked else ', lenses only'}")
     print(f"how well they are known: {report}, {picture}")

@@ -48,7 +48,7 @@ def example(
     windy = replace(plain, seed=seed + 1, undeclared=simulation.parse_effects([WIND]))
     named = ((PLAIN, plain), (WINDY, windy))
     earlier = [f"{name}/{file}" for name, _ in named for file in simulation_files()]
-    with whole_folder(out, earlier=earlier, merged=(PLAIN, WINDY)) as stage:
+    with whole_folder(out, earlier=earlier) as stage:
         if out.exists():
             for name, _ in named:
                 check_replaceable(out / name, mark=TRUTH_FILE, what="a simulated dataset", force=force)

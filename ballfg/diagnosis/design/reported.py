@@ -9,7 +9,6 @@ from ballfg.diagnosis.result import Diagnosis
 from ballfg.diagnosis.search.hypothesis import TWINS
 from ballfg.dynamics import EFFECTS
 from ballfg.files.json_file import read_json
-from ballfg.files.moving import settle
 
 
 def pairs_of(diagnosis: Diagnosis) -> list[tuple[str, str]]:
@@ -25,7 +24,6 @@ def reported_pairs(folder: Path) -> list[tuple[str, str]]:
 
     Raises: FileNotFoundError: no report there. ValueError: a file that is no report, or no pair in it.
     """
-    settle(folder)
     path = folder / REPORT
     if not path.is_file():
         raise FileNotFoundError(f"diagnosis must be a folder with {REPORT}; {folder} has none. Run ballfg diagnose.")

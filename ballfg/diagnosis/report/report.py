@@ -16,6 +16,7 @@ from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.page import page
 from ballfg.diagnosis.result import Candidate, Diagnosis, Errors, Value
 from ballfg.dynamics import BallModel, save_model
+from ballfg.dynamics.networks.learned_file import LEARNED
 from ballfg.files.json_file import read_json
 from ballfg.files.whole_folder import check_replaceable, whole_folder
 
@@ -40,7 +41,7 @@ def write_report(
     """Write `report.json`, `report.html` and `model.yaml` into a folder.
 
     They appear together. An earlier report is replaced: its files are those that its `report.json` lists. Other files
-    of the folder stay.
+    of the folder stay, and so do folders of weights, which copies of its models may name.
 
     Args:
         diagnosis: to report.
@@ -55,7 +56,7 @@ def write_report(
     folder = Path(out).resolve()
     check_report_folder(folder)
     earlier = earlier_files(folder / REPORT) or ()
-    with whole_folder(folder, earlier=[glob.escape(name) for name in earlier], last=REPORT) as made:
+    with whole_folder(folder, earlier=[glob.escape(name) for name in earlier if LEARNED not in name]) as made:
         save_model(diagnosis.model, made / MODEL)
         for name, model in (rooms or {}).items():
             save_model(model, made / room_file(name))

@@ -6,7 +6,6 @@ saving again never changes one that a file names.
 
 import hashlib
 import re
-import shutil
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -30,6 +29,8 @@ from ballfg.files.whole_folder import whole_folder
 from ballfg.tracks import TrackNoise
 
 CONFIG, WEIGHTS = "config.yaml", "weights.safetensors"
+LEARNED = ".learned-"
+"""In the name of a folder, between the stem of the first model file that named it and the digest of its content."""
 _MODEL, _LAUNCHER, BASE = "model.", "launcher.", "base."
 """What the names of tensors start with: those of the networks and of the spin embedding; those of the base, which
 stand in the model file itself."""
@@ -76,23 +77,15 @@ def write_learned(model: BallModel, parent: Path, stem: str) -> str:
     """Write the folder of a model's learned part.
 
     Args: model: learned, or analytic with `trained`.  parent: folder to write into.  stem: start of the name.
-    Returns: the new folder's name. It appears only once it is whole.
+    Returns: the folder's name. It appears only once it is whole, and nothing removes it: model files are copied.
     """
     config = yaml.safe_dump(_config(model).model_dump(mode="json"), sort_keys=False, allow_unicode=True).encode()
     weights = safetensors.torch.save({name: t.detach().contiguous() for name, t in _tensors(model).items()})
-    folder = parent / f"{stem}.learned-{_digest(config, weights)}"
-    if not folder.exists():
-        with whole_folder(folder) as part:
-            (part / CONFIG).write_bytes(config)
-            (part / WEIGHTS).write_bytes(weights)
+    folder = parent / f"{stem}{LEARNED}{_digest(config, weights)}"
+    with whole_folder(folder) as part:
+        (part / CONFIG).write_bytes(config)
+        (part / WEIGHTS).write_bytes(weights)
     return folder.name
-
-
-def remove_others(parent: Path, stem: str, keep: str | None) -> None:
-    """Remove the folders that `write_learned` made earlier under this stem, but for one."""
-    for folder in parent.glob(f"{stem}.learned-{'[0-9a-f]' * 12}"):
-        if folder.name != keep:
-            shutil.rmtree(folder)
 
 
 def read_learned(folder: Path, analytic: AnalyticModel) -> BallModel:
@@ -124,7 +117,7 @@ def _digest(config: bytes, weights: bytes) -> str:
 
 def _check_digest(folder: Path) -> None:
     """Refuses files that are not those that were saved. A folder that somebody has named otherwise has no digest."""
-    named = re.search(r"\.learned-([0-9a-f]{12})$", folder.name)
+    named = re.search(rf"{re.escape(LEARNED)}([0-9a-f]{{12}})$", folder.name)
     found = _digest((folder / CONFIG).read_bytes(), (folder / WEIGHTS).read_bytes())
     if named is not None and named[1] != found:
         raise ValueError(

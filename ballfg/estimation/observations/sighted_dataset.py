@@ -8,7 +8,7 @@ from typing import Final
 
 from ballfg.checks import shown
 from ballfg.estimation.observations.sightings import NeverSeenByTwoError, sighted_track
-from ballfg.files.moving import settle
+from ballfg.files.one_state import of_one_state
 from ballfg.tracks.dataset import TrackFolder
 from ballfg.tracks.detections_file import DETECTIONS_FILE, read_sightings
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, read_info
@@ -86,6 +86,7 @@ class SightedDataset(TrackFolder):
         return list(self._tracks)
 
 
+@of_one_state
 def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
     """Opens the detections of a dataset and checks all of them. They are held in memory.
 
@@ -98,7 +99,6 @@ def read_sighted(folder: str | PathLike[str]) -> SightedDataset:
         ValueError: the content breaks a rule, or there is no ball in it; the message names file, line and remedy.
     """
     path = Path(folder)
-    settle(path)
     for name in (INFO_FILE, CAMERAS_FILE, DETECTIONS_FILE):
         if not (path / name).is_file():
             raise FileNotFoundError(

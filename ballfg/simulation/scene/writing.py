@@ -67,7 +67,7 @@ def write_scene(
             raise ValueError(f"camera names must be good as file names; got {shown(camera.name)}. Rename it.")
     scene = path / SCENE_FILE
     earlier = [glob.escape(name) for name in earlier_files(scene)]
-    with whole_folder(path, earlier=earlier, last=SCENE_FILE) as stage:
+    with whole_folder(path, earlier=earlier) as stage:
         check_scene_folder(path, force=force)
         every_image = itertools.chain.from_iterable(map(recording.images, range(len(recording.cameras))))
         drawn = watch(every_image, recording.image_count, "frames drawn")

@@ -8,7 +8,6 @@ import numpy as np
 
 from ballfg.arrays import Array, Mask
 from ballfg.checks import shown
-from ballfg.files.moving import settle
 from ballfg.tracks import detections_file
 from ballfg.tracks.checks import check_step
 from ballfg.tracks.rows import KEY
@@ -43,7 +42,6 @@ def read_detections(
         ValueError: a column that is missing, a cell out of its range, an unknown camera, a camera without rows; the
             message names file, line and column.
     """
-    settle(path.parent)
     header, texts, values = detections_file.read_columns(path, REQUIRED)
     names = texts[detections_file.CAMERA]
     rows = np.arange(len(names))
