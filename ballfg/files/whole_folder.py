@@ -51,7 +51,7 @@ def whole_folder(folder: Path, *, earlier: Iterable[str] = (), argument: str = "
                 if not os.path.lexists(there):
                     _link(path, there)
             for path, there, name in _staying(_put(place, target), target, patterns):
-                if name not in ours and not (os.path.lexists(there) and os.path.samestat(path.lstat(), there.lstat())):
+                if name not in ours and _stamp(path) != _stamp(there):
                     os.replace(path, there)  # somebody has written it meanwhile
             os.utime(target)
         flush_folder(target.parent)
@@ -159,6 +159,11 @@ def _link(path: Path, there: Path) -> None:
         os.link(path, there, follow_symlinks=False)
     except OSError:
         shutil.copy2(path, there, follow_symlinks=False)
+
+
+def _stamp(path: Path) -> tuple[int, int] | None:
+    found = path.lstat() if os.path.lexists(path) else None
+    return None if found is None else (found.st_size, found.st_mtime_ns)
 
 
 def _put(place: Path, target: Path) -> Path:
