@@ -37,6 +37,12 @@ MAX_SAID = 160
 """Characters of a library's own words in a message."""
 MAX_LISTED = 12
 """Names in a list in a message."""
+MAX_NAME = 200
+"""Characters of the name of a track, dataset, camera, label or group: they go to files, pages and terminals."""
+MAX_TEXT = 2000
+"""Characters of other text that a file states, such as where data come from."""
+_JOINERS = "\u200c\u200d"
+"""Invisible letters that Persian, Indian scripts and emoji are written with."""
 _MAX_COMPARED = 200
 """Candidates that a misspelt name is compared with; each takes some 20 microseconds."""
 
@@ -46,9 +52,24 @@ def type_name(value: object) -> str:
     return "nothing" if value is None else type(value).__name__
 
 
+def is_visible(text: str) -> bool:
+    """Whether a text shows what it holds: no control or formatting characters, such as those that turn its direction.
+
+    Source: Unicode Standard Annex 44, general categories; those that start with C or Z, but for a space.
+    """
+    return text.isprintable() or all(letter.isprintable() or letter in _JOINERS for letter in text)
+
+
+def visible(text: str) -> str:
+    """The text with all that a terminal would obey, or not show, as Python writes it."""
+    if is_visible(text):
+        return text
+    return "".join(letter if is_visible(letter) else ascii(letter)[1:-1] for letter in text)
+
+
 def one_line(error: object) -> str:
     """The text of an error on one line, without its full stop."""
-    return " ".join(str(error).split()).rstrip(".")
+    return visible(" ".join(str(error).split())).rstrip(".")
 
 
 def shown(value: object) -> str:
@@ -64,15 +85,14 @@ def shown(value: object) -> str:
 
 
 def short_text(text: str, most: int = MAX_SHOWN) -> str:
-    """The text, or its beginning where it is longer than a message can hold, `most` characters."""
-    return text if len(text) <= most else f"{text[: most - 3]}..."
+    """The text, or its beginning where it is longer than a message can hold, `most` characters; all of it visible."""
+    return visible(text if len(text) <= most else f"{text[: most - 3]}...")
 
 
 def listed(names: Collection[object]) -> str:
     """Names in a message: the first ones, and how many more there are; line feeds and their like as in Python."""
-    first = [
-        short_text(str(name) if str(name).isprintable() else repr(name)) for name in itertools.islice(names, MAX_LISTED)
-    ]
+    texts = map(str, itertools.islice(names, MAX_LISTED))
+    first = [short_text(text if is_visible(text) else repr(text)) for text in texts]
     more = len(names) - len(first)
     return (", ".join(first) or "nothing") + (f" and {more} more" if more else "")
 
@@ -88,6 +108,38 @@ def check_text(label: str, value: object, *, optional: bool = False) -> None:
         raise TypeError(f"{label} must be text; got {type_name(value)} {short_text(str(value))}. Put it in quotes.")
     if not value.strip():
         raise ValueError(f"{label} must not be empty; got {shown(value)}. Give it a text.")
+    if not is_text(value):
+        raise ValueError(f"{label} must be {TEXT_RULE}; got {shown(value)}. Correct it.")
+
+
+TEXT_RULE = f"text of at most {MAX_TEXT} characters without control or formatting characters"
+"""What text beside names must be."""
+
+
+def is_text(value: str) -> bool:
+    """Whether a text, which may have several lines, can be shown: `TEXT_RULE`."""
+    return len(value) <= MAX_TEXT and is_visible("".join(value.split()))
+
+
+def is_name(value: str) -> bool:
+    """Whether a text can name a track, a dataset, a camera, a label or a group: `NAME_RULE`."""
+    return bool(value) and not value.isspace() and len(value) <= MAX_NAME and is_visible(value)
+
+
+NAME_RULE = f"printable text of one line, 1 to {MAX_NAME} characters without control or formatting characters"
+"""What a name must be."""
+
+
+def check_name(label: str, value: object, remedy: str = "Rename it.") -> str:
+    """The name itself.
+
+    Raises: TypeError: not text. ValueError: no name that files and terminals can show: `is_name`.
+    """
+    if not isinstance(value, str):
+        raise TypeError(f"{label} must be text; got {type_name(value)} {shown(value)}. Put it in quotes.")
+    if not is_name(value):
+        raise ValueError(f"{label} must be {NAME_RULE}; got {shown(value)}. {remedy}")
+    return value
 
 
 def check_keys(where: str, content: dict[Any, Any], known: Collection[str], needed: Collection[str]) -> None:

@@ -76,7 +76,9 @@ def _in_words(error: Exception) -> str:
 
 
 def _bad_input(message: str, context: typer.Context | None = None) -> int:
-    text = "".join(letter if letter.isprintable() else ascii(letter)[1:-1] for letter in " ".join(message.split()))
+    from ballfg.checks import visible  # not with the module: `ballfg --help` must not wait for numpy
+
+    text = visible(" ".join(message.split()))
     if len(text) > _LONGEST:
         text = f"{text[:_LONGEST]} ... ({len(text) - _LONGEST} characters more)"
     hint = "" if context is None else f" See '{context.command_path} --help'."

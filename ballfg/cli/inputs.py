@@ -217,8 +217,10 @@ def check_out(out: Path, dataset: Path) -> None:
 
 def print_notes(notes: Iterable[str]) -> None:
     """Prints what the user should know, on stderr."""
+    from ballfg.checks import visible
+
     for note in notes:
-        print(f"note: {note}", file=sys.stderr)
+        print(f"note: {visible(note)}", file=sys.stderr)
 
 
 @contextmanager

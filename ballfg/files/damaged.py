@@ -1,4 +1,8 @@
-"""Files that may be damaged or hostile: what a library raises becomes one line, and what they unpack to is bounded."""
+"""Files that may be damaged or hostile: what a library raises becomes one line, and what they unpack to is bounded.
+
+Every reader passes here before it decodes anything. A small file may unpack to `FREE` bytes, a large one to `RATIO`
+times its size more; text is held whole up to `MAX_TEXT` bytes, an image up to `MAX_PIXELS`.
+"""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,10 +11,19 @@ from typing import Final
 
 from ballfg.checks import one_line, short_text
 
-FREE: Final = 64_000_000
+FREE: Final = 32_000_000
 """Bytes that any file may unpack to."""
-RATIO: Final = 100
-"""Times its own size that a file may unpack to beyond that. Measurements shrink to a half or a third."""
+RATIO: Final = 20
+"""Times its own size that a file may unpack to beyond that. Measurements shrink to a half or third, whole rows of zeros
+to a tenth."""
+NUMBER: Final = 8
+"""Bytes of a number in memory, whatever it takes in a file."""
+MAX_TEXT: Final = 250_000_000
+"""Bytes of a file of text that is held whole."""
+MAX_LINE: Final = 1 << 18
+"""Characters of a line of a table. Those of a result have some 400."""
+MAX_PIXELS: Final = 64_000_000
+"""Of an image or a frame: 192 MB of three colours. A frame in 4K has 8 million."""
 _SAID: Final = 160
 """Characters of a library's own words."""
 
@@ -27,8 +40,7 @@ def library_reads(path: Path, kind: str, remedy: str = "Copy or export it again.
     except Exception as error:
         if type(error) is ValueError and str(path) in str(error):
             raise
-        said = one_line(error) or type(error).__name__
-        said = said if len(said) <= _SAID else f"{said[:_SAID]}..."
+        said = short_text(one_line(error) or type(error).__name__, _SAID)
         raise ValueError(f"{path} must be a whole {kind} file; {said}. {remedy}") from None
 
 
@@ -40,8 +52,8 @@ def most_unpacked(path: Path) -> int:
 def check_unpacked(path: Path, size: int) -> None:
     """Refuses a file that says it holds far more than its own size can tell; call it before anything is unpacked.
 
-    Args: path: of the file.  size: bytes that its content would take in memory.
-    Raises: ValueError: more than 64 MB and 100 times the size of the file.
+    Args: path: of the file.  size: bytes that its content would take in memory, `NUMBER` for each cell of a table.
+    Raises: ValueError: more than 32 MB and 20 times the size of the file.
     """
     most = most_unpacked(path)
     if size > most:
@@ -49,3 +61,28 @@ def check_unpacked(path: Path, size: int) -> None:
             f"{path} must unpack to at most {most / 1e6:.0f} MB, which is {FREE / 1e6:.0f} MB and {RATIO} times its "
             f"size; it says {short_text(f'{size / 1e6:.0f}')} MB. Write it again without rows that say nothing."
         )
+
+
+def check_count(path: Path, what: str, count: int, most: int) -> None:
+    """Refuses a file with more parts than its reader can look at. Args: what: the parts. Raises: ValueError."""
+    if count > most:
+        raise ValueError(f"{path} must have at most {most} {what}; got {count}. Split it, or leave some out.")
+
+
+def check_pixels(path: Path, width: int, height: int) -> None:
+    """Refuses an image or video of a size that no camera has, px; call it before anything is decoded.
+
+    Raises: ValueError: more than `MAX_PIXELS`, or none.
+    """
+    if not 0 < width * height <= MAX_PIXELS:
+        raise ValueError(
+            f"{path} must have at most {MAX_PIXELS / 1e6:g} million pixels; it says {width} x {height}. Scale it down."
+        )
+
+
+def whole_content(path: Path, most: int = MAX_TEXT) -> bytes:
+    """The bytes of a file of at most `most`. Raises: ValueError: it is larger, as one full of holes is. OSError."""
+    size = path.stat().st_size
+    if size > most:
+        raise ValueError(f"{path} must have at most {most / 1e6:g} MB; it has {size / 1e6:.0f} MB. Split it.")
+    return path.read_bytes()

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import listed, shown
+from ballfg.checks import MAX_TEXT, NAME_RULE, is_name, listed, short_text, shown
 from ballfg.importing.choices import Choices, UndecidedError
 from ballfg.importing.columns import Roles
 from ballfg.importing.formats.raw import Column, RawTable, is_number, numbers
@@ -99,9 +99,14 @@ def cut(table: RawTable, roles: Roles, choices: Choices, counts: Counts) -> list
         parts = _at_restarts(stamps, rows, counts)
         names = [f"{i:03d}" for i in range(len(parts))]
     else:
-        parts, names = _by_name(
-            table.texts.get(roles.trajectory, table.columns[roles.trajectory]), stamps, rows, counts
-        )
+        column = table.texts.get(roles.trajectory, table.columns[roles.trajectory])
+        parts, names = _by_name(column, stamps, rows, counts)
+        for name, part in zip(names, parts, strict=True):
+            if not is_name(name):
+                raise ValueError(
+                    f"{table.where}, row {part[0] + 1}, column {shown(roles.trajectory)}: must be {NAME_RULE}; got "
+                    f"{shown(name)}. Rename the shot."
+                )
     found = []
     labels = _labels(table, roles.others, parts, counts)
     for i, (name, part) in enumerate(zip(names, parts, strict=True)):
@@ -194,12 +199,11 @@ def _ordered(part: NDArray[np.intp], stamps: Stamps, counts: Counts) -> NDArray[
 def _by_name(
     column: Column, stamps: Stamps, rows: NDArray[np.intp], counts: Counts
 ) -> tuple[list[NDArray[np.intp]], list[str]]:
-    _, first, codes = np.unique(column[rows].astype(str), return_index=True, return_inverse=True)
+    codes_of: dict[str, int] = {}  # an array of texts would give each row the room of the longest
+    codes = np.array([codes_of.setdefault(str(value), len(codes_of)) for value in column[rows].tolist()])
     order = np.argsort(codes, kind="stable")
     parts = np.split(rows[order], np.flatnonzero(np.diff(codes[order])) + 1)
-    sequence = np.argsort(first)
-    names = [_text(column[parts[i][0]]) for i in sequence]
-    return [_ordered(parts[i], stamps, counts) for i in sequence], names
+    return [_ordered(part, stamps, counts) for part in parts], [_text(column[part[0]]) for part in parts]
 
 
 def _text(value: object) -> str:
@@ -242,14 +246,14 @@ def _needed(roles: Roles) -> tuple[str, ...]:
 
 
 def _may_be_label(name: str) -> bool:
-    return bool(name.strip()) and name.isprintable() and name != "trajectory"
+    return is_name(name) and name != "trajectory"
 
 
 def _label(column: Column, row: int) -> Label | None:
     if is_number(column):
         value = float(column[row])
         return value if np.isfinite(value) else None
-    return " ".join(str(column[row]).split()) or None
+    return short_text(" ".join(str(column[row]).split()), MAX_TEXT) or None
 
 
 def _empty(column: Column) -> bool:

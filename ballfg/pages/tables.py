@@ -10,12 +10,15 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pa_csv
-import pyarrow.parquet as pq
+from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import one_line
-from ballfg.files.damaged import check_unpacked, library_reads
+from ballfg.checks import NAME_RULE, is_name, one_line, shown
+from ballfg.files.parquet import open_parquet
+from ballfg.files.spreadsheet import bare
 from ballfg.state import SIGMA_NAMES, STATE_NAMES
+from ballfg.tracks import csv_files
+from ballfg.tracks.rows import distinct
 
 KEYS = ("trajectory", "t")
 LARGEST = 1e12
@@ -63,15 +66,9 @@ def columns_of(path: Path) -> list[str]:
     Raises: ValueError: the file cannot be read as the table that its ending promises.
     """
     if path.suffix.lower() == ".parquet":
-        with library_reads(path, "Parquet", "Write it again."):
-            about = pq.read_metadata(path)
-            check_unpacked(path, 8 * about.num_rows * about.num_columns)
-            return list(about.schema.to_arrow_schema().names)
-    try:
-        with path.open(encoding="utf-8") as lines:
-            return [name.strip().strip('"') for name in lines.readline().rstrip("\r\n").split(",")]
-    except UnicodeDecodeError:
-        raise ValueError(f"{path} must be a CSV table in UTF-8; got other bytes. Write it again.") from None
+        with open_parquet(path) as file:
+            return list(file.schema_arrow.names)
+    return [name.strip() for name in csv_files.read_header(path)]
 
 
 def read_table(path: Path, kind: Kind) -> ResultTable:
@@ -80,10 +77,13 @@ def read_table(path: Path, kind: Kind) -> ResultTable:
     Raises: ValueError: no rows, a cell that is no number, or a stamp that is not finite.
     """
     names = [*KEYS, *kind.value]
-    types = {"trajectory": pa.string()} | dict.fromkeys(names[1:], pa.float64())
+    types = {"trajectory": pa.dictionary(pa.int32(), pa.string())} | dict.fromkeys(names[1:], pa.float64())
+    is_csv = path.suffix.lower() != ".parquet"
     try:
-        if path.suffix.lower() == ".parquet":
-            found = pq.read_table(path, columns=names).cast(pa.schema(list(types.items())))
+        if not is_csv:
+            with open_parquet(path) as file:
+                found = file.read(columns=names).select(names)
+            found = pa.table({name: _as(found[name], types[name]) for name in names})
         else:
             options = pa_csv.ConvertOptions(
                 column_types=types, include_columns=names, strings_can_be_null=False, null_values=["", "nan", "NaN"]
@@ -106,10 +106,29 @@ def read_table(path: Path, kind: Kind) -> ResultTable:
             f"{path}: {names[1 + column]} must be at most {LARGEST:g} in SI units; row {row + 1} has "
             f"{values[row, column]:g}. Correct it."
         )
-    keys = found["trajectory"].combine_chunks().dictionary_encode()
-    codes = keys.indices.to_numpy().astype(np.int64)
+    tracks, codes = _tracks(path, found["trajectory"], is_csv)
     order = np.lexsort((values[:, 0], codes))
-    counts = np.bincount(codes, minlength=len(keys.dictionary))
-    ends = np.cumsum(counts).tolist()
+    ends = np.cumsum(np.bincount(codes, minlength=len(tracks))).tolist()
     rows = map(slice, [0, *ends], ends)
-    return ResultTable(path, kind, dict(zip(keys.dictionary.to_pylist(), rows, strict=True)), values[order])
+    return ResultTable(path, kind, dict(zip(tracks, rows, strict=True)), values[order])
+
+
+def _as(column: pa.ChunkedArray, kind: pa.DataType) -> pa.ChunkedArray:
+    """The column as another type; whole numbers may name tracks."""
+    if pa.types.is_dictionary(kind) and not pa.types.is_dictionary(column.type):
+        return column.cast(pa.string()).dictionary_encode()
+    return column.cast(kind)
+
+
+def _tracks(path: Path, column: pa.ChunkedArray, is_csv: bool) -> tuple[list[str], NDArray[np.int64]]:
+    """The names of the tracks in the order in which they first appear, and the number of each row's track."""
+    texts, places = distinct(column.unify_dictionaries().combine_chunks())
+    codes_of: dict[str, int] = {}
+    codes = []
+    for place, text in enumerate(texts):
+        if not text or not is_name(text):
+            row = int(np.argmax(places == place)) + 1
+            got = shown(text or "")
+            raise ValueError(f"{path}, row {row}: trajectory must be {NAME_RULE}; got {got}. Rename the track.")
+        codes.append(codes_of.setdefault(bare(text) if is_csv else text, len(codes_of)))
+    return list(codes_of), np.array(codes, dtype=np.int64)[places]

@@ -8,15 +8,19 @@ import csv
 import re
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
+from typing import IO
 
 import pyarrow as pa
 import pyarrow.csv as pa_csv
 
 from ballfg.checks import LARGEST, did_you_mean, one_line, shown
+from ballfg.files.damaged import MAX_LINE
+from ballfg.files.spreadsheet import bare
 
 _NUMBER = re.compile(r"\s*[+-]?(\d++\.?\d*+|\.\d++)([eE][+-]?\d+)?\s*", re.ASCII)
 _NOT_FINITE = re.compile(r"\s*[+-]?(nan|inf|infinity)\s*", re.IGNORECASE)
-_HEADER_LIMIT = 1 << 16  # bytes
+MAX_HEADER = 1 << 16
+"""Bytes of the line of column names."""
 
 
 def is_number(cell: str) -> bool:
@@ -27,16 +31,21 @@ def is_number(cell: str) -> bool:
 def read_header(path: Path) -> list[str]:
     """The column names of a CSV file.
 
-    Raises: ValueError: an empty file, or one that is not UTF-8 text.
+    Raises: ValueError: an empty file, one that is not UTF-8 text, or a first line of more than `MAX_HEADER` bytes.
     """
     with path.open("rb") as file:
-        first = re.split(rb"[\r\n]", file.read(_HEADER_LIMIT), maxsplit=1)[0]
+        first = re.split(rb"[\r\n]", file.read(MAX_HEADER + 1), maxsplit=1)[0]
     if not first.strip():
         raise ValueError(f"{path}: must begin with a line of column names; got an empty file or line. Add the header.")
+    if len(first) > MAX_HEADER:
+        raise ValueError(
+            f"{path}, line 1: the line of column names must have at most {MAX_HEADER} bytes; it has more. "
+            "Leave columns out, or put each row on a line of its own."
+        )
     text = first.decode("utf-8-sig", errors="surrogateescape")
     if "\0" in text or _has_surrogate(text):
         raise _not_utf8(path, 1)
-    return next(csv.reader([text]))
+    return [bare(name) for name in next(csv.reader([text]))]
 
 
 def check_header(path: Path, header: Sequence[str], required: Sequence[str], known: Collection[str]) -> None:
@@ -63,8 +72,9 @@ def check_header(path: Path, header: Sequence[str], required: Sequence[str], kno
 
 def convert_options(texts: Sequence[str], numbers: Sequence[str]) -> pa_csv.ConvertOptions:
     """Makes the fast reader read these columns, in this order, and take no cell for a missing value."""
+    text = pa.dictionary(pa.int32(), pa.string())
     return pa_csv.ConvertOptions(
-        column_types={**dict.fromkeys(texts, pa.string()), **dict.fromkeys(numbers, pa.float64())},
+        column_types={**dict.fromkeys(texts, text), **dict.fromkeys(numbers, pa.float64())},
         include_columns=[*texts, *numbers],
         null_values=[],
     )
@@ -73,10 +83,11 @@ def convert_options(texts: Sequence[str], numbers: Sequence[str]) -> pa_csv.Conv
 def records(path: Path) -> Iterator[tuple[int, list[str]]]:
     """The rows of data with the number of the line on which each begins; empty lines are skipped.
 
-    Raises: ValueError: text that is not UTF-8, or a quote that is never closed.
+    Raises: ValueError: text that is not UTF-8, a line of more than `MAX_LINE` characters, or a quote that is never
+        closed.
     """
     with path.open(encoding="utf-8-sig", errors="surrogateescape", newline="") as file:
-        reader = csv.reader(file, strict=True)
+        reader = csv.reader(_lines(path, file), strict=True)
         line = 1
         try:
             next(reader, None)
@@ -86,13 +97,26 @@ def records(path: Path) -> Iterator[tuple[int, list[str]]]:
                 if any(map(_has_surrogate, cells)):
                     raise _not_utf8(path, line)
                 if cells:
-                    yield line, cells
+                    yield line, [bare(cell) for cell in cells]
         except StopIteration:
             return
         except csv.Error as error:
             raise ValueError(
                 f"{path}, line {line}: must be a row of comma-separated cells; {one_line(error)}. Check its quotes."
             ) from None
+
+
+def _lines(path: Path, file: IO[str]) -> Iterator[str]:
+    """The lines of a file. Raises: ValueError: a longer one than `MAX_LINE`."""
+    number = 0
+    while line := file.readline(MAX_LINE + 1):
+        number += 1
+        if len(line) > MAX_LINE:
+            raise ValueError(
+                f"{path}, line {number}: must have at most {MAX_LINE} characters; it has more. Put each row on a line "
+                "of its own."
+            )
+        yield line
 
 
 def lines_of_rows(path: Path, rows: Sequence[int]) -> list[int]:

@@ -12,10 +12,12 @@ import pyarrow.csv as pa_csv
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import LARGEST, did_you_mean, shown
+from ballfg.checks import LARGEST, NAME_RULE, did_you_mean, is_name, shown
+from ballfg.files.damaged import check_unpacked
+from ballfg.files.spreadsheet import bare
 from ballfg.tracks import csv_files
 from ballfg.tracks.checks import check_step
-from ballfg.tracks.rows import KEY
+from ballfg.tracks.rows import KEY, distinct
 from ballfg.tracks.sightings import Sightings
 from ballfg.tracks.table import TableWriter
 
@@ -168,9 +170,21 @@ def read_columns(path: Path, required: Sequence[str]) -> tuple[list[str], dict[s
         raise csv_files.explain(path, numbers, str(error)) from None
     return (
         header,
-        {name: np.array(table.column(name).to_pylist(), dtype=np.str_) for name in texts},
+        {name: _texts(path, name, table.column(name)) for name in texts},
         {name: np.asarray(table.column(name).to_numpy(), dtype=np.float64) for name in numbers},
     )
+
+
+def _texts(path: Path, name: str, column: pa.ChunkedArray) -> Texts:
+    """(n,) names of balls, which may be missing, or of cameras."""
+    words, codes = distinct(column.unify_dictionaries().combine_chunks())
+    plain = [bare(word or "") for word in words]
+    for code, word in enumerate(plain):
+        if word.strip() and not is_name(word):
+            place = _place(path, np.flatnonzero(codes == code), name)
+            raise ValueError(f"{place} must be {NAME_RULE}; got {shown(word)}. Rename it.")
+    check_unpacked(path, 4 * len(codes) * max(map(len, plain), default=0))
+    return np.array(plain, dtype=np.str_)[codes]
 
 
 def check_values(

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import LARGEST, shown
+from ballfg.checks import LARGEST, NAME_RULE, is_name, shown
 from ballfg.tracks.csv_files import no_rows
 from ballfg.tracks.rows import Block, RowSource
 
@@ -93,11 +93,11 @@ def groups(source: RowSource, index: Index) -> Iterator[RowGroup]:
 def check_cells(source: RowSource, block: Block) -> None:
     """Refuses a block with a nameless row, a value that is not finite, or a sigma that is none."""
     for code, name in enumerate(block.names):
-        if not name or not name.isprintable():
+        if not name or not is_name(name):
             row = block.start + int(np.argmax(block.codes == code))
             raise ValueError(
-                f"{source.where(row)}, column 'trajectory': must name the trajectory in printable text; "
-                f"got {shown(name or '')}. Fill in a name."
+                f"{source.where(row)}, column 'trajectory': must be {NAME_RULE}; got {shown(name or '')}. "
+                "Fill in a name."
             )
     bad = ~(np.abs(block.values) <= LARGEST)
     sigmas = block.values[:, 4:]

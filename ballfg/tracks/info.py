@@ -7,7 +7,17 @@ from typing import Any
 
 import yaml
 
-from ballfg.checks import MAX_LISTED, check_number, check_text, did_you_mean, listed, nearest, shown, type_name
+from ballfg.checks import (
+    MAX_LISTED,
+    check_name,
+    check_number,
+    check_text,
+    did_you_mean,
+    listed,
+    nearest,
+    shown,
+    type_name,
+)
 from ballfg.files.strict_yaml import YamlError, read_yaml
 from ballfg.tracks.noise import TrackNoise
 
@@ -96,8 +106,9 @@ class DatasetInfo:
     """How the tracks were read from their source, as `ballfg import` states it in the section `import`; for people."""
 
     def __post_init__(self) -> None:
-        for key in ("name", "source", "licence"):
-            check_text(key, getattr(self, key), optional=key != "name")
+        check_name("name", self.name)
+        for key in ("source", "licence"):
+            check_text(key, getattr(self, key), optional=True)
         if not isinstance(self.noise, TrackNoise | None):
             raise TypeError(f"noise must be a TrackNoise or None; got {type(self.noise).__name__}.")
         if not isinstance(self.imported, Mapping | None):

@@ -3,7 +3,7 @@
 from collections.abc import Collection
 from pathlib import Path
 
-from ballfg.checks import did_you_mean, shown
+from ballfg.checks import NAME_RULE, TEXT_RULE, did_you_mean, is_name, is_text, shown
 from ballfg.tracks import csv_files
 from ballfg.tracks.rows import KEY
 from ballfg.tracks.track import FASTEST_SPIN, SPIN_LABELS, Label
@@ -49,9 +49,11 @@ def read_labels(path: Path, trajectories: Collection[str]) -> LabelTable:
     """
     header = csv_files.read_header(path)
     csv_files.check_header(path, header, (KEY,), (KEY,))
-    if not all(name.strip() and name.isprintable() for name in header):
-        got = shown(",".join(header))
-        raise ValueError(f"{path}: each column must have a printable name; got {got}. Name it or delete it.")
+    for name in header:
+        if not is_name(name):
+            raise ValueError(
+                f"{path}, line 1: the name of each column must be {NAME_RULE}; got {shown(name)}. Name it or delete it."
+            )
     csv_files.check_header(path, header, (), header)
     rows, lines, cells = _read_rows(path, header, set(trajectories))
     columns = {
@@ -91,6 +93,11 @@ def _read_rows(
 
 def _column(path: Path, name: str, cells: list[str], lines: list[int]) -> list[Label | None]:
     text: list[Label | None] = [cell or None for cell in cells]
+    for cell, line in zip(cells, lines, strict=True):
+        if not is_text(cell):
+            raise ValueError(
+                f"{path}, line {line}, column {shown(name)}: must be {TEXT_RULE}; got {shown(cell)}. Correct it."
+            )
     if name in TEXT_LABELS:
         return text
     for cell, line in zip(cells, lines, strict=True):

@@ -2,28 +2,29 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.csv as pa_csv
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.checks import one_line, shown
-from ballfg.files.damaged import check_unpacked
+from ballfg.files.damaged import MAX_LINE
+from ballfg.files.parquet import open_parquet
+from ballfg.files.spreadsheet import bare
 from ballfg.tracks import csv_files
 
 KEY = "trajectory"
 VALUES = ("t", "x", "y", "z")
 SIGMAS = ("sigma_x", "sigma_y", "sigma_z")
 
-# The CSV reader reads up to some 32 blocks ahead: small blocks keep that below 10 MB, at the same speed.
-_CSV_BLOCK = 1 << 18  # bytes of text a block
+# The CSV reader reads up to some 32 blocks ahead: small blocks keep that below 10 MB, at the same speed. A line must
+# fit into one.
+_CSV_BLOCK = MAX_LINE  # bytes of text a block
 _PARQUET_BLOCK = 1 << 14  # rows a block
-_PARQUET_BUFFER = 1 << 20  # bytes read at once from each column
 
 
 @dataclass(frozen=True)
@@ -93,7 +94,8 @@ class CsvRows(RowSource):
         try:
             with pa_csv.open_csv(self.path, read_options=options, convert_options=convert) as reader:
                 for batch in reader:
-                    yield _block(batch, start)
+                    block = _block(batch, start)
+                    yield replace(block, names=[None if name is None else bare(name) for name in block.names])
                     start += batch.num_rows
         except pa.ArrowInvalid as error:
             raise csv_files.explain(self.path, self.columns, str(error)) from None
@@ -107,12 +109,8 @@ class ParquetRows(RowSource):
     """`tracks.parquet`."""
 
     def __init__(self, path: Path) -> None:
-        try:
-            about = pq.read_metadata(path)
-            schema = about.schema.to_arrow_schema()
-        except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-            raise ValueError(f"{path}: must be a Parquet file; {one_line(error)}. Write it again.") from None
-        check_unpacked(path, 8 * about.num_rows * about.num_columns)
+        with open_parquet(path) as file:
+            schema = file.schema.to_arrow_schema()  # without the dictionaries that texts are read as
         super().__init__(path, schema.names)
         for name in self.columns:
             kind = schema.field(name).type
@@ -127,8 +125,7 @@ class ParquetRows(RowSource):
         names = [KEY, *self.columns]
         start = 0
         try:
-            # A small buffer and no pre-buffering: a file with one huge row group must not be held whole.
-            with pq.ParquetFile(self.path, buffer_size=_PARQUET_BUFFER, pre_buffer=False) as file:
+            with open_parquet(self.path) as file:
                 for batch in file.iter_batches(_PARQUET_BLOCK, columns=names, use_threads=False):
                     yield _block(batch.select(names), start)
                     start += batch.num_rows
@@ -143,14 +140,26 @@ class ParquetRows(RowSource):
 
 
 def _block(batch: pa.RecordBatch, start: int) -> Block:
-    keys = batch.column(0).cast(pa.string()).dictionary_encode(null_encoding="encode")
+    names, codes = distinct(batch.column(0))
     columns = [column.cast(pa.float64()).to_numpy(zero_copy_only=False) for column in batch.columns[1:]]
-    return Block(
-        start=start,
-        names=keys.dictionary.to_pylist(),
-        codes=keys.indices.to_numpy(zero_copy_only=False),
-        values=np.stack(columns, axis=1) if batch.num_rows else np.empty((0, len(columns))),
-    )
+    values = np.stack(columns, axis=1) if batch.num_rows else np.empty((0, len(columns)))
+    return Block(start, names, codes, values)
+
+
+def distinct(column: pa.Array) -> tuple[list[str | None], NDArray[np.int32]]:
+    """The distinct texts of a column, in the order in which they first appear.
+
+    Args: column: (n,) of any type that can be text.
+    Returns: the texts, None for missing ones, and (n,) the number of each row's.
+    """
+    if not pa.types.is_dictionary(column.type):
+        column = column.cast(pa.string()).dictionary_encode()
+    words = column.dictionary.cast(pa.string())
+    places = column.indices.fill_null(len(words)).to_numpy(zero_copy_only=False)
+    used, first, codes = np.unique(places, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    names = [words[int(place)].as_py() if place < len(words) else None for place in used[order]]
+    return names, np.argsort(order)[codes].astype(np.int32)
 
 
 def _counted(word: str, numbers: Sequence[int]) -> str:

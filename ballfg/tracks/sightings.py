@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import check_array, check_iterable, check_text, shown
+from ballfg.checks import check_array, check_iterable, check_name, shown
 
 ROUNDING = 1e-6
 """Relative to the trace: a covariance that was computed in single precision is symmetric up to this."""
@@ -44,7 +44,7 @@ class Sightings:
         check_iterable("cameras", self.cameras)
         names = tuple(self.cameras)
         for name in names:
-            check_text("a name of cameras", name)
+            check_name("a name of cameras", name)
         if not names or len(set(names)) < len(names):
             raise ValueError(f"cameras must be different names, at least one; got {list(names)}. Rename or add some.")
         object.__setattr__(self, "cameras", names)

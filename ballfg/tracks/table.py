@@ -16,6 +16,7 @@ import pyarrow.parquet as pq
 from numpy.typing import ArrayLike
 
 from ballfg.checks import shown
+from ballfg.files.spreadsheet import NUMBER, QUOTED, guarded
 from ballfg.files.whole_file import check_file, whole_file
 
 ENDINGS = (".csv", ".parquet")
@@ -25,7 +26,9 @@ _BLOCK_ROWS = 1 << 16  # rows held back before they are written; also the row gr
 class TableWriter:
     """Writes a table block by block; the file takes its name only when the `with` block ends without an exception.
 
-    Floats are written with as many digits as bring back the same float64. Memory is bounded by a block.
+    Floats are written with as many digits as bring back the same float64. Memory is bounded by a block. In CSV, a text
+    that a spreadsheet would take for a formula (=, +, - or @ at its beginning, and no number) stands behind an
+    apostrophe; the readers of ballfg take it away.
 
     Example:
         with TableWriter("states.csv") as table:
@@ -100,11 +103,14 @@ class TableWriter:
             # The library quotes the header and, where a text needs quotes, all texts; simple readers expect neither.
             if not self._has_header:
                 header = io.StringIO()
-                csv.writer(header, lineterminator="\n").writerow(table.column_names)
+                csv.writer(header, lineterminator="\n").writerow(map(guarded, table.column_names))
                 self._file.write(header.getvalue().encode())
                 self._has_header = True
+            for place, field in enumerate(table.schema):
+                if pa.types.is_string(field.type):
+                    table = table.set_column(place, field, _guarded(table.column(place)))
             texts = [column for column in table.columns if pa.types.is_string(column.type)]
-            quoted = any(pc.any(pc.match_substring_regex(column, '[,"\r\n]')).as_py() for column in texts)
+            quoted = any(pc.any(pc.match_substring_regex(column, '[,;"\t\r\n]')).as_py() for column in texts)
             style = pa_csv.WriteOptions(include_header=False, quoting_style="needed" if quoted else "none")
             pa_csv.write_csv(table, self._file, style)
         else:
@@ -149,6 +155,12 @@ def _arrow(name: str, array: np.ndarray, count: int) -> pa.Array:
     if array.ndim == 0:
         return pa.repeat(pa.scalar(array.item(), type=kind or pa.from_numpy_dtype(array.dtype)), count)
     return pa.array(array, type=kind)
+
+
+def _guarded(column: pa.ChunkedArray) -> pa.ChunkedArray:
+    """The texts of a column, none of which a spreadsheet takes for a formula; see `ballfg.files.spreadsheet`."""
+    risky = pc.and_(pc.match_substring_regex(column, QUOTED), pc.invert(pc.match_substring_regex(column, NUMBER)))
+    return pc.if_else(risky, pc.binary_join_element_wise("'", column, ""), column)
 
 
 def _conformed(batch: pa.RecordBatch, schema: pa.Schema) -> pa.RecordBatch:

@@ -10,7 +10,18 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ballfg.arrays import Array
-from ballfg.checks import as_float, check_array, check_flag, shown, type_name
+from ballfg.checks import (
+    NAME_RULE,
+    TEXT_RULE,
+    as_float,
+    check_array,
+    check_flag,
+    check_name,
+    is_name,
+    is_text,
+    shown,
+    type_name,
+)
 
 SPIN_LABELS = ("spin_x", "spin_y", "spin_z")
 
@@ -75,7 +86,7 @@ class Track:
     """The dataset that the track was read from: tells its ball, table and noise. It does not travel to processes."""
 
     def __post_init__(self) -> None:
-        _check_name(self.name)
+        check_name("track name", self.name, "Rename the trajectory.")
         times = _finite(self.name, "times", self.times)
         if times.ndim != 1 or len(times) == 0:
             raise ValueError(
@@ -203,15 +214,6 @@ def _checked_observations(track: str, observations: object, samples: int, rough:
     return found
 
 
-def _check_name(name: object) -> None:
-    if not isinstance(name, str):
-        raise TypeError(f"track name must be a str; got {type(name).__name__} {shown(name)}. Pass str({shown(name)}).")
-    if not name or not name.isprintable():
-        raise ValueError(
-            f"track name must be printable text of one line, not empty; got {shown(name)}. Rename the trajectory."
-        )
-
-
 def _finite(track: str, argument: str, value: ArrayLike, shape: tuple[int, ...] | None = None) -> Array:
     array = check_array(f"track {shown(track)}: {argument}", value, shape, "Pass one row per sample.")
     if not np.isfinite(array).all():
@@ -231,12 +233,16 @@ def _checked_labels(track: str, labels: Mapping[str, Label]) -> dict[str, Label]
         )
     checked: dict[str, Label] = {}
     for key, value in labels.items():
-        if not isinstance(key, str) or not key.strip() or not key.isprintable() or key == "trajectory":
+        if not isinstance(key, str) or not is_name(key) or key == "trajectory":
             raise ValueError(
-                f"track {shown(track)}: label names must be printable text other than 'trajectory'; got {shown(key)}. "
+                f"track {shown(track)}: label names must be {NAME_RULE}, other than 'trajectory'; got {shown(key)}. "
                 "Rename it."
             )
         if isinstance(value, str) and key not in SPIN_LABELS:
+            if not is_text(value):
+                raise ValueError(
+                    f"track {shown(track)}: label {shown(key)} must be {TEXT_RULE}; got {shown(value)}. Correct it."
+                )
             checked[key] = value
         elif isinstance(value, int | float | np.integer | np.floating) and np.isfinite(value):
             if key in SPIN_LABELS and abs(value) > FASTEST_SPIN:

@@ -9,6 +9,7 @@ from typing import Final, Literal, TextIO
 
 from ballfg.arrays import Array
 from ballfg.checks import check_choice, check_each, check_instance, check_path, shown
+from ballfg.files.spreadsheet import guarded
 from ballfg.files.whole_folder import whole_folder
 from ballfg.tracks.checks import check_scale
 from ballfg.tracks.dataset import TRACK_FILES
@@ -109,7 +110,9 @@ def _columns(track: Track) -> dict[str, Array | str]:
 
 def _write_labels(path: Path, spool: Path, label_names: list[str]) -> None:
     with path.open("x", encoding="utf-8", newline="") as file, spool.open(encoding="utf-8") as lines:
-        writer = csv.DictWriter(file, [KEY, *label_names], restval="", lineterminator="\n")
-        writer.writeheader()
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(map(guarded, (KEY, *label_names)))
         for line in lines:
-            writer.writerow(json.loads(line))
+            cells = json.loads(line)
+            row = (cells.get(name, "") for name in (KEY, *label_names))
+            writer.writerow(guarded(cell) if isinstance(cell, str) else cell for cell in row)

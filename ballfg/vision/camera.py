@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ballfg.arrays import Array, Mask
-from ballfg.checks import check_array, check_number, shown
+from ballfg.checks import check_array, check_name, check_number, shown
 
 MOST_PIXELS: Final = 1_000_000
 """px, of one side of an image."""
@@ -58,10 +58,7 @@ class Camera:
     """s by which the camera's stamps are late: what it stamps t happened at t - time_offset."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str):
-            raise TypeError(f"a camera's name must be text; got {shown(self.name)}. Put it in quotes.")
-        if not self.name.strip() or not self.name.isprintable():
-            raise ValueError(f"a camera's name must be printable text; got {shown(self.name)}. Rename it.")
+        check_name("a camera's name", self.name)
         where = f"camera {shown(self.name)}"
         sides = check_array(f"{where}: size", self.size, (2,), "Give width and height in px.")
         if not ((sides > 0.0) & (sides <= MOST_PIXELS) & (sides % 1.0 == 0.0)).all():

@@ -99,7 +99,7 @@ def test_a_matrix_whose_shape_does_not_fit_is_refused(tmp_path: Path, ending: st
         (".xml", "<opencv_storage><a>1</a><a>2</a></opencv_storage>", "'a' stands twice"),
         (".xml", "<!DOCTYPE x [<!ENTITY a 'b'>]><opencv_storage>&a;</opencv_storage>", "declarations such as"),
         (".xml", "<opencv_storage>" + "<a>" * 60 + "</a>" * 60 + "</opencv_storage>", "nested at most 40 deep"),
-        (".xml", "<opencv_storage>" + "<a/>" * 600_000 + "</opencv_storage>", "must hold at most 250000 nodes"),
+        (".xml", "<opencv_storage>" + "<a/>" * 600_000 + "</opencv_storage>", "must have at most 1 MB"),
         (".xml", "<opencv_storage>1 2</opencv_storage>", "with names at its top"),
         (".xml", "", "it cannot be parsed"),
         (".json", '{"a": [1, 2}', "it cannot be parsed"),

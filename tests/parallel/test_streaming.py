@@ -68,7 +68,7 @@ def test_a_table_that_is_damaged_while_it_is_read_leaves_no_file(
     out.write_text("an earlier result")
     arguments = ("estimate", folder_copy, "--method", "sliding-window", "--jobs", 1, "--out", out)
     assert status(*arguments) == 2
-    assert "must be a Parquet file" in capsys.readouterr().err
+    assert "must be a whole Parquet file" in capsys.readouterr().err
     assert out.read_text() == "an earlier result"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["shots", "states.parquet"]
 
@@ -81,5 +81,5 @@ def test_a_parquet_file_that_ends_in_the_middle_is_refused_at_once(
     table = tmp_path / "half" / "tracks.parquet"
     table.write_bytes(table.read_bytes()[: table.stat().st_size // 2])
     assert status("estimate", tmp_path / "half", "--out", tmp_path / "states.csv") == 2
-    assert "must be a Parquet file" in capsys.readouterr().err
+    assert "must be a whole Parquet file" in capsys.readouterr().err
     assert not (tmp_path / "states.csv").exists()

@@ -70,5 +70,5 @@ def test_a_cut_or_garbled_parquet_file_is_refused(tmp_path, info, make_tracks):
     cut = [whole[:size] for size in (0, 3, len(whole) // 2, len(whole) - 1)]
     for content in [*cut, whole[:-60] + b"\xff" * 40 + whole[-20:]]:
         (tmp_path / "tracks.parquet").write_bytes(content)
-        with pytest.raises(ValueError, match=r"tracks\.parquet: must be a Parquet file; .*\. Write it again\."):
+        with pytest.raises(ValueError, match=r"tracks\.parquet must be a whole Parquet file; .*\. Write it again\."):
             read_dataset(tmp_path)

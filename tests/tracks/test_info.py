@@ -67,7 +67,7 @@ def test_of_many_unknown_fields_the_first_are_named(make_folder):
         (_yaml(name=""), "name is required; got frame, ball. Add it."),
         (_yaml(name="names: a"), "name is required; got names, frame, ball. Add it, or rename 'names'."),
         (_yaml(name="name: 17"), "name must be text; got int 17. Put it in quotes."),
-        (_yaml(name="name: ' '"), "name must not be empty; got ' '."),
+        (_yaml(name="name: ' '"), "name must be printable text of one line, "),
         (_yaml(frame=""), "frame is required; got name, ball."),
         (_yaml(frame="frame: z"), "frame must be a mapping with up and table_height; got 'z'. Write frame: {up: ..."),
         (_yaml(frame="frame: {up: y, table_height: 0}"), "frame.up must be 'z', the only up axis that is supported"),

@@ -196,8 +196,8 @@ CELLS = "must be a number with a decimal point"
             SIGMA_HEAD + "a,0,0,0,1,2,2,2\na,.01,0,0,1,2,2,2\n",
             "sigmas must be in m, their median at most 1; got 2. The",
         ),
-        (HEAD + A + ",0,1,2,3\n", "line 4, column 'trajectory': must name the trajectory in printable text; got ''."),
-        (HEAD + A + '"b\nc",0,1,2,3\n', "line 4, column 'trajectory': must name the trajectory in printable text; got"),
+        (HEAD + A + ",0,1,2,3\n", "line 4, column 'trajectory': must be printable text of one line, "),
+        (HEAD + A + '"b\nc",0,1,2,3\n', "line 4, column 'trajectory': must be printable text of one line, "),
         (
             HEAD + A + '"b,0,1,2,3\nb,0,1,2,3\n',
             "line 4: must be a row of comma-separated cells; unexpected end of data.",
@@ -333,7 +333,7 @@ def test_parquet_types_that_mean_the_same_are_read(make_folder, change):
         ({"x": ["0", "1"]}, "tracks.parquet, column 'x': must hold numbers; got type string. Convert it to float64"),
         ({"t": pa.array([0, 1], pa.timestamp("ms"))}, "column 't': must hold numbers; got type timestamp[ms]."),
         ({"x": [0.0, None]}, "tracks.parquet, row 2, column 'x': must be finite; got nan."),
-        ({"trajectory": ["a", None]}, "tracks.parquet, row 2, column 'trajectory': must name the trajectory"),
+        ({"trajectory": ["a", None]}, "tracks.parquet, row 2, column 'trajectory': must be printable text of one line, "),
         ({"trajectory": [b"\xff", b"a"]}, "tracks.parquet: cannot be read as a table of tracks; Invalid UTF8"),
         ({"t": [0.0, 0.0], "x": [0.0, 1.0]}, "tracks.parquet, rows 1 and 2: trajectory 'a' must have one position"),
     ],
@@ -347,4 +347,4 @@ def test_a_bad_parquet_file_is_named(make_folder, change, message):
 def test_a_parquet_file_that_is_none(make_folder):
     folder = make_folder(tracks=None)
     (folder / "tracks.parquet").write_bytes(b"trajectory,t,x,y,z\n")
-    assert "tracks.parquet: must be a Parquet file;" in _message(folder)
+    assert "tracks.parquet must be a whole Parquet file;" in _message(folder)

@@ -9,27 +9,32 @@ from typing import IO, Any, Final
 
 import numpy as np
 
-from ballfg.checks import listed
-from ballfg.files.damaged import check_unpacked, library_reads
+from ballfg.checks import listed, shown
+from ballfg.files.damaged import FREE, NUMBER, check_count, check_unpacked, library_reads
 from ballfg.importing.formats.nested import nested_tables
-from ballfg.importing.formats.raw import RawTable, table_of
+from ballfg.importing.formats.raw import MAX_COLUMNS, RawTable, table_of
 from ballfg.importing.formats.text_files import text_table
 
 MAX_DEPTH: Final = 40
 """Groups within groups."""
+MAX_MEMBERS: Final = 20_000
+"""Files within an archive, and datasets and groups within an HDF5 file: four for each of 5,000 shots."""
+EXCEL_COST: Final = 4
+"""Bytes of memory for each byte of the XML of which an Excel file is a zip."""
 _PLAIN: Final = "Save plain arrays of numbers with numpy.savez."
 
 
 def read_parquet(path: Path) -> list[RawTable]:
     """The table of a Parquet file. Raises: ValueError: it is none."""
     import pyarrow as pa
-    import pyarrow.parquet as pq
 
-    with library_reads(path, "Parquet"):
-        about = pq.read_metadata(path)
-    check_unpacked(path, 8 * about.num_rows * about.num_columns)
-    with library_reads(path, "Parquet"):
-        columns = _columns(pa, pq.read_table(path).flatten())
+    from ballfg.files.parquet import open_parquet
+
+    with library_reads(path, "Parquet"), open_parquet(path) as file:
+        check_count(path, "columns", file.metadata.num_columns, MAX_COLUMNS)
+        table = file.read(use_threads=False).flatten()
+        check_unpacked(path, sum(_copied(chunk) for column in table.columns for chunk in column.chunks))
+        columns = _columns(pa, table)
     rows: list[dict[str, Any]] = []
     if any(isinstance(values, list) and values and isinstance(values[0], list) for values in columns.values()):
         rows = [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
@@ -39,6 +44,8 @@ def read_parquet(path: Path) -> list[RawTable]:
 
 def _columns(pa: Any, table: Any) -> dict[str, Any]:
     """The columns of an Arrow table by name: arrays of numbers and dates, lists of all else."""
+    from ballfg.files.parquet import texts_of
+
     columns: dict[str, Any] = {}
     for field, column in zip(table.schema, table.columns, strict=True):
         if pa.types.is_timestamp(field.type):
@@ -48,8 +55,23 @@ def _columns(pa: Any, table: Any) -> dict[str, Any]:
         elif pa.types.is_integer(field.type) or pa.types.is_floating(field.type):
             columns[field.name] = column.cast(pa.float64(), safe=False).to_numpy()
         else:
-            columns[field.name] = column.to_pylist()
+            columns[field.name] = texts_of(column)
     return columns
+
+
+def _copied(array: Any, inside: bool = False) -> int:
+    """Bytes of the texts within lists and structures, each of which becomes a copy of its own."""
+    import pyarrow as pa
+    import pyarrow.compute as pc
+
+    kind = array.type
+    if pa.types.is_dictionary(kind):
+        return len(array) * (pc.max(pc.binary_length(array.dictionary)).as_py() or 0) if inside else 0
+    if pa.types.is_struct(kind):
+        return sum(_copied(part, True) for part in array.flatten())
+    if pa.types.is_map(kind):
+        return _copied(array.keys, True) + _copied(array.items, True)
+    return _copied(array.values, True) if pa.types.is_nested(kind) else 0
 
 
 def read_excel(path: Path) -> list[RawTable]:
@@ -66,8 +88,9 @@ def read_excel(path: Path) -> list[RawTable]:
     if not zipfile.is_zipfile(path):
         raise ValueError(f"{path} must be an Excel file (.xlsx); it is none. Save it again as .xlsx or CSV.")
     with library_reads(path, "Excel"), zipfile.ZipFile(path) as archive:
-        size = sum(member.file_size for member in archive.infolist())
-    check_unpacked(path, size)
+        members = archive.infolist()
+        check_count(path, "files within it", len(members), MAX_MEMBERS)
+        check_unpacked(path, EXCEL_COST * sum(member.file_size for member in members))
     sheets: dict[str, str] = {}
     with library_reads(path, "Excel"):
         book = openpyxl.load_workbook(io.BytesIO(path.read_bytes()), read_only=True, data_only=True)
@@ -169,6 +192,7 @@ class _Group:
     def __init__(self, h5py: Any, path: Path) -> None:
         self._h5py, self._path = h5py, path
         self._size = 0
+        self._seen: set[int] = set()
 
     def content(self, group: Any, depth: int) -> dict[str, Any]:
         """Arrays and numbers of a group, by name."""
@@ -179,15 +203,48 @@ class _Group:
         if depth > MAX_DEPTH:
             raise ValueError(f"{self._path}: groups must be nested at most {MAX_DEPTH} deep. Write it flatter.")
         for key in group:
+            link = group.get(key, getlink=True)
+            if isinstance(link, self._h5py.ExternalLink):
+                raise ValueError(f"{self._path} must hold its data itself; {shown(key)} is a link to another file.")
             value = group.get(key)  # None where a link leads nowhere
+            if value is None or self._is_known(value):
+                continue
             if isinstance(value, self._h5py.Group):
                 if not key.startswith("#"):  # MATLAB keeps the parts of cells there
                     content[key] = self.content(value, depth + 1)
             elif isinstance(value, self._h5py.Dataset) and value.shape is not None:
-                self._size += value.size * value.dtype.itemsize
-                check_unpacked(self._path, self._size)
-                content[key] = value[()]
+                content[key] = self._data(key, value)
         return content
+
+    def _is_known(self, value: Any) -> bool:
+        """Whether another link has led there: two links in each of 40 groups would be 2^40 ways."""
+        place = self._h5py.h5o.get_info(value.id).addr
+        known = place in self._seen
+        self._seen.add(place)
+        check_count(self._path, "groups and datasets", len(self._seen), MAX_MEMBERS)
+        return known
+
+    def _data(self, key: str, value: Any) -> Any:
+        """The array of a dataset, whose bytes and those of its largest chunk are counted first."""
+        if value.external or value.is_virtual:
+            raise ValueError(f"{self._path} must hold its data itself; those of {shown(key)} are in another file.")
+        width = max(value.dtype.itemsize, NUMBER)
+        self._size += max(value.size, math.prod(value.chunks or (1,))) * width
+        check_unpacked(self._path, self._size)
+        if not value.dtype.hasobject or value.ndim == 0 or value.size == 0:
+            return value[()]
+        # texts and lists of any length: many may be one in the file, and each becomes a copy of its own
+        parts, few = [], max(1, FREE * len(value) // (self._path.stat().st_size * value.size))
+        for start in range(0, len(value), few):
+            parts.append(value[start : start + few])
+            self._size += sum(map(_length, parts[-1].ravel().tolist()))
+            check_unpacked(self._path, self._size)
+        return np.concatenate(parts)
+
+
+def _length(value: Any) -> int:
+    """Bytes or so of a text, a list, or a row of them."""
+    return sum(map(_length, value)) if isinstance(value, tuple) else getattr(value, "nbytes", 0) or len(str(value))
 
 
 def _array_bytes(path: Path) -> int:
@@ -197,11 +254,14 @@ def _array_bytes(path: Path) -> int:
             return _header_bytes(file)
     size = 0
     with zipfile.ZipFile(path) as archive:
-        for member in archive.infolist():
-            size += member.file_size
+        members = archive.infolist()
+        check_count(path, "arrays", len(members), MAX_MEMBERS)
+        for member in members:
+            within = member.file_size
             if member.filename.endswith(".npy"):
                 with archive.open(member) as file:
-                    size = max(size, _header_bytes(file))
+                    within = max(within, _header_bytes(file))
+            size += within
     return size
 
 
@@ -210,4 +270,4 @@ def _header_bytes(file: IO[bytes]) -> int:
     version = np.lib.format.read_magic(file)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
     shape, _, kind = header(file)
-    return math.prod(shape) * max(kind.itemsize, 1)
+    return math.prod(shape) * max(kind.itemsize, NUMBER)

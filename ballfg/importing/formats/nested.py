@@ -1,6 +1,7 @@
 """Tables in nested data: JSON, MATLAB structures, dicts and lists of arrays, groups of HDF5."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -11,21 +12,37 @@ _LEAST: Final = 3
 """Rows from which on a list is taken for a table; shorter lists are points or settings."""
 _POINT: Final = 4
 """Most numbers of a point in one row."""
+MAX_PARTS: Final = 100_000
+"""Lists and mappings that are looked into; each shot is one or a few."""
 
 
 def nested_tables(content: Any, name: str, source: str) -> list[RawTable]:
     """All tables in nested dicts, lists and arrays. A scalar beside a table becomes a constant column of it.
 
     Args: content: to search.  name: of the whole.  source: the file, for messages.
-    Raises: ValueError: lists within lists beyond some hundred levels.
+    Raises: ValueError: lists within lists beyond some hundred levels, or more than `MAX_PARTS`.
     """
     try:
-        return _tables(content, name, source, {})
+        return _tables(content, name, _Source(source), {})
     except RecursionError:
         raise ValueError(f"{source} must be nested less deep; it has hundreds of levels. Write tables.") from None
 
 
-def _tables(content: Any, name: str, source: str, known: Mapping[str, Any]) -> list[RawTable]:
+@dataclass
+class _Source:
+    """The file that is searched, and how many parts of it have been found."""
+
+    name: str
+    parts: int = 0
+
+    def add(self, parts: int) -> None:
+        """Counts parts before they are looked into. Raises: ValueError: too many."""
+        self.parts += parts
+        if self.parts > MAX_PARTS:
+            raise ValueError(f"{self.name} must have at most {MAX_PARTS} lists of samples; got more. Split it.")
+
+
+def _tables(content: Any, name: str, source: _Source, known: Mapping[str, Any]) -> list[RawTable]:
     if hasattr(content, "columns") and hasattr(content, "to_numpy"):  # a DataFrame of pandas or of another library
         content = {_label(label): np.asarray(content[label]) for label in content.columns}
     if isinstance(content, np.ndarray):
@@ -41,12 +58,13 @@ def _label(label: Any) -> str:
     return ".".join(str(part) for part in label if str(part)) if isinstance(label, tuple) else str(label)
 
 
-def _of_array(array: np.ndarray, name: str, source: str, known: Mapping[str, Any]) -> list[RawTable]:
+def _of_array(array: np.ndarray, name: str, source: _Source, known: Mapping[str, Any]) -> list[RawTable]:
     if array.dtype.names:
         return _of_mapping({key: array[key] for key in array.dtype.names}, name, source, known)
     if array.dtype.kind == "O":
         return _tables(array.tolist(), name, source, known)
     if array.ndim == 3:
+        source.add(len(array))
         return [table for i, part in enumerate(array) for table in _of_array(part, f"{name}/{i:03d}", source, known)]
     if array.ndim != 2 or array.dtype.kind not in "iuf":
         return []
@@ -58,25 +76,21 @@ def _of_array(array: np.ndarray, name: str, source: str, known: Mapping[str, Any
     return [_table(name, columns, source, {}, named=False)]
 
 
-def _of_mapping(content: Mapping[Any, Any], name: str, source: str, known: Mapping[str, Any]) -> list[RawTable]:
+def _of_mapping(content: Mapping[Any, Any], name: str, source: _Source, known: Mapping[str, Any]) -> list[RawTable]:
     items = {str(key): value for key, value in content.items() if not str(key).startswith("__")}
     scalars = {key: value for key, value in items.items() if _is_scalar(value)}
-    vectors = {
-        label: column
-        for key, value in items.items()
-        if not _is_scalar(value)
-        for label, column in _vectors(key, value).items()
-    }
+    parts = {key: value for key, value in items.items() if key not in scalars}
+    vectors = {label: column for key, value in parts.items() for label, column in _vectors(key, value).items()}
     lengths = [len(column) for column in vectors.values()]
     length = max(set(lengths), key=lambda one: (lengths.count(one), one)) if lengths else 0
     below = {**known, **scalars}
     columns = {label: column for label, column in vectors.items() if len(column) == length}
     if length >= _LEAST and len(columns) >= 2:
         return [_table(name, columns, source, below)]
+    source.add(len(parts))
     found: list[RawTable] = []
-    for key, value in items.items():
-        if not _is_scalar(value):
-            found += _tables(value, f"{name}/{key}" if name else key, source, below)
+    for key, value in parts.items():
+        found += _tables(value, f"{name}/{key}" if name else key, source, below)
     return found
 
 
@@ -106,7 +120,7 @@ def _vectors(key: str, value: Any) -> dict[str, Any]:
     return {}
 
 
-def _of_list(items: list[Any], name: str, source: str, known: Mapping[str, Any]) -> list[RawTable]:
+def _of_list(items: list[Any], name: str, source: _Source, known: Mapping[str, Any]) -> list[RawTable]:
     if all(isinstance(item, Mapping) for item in items):
         rows = [_flat(item) for item in items]
         if len(items) >= _LEAST and all(row is not None for row in rows):
@@ -118,8 +132,10 @@ def _of_list(items: list[Any], name: str, source: str, known: Mapping[str, Any])
         if len(widths) == 1 and len(items) >= _LEAST and widths != {1}:
             columns = {str(i): [item[i] for item in items] for i in range(widths.pop())}
             return [_table(name, columns, source, known, named=False)]
+    parts = [(i, item) for i, item in enumerate(items) if not _is_scalar(item)]
+    source.add(len(parts))
     found: list[RawTable] = []
-    for i, item in enumerate(items):
+    for i, item in parts:
         found += _tables(item, f"{name}/{i:03d}", source, known)
     return found
 
@@ -155,7 +171,7 @@ def _is_scalar(value: Any) -> bool:
 
 
 def _table(
-    name: str, columns: Mapping[str, Any], source: str, known: Mapping[str, Any], named: bool = True
+    name: str, columns: Mapping[str, Any], source: _Source, known: Mapping[str, Any], named: bool = True
 ) -> RawTable:
     count = len(next(iter(columns.values())))
     constant = {
@@ -163,4 +179,4 @@ def _table(
         for key, value in known.items()
         if key not in columns and value is not None
     }
-    return table_of(name, {**columns, **constant}, source, named)
+    return table_of(name, {**columns, **constant}, source.name, named)

@@ -33,6 +33,8 @@ MISSING: Final = (
 """What files write, in lower case, where a number is missing."""
 WITH_UNIT: Final = re.compile(r"^\s*([-+]?(?:\d++\.?\d*+|\.\d++)(?:[eE][-+]?\d++)?)\s*([^\W\d_]{1,3})\s*$")
 """A number with its unit, such as 12.5 mm."""
+MAX_COLUMNS: Final = 10_000
+"""Of a table. Marker systems write some hundred."""
 _MOSTLY: Final = 0.5
 """Share of a column's cells that must be numbers, where it is taken for one of numbers."""
 
@@ -73,7 +75,12 @@ class RawTable:
 
 
 def table_of(name: str, columns: Mapping[str, Any], source: str = "", named: bool = True) -> RawTable:
-    """A table whose columns are arrays or lists (n,) of anything; text that is numbers becomes numbers."""
+    """A table whose columns are arrays or lists (n,) of anything; text that is numbers becomes numbers.
+
+    Raises: ValueError: more than `MAX_COLUMNS`.
+    """
+    if len(columns) > MAX_COLUMNS:
+        raise ValueError(f"{source} must have at most {MAX_COLUMNS} columns; got {len(columns)}. Leave some out.")
     ready: dict[str, Column] = {}
     texts: dict[str, Column] = {}
     for label, values in columns.items():

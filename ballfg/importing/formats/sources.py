@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from ballfg.checks import shown
-from ballfg.files.json_file import parse_json
+from ballfg.files.json_file import MAX_VALUES, has_too_many, parse_json
 from ballfg.importing.formats.containers import read_bag, read_excel, read_hdf5, read_npz, read_parquet
 from ballfg.importing.formats.matlab import read_matlab
 from ballfg.importing.formats.nested import nested_tables
@@ -113,6 +113,8 @@ def _of_file(path: Path, topic: str | None) -> list[RawTable]:
 
 def _json(path: Path, text: str) -> list[RawTable]:
     """The tables of a JSON file, or of one with a JSON value on each line."""
+    if has_too_many(text):
+        raise ValueError(f"{path} must hold at most {MAX_VALUES} names and values. Split it, or write CSV or Parquet.")
     try:
         content = parse_json(text)
     except json.JSONDecodeError as error:

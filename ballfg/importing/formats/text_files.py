@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Final
 
 from ballfg.checks import one_line
+from ballfg.files.damaged import MAX_LINE, whole_content
+from ballfg.files.spreadsheet import bare
 from ballfg.importing.formats.raw import MISSING, WITH_UNIT, RawTable, table_of
 from ballfg.importing.names import unit_of_text
 
@@ -18,6 +20,8 @@ _NUMBER: Final = re.compile(r"^[-+]?(\d++\.?\d*+|\.\d++)([eE][-+]?\d++)?$")
 _DECIMAL_COMMA: Final = re.compile(r"^[-+]?\d*,\d+([eE][-+]?\d++)?$")
 _LOOK: Final = 200
 """Lines that are looked at to find the separator."""
+_HEAD: Final = 4096
+"""Bytes at the beginning that tell whether a file is text."""
 _CONTROL: Final = 0.02
 """Share of control characters from which on a file is not text."""
 
@@ -32,7 +36,9 @@ def read_text_table(path: Path) -> list[RawTable]:
 
 def decoded(path: Path) -> str:
     """The text of a file, whatever its encoding. Raises: ValueError: empty, or not text."""
-    text = _text(path, path.read_bytes())
+    with path.open("rb") as file:
+        _text(path, file.read(_HEAD))  # a file that is not text may be of any size
+    text = _text(path, whole_content(path))
     if not text.strip():
         raise ValueError(f"{path} must hold rows of numbers; the file is empty. Export it again.")
     return text
@@ -41,7 +47,7 @@ def decoded(path: Path) -> str:
 def _text(path: Path, content: bytes) -> str:
     if content[:2] in (b"\xff\xfe", b"\xfe\xff"):
         return content.decode("utf-16", "replace")
-    head = content[:4096]
+    head = content[:_HEAD]
     if b"\0" in head or sum(byte < 32 and byte not in b"\t\r\n\f" for byte in head) > _CONTROL * len(head):
         raise ValueError(
             f"{path} must be text, JSON, Parquet, Excel, HDF5, npz, MATLAB or a ROS bag; it is binary and begins with "
@@ -65,6 +71,12 @@ def text_table(text: str, name: str, source: str) -> RawTable:
 
 def _text_table(text: str, name: str, source: str) -> RawTable:
     lines = [line for line in text.splitlines() if line.strip()]
+    longest = max(map(len, lines), default=0)
+    if longest > MAX_LINE:
+        raise ValueError(
+            f"{source} must have lines of at most {MAX_LINE} characters; one has {longest}. Export the table as CSV, "
+            "one row a line."
+        )
     comments = [line for line in lines if line.lstrip().startswith(_COMMENTS)]
     rows_of_text = [line for line in lines if not line.lstrip().startswith(_COMMENTS)]
     separator = _separator(rows_of_text)
@@ -84,8 +96,9 @@ def _text_table(text: str, name: str, source: str) -> RawTable:
     if not header and comments:
         header = _header_in_comment(comments[-1], separator, width)
     data = [row for row in rows[start:] if len(row) == width]
-    names = _joined(header, width) if header else [str(i) for i in range(width)]
-    table = table_of(name, dict(zip(names, zip(*data, strict=True), strict=True)), source, bool(header))
+    names = [bare(one) for one in _joined(header, width)] if header else [str(i) for i in range(width)]
+    columns = {one: [bare(cell) for cell in cells] for one, cells in zip(names, zip(*data, strict=True), strict=True)}
+    table = table_of(name, columns, source, bool(header))
     if len(rows) - start > len(data):
         table.notes.append(f"{len(rows) - start - len(data)} lines without {width} cells left out")
     return table

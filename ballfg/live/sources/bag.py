@@ -10,6 +10,7 @@ import numpy as np
 
 from ballfg.checks import listed
 from ballfg.files.damaged import library_reads
+from ballfg.live.sources.bag_limits import check_bag
 from ballfg.live.sources.lines import Sample
 
 Point = Any
@@ -46,6 +47,7 @@ def bag_samples(bag: Path, topic: str | None) -> Iterator[Sample]:
     need_rosbags()
     if not bag.exists():
         raise FileNotFoundError(f"bag must exist; {bag} does not. Give a folder of rosbag2 or a file .mcap.")
+    check_bag(bag)
     chosen = _topic(bag, topic)
     return _samples(bag, chosen)
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ballfg.arrays import Array
 from ballfg.checks import shown
 from ballfg.vision.arrays import Image
-from ballfg.vision.detection.video import IMAGE_ENDINGS
+from ballfg.vision.image_file import ENDINGS, read_image
 
 MIN_CORNERS: Final = 8
 """Corners that a view must show: a homography needs 4, and twice as many tell when one of them is wrong."""
@@ -165,9 +165,9 @@ def image_files(places: Iterable[str]) -> list[Path]:
     for place in places:
         path = Path(place)
         found = sorted(path.iterdir()) if path.is_dir() else sorted(map(Path, glob.glob(place))) or [path]
-        images = [file for file in found if file.is_file() and file.suffix.lower() in IMAGE_ENDINGS]
+        images = [file for file in found if file.is_file() and file.suffix.lower() in ENDINGS]
         if not images:
-            endings = ", ".join(IMAGE_ENDINGS)
+            endings = ", ".join(ENDINGS)
             raise FileNotFoundError(
                 f"{place}: must be a folder, a pattern or a file of images ({endings}). Correct it."
             )
@@ -180,11 +180,7 @@ def read_grey(path: Path) -> Image:
 
     Raises: ValueError: not an image; the message names the file.
     """
-    data = np.fromfile(path, dtype=np.uint8)
-    image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION) if len(data) else None
-    if image is None:
-        raise ValueError(f"{path}: must be an image; it cannot be read. Delete it or save it anew.")
-    return np.asarray(image, dtype=np.uint8)
+    return read_image(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION)
 
 
 def find_views(files: Iterable[Path], board: Board) -> Iterator[View]:

@@ -12,12 +12,12 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.checks import listed, shown
+from ballfg.files.damaged import check_pixels
 from ballfg.tracks import csv_files
 from ballfg.tracks.checks import check_step
 from ballfg.vision.arrays import Image
+from ballfg.vision.image_file import ENDINGS, read_image
 
-IMAGE_ENDINGS: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
-"""Endings of what counts as an image in a folder; other files are left alone."""
 SHORT: Final = (3, 0.02)
 """Frames, and share of them, that may be missing at the end of what the container announces: it often estimates."""
 
@@ -126,10 +126,10 @@ class ImageFolder(Video):
     """Frames of a folder of images, in the natural order of their names (2 before 10). See `open_video`."""
 
     def __init__(self, path: Path, stamps: Array) -> None:
-        self._files = sorted((file for file in path.iterdir() if file.suffix.lower() in IMAGE_ENDINGS), key=_natural)
+        self._files = sorted((file for file in path.iterdir() if file.suffix.lower() in ENDINGS), key=_natural)
         if not self._files:
-            raise ValueError(f"folder {path} must hold images ({', '.join(IMAGE_ENDINGS)}); got none. Check the path.")
-        image = _read(self._files[0])
+            raise ValueError(f"folder {path} must hold images ({', '.join(ENDINGS)}); got none. Check the path.")
+        image = read_image(self._files[0], cv2.IMREAD_COLOR)
         super().__init__(path, (image.shape[1], image.shape[0]), len(self._files), stamps)
         self._check_count(len(self._files))
         if len(self._files) > len(stamps):
@@ -144,7 +144,7 @@ class ImageFolder(Video):
         return ((np.nan, self._image(file)) for file in self._files)
 
     def _image(self, file: Path) -> Image:
-        image = _read(file)
+        image = read_image(file, cv2.IMREAD_COLOR)
         size = (image.shape[1], image.shape[0])
         if size != self.size:
             raise ValueError(
@@ -208,18 +208,14 @@ def read_stamps(path: Path) -> Array:
 
 
 def _capture(path: Path) -> cv2.VideoCapture:
-    """Decoding on one thread: the cameras are what is spread over the cores."""
+    """Decoding on one thread: the cameras are what is spread over the cores. Opening reads headers alone."""
     capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
     if not capture.isOpened():
         raise ValueError(f"video {path} must be a file that FFmpeg decodes; it is not, or it is cut off. Convert it.")
+    width, height = (int(capture.get(side)) for side in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+    if width and height:  # else there is no frame to decode
+        check_pixels(path, width, height)
     return capture
-
-
-def _read(file: Path) -> Image:
-    image = cv2.imread(str(file), cv2.IMREAD_COLOR)
-    if image is None:
-        raise ValueError(f"image {file} must be readable; OpenCV cannot decode it. Write it again or remove it.")
-    return np.asarray(image, dtype=np.uint8)
 
 
 def _natural(file: Path) -> tuple[Sequence[tuple[int, str]], str]:

@@ -1,0 +1,51 @@
+"""Images of files: their size is read from the header, and bounded, before anything is decoded."""
+
+from pathlib import Path
+from typing import Final
+
+import cv2
+import numpy as np
+from PIL import Image as Header
+
+from ballfg.checks import one_line
+from ballfg.files.damaged import check_pixels, whole_content
+from ballfg.vision.arrays import Image
+
+ENDINGS: Final = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm")
+"""Endings of what counts as an image in a folder; other files are left alone."""
+FORMATS: Final = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM", "MPO")
+"""Of Pillow's, which reads the headers alone. MPO: a JPEG with further pictures behind it, as telephones write."""
+_TILES: Final = (322, 323)
+"""Tags of TIFF: width and height of the pieces in which the pixels are kept."""
+
+
+def read_image(path: Path, flags: int) -> Image:
+    """An image as OpenCV decodes it, (h, w) or (h, w, 3) uint8, BGR.
+
+    Args: path: of the file.  flags: of `cv2.imdecode`.
+    Raises: ValueError: not an image, or one of more than 64 million pixels; the message names the file. OSError.
+    """
+    _check_size(path)
+    image = cv2.imdecode(np.frombuffer(whole_content(path), dtype=np.uint8), flags)
+    if image is None:
+        raise ValueError(f"image {path} must be readable; OpenCV cannot decode it. Write it again or remove it.")
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _check_size(path: Path) -> None:
+    try:
+        with Header.open(path, formats=FORMATS) as header:
+            sizes = [header.size]
+            tags = getattr(header, "tag_v2", {})
+            if all(tag in tags for tag in _TILES):
+                sizes.append(tuple(int(tags[tag]) for tag in _TILES))
+    except Header.DecompressionBombError as error:
+        raise ValueError(f"image {path} must be smaller; {one_line(error)}. Scale it down.") from None
+    except OSError as error:
+        if error.errno is not None:
+            raise
+        raise ValueError(f"image {path} must be readable; its header is not. Write it again or remove it.") from None
+    except Exception as error:  # of any class: the header is damaged
+        raise ValueError(f"image {path} must be readable; {one_line(error)}. Write it again or remove it.") from None
+    for width, height in sizes:
+        check_pixels(path, width, height)
