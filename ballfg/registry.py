@@ -13,6 +13,8 @@ from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points, p
 from types import ModuleType
 from typing import Any, Generic, TypeVar, cast
 
+from ballfg.interrupts import is_interrupt
+
 T = TypeVar("T")
 C = TypeVar("C", bound=type[Any])
 PACKAGE = "ballfg"
@@ -152,7 +154,9 @@ class Registry(Mapping[str, type[T]], Generic[T]):
                 before.pop(cast("Any", offered).name, None)  # its module may have registered it already
             elif not isinstance(offered, ModuleType):
                 offered()
-        except Exception as error:
+        except BaseException as error:  # one that leaves, by sys.exit or otherwise, would take the command with it
+            if is_interrupt(error):
+                raise
             raise ValueError(
                 f"entry point '{point.name}' = '{point.value}' of package {_package(point)} (group {self.group}) "
                 f"cannot be used ({type(error).__name__}: {error}). Mend or uninstall that package."

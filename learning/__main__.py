@@ -1,6 +1,6 @@
 """`python -m ballfg.learning` is `ballfg-train`, so that torchrun can start it as a module."""
 
-from ballfg.learning.cli import run
+from ballfg.cli.entry import train
 
 if __name__ == "__main__":
-    run()
+    train()

@@ -100,11 +100,15 @@ def _train_here(config: TrainConfig, folder: Path, resume: bool, typed: str) -> 
 
 
 def _train_guarded(config: TrainConfig, folder: Path, resume: bool, typed: str) -> int:
-    """The work of each process that this command starts. Returns: its exit status."""
+    """The work of each process that this command starts. Returns: its exit status; none where it was interrupted."""
+    from ballfg.learning.run.launch import NO_STATUS
 
     def work() -> int:
-        with alive("ballfg-train"):
-            return _train_here(config, folder, resume, typed)
+        try:
+            with alive("ballfg-train"):
+                return _train_here(config, folder, resume, typed)
+        except KeyboardInterrupt:  # this command says so
+            return NO_STATUS
 
     return guarded(work)
 

@@ -9,6 +9,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 LEVELS = (
+    ("interrupts",),
     ("state", "arrays", "checks", "progress", "registry", "machine", "collector"),
     ("files",),
     ("parallel",),
@@ -25,7 +26,7 @@ LEVELS = (
     ("benchmarks", "cli"),
 )
 """Rooms from the first to the last; a module imports from its own room and from earlier levels only."""
-COMMANDS = {"ballfg.learning.cli", "ballfg.benchmarks.cli"}
+COMMANDS = {"ballfg.learning.cli", "ballfg.learning.__main__", "ballfg.benchmarks.cli"}
 """Commands that live in their room: they may import from `ballfg.cli` what all commands share."""
 SETUPTOOLS = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["setuptools"]
 

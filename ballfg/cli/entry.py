@@ -1,6 +1,6 @@
 """The entry points of the installed programs: what they need of their process, before anything large is imported.
 
-Ctrl-C is one line even while they are being imported.
+Ctrl-C, SIGTERM and SIGHUP are one line even while they are being imported.
 """
 
 import os
@@ -8,6 +8,7 @@ import sys
 from importlib import import_module
 
 from ballfg.collector import collect_rarely
+from ballfg.interrupts import interrupted, let_go, listen, say_so
 
 
 def ballfg() -> None:
@@ -26,14 +27,20 @@ def train() -> None:
 
 
 def _run(module: str) -> None:
-    _open_streams()
-    _check_folder()
-    collect_rarely()
     try:
+        listen()
+        _open_streams()
+        _check_folder()
+        collect_rarely()
         import_module(module).run()
+    except Exception:
+        if not interrupted():  # a library may have made another exception of the interrupt
+            raise
+        sys.exit(say_so())
     except KeyboardInterrupt:
-        print("ballfg: interrupted", file=sys.stderr)
-        sys.exit(130)
+        sys.exit(say_so())
+    finally:
+        let_go()
 
 
 def _open_streams() -> None:

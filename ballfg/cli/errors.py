@@ -6,6 +6,8 @@ from typing import Final
 
 import typer
 
+from ballfg.interrupts import interrupted, say_so
+
 BAD_INPUT = 2
 """Exit status for input that cannot be used."""
 NOT_ESTIMATED = 3
@@ -28,30 +30,35 @@ def guarded(command: Callable[[], object]) -> int:
     """Runs a command and turns what a user can mend into one line `ballfg: error: ...` and an exit status.
 
     Args: command: takes no arguments; may raise.
-    Returns: 0, 2 for bad input, 3 where some tracks could not be estimated, 130 after Ctrl-C, or the status that the
-        command returned.
+    Returns: 0, 2 for bad input, 3 where some tracks could not be estimated, 128 and the signal's number after Ctrl-C,
+        SIGTERM or SIGHUP, or the status that the command returned.
     """
     try:
         result = command()
     except typer.Exit as request:
         return request.exit_code
     except (KeyboardInterrupt, typer.Abort):
-        return _interrupted()
-    except USER_ERRORS as error:
-        if type(error).__name__ == "LinAlgError":  # numpy makes it a ValueError, but no user can mend it
-            raise
-        return _bad_input(_in_words(error))
+        return say_so()
     except Exception as error:
-        # errors in the use of a command: typer's own base class has moved between versions, their method has not
-        message = getattr(error, "format_message", None)
-        if message is None and NO_MEMORY in str(error):
-            return _bad_input(_in_words(MemoryError(f"torch {NO_MEMORY}")))
-        if message is None:
-            raise
-        return _bad_input(message(), getattr(error, "ctx", None))
+        return say_so() if interrupted() else _refused(error)  # libraries make other exceptions of an interrupt
     if result == INTERRUPTED:
-        return _interrupted()
+        return say_so()
     return result if isinstance(result, int) else 0
+
+
+def _refused(error: Exception) -> int:
+    """The exit status of what a user can mend, with its line; everything else is raised again."""
+    if isinstance(error, USER_ERRORS):
+        if type(error).__name__ == "LinAlgError":  # numpy makes it a ValueError, but no user can mend it
+            raise error
+        return _bad_input(_in_words(error))
+    # errors in the use of a command: typer's own base class has moved between versions, their method has not
+    message = getattr(error, "format_message", None)
+    if message is None and NO_MEMORY in str(error):
+        return _bad_input(_in_words(MemoryError(f"torch {NO_MEMORY}")))
+    if message is None:
+        raise error
+    return _bad_input(message(), getattr(error, "ctx", None))
 
 
 def check_words(words: Sequence[str]) -> None:
@@ -84,8 +91,3 @@ def _bad_input(message: str, context: typer.Context | None = None) -> int:
     hint = "" if context is None else f" See '{context.command_path} --help'."
     print(f"ballfg: error: {text}{hint}", file=sys.stderr)
     return BAD_INPUT
-
-
-def _interrupted() -> int:
-    print("ballfg: interrupted", file=sys.stderr)
-    return INTERRUPTED

@@ -50,7 +50,7 @@ def temporary_folder(name: str) -> Path:
         for each in (folder.parent, folder):
             with suppress(FileExistsError):
                 each.mkdir(PRIVATE)
-        if is_own(folder):
+        if is_own(folder) and not folder.parent.is_symlink():
             return folder
     folder = Path(tempfile.mkdtemp(prefix="ballfg-"))
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -61,15 +61,31 @@ def is_own(folder: Path) -> bool:
     """Whether nobody but this user and root can change what a folder holds, or put another one in its place.
 
     The folder belongs to this user or to root, and so do all folders around it; others may write to none of them,
-    unless its sticky bit keeps what others own, as that of /tmp does. Links are followed, and judged where they lead.
+    unless its sticky bit keeps what others own, as that of /tmp does. Links of this user and of root are followed, and
+    judged where they lead; others could let theirs lead elsewhere at any time.
     """
     try:
         real = Path(os.path.realpath(folder, strict=True))
-        return _is_closed(real.stat(), sticky=False) and all(
-            _is_closed(each.stat(), sticky=True) for each in real.parents
+        return (
+            _is_closed(real.stat(), sticky=False)
+            and all(_is_closed(each.stat(), sticky=True) for each in real.parents)
+            and all(each.lstat().st_uid in (_ROOT, os.geteuid()) for each in (folder, *folder.absolute().parents))
         )
     except OSError:
         return False
+
+
+def own_bytes(path: Path) -> bytes:
+    """The content of a file that only this user and root can change; ask `is_own` about its folder before.
+
+    Raises: OSError: it cannot be read. ValueError: somebody else owns it or may write to it, or it is no file.
+    """
+    with open(path, "rb") as file:
+        found = os.fstat(file.fileno())
+        own = stat.S_ISREG(found.st_mode) and found.st_uid in (_ROOT, os.geteuid())
+        if not own or found.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+            raise ValueError(f"{path} must be a file that only this user may write to. Change its owner and its mode.")
+        return file.read()
 
 
 def _is_closed(found: os.stat_result, *, sticky: bool) -> bool:

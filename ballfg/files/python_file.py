@@ -7,6 +7,8 @@ from pathlib import Path
 from traceback import extract_tb
 from types import ModuleType
 
+from ballfg.interrupts import is_interrupt
+
 
 def run_file(path: Path, what: str) -> ModuleType:
     """The module of a file, under a name that no import finds: worker processes then get its contents as a whole.
@@ -35,7 +37,9 @@ def blamed(path: Path, doing: str) -> Iterator[None]:
     """
     try:
         yield
-    except (Exception, SystemExit) as error:
+    except BaseException as error:  # one that leaves, by sys.exit or otherwise, would take the command with it
+        if is_interrupt(error):
+            raise
         during = f" ({doing})" if doing else ""
         raise ValueError(f"{path} must run as Python{during}; {_where(error, path)}. Mend it there.") from error
 

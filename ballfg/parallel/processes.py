@@ -1,28 +1,34 @@
-"""Processes of this machine, by joblib's loky: they are kept for the next work, and replaced when one dies."""
+"""Processes of this machine: kept for the next work, replaced when one dies, and gone with this process.
 
+Each is an interpreter with two pipes: one for calls and answers, and its standard input, to which only this process can
+write. When this process ends, however it ends, the system closes them, and the other process ends too (`worker.py`).
+There is nothing else that could stay: no semaphore, no file, no process that looks after the others.
+"""
+
+import atexit
+import os
 import pickle
-import warnings
+import signal
+import subprocess
+import sys
+import threading
 from collections.abc import Callable, Sequence
 from concurrent.futures import CancelledError, Future
-from typing import Any, Final
+from contextlib import suppress
+from multiprocessing import Pipe
+from queue import SimpleQueue
+from typing import IO, Any, Final, cast
 
-from joblib.externals.loky import get_reusable_executor
-from joblib.externals.loky.process_executor import ProcessPoolExecutor, TerminatedWorkerError
-
-from ballfg.collector import collect_rarely
 from ballfg.parallel.same_versions import own_versions
-from ballfg.parallel.work import Work, compute, packed
+from ballfg.parallel.work import Work, packed
 
-IDLE: Final = 300
-"""s after which processes without work end."""
 ONE_THREAD: Final = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), "1")
 MOST_DEATHS: Final = 3
 """A chunk that lost so many processes is given up: it is probably what ends them."""
+BEGIN: Final = "import sys; exec(sys.stdin.readline())"
+"""What a process runs; the line that it reads lets it find the modules that this one finds."""
 
-warnings.filterwarnings("ignore", "A worker stopped while some jobs", UserWarning)
-"""loky replaces a worker that has grown by 300 MB, as one does that compiles machine code; nobody need hear of it."""
-
-_started: set[int] = set()
+Told = Callable[[Any], object]
 
 
 class Processes:
@@ -45,48 +51,213 @@ class Processes:
     @property
     def started(self) -> bool:
         """Whether so many processes were started before; they may be there still."""
-        return self._others in _started
+        return _crew.size >= self._others
 
-    def sender(self, function: Callable[[Sequence[Any]], Any]) -> Callable[[Sequence[Any]], "_Chunk"]:
-        """Hands a function of a chunk over; see Executor."""
-        _started.add(self._others)
+    def sender(
+        self, function: Callable[[Sequence[Any]], Any], told: Told | None = None
+    ) -> Callable[[Sequence[Any]], "_Chunk"]:
+        """Hands a function of a chunk over; see Executor.
+
+        Args: told: called, in another thread, with what the function tells by `worker.tell` while it computes.
+        """
         work = Work.of(function)
-        return lambda chunk: _Chunk(self._pool, work, chunk)
+        return lambda chunk: _Chunk(_crew.line(self._others), work, chunk, told)
 
     def stop(self) -> None:
-        """Ends the processes at once."""
-        self._pool().shutdown(wait=True, kill_workers=True)
-        _started.clear()
-
-    def _pool(self) -> ProcessPoolExecutor:
-        return get_reusable_executor(max_workers=self._others, timeout=IDLE, env=ONE_THREAD, initializer=collect_rarely)
+        """Ends all processes at once."""
+        _stop()
 
 
 class _Chunk:
     """A chunk that goes to a new process where the one that had it has died."""
 
-    def __init__(self, pool: Callable[[], ProcessPoolExecutor], work: Work, chunk: Sequence[Any]) -> None:
-        self._pool, self._first = pool, repr(chunk[0])
-        self._call = (compute, work.name, work.content, packed(chunk), own_versions())
-        self._future: Future[bytes] = pool().submit(*self._call)
+    def __init__(self, line: "_Line", work: Work, chunk: Sequence[Any], told: Told | None) -> None:
+        self._first, self._told = repr(chunk[0]), told
+        self._call = pickle.dumps((work.name, work.content, packed(chunk), own_versions()))
+        self._future = Future[tuple[str, bytes]]()
+        line.put(self)
 
     def done(self) -> bool:
-        """Whether the result is there, or the process has died."""
+        """Whether the result is there, or an error."""
         return self._future.done()
 
     def result(self) -> Any:
-        """The result; see Pending. Raises: ChildProcessError: if the chunk lost too many processes."""
-        for _ in range(MOST_DEATHS):
+        """The result; see Pending. Raises: ChildProcessError: the chunk lost too many processes."""
+        kind, content = self._future.result()
+        if kind == "error":
+            raise pickle.loads(content)
+        return pickle.loads(content)
+
+    def cancel(self) -> bool:
+        """Gives the chunk up where no process has begun it."""
+        return self._future.cancel()
+
+    def compute(self, crew: "_Crew") -> None:
+        """Has a process compute it."""
+        if self._future.set_running_or_notify_cancel():
             try:
-                return pickle.loads(self._future.result())
-            except (TerminatedWorkerError, CancelledError):  # the whole pool ends with one of its processes
-                self._future = self._pool().submit(*self._call)
-        self.cancel()
+                self._future.set_result(self._answered(crew))
+            except BaseException as error:  # told to whoever asks for the result
+                self._future.set_exception(error)
+
+    def _answered(self, crew: "_Crew") -> tuple[str, bytes]:
+        for _ in range(MOST_DEATHS):
+            process = crew.taken()
+            with suppress(EOFError, OSError):  # it has died
+                answer = process.answer(self._call, self._told)
+                crew.put_back(process)
+                return answer
+            crew.bury(process)
         raise ChildProcessError(
             f"processes must live while they work; {MOST_DEATHS} died over a chunk that begins with {self._first}. "
             "Memory is probably short: use fewer processes."
         )
 
-    def cancel(self) -> bool:
-        """Gives the chunk up where no process has begun it."""
-        return self._future.cancel()
+
+_Line = SimpleQueue[_Chunk | None]
+
+
+class _Crew:
+    """All processes, and the chunks that wait for them: a line for each number of processes that was asked for."""
+
+    def __init__(self) -> None:
+        self._processes: set[_Process] = set()
+        self._free: list[_Process] = []
+        self._lines: dict[int, _Line] = {}
+        self._lock = threading.Lock()
+        self._stopped = False
+
+    @property
+    def size(self) -> int:
+        return len(self._processes)
+
+    def line(self, size: int) -> _Line:
+        """The line of a number of processes; as many threads take from it, one for each chunk at work."""
+        with self._lock:
+            if size not in self._lines:
+                self._lines[size] = SimpleQueue()
+                for _ in range(size):
+                    threading.Thread(target=self._work, args=(self._lines[size],), daemon=True).start()
+            return self._lines[size]
+
+    def _work(self, line: _Line) -> None:
+        while (chunk := line.get()) is not None:
+            chunk.compute(self)
+
+    def taken(self) -> "_Process":
+        """A process for one chunk. Raises: CancelledError: all were ended."""
+        with self._lock:
+            if self._stopped:
+                raise CancelledError
+            while self._free:
+                process = self._free.pop()
+                if process.lives():
+                    return process
+                self._bury(process)
+            process = _Process()
+            self._processes.add(process)
+            return process
+
+    def put_back(self, process: "_Process") -> None:
+        with self._lock:
+            self._free.append(process)
+            if self._stopped:
+                self._bury_free()
+
+    def bury(self, process: "_Process") -> None:
+        with self._lock:
+            self._bury(process)
+
+    def _bury_free(self) -> None:
+        while self._free:
+            self._bury(self._free.pop())
+
+    def _bury(self, process: "_Process") -> None:
+        process.kill()
+        process.close()
+        self._processes.discard(process)
+
+    def stop(self) -> None:
+        """Ends all processes; threads that wait for one find that it has died."""
+        with self._lock:
+            self._stopped = True
+            for process in self._processes:
+                process.kill()
+            self._bury_free()
+            for size, line in self._lines.items():
+                for _ in range(size):
+                    line.put(None)
+
+    def forget(self) -> None:
+        """Closes the pipes of a copy of this process: it must not keep the others alive, nor do they serve it."""
+        for process in self._processes:
+            process.close()
+
+
+class _Process:
+    """An interpreter that computes one chunk after another."""
+
+    def __init__(self) -> None:
+        self._calls, theirs = Pipe()
+        # Ctrl-C at the terminal is for this process alone; the other says so itself as soon as it can
+        before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+        try:
+            with theirs:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-c", BEGIN],
+                    stdin=subprocess.PIPE,
+                    pass_fds=[handle := theirs.fileno()],
+                    env=os.environ | ONE_THREAD,
+                    text=True,
+                )
+        finally:
+            signal.pthread_sigmask(signal.SIG_SETMASK, before)
+        with suppress(OSError):  # of one that died at once: its first call says so
+            print(
+                f"sys.path[:] = {sys.path!r}; from ballfg.parallel.worker import serve; serve({handle})",
+                file=self._process.stdin,
+                flush=True,
+            )
+
+    def lives(self) -> bool:
+        return self._process.poll() is None
+
+    def answer(self, call: bytes, told: Told | None) -> tuple[str, bytes]:
+        """What the process answers to a call. Raises: EOFError, OSError: it has died."""
+        self._calls.send_bytes(call)
+        while True:
+            kind, content = pickle.loads(self._calls.recv_bytes())
+            if kind != "told":
+                return kind, content
+            if told is not None:
+                told(content)
+
+    def kill(self) -> None:
+        """Ends it at once; a thread that waits for its answer finds that it has died."""
+        self._process.kill()
+        self._process.wait()
+
+    def close(self) -> None:
+        """Closes its pipes."""
+        self._calls.close()
+        with suppress(OSError):
+            cast("IO[str]", self._process.stdin).close()
+
+
+_crew = _Crew()
+
+
+def _stop() -> None:
+    global _crew
+    _crew, ended = _Crew(), _crew
+    ended.stop()
+
+
+def _forget() -> None:
+    global _crew
+    _crew, others = _Crew(), _crew
+    others.forget()
+
+
+atexit.register(_stop)
+os.register_at_fork(after_in_child=_forget)

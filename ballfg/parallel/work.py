@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from threading import Lock
 from typing import Any, TypeVar
 
-from joblib.externals.loky.backend.reduction import dumps
+from cloudpickle import dumps
 
 from ballfg.parallel.same_versions import differences
 

@@ -7,13 +7,12 @@ from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from joblib.externals.loky import get_reusable_executor
-
 from ballfg.benchmarks.cameras.clocks import sighted
 from ballfg.benchmarks.cameras.scenes import Filmed, Scenario
 from ballfg.benchmarks.speed.stopwatch import milliseconds
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Online, Settings, sightings_of
+from ballfg.parallel.processes import Processes
 from ballfg.progress import progress
 from ballfg.simulation.scene import write_scene
 from ballfg.vision import Camera, Detections, detect_all, track_detections
@@ -51,7 +50,7 @@ def stream_times(scenario: Scenario, runs: int) -> list[StreamTimes]:
 
 
 def _timed(videos: dict[str, Path], cameras: Sequence[Camera]) -> StreamTimes:
-    get_reusable_executor().shutdown(wait=True)  # each run starts its processes, as the command does
+    Processes(len(videos), helped=False).stop()  # each run starts its processes, as the command does
     start = time.perf_counter()
     found: dict[str, Detections] = detect_all(videos, jobs=len(videos))
     searched = time.perf_counter()

@@ -1,10 +1,13 @@
 """Several training processes on this machine, started as torchrun would start them."""
 
+import multiprocessing
 import os
 import signal
 import time
 from collections.abc import Callable
-from multiprocessing.sharedctypes import Synchronized
+from ctypes import c_int
+from multiprocessing import resource_tracker
+from threading import Thread
 from typing import Any
 
 from torch.distributed import TCPStore
@@ -27,11 +30,18 @@ def launch(processes: int, work: Callable[..., int], *arguments: Any) -> int:
     Returns: the status of the first process.
     Raises:
         ChildProcessError: if a process was killed.
-        KeyboardInterrupt: after Ctrl-C, if the first process ended before it could return.
+        KeyboardInterrupt: after Ctrl-C, and if the first process ended before it could return.
     """
     store = TCPStore(HOST, 0, is_master=True, wait_for_workers=False)
-    status = get_context("spawn").Value("i", NO_STATUS)
-    group = start_processes(_take_part, (processes, store.port, status, work, arguments), nprocs=processes, join=False)
+    # without a lock: its semaphore would outlive a kill
+    status: c_int = get_context("spawn").Value("i", NO_STATUS, lock=False)
+    resource_tracker.ensure_running()  # it lets signals through in this process
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # a process that still imports prints tracebacks
+    try:
+        shared = processes, store.port, status, work, arguments
+        group = start_processes(_take_part, shared, nprocs=processes, join=False)
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     try:
         _wait(group)
     except ProcessExitedException as error:
@@ -48,11 +58,13 @@ def _take_part(
     rank: int,
     processes: int,
     port: int,
-    status: "Synchronized[int]",
+    status: c_int,
     work: Callable[..., int],
     arguments: tuple[Any, ...],
 ) -> None:
     """Set the environment as torchrun does, then work."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    Thread(target=_end_with_parent, daemon=True).start()
     os.environ.update(
         RANK=str(rank),
         LOCAL_RANK=str(rank),
@@ -68,6 +80,13 @@ def _take_part(
         return
     if rank == 0:
         status.value = found
+
+
+def _end_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _wait(group: ProcessContext) -> None:

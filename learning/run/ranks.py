@@ -170,12 +170,13 @@ def join_ranks() -> Iterator[Ranks]:
         return
     dist.init_process_group("gloo", init_method="env://")
     ranks: Ranks = Ranks(dist.get_rank(), dist.get_world_size())
-    before = signal.signal(signal.SIGINT, ranks._on_interrupt) if ranks.size > 1 else None
+    handled = (signal.SIGINT, signal.SIGTERM) if ranks.size > 1 else ()  # torchrun hands SIGTERM on
+    before = {number: signal.signal(number, ranks._on_interrupt) for number in handled}
     try:
         yield ranks
     finally:
-        if before is not None:
-            signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         dist.destroy_process_group()
 
 

@@ -255,7 +255,7 @@ for command in (["--help"], ["estimate", "--help"], ["predict", "--help"]):
         run(command)
     except SystemExit as done:
         assert not done.code
-loaded = {"torch", "gtsam", "numpy", "pyarrow", "joblib", "scipy"} & set(sys.modules)
+loaded = {"torch", "gtsam", "numpy", "pyarrow", "cloudpickle", "scipy"} & set(sys.modules)
 assert not loaded, loaded
 """
     done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)

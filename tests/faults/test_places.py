@@ -116,6 +116,6 @@ def test_a_user_without_a_home(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) 
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     cache_folder.cache_clear()
     try:
-        assert cache_folder() == tmp_path / f"ballfg-{os.getuid()}"
+        assert cache_folder() == tmp_path / f"ballfg-{os.getuid()}" / "cache"
     finally:
         cache_folder.cache_clear()

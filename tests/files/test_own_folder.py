@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.files.own_folder import is_own, own_folder, state_folder, temporary_folder
+from ballfg.files.own_folder import is_own, own_bytes, own_folder, state_folder, temporary_folder
 
 
 def test_a_folder_for_this_user_alone_is_its_own(tmp_path: Path) -> None:
@@ -42,8 +42,23 @@ def test_a_link_is_judged_where_it_leads(tmp_path: Path) -> None:
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root can give a folder to somebody else")
 def test_a_folder_of_somebody_else_is_not(tmp_path: Path) -> None:
     made = own_folder(tmp_path / "a")
+    (tmp_path / "link").symlink_to(made)
+    assert is_own(tmp_path / "link")
+    os.chown(tmp_path / "link", 12345, 12345, follow_symlinks=False)
+    assert not is_own(tmp_path / "link")  # its owner could let it lead elsewhere
     os.chown(made, 12345, 12345)
     assert not is_own(made)
+
+
+def test_a_file_that_others_may_write_to_is_not_read(tmp_path: Path) -> None:
+    file = tmp_path / "a"
+    file.write_bytes(b"content")
+    file.chmod(0o644)
+    assert own_bytes(file) == b"content"
+    for mode in (0o664, 0o646):
+        file.chmod(mode)
+        with pytest.raises(ValueError, match="only this user may write to"):
+            own_bytes(file)
 
 
 def test_state_goes_to_a_private_folder_where_the_users_own_is_open(

@@ -1,24 +1,38 @@
-"""Where machine code is kept from one process to the next, whatever may be read and written there."""
+"""Where machine code is kept from one process to the next, whatever may be read and written there.
+
+Machine code is run as it is found. So it is read from folders that nobody but this user and root can change, wherever
+their names come from, and each file says of which function, sources, versions and processor it is.
+"""
 
 from __future__ import annotations
 
-import atexit
 import hashlib
 import os
 import pickle
-import shutil
-import stat
+import re
+import sys
 import tempfile
 import uuid
-from contextlib import suppress
-from functools import lru_cache
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from functools import cache, lru_cache
+from io import BytesIO
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final
 
+import llvmlite
+import numba
 from numba.core.caching import CompileResultCacheImpl, FunctionCache, IndexDataCacheFile
 
-PRIVATE: Final = 0o700
+from ballfg.files.own_folder import is_own, own_bytes, temporary_folder
+
+READABLE: Final = 0o755
+"""Mode of the folder of the cache: others may read what an administrator has compiled for them."""
+FOR_OTHERS_TO_READ: Final = 0o644
 DIGEST_SIZE: Final = hashlib.sha256().digest_size
+NOTED: Final = "BALLFG_CACHE_NOTED"
+"""Environment variable: this process, or one that started it, has printed the note on folders that are not used."""
+_IMPORTS: Final = re.compile(rb"^(?:from|import) (ballfg[\w.]*)", re.MULTILINE)
 _LOCATORS: Final[dict[str, Any]] = {
     locator.__name__.lstrip("_"): locator for locator in CompileResultCacheImpl._locator_classes
 }  # some versions of numba begin these names with a line
@@ -34,47 +48,56 @@ def configured_folder() -> Path:
 @lru_cache(maxsize=1)
 def cache_folder() -> Path:
     """The folder that compiled functions are written to: the configured one, or one for temporary files."""
-    try:
+    with suppress(OSError, RuntimeError):
         folder = configured_folder()
-        folder.mkdir(parents=True, exist_ok=True)
+        folder.mkdir(READABLE, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
-            pass
-    except (OSError, RuntimeError):
-        folder = _temporary_folder()
-    return folder
+            if _is_trusted(folder):
+                return folder
+    return temporary_folder("cache")
 
 
-def _temporary_folder() -> Path:
-    """One that later processes of this user find again; where anybody else could write to it, one for this process."""
-    user = os.getuid()
-    folder = Path(tempfile.gettempdir()) / f"ballfg-{user}"
-    with suppress(FileExistsError):
-        folder.mkdir(PRIVATE)
-    found = folder.lstat()  # of a link: the link's own
-    if stat.S_ISDIR(found.st_mode) and found.st_uid == user and stat.S_IMODE(found.st_mode) == PRIVATE:
-        return folder
-    folder = Path(tempfile.mkdtemp(prefix="ballfg-"))
-    atexit.register(shutil.rmtree, folder, ignore_errors=True)
-    return folder
+@cache
+def _is_trusted(folder: Path) -> bool:
+    """Whether machine code in a folder may be run; where not, the first such folder is named on stderr."""
+    trusted = is_own(folder)
+    if not trusted and NOTED not in os.environ and sys.stderr is not None:
+        os.environ[NOTED] = "1"
+        print(
+            f"note: {folder} is not used for machine code, since others than this user may change it, or a folder "
+            "around it; what is missing is compiled anew",
+            file=sys.stderr,
+        )
+    return trusted
 
 
 def readable(name: str) -> list[Path]:
     """Where a kept file may be found: a folder that an administrator has filled is read though nothing is written."""
+    folders = [cache_folder()]
     with suppress(RuntimeError):
-        return list(dict.fromkeys((configured_folder() / name, cache_folder() / name)))
-    return [cache_folder() / name]
+        if _is_trusted(configured_folder()):
+            folders.insert(0, configured_folder())
+    return [folder / name for folder in dict.fromkeys(folders)]
 
 
 def keep(name: str, text: str) -> Path:
     """Write a file to the cache at once: another process never reads half of it. Returns: its path."""
     path = cache_folder() / name
-    part = path.with_name(f"{name}.{uuid.uuid4().hex}.part")  # tempfile's would be closed to other users
+    with _replaced(path) as file:
+        file.write(text.encode())
+    return path
+
+
+@contextmanager
+def _replaced(path: Path) -> Iterator[IO[bytes]]:
+    """A new file that takes the place of another one; this user alone may change it."""
+    part = path.with_name(f"{path.name}.{uuid.uuid4().hex}.part")
     try:
-        part.write_text(text, encoding="utf-8")
+        with open(part, "wb", opener=lambda name, flags: os.open(name, flags, FOR_OTHERS_TO_READ)) as file:
+            yield file
         os.replace(part, path)
     finally:
-        part.unlink(missing_ok=True)  # of a disk that is full
-    return path
+        part.unlink(missing_ok=True)  # of a disk that is full, or after an interrupt
 
 
 class _Temporary(_InTree):
@@ -92,8 +115,20 @@ class _Beside(_InTree):
         """Nothing is needed to read."""
 
 
-WRITTEN: Final[list[type[object]]] = [*CompileResultCacheImpl._locator_classes, _Temporary]
-READ: Final[list[type[object]]] = [_Beside]
+class _Trusted:
+    """A locator of numba's, which finds nothing where somebody else could change what it finds."""
+
+    def __init__(self, locator: Any) -> None:
+        self._locator = locator
+
+    def from_function(self, function: Any, file: str) -> Any:
+        """As numba asks for it; None where there is no such folder."""
+        found = self._locator.from_function(function, file)
+        return found if found is not None and _is_trusted(Path(found.get_cache_path())) else None
+
+
+WRITTEN: Final = [_Trusted(locator) for locator in (*CompileResultCacheImpl._locator_classes, _Temporary)]
+READ: Final[list[Any]] = [_Beside]
 
 
 class _Written(CompileResultCacheImpl):
@@ -104,8 +139,37 @@ class _Read(CompileResultCacheImpl):
     _locator_classes = READ
 
 
-class _Digested(IndexDataCacheFile):
-    """Files of machine code, each with the digest of the rest: damaged code ends the process, or computes nonsense."""
+class _Checked(IndexDataCacheFile):
+    """Files of machine code, each with what it is of, and with the digest of the rest.
+
+    Damaged code, or that of another function, ends the process, or computes nonsense.
+    """
+
+    def __init__(self, folder: str, base: str, stamp: str) -> None:
+        super().__init__(folder, base, stamp)
+        self._version = f"numba {numba.__version__}, llvmlite {llvmlite.__version__}"
+        self._about = f"{base}, {stamp}, {self._version}"
+
+    def save(self, key: Any, data: Any) -> None:
+        """Keep code. Args: key: signature, processor and its features, bytecode."""
+        super().save(key, (f"{self._about}, {key}", data))
+
+    def load(self, key: Any) -> Any:
+        """The code of a key; None where there is none. Raises: ValueError: other code was put in its place."""
+        about, data = super().load(key) or ("", None)
+        if data is not None and about != f"{self._about}, {key}":
+            raise ValueError(f"{self._index_name} must lead to its own code. It is compiled again.")
+        return data
+
+    def _load_index(self) -> Any:
+        try:
+            file = BytesIO(own_bytes(Path(self._index_path)))
+        except FileNotFoundError:
+            return {}
+        if pickle.load(file) != self._version:
+            return {}
+        stamp, overloads = pickle.load(file)
+        return overloads if stamp == self._source_stamp else {}
 
     def _save_data(self, name: str, data: Any) -> None:
         content = self._dump(data)
@@ -113,22 +177,44 @@ class _Digested(IndexDataCacheFile):
             file.write(_digest(content) + content)
 
     def _load_data(self, name: str) -> Any:
-        content = Path(self._data_path(name)).read_bytes()
+        content = own_bytes(Path(self._data_path(name)))
         digest, code = content[:DIGEST_SIZE], content[DIGEST_SIZE:]
         if digest != _digest(code):
             raise ValueError(f"{name} must hold what was written; its digest is another. It is compiled again.")
         return pickle.loads(code)
+
+    def _open_for_write(self, path: str) -> Any:
+        return _replaced(Path(path))
 
 
 def _digest(content: bytes) -> bytes:
     return hashlib.sha256(content).digest()
 
 
+@cache
+def _stamp(file: str) -> str:
+    """Digest of a source file and of those of ballfg that it imports, directly or not: what it calls is built in."""
+    found, waiting = dict[str, bytes](), [file]
+    while waiting:
+        path = waiting.pop()
+        if path not in found:
+            found[path], imported = _read(path)
+            waiting += [path for name in imported if (path := getattr(sys.modules.get(name), "__file__", None))]
+    return _digest(b"".join(found[path] for path in sorted(found))).hex()
+
+
+@cache
+def _read(path: str) -> tuple[bytes, tuple[str, ...]]:
+    """The digest of a source file, and the modules of ballfg that it imports."""
+    content = Path(path).read_bytes()
+    return _digest(content), tuple(name.decode() for name in _IMPORTS.findall(content))
+
+
 class _Cache(FunctionCache):
     def __init__(self, function: Any) -> None:
         super().__init__(function)
-        stamp = self._impl.locator.get_source_stamp()
-        self._cache_file = _Digested(self.cache_path, self._impl.filename_base, stamp)
+        stamp = _stamp(function.__code__.co_filename)
+        self._cache_file = _Checked(self.cache_path, self._impl.filename_base, stamp)
 
 
 class _KeptBeside(_Cache):
@@ -138,18 +224,21 @@ class _KeptBeside(_Cache):
 class Kept(_Cache):
     """Machine code of a function on disk.
 
-    It is written to the first folder that numba can write to, and read from beside the source too, where whoever
-    installed the package may have compiled it; `NUMBA_CACHE_DIR` is the only folder where it is set. What cannot be
-    read, or is damaged, as after a power failure, is made again; a full disk costs time.
+    It is written to the first folder that numba can write to and nobody else can change, and read from beside the
+    source too, where whoever installed the package may have compiled it; `NUMBA_CACHE_DIR` is the only folder where it
+    is set. What cannot be read, is damaged, as after a power failure, or belongs to somebody else is made again; a full
+    disk costs time.
     """
 
     _impl_class: Any = _Written
 
     def __init__(self, function: Any) -> None:
         super().__init__(function)
-        beside = _KeptBeside(function)
         told = isinstance(self._impl.locator, _LOCATORS["UserProvidedCacheLocator"])
-        self._beside = None if told or beside.cache_path == self.cache_path else beside
+        beside = Path(function.__code__.co_filename).with_name("__pycache__")
+        self._beside: Any = None
+        if not told and str(beside) != self.cache_path and any(beside.glob("*.nbi")) and _is_trusted(beside):
+            self._beside = _KeptBeside(function)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The code that was kept; None where there is none."""

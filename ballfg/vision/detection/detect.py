@@ -1,19 +1,19 @@
 """Videos through detectors, ballfg's or a user's: one after the other, or each camera in a process of its own."""
 
-import multiprocessing
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future
 from functools import partial
 from itertools import count
 from pathlib import Path
-from queue import Empty, Queue
+from queue import Empty, SimpleQueue
 from typing import Final, TypeVar
 
 import cv2
-from joblib.externals.loky import get_reusable_executor
 
 from ballfg.checks import did_you_mean, shown
 from ballfg.files.python_file import blamed, run_file
+from ballfg.parallel.executor import Pending
+from ballfg.parallel.processes import Processes
+from ballfg.parallel.worker import tell
 from ballfg.progress import Watch, unwatched
 from ballfg.vision.arrays import Image
 from ballfg.vision.detection.background import FEWEST
@@ -28,8 +28,8 @@ Maker = Callable[[Video], Detector]
 
 SAMPLE: Final = 15
 """Frames from which a background is learned: what stands in the same place in eight of them is background."""
-LOOKS: Final = 1.0
-"""s. When nothing was told for so long, it is looked whether a process has died."""
+LOOKS: Final = 0.05
+"""s. When nothing was told for so long, it is looked which processes have ended."""
 TELLS: Final = 20
 """Frames after which a process says how far it is."""
 SEARCHED: Final = "frames searched"
@@ -124,51 +124,44 @@ def detect_all(
 
 
 def _in_processes(videos: Mapping[str, Video], make: Maker, jobs: int, watch: Watch) -> dict[str, Detections]:
-    with multiprocessing.Manager() as manager:
-        told = manager.Queue()
-        pool = get_reusable_executor(max_workers=min(jobs, len(videos)))
-        running = [pool.submit(_job, video, name, make, told) for name, video in videos.items()]
-        for _ in watch(_told(told, running), sum(video.count for video in videos.values()), SEARCHED):
-            pass
-        failed = next((job for job in running if _failed(job)), None)
-        if failed is not None:
-            pool.shutdown(wait=True, kill_workers=True)  # what the other cameras see is of no use any more
-            failed.result()
-        return {name: job.result() for name, job in zip(videos, running, strict=True)}
-
-
-def _failed(job: Future[Detections]) -> bool:
-    return job.done() and job.exception() is not None
-
-
-def _job(video: Video, camera: str, make: Maker, told: Queue[int | None]) -> Detections:
-    """One camera, in a process of its own; says how many frames are done, and None at the end, come what may."""
-    cv2.setNumThreads(1)
+    others, told = Processes(min(jobs, len(videos)), helped=False), SimpleQueue[int]()
+    send = others.sender(_job, told.put)
+    running = {name: send([(video, name, make)]) for name, video in videos.items()}
     try:
-        return detect(video, camera, make(video), partial(_telling, told))
-    finally:
-        told.put(None)
+        for _ in watch(_told(told, running.values()), sum(video.count for video in videos.values()), SEARCHED):
+            pass
+        return {name: job.result() for name, job in running.items()}
+    except BaseException:
+        others.stop()  # what the other cameras see is of no use any more
+        raise
 
 
-def _telling(told: Queue[int | None], frames: Iterable[T], total: int, what: str) -> Iterator[T]:
+def _job(chunk: Sequence[tuple[Video, str, Maker]]) -> Detections:
+    """One camera, in a process of its own, which tells how many frames are done."""
+    cv2.setNumThreads(1)
+    ((video, camera, make),) = chunk
+    return detect(video, camera, make(video), _telling)
+
+
+def _telling(frames: Iterable[T], total: int, what: str) -> Iterator[T]:
     done = 0
     for done, frame in enumerate(frames, start=1):
         if done % TELLS == 0:
-            told.put(TELLS)
+            tell(TELLS)
         yield frame
-    told.put(done % TELLS)
+    tell(done % TELLS)
 
 
-def _told(told: Queue[int | None], running: Sequence[Future[Detections]]) -> Iterator[int]:
-    """Counts the frames that the processes say are done, until each has ended or one has failed."""
-    number, left = 0, len(running)
-    while left and not any(_failed(job) for job in running):
+def _told(told: SimpleQueue[int], running: Iterable[Pending]) -> Iterator[int]:
+    """Counts the frames that the processes say are done, until each has ended. Raises: what the first one raises."""
+    number, left = 0, list(running)
+    while left:
         try:
             done = told.get(timeout=LOOKS)
         except Empty:
-            continue
-        if done is None:
-            left -= 1
+            for job in [job for job in left if job.done()]:
+                job.result()
+                left.remove(job)
             continue
         yield from range(number, number + done)
         number += done

@@ -5,18 +5,20 @@ from __future__ import annotations
 import errno
 import importlib.util
 import os
+import pickle
 import stat
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import pytest
 
 from ballfg.dynamics.compiled import kept
 from ballfg.dynamics.compiled.build import read_note, write_note
-from ballfg.dynamics.compiled.kept import cache_folder
+from ballfg.dynamics.compiled.kept import NOTED, _is_trusted, _read, _stamp, cache_folder, keep, readable
 from tests.places import ROOT
 
 FUNCTION_FILE = """
@@ -31,9 +33,14 @@ def twice(x):
 
 @pytest.fixture(autouse=True)
 def _asked_anew() -> Iterator[None]:
-    cache_folder.cache_clear()
+    before = os.environ.pop(NOTED, None)
+    for asked in (cache_folder, _is_trusted):
+        asked.cache_clear()
     yield
-    cache_folder.cache_clear()
+    for asked in (cache_folder, _is_trusted):
+        asked.cache_clear()
+    os.environ.pop(NOTED, None)
+    os.environ |= {} if before is None else {NOTED: before}
 
 
 @pytest.fixture
@@ -43,15 +50,17 @@ def function(tmp_path: Path) -> Callable[[], Any]:
     file.parent.mkdir()
     file.write_text(FUNCTION_FILE)
 
-    def declared() -> Any:
-        spec = importlib.util.spec_from_file_location("some_function", file)
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-        return module.twice
+    return lambda: declared_in(file).twice
 
-    return declared
+
+def declared_in(file: Path) -> Any:
+    """The module of a file, as a new process declares it."""
+    spec = importlib.util.spec_from_file_location(file.stem, file)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
 
 
 @pytest.fixture
@@ -60,7 +69,7 @@ def nowhere_to_write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("BALLFG_CACHE", "/proc/nowhere")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     monkeypatch.setattr(kept._Written, "_locator_classes", [kept._Temporary])
-    return tmp_path / f"ballfg-{os.getuid()}"
+    return tmp_path / f"ballfg-{os.getuid()}" / "cache"
 
 
 def cut(content: bytes) -> bytes:
@@ -163,7 +172,7 @@ def test_notes_in_a_folder_that_is_only_read(tmp_path: Path, monkeypatch: pytest
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
     monkeypatch.setattr("tempfile.TemporaryFile", full)
     cache_folder.cache_clear()
-    assert cache_folder().parent == tmp_path / "temporary"
+    assert cache_folder() == tmp_path / "temporary" / f"ballfg-{os.getuid()}" / "cache"
     assert read_note("a") == {"size": 3}
     write_note("b", {"size": 4})
     assert read_note("b") == {"size": 4}
@@ -176,6 +185,133 @@ def test_a_note_that_finds_a_full_disk_leaves_nothing(tmp_path: Path, monkeypatc
     write_note("a", {"size": 3})
     assert read_note("a") is None
     assert not [path for path in tmp_path.rglob("*") if path.is_file()]
+
+
+class Planted:
+    """What runs when it is unpickled."""
+
+    def __init__(self, mark: Path) -> None:
+        self.mark = mark
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.mark,)
+
+
+def plant(index: Path, mark: Path) -> None:
+    """Puts a pickle that leaves a mark where numba keeps its index."""
+    index.write_bytes(pickle.dumps(Planted(mark)))
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_machine_code_in_a_folder_that_others_may_change_is_not_run(
+    tmp_path: Path,
+    function: Callable[[], Any],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    told: bool,
+) -> None:
+    """Beside the source, and where numba is told to keep it; one line says so."""
+    monkeypatch.setattr("numba.config.CACHE_DIR", str(tmp_path / "told") if told else "")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "mine"))
+    assert function()(2.0) == 4.0
+    (index,) = tmp_path.rglob("*.nbi")
+    plant(index, tmp_path / "mark")
+    index.parent.chmod(0o777)
+    capsys.readouterr()
+    for hits in (False, True):
+        _is_trusted.cache_clear()
+        twice = function()
+        assert twice(2.0) == 4.0
+        assert bool(twice.stats.cache_hits) == hits
+    assert not (tmp_path / "mark").exists()
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert said.startswith(f"note: {index.parent} is not used for machine code")
+
+
+@pytest.mark.parametrize(
+    ("variable", "place"), [("BALLFG_CACHE", "ballfg"), ("XDG_CACHE_HOME", "ballfg"), ("HOME", ".cache/ballfg")]
+)
+def test_a_cache_that_others_may_change_is_neither_read_nor_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], variable: str, place: str
+) -> None:
+    for name in ("BALLFG_CACHE", "XDG_CACHE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv(variable, str(tmp_path))
+    assert readable("a.py") == [tmp_path / place / "a.py"]
+    (tmp_path / place).chmod(0o777)
+    cache_folder.cache_clear()
+    _is_trusted.cache_clear()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    mine = tmp_path / f"ballfg-{os.getuid()}" / "cache"
+    assert readable("a.py") == [mine / "a.py"]
+    assert keep("a.py", "") == mine / "a.py"
+    assert not list((tmp_path / place).iterdir())
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def of_somebody_else(file: Path) -> None:
+    os.chown(file, 12345, 12345)
+
+
+def open_to_all(file: Path) -> None:
+    file.chmod(0o666)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [open_to_all, pytest.param(of_somebody_else, marks=pytest.mark.skipif(os.geteuid() != 0, reason="only root may"))],
+)
+@pytest.mark.parametrize("ending", ["nbi", "nbc"])
+def test_a_file_that_others_may_change_is_replaced(
+    tmp_path: Path, function: Callable[[], Any], given: Callable[[Path], None], ending: str
+) -> None:
+    assert function()(2.0) == 4.0
+    (file,) = tmp_path.rglob(f"*.{ending}")
+    if ending == "nbi":
+        plant(file, tmp_path / "mark")
+    given(file)
+    for hits in (False, True):
+        twice = function()
+        assert twice(2.0) == 4.0
+        assert bool(twice.stats.cache_hits) == hits
+    assert not (tmp_path / "mark").exists()
+    assert (file.stat().st_uid, stat.S_IMODE(file.stat().st_mode) & 0o022) == (os.geteuid(), 0)
+
+
+@pytest.mark.parametrize("ending", ["nbc", "nbi"])
+def test_files_of_two_functions_exchanged_are_noticed(tmp_path: Path, ending: str) -> None:
+    """They ended the process, or computed the other function."""
+    file = tmp_path / "some_function.py"
+    file.write_text(FUNCTION_FILE + FUNCTION_FILE.replace("2.0", "3.0").replace("twice", "thrice"))
+    both = declared_in(file)
+    assert (both.twice(2.0), both.thrice(2.0)) == (4.0, 6.0)
+    (one,), (other,) = tmp_path.rglob(f"*twice*.{ending}"), tmp_path.rglob(f"*thrice*.{ending}")
+    contents = one.read_bytes(), other.read_bytes()
+    other.write_bytes(contents[0])
+    one.write_bytes(contents[1])
+    again = declared_in(file)
+    assert (again.twice(2.0), again.thrice(2.0)) == (4.0, 6.0)
+    assert not again.twice.stats.cache_hits
+    assert not again.thrice.stats.cache_hits
+
+
+def test_a_change_of_another_file_that_is_built_in_is_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a function calls, and the constants that it reads; numba looks at the function's own file alone."""
+    text = FUNCTION_FILE.replace("\n@machine", "from ballfg.made_up import FACTOR\n\n@machine").replace("2.0", "FACTOR")
+    (tmp_path / "some_function.py").write_text(text)
+    for factor in (2.0, 3.25):
+        other = tmp_path / "made_up.py"
+        other.write_text(f"FACTOR = {factor}\n")
+        module = ModuleType("ballfg.made_up")
+        module.__dict__.update(FACTOR=factor, __file__=str(other))
+        monkeypatch.setitem(sys.modules, "ballfg.made_up", module)
+        for hits in (False, True):
+            for asked in (_stamp, _read):
+                asked.cache_clear()
+            found = declared_in(tmp_path / "some_function.py").twice
+            assert found(2.0) == 2.0 * factor
+            assert bool(found.stats.cache_hits) == hits
 
 
 @pytest.mark.parametrize("kind", ["open to others", "a link", "a file"])

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from joblib.externals.loky.cloudpickle_wrapper import dumps  # what worker processes are sent with
+from cloudpickle import dumps  # what worker processes are sent with
 
 from ballfg.dynamics import EFFECTS, Coefficient, FlightEffect, load_effects, model_from_dict, nominal_model, register
 from ballfg.dynamics.measurement import MeasurementEffect

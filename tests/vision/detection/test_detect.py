@@ -8,7 +8,7 @@ import signal
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
-from queue import Queue
+from queue import SimpleQueue
 
 import cv2
 import numpy as np
@@ -116,7 +116,7 @@ def test_a_process_that_dies_ends_the_search(films: dict[str, Path]) -> None:
     def die(video: Video) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
-    with pytest.raises(RuntimeError, match="terminated"):
+    with pytest.raises(ChildProcessError, match="3 died over a chunk"):
         detect_all(films, die, jobs=2)
 
 
@@ -131,10 +131,24 @@ def test_a_video_too_short_for_a_background_is_named(tmp_path: Path) -> None:
 
 
 def test_frames_are_counted_over_all_cameras_until_each_has_ended() -> None:
-    told: Queue[int | None] = Queue()
-    for done in (3, 2, None, 4, None):
+    told: SimpleQueue[int] = SimpleQueue()
+    for done in (3, 2, 4):
         told.put(done)
-    assert list(_told(told, [Future(), Future()])) == list(range(9))
-    failed: Future[Detections] = Future()
+    ended, failed = Future[Detections](), Future[Detections]()
+    ended.set_result(Detections.of_frames("left", []))
     failed.set_exception(ValueError("no video"))
-    assert list(_told(told, [Future(), failed])) == []
+    assert list(_told(told, [ended, ended])) == list(range(9))
+    with pytest.raises(ValueError, match="no video"):
+        list(_told(told, [Future(), failed]))
+
+
+def test_processes_tell_every_frame(films: dict[str, Path]) -> None:
+    seen: list[int] = []
+
+    def watch(items: Iterable[int], total: int, what: str) -> Iterator[int]:
+        for item in items:
+            seen.append(item)
+            yield item
+
+    detect_all(films, lambda video: brightest, jobs=2, watch=watch)
+    assert seen == list(range(2 * COUNT))

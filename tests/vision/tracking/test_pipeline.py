@@ -12,7 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from joblib.externals.loky.backend.reduction import dumps
+from cloudpickle import dumps
 
 from ballfg.tracks import TABLE_TENNIS, DatasetInfo, read_dataset
 from ballfg.vision import Camera

@@ -1,0 +1,70 @@
+"""A process that computes chunks for another one, and ends as soon as the other one has ended."""
+
+import os
+import pickle
+import signal
+import traceback
+from multiprocessing.connection import Connection
+from threading import Thread
+from typing import Any, Final
+
+from ballfg.collector import collect_rarely
+from ballfg.parallel.work import compute, packed
+
+IDLE: Final = 300.0
+"""s after which a process without work ends."""
+
+_asker: Connection | None = None
+
+
+def serve(handle: int) -> None:
+    """Computes one chunk after another, until nobody asks any more.
+
+    Args: handle: of a connection, for calls and answers.
+    """
+    global _asker
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C at the terminal: the process that asks ends this one
+    Thread(target=_end_with_asker, daemon=True).start()
+    collect_rarely()
+    _asker = Connection(handle)
+    try:
+        while _asker.poll(IDLE):
+            _send(_answer(*pickle.loads(_asker.recv_bytes())))
+    except (EOFError, ConnectionError):
+        return
+
+
+def tell(thing: Any) -> None:
+    """Sends something to the process that asks, while a chunk is computed for it; see `Processes.sender`."""
+    _send(("told", thing))
+
+
+def _end_with_asker() -> None:
+    """Standard input ends when the one process that can write to it has ended."""
+    while os.read(0, 1024):
+        pass
+    os._exit(0)
+
+
+def _send(thing: tuple[str, Any]) -> None:
+    assert _asker is not None
+    _asker.send_bytes(pickle.dumps(thing))
+
+
+def _answer(name: str, content: bytes, chunk: bytes, versions: dict[str, str]) -> tuple[str, bytes]:
+    try:
+        return "value", compute(name, content, chunk, versions)
+    except BaseException as error:
+        return "error", _packed(error)
+
+
+def _packed(error: BaseException) -> bytes:
+    """An exception that can be raised elsewhere, with the lines in which it was raised here."""
+    lines = "".join(traceback.format_exception(error))
+    error.add_note(f"raised in another process:\n{lines}")
+    try:
+        content = packed(error)
+        pickle.loads(content)
+    except Exception:  # some cannot be copied
+        return packed(RuntimeError(lines))
+    return content
