@@ -75,10 +75,11 @@ def shots_of(
 
 
 def _shot(track: Track, smoother: Smoother, samples: int | None, seconds: float | None) -> Shot | str:
+    track = track.since_first()
     whole = smoother.segment(track)
     end = int(whole.hits[0]) + 1 if len(whole.hits) else len(track)
     track, usable = part(track, end), whole.usable[:end]
-    observed = samples if seconds is None else int(np.searchsorted(track.times, track.times[0] + seconds, side="right"))
+    observed = samples if seconds is None else len(track.opening(seconds))
     assert observed is not None
     if observed < LEAST_OBSERVED or usable[:observed].sum() < LEAST_OBSERVED:
         return f"fewer than {LEAST_OBSERVED} usable samples are observed"

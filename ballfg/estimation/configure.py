@@ -111,7 +111,7 @@ _FITTED: dict[tuple[Dataset | SightedDataset, BallModel, tuple[float, ...], floa
 def _fitted(dataset: Dataset | SightedDataset, model: BallModel, observed: float, watch: Watch) -> Settings | None:
     """The settings with the noise that the tracks show; None where they show none."""
     tracks = spread_over(dataset, min(len(dataset), TRACKS_FOR_TABLE), QUICK_TRACKS)
-    parts = [track.until(float(track.times[0]) + observed) for track in tracks] if np.isfinite(observed) else tracks
+    parts = [track.opening(observed) for track in tracks]
     surfaces, before = dataset_surfaces(dataset), dataset_settings(dataset, model)
     known = dataset.info.position_noise is not None
     return tracks_settings(model, surfaces, before, parts, known, watch)

@@ -21,6 +21,7 @@ from ballfg.arrays import Array, Index
 from ballfg.checks import check_keys, one_line, short_text, shown
 from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.files.whole_file import write_text
+from ballfg.tracks.stamps import elapsed
 
 if TYPE_CHECKING:
     from ballfg.estimation.observations.sighted_dataset import SightedDataset
@@ -296,7 +297,7 @@ def _by_bin(tracks: list[tuple[Index, Array]]) -> Iterator[_Bin]:
 
 def _bins(prediction: TrackPrediction) -> Index:
     """(k,) bin of the horizon of each stamp; a stamp at the end of a bin belongs to it."""
-    ahead = (prediction.times - prediction.estimate.times[-1]) / BIN
+    ahead = elapsed(prediction.times, float(prediction.estimate.times[-1])) / BIN
     return np.maximum(np.ceil(ahead - EDGE).astype(np.int64) - 1, 0)
 
 

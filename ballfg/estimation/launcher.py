@@ -73,7 +73,7 @@ class Launcher:
         if settings is None or len(track) < 2:
             return None
         first = slice(0, FIRST_SAMPLES)
-        velocity = window_velocities(track.times[first], track.positions[first]).mean(axis=0)
+        velocity = window_velocities(track.seconds[first], track.positions[first]).mean(axis=0)
         with torch.no_grad():
             spin = self.embedding.spin(torch.from_numpy(settings), torch.from_numpy(velocity))
         return SpinLabel(spin.numpy(), self.sigma)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import enum
 import operator
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -156,6 +156,19 @@ class Estimate:
     def nis(self) -> Array:
         """(m,) squared length of `whitened`, dimensionless: chi-square with `dim` degrees of freedom."""
         return np.asarray((self.whitened**2).sum(axis=-1))
+
+    def dated(self, times: Array, origin: float | None = None) -> Estimate:
+        """The estimate on the clock of the data; estimators count stamps from a track's first.
+
+        Args:
+            times: (n,) s, the stamps as they were written.
+            origin: s, the first one of the whole track, where these are some of them.
+        """
+        origin = float(times[0]) if origin is None else origin
+        if origin == 0.0:
+            return self
+        contacts = tuple(replace(c, time=origin + c.time) for c in self.contacts)
+        return replace(self, times=times, contacts=contacts)
 
     def predict(self, horizon: float, step: float = 0.01) -> Ahead:
         """The path of the ball from the last sample on; arguments and errors as those of `BallState.predict`."""

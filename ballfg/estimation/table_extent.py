@@ -76,7 +76,7 @@ def find_table_extent(tracks: Iterable[Track], table_height: float, radius: floa
     """
     if abs(radius / TABLE_TENNIS.radius - 1.0) > RADIUS_TOLERANCE:
         return None
-    paths = [(track.times, track.positions) for track in tracks]
+    paths = [(track.seconds, track.positions) for track in tracks]
     bounces = _gathered(_bounces(times, positions, table_height + radius, radius) for times, positions in paths)
     if len(bounces) < LEAST_BOUNCES:
         return None

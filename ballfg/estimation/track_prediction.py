@@ -23,6 +23,7 @@ from ballfg.prediction.belief import Belief
 from ballfg.prediction.propagate import Propagator
 from ballfg.state import POSITION, VELOCITY
 from ballfg.tracks import Track
+from ballfg.tracks.stamps import STAMP_TOLERANCE
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -31,8 +32,6 @@ if TYPE_CHECKING:
 
 BLOCK = 64
 """Tracks that are propagated together, in one process; memory grows with it."""
-STAMP_TOLERANCE = 1e-9
-"""s. A stamp this little after the end of the observed part belongs to it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,17 +145,24 @@ def _block(
     """Predictions of a block; without the model where it is that of all, which need not travel with every track."""
     for track in tracks:
         estimator.prepared(track)  # what is no track in m and s shows in the whole
-    parts = [track.until(float(track.times[0]) + observe(track) + _tolerance(track)) for track in tracks]
+    counted = [track.since_first() for track in tracks]
+    parts = [track.opening(observe(track)) for track in counted]
     estimates = estimate_together(estimator, parts, device)
-    found = list(_predict_block(estimator, propagator, estimates, list(tracks), horizon))
+    made = _predict_block(estimator, propagator, estimates, counted, horizon)
+    found = [_dated(one, track.times) for one, track in zip(made, tracks, strict=True)]
     if estimator.model.variations:  # the world of each estimate is that of its track
         return found
     return [replace(one, estimate=replace(one.estimate, world=None)) for one in found]
 
 
-def _tolerance(track: Track) -> float:
-    """Seconds by which a stamp may miss a limit: `STAMP_TOLERANCE`, more where large stamps are rounded."""
-    return STAMP_TOLERANCE + 2.0 * float(np.spacing(np.abs(track.times[[0, -1]]).max()))
+def _dated(prediction: TrackPrediction, times: Array) -> TrackPrediction:
+    """A prediction on the clock of the data.
+
+    Args: times: (n,) s, the stamps of the whole track as they were written.
+    """
+    observed = len(prediction.estimate.times)
+    estimate = prediction.estimate.dated(times[:observed])
+    return replace(prediction, times=times[observed : observed + len(prediction.times)], estimate=estimate)
 
 
 def _predict_block(
@@ -203,7 +209,7 @@ def _predict_alike(
 
 def _later(track: Track, end: float, horizon: float) -> NDArray[np.bool_]:
     """(n,) bool: the stamps that are predicted."""
-    return (track.times > end) & (track.times <= end + horizon + _tolerance(track))
+    return (track.times > end) & (track.times <= end + horizon + STAMP_TOLERANCE)
 
 
 def _padded(times: list[Array], ends: list[float]) -> Array:

@@ -49,7 +49,7 @@ def table_of(tracks: Sequence[Track], ball: Ball, choices: Choices) -> tuple[flo
     if choices.table_height is not None:
         height = choices.table_height
         return height, Guess("table height", f"{height:g} m", "as given", "stated", f"--table-height {height:g}")
-    found = surface((track.times, track.positions) for track in tracks)
+    found = surface((track.seconds, track.positions) for track in tracks)
     if found is None:
         lowest = min(float(track.positions[:, 2].min()) for track in tracks)
         raise UndecidedError(

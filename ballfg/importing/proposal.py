@@ -62,7 +62,7 @@ def _proposed(tables: list[RawTable], choices: Choices) -> Proposal:
     tracks, notes = _tracks(shots, frame)
     ball, ball_guess = ball_of(choices, frame)
     height, height_guess = table_of(tracks, ball, choices)
-    rate = float(f"{1.0 / np.median(np.concatenate([np.diff(track.times) for track in tracks])):.4g}")
+    rate = float(f"{1.0 / np.median(np.concatenate([np.diff(track.seconds) for track in tracks])):.4g}")
     guesses = [*_column_guesses(roles), *guesses, height_guess, split_guess, ball_guess]
     source = ", ".join(dict.fromkeys(table.source for table in chosen))
     info = DatasetInfo(

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from ballfg.arrays import Array
 from ballfg.importing.formats.raw import MISSING, Column
+from ballfg.tracks.stamps import elapsed
 
 Stamps = NDArray[Any]
 """(n,) int64 or float64, in a unit that is not known yet."""
@@ -60,6 +61,8 @@ def origin_of(stamps: Stamps, unit: str) -> int | float:
 
 def in_seconds(stamps: Stamps, unit: str, origin: int | float) -> Array:
     """(n,) s since the origin."""
+    if stamps.dtype.kind == "f" and unit == "s":
+        return elapsed(stamps, origin)
     return np.asarray(stamps - origin, dtype=np.float64) / _DIVISORS[unit]
 
 

@@ -178,7 +178,7 @@ class Ball:
         samples = window.samples[-LOOK_BACK:]
         found: list[BallEvent] = []
         for before, sample in pairwise(samples):
-            found += _events(sample.motion, before.motion, before.time, sample.time)
+            found += _events(sample.motion, before.motion, *map(self._online.stamp_of, (before.time, sample.time)))
         fresh = [event for event in found if not self._was_told(event)]
         self._told.extend((event.kind, event.time) for event in fresh)
         return tuple(fresh)

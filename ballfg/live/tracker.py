@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +19,7 @@ from ballfg.live.clock import Clock, Stamp
 from ballfg.live.gate import FAR, GATE, HIT_GATE, Gate, assign
 from ballfg.live.newcomer import Newcomer
 from ballfg.tracks import Ball as BallKind
+from ballfg.tracks.stamps import elapsed, written
 
 GAP = 0.5
 """s. A ball that was not seen for longer is lost; the estimator links nothing over longer gaps either."""
@@ -87,7 +88,7 @@ class Counts:
 
 @dataclass
 class _Frame:
-    """The positions of one stamp, and what has become of each."""
+    """The positions of one stamp, and what has become of each; its time is counted from the stream's first stamp."""
 
     time: float
     late: bool
@@ -149,11 +150,12 @@ class Tracker:
         self._clock = Clock(self.lag, self.gap)
         self._balls: list[Ball] = []
         self._newcomers: list[Newcomer] = []
+        self._origin: float | None = None  # s, the stream's first stamp: all others are counted from it
 
     @property
     def balls(self) -> dict[int, OnlineState]:
         """The newest state of every ball by its number."""
-        return {ball.number: ball.states[-1] for ball in self._balls}
+        return {ball.number: self._dated_state(ball.states[-1]) for ball in self._balls}
 
     def push(self, time: float, positions: ArrayLike, sigmas: ArrayLike | None = None) -> list[BallUpdate]:
         """Take in the positions of one stamp.
@@ -177,7 +179,11 @@ class Tracker:
             if given.shape not in ((3,), points.shape):
                 raise ValueError(f"sigmas must be (3,) or as positions, {points.shape}; got {given.shape}.")
             spreads = list(np.broadcast_to(given, points.shape))
-        frame = _Frame(as_float("time", time, "s"), False, points, spreads, [None] * len(points))
+        stamp = as_float("time", time, "s")
+        if self._origin is None and np.isfinite(stamp):
+            self._origin = stamp
+        since = stamp if self._origin is None else float(elapsed(stamp, self._origin))
+        frame = _Frame(since, False, points, spreads, [None] * len(points))
         self.counts.positions += len(points)
         self._refuse_unusable(frame)
         gone = self._turn_clock(frame) if frame.open else []
@@ -186,7 +192,23 @@ class Tracker:
             self._to_newcomers(frame)
             self._to_balls(frame, HIT_GATE, hit=True)
             self._begin_newcomers(frame)
-        return gone + [update for update in frame.updates if update is not None]
+        return [self._dated(update) for update in (*gone, *frame.updates) if update is not None]
+
+    def _stamp(self, seconds: float) -> float:
+        """A stamp on the sender's clock, s, of a moment that is counted from the stream's first stamp."""
+        return float(written(seconds, self._origin or 0.0))
+
+    def _dated_state(self, state: OnlineState) -> OnlineState:
+        return replace(state, time=self._stamp(state.time))
+
+    def _dated(self, update: BallUpdate) -> BallUpdate:
+        """An update on the sender's clock."""
+        return replace(
+            update,
+            time=self._stamp(update.time),
+            state=None if update.state is None else self._dated_state(update.state),
+            events=tuple(replace(event, time=self._stamp(event.time)) for event in update.events),
+        )
 
     def tidy(self) -> None:
         """Do what can wait: call it after the updates were used, and the next push is quicker. Nothing else changes."""
@@ -198,7 +220,7 @@ class Tracker:
 
         Returns: one update for each ball.
         """
-        gone = [self._lost(ball) for ball in self._balls]
+        gone = [self._dated(self._lost(ball)) for ball in self._balls]
         self._begin()
         return gone
 

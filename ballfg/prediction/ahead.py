@@ -126,9 +126,9 @@ def look_ahead(start: BallState, horizon: float, step: float = 0.01) -> Ahead:
         )
     propagator, belief = carried_by(start)
     count = max(int(np.ceil(horizon / step - 1e-9)), 1)
-    times = start.time + np.minimum(step * np.arange(1, count + 1), horizon)
-    path = propagator.rollout(belief, times)
-    return Ahead(start, horizon, times, path.states[0], definite(path.covariances[0]))
+    since = np.minimum(step * np.arange(1, count + 1), horizon)
+    path = propagator.rollout(belief.from_zero(), since)
+    return Ahead(start, horizon, start.time + since, path.states[0], definite(path.covariances[0]))
 
 
 def carried_by(start: BallState) -> tuple[Propagator, Belief]:

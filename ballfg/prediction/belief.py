@@ -77,6 +77,10 @@ class Belief:
     def __len__(self) -> int:
         return len(self.time)
 
+    def from_zero(self) -> Belief:
+        """The belief with time counted from now, so that steps are not rounded as large stamps are."""
+        return replace(self, time=torch.zeros_like(self.time))
+
     @staticmethod
     def joined(beliefs: Sequence[Belief]) -> Belief:
         """All balls of some beliefs.

@@ -6,7 +6,7 @@ g = 0: a ball that is late is further back but crosses at the same place (docs/d
 
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -49,6 +49,10 @@ class Crossing:
     state: Array
     covariance: Array
 
+    def later(self, seconds: float) -> "Crossing":
+        """The same event on a clock that is so many seconds ahead."""
+        return replace(self, time=self.time + seconds)
+
     def __repr__(self) -> str:
         x, y, z = self.state[POSITION].tolist()
         spread = ", ".join(f"{1e3 * s:.3g}" for s in np.sqrt(np.diagonal(self.covariance))[POSITION])
@@ -80,15 +84,16 @@ def next_contact(
     Raises: ValueError: as `next_crossing`.
     """
     end, earliest = _span(belief, horizon, after)
+    start, belief = float(belief.time), belief.from_zero()
     while (left := end - float(belief.time)) > 0.0:
         found = propagator.search(belief, left, earliest - float(belief.time))
         if found.end == FOUND:
-            return _projected(found.belief, found.gradient, found.rate)
+            return _projected(found.belief, found.gradient, found.rate).later(start)
         if found.end == NONE:
             return None
         crossing, belief = _contact_step(propagator, found.belief, end, earliest)
         if crossing is not None:
-            return crossing
+            return crossing.later(start)
     return None
 
 
@@ -136,15 +141,16 @@ def _line_crossing(
         return (state[..., :STATE_DIM] * normal).sum(-1, keepdim=True) - offset
 
     end, earliest = _span(belief, horizon, after)
+    start, belief = float(belief.time), belief.from_zero()
     while (left := end - float(belief.time)) > 0.0:
         found = propagator.search(belief, left, earliest - float(belief.time), line, either_way=either_way)
         if found.end == FOUND:
-            return _projected(found.belief, found.gradient, found.rate)
+            return _projected(found.belief, found.gradient, found.rate).later(start)
         if found.end == NONE:
             return None
         crossing, belief = _crossing_step(propagator, found.belief, event, end, earliest, either_way)
         if crossing is not None:
-            return crossing
+            return crossing.later(start)
     return None
 
 
@@ -169,10 +175,11 @@ def next_crossing(
     Raises: ValueError: if the belief does not hold exactly one ball, or the horizon is not a positive number of s.
     """
     end, earliest = _span(belief, horizon, after)
+    start, belief = float(belief.time), belief.from_zero()
     while end - float(belief.time) > 0.0:
         crossing, belief = _crossing_step(propagator, belief, event, end, earliest, either_way)
         if crossing is not None:
-            return crossing
+            return crossing.later(start)
     return None
 
 
@@ -205,12 +212,12 @@ def _crossing_step(
 
 
 def _span(belief: Belief, horizon: float, after: float) -> tuple[float, float]:
-    """End of a search, and the time (s) after which events count; the arguments are checked."""
+    """End of a search, and the time after which events count, s since the belief's; the arguments are checked."""
     if len(belief) != 1:
         raise ValueError(f"belief must hold one ball; got {len(belief)}. Take them one by one.")
     horizon = check_number("horizon", horizon, "s", above=0.0)
     start = float(belief.time)
-    return start + horizon, max(start, after) + JUST_NOW
+    return horizon, max(after - start, 0.0) + JUST_NOW + float(np.spacing(abs(start)))  # as `after` was rounded
 
 
 def _contact_within(model: BallModel, mean: Tensor, h: Tensor, surfaces: Surfaces) -> tuple[Tensor, float] | None:

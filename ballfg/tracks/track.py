@@ -22,6 +22,7 @@ from ballfg.checks import (
     shown,
     type_name,
 )
+from ballfg.tracks.stamps import STAMP_TOLERANCE, elapsed
 
 SPIN_LABELS = ("spin_x", "spin_y", "spin_z")
 
@@ -137,9 +138,26 @@ class Track:
         return replace(self, observations=(*self.observations, *observations)) if observations else self
 
     @property
+    def seconds(self) -> Array:
+        """(n,) s since the first sample: what is computed with, so that nothing depends on the clock's origin."""
+        return elapsed(self.times, float(self.times[0]))
+
+    @property
     def duration(self) -> float:
         """Time from the first sample to the last, s."""
-        return float(self.times[-1] - self.times[0])
+        return float(self.seconds[-1])
+
+    def since_first(self) -> Track:
+        """The same track with stamps counted from its first: what estimators compute with."""
+        return self if self.times[0] == 0.0 else replace(self, times=self.seconds)
+
+    def opening(self, seconds: float) -> Track:
+        """The samples of the first seconds, a stamp at their end among them, as a new track.
+
+        Args: seconds: since the first sample; not negative.
+        """
+        count = int(np.searchsorted(self.seconds, seconds + STAMP_TOLERANCE, side="right"))
+        return self if count == len(self) else self.until(float(self.times[count - 1]))
 
     @property
     def spin_label(self) -> Array | None:

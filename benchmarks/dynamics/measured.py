@@ -14,11 +14,10 @@ from ballfg.estimation import Estimate, Smoother, dataset_settings, dataset_surf
 from ballfg.prediction.apexes import measured_apexes
 from ballfg.progress import progress
 from ballfg.tracks import Dataset, Track
+from ballfg.tracks.stamps import STAMP_TOLERANCE
 
 LEAST_OBSERVED: Final = 10
 """Samples of a quarter of a second that a shot must have: fewer do not show where it goes."""
-STAMP_TOLERANCE: Final = 1e-9
-"""s. A stamp this little after the end of a part belongs to it."""
 
 GROUP: Final = "group"
 """The label of a launcher and its setting. Tracks without it are one group of their dataset's name."""
@@ -102,7 +101,7 @@ def measured_shot(track: Track, estimate: Estimate) -> Shot | None:
     """A measured track up to the first hit that its estimate has; None if nothing is left to predict."""
     last = int(estimate.hits[0]) if len(estimate.hits) else len(track) - 1
     track = track.until(float(track.times[last]))
-    since = track.times - track.times[0]
+    since = track.seconds
     observed = int((since <= OBSERVE + STAMP_TOLERANCE).sum())
     if observed < LEAST_OBSERVED or observed >= len(track):
         return None

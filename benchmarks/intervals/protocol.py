@@ -99,7 +99,7 @@ def judged_both_ways(
     for number, (judged, others) in enumerate((halves, halves[::-1])):
         shown = {
             USUAL: [],
-            OBSERVED_PARTS: [track.until(float(track.times[0]) + OBSERVED) for track in judged],
+            OBSERVED_PARTS: [track.opening(OBSERVED) for track in judged],
             OTHER_TRACKS: list(others),
         }[method]
         asked = spread_over(shown, len(shown))

@@ -148,7 +148,7 @@ def _chosen(dataset: Dataset, most: int) -> tuple[list[Track], list[str]]:
         )
     kept = set(np.linspace(0, count - 1, min(count, most)).round().astype(int).tolist())
     excluded = [] if len(kept) == count else [f"of {count} tracks {len(kept)}, evenly spread, were looked at"]
-    return [track for i, track in enumerate(dataset) if i in kept], excluded
+    return [track.since_first() for i, track in enumerate(dataset) if i in kept], excluded
 
 
 def _excess_noise(tracks: Sequence[Track], settings: Settings) -> float:

@@ -96,16 +96,17 @@ class ExtendedKalmanFilter(Estimator):
 
         Coefficients are those of the last sample; cross covariances tie each state to the coefficients at that state.
         """
-        track = self.prepared(track, factors)
+        written = self.prepared(track, factors)
+        track = written.since_first()
         run = _Run(self, track)
         record = run.record
         if not run.finite():
-            return self._failed(track, run)
+            return self._failed(track, run).dated(written.times)
         mean, covariance = rts_smooth(record) if self.smooth else (record.mean, record.covariance)
         if record.start > 0 and (self.smooth or self.initialise == "prior"):
             fly_back(self.ball, record.start, track.times, run.flight_noise, run.fading, mean, covariance)
         whitened = record.innovations(run.H, mean, covariance, track.positions) if self.smooth else record.whitened
-        return self._result(track, run, mean, covariance, whitened)
+        return self._result(track, run, mean, covariance, whitened).dated(written.times)
 
     def _result(
         self,

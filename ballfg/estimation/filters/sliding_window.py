@@ -53,7 +53,8 @@ class SlidingWindow(Estimator):
 
     def estimate(self, track: Track, factors: Sequence[FactorBatch] = ()) -> Estimate:
         """The states of a track, from its positions alone; a single sample has no velocity and the status says so."""
-        track = self.prepared(track, factors)
+        written = self.prepared(track, factors)
+        track = written.since_first()
         n, settings = len(track), self.settings.for_track(track)
         white = sample_sigmas(settings, n, track.sigmas)
         sigma = total_sigmas(settings, white, window_velocities(track.times, track.positions))
@@ -82,7 +83,7 @@ class SlidingWindow(Estimator):
             notes=self.doubts(track),
             cross_covariances=np.zeros((n, STATE_DIM, 0)),
         )
-        return plausible(estimate, track, sigma, self.settings)
+        return plausible(estimate, track, sigma, self.settings).dated(written.times)
 
     def _spin_covariance(self, track: Track, bounced: NDArray[np.bool_]) -> Array:
         """(n, 3, 3): prior or label, the random walk since, and an unknown change once the ball may have bounced."""

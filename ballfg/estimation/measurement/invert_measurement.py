@@ -95,17 +95,20 @@ class InvertMeasurement(Estimator):
 
         Args: track, factors: as for `estimate`.
         """
-        undone = yield from self._undoing(self.prepared(track, factors))
+        written = self.prepared(track, factors)
+        track = written.since_first()
+        undone = yield from self._undoing(track)
         found = undone.estimate if self.inner is self.smoother else self.inner.estimate(undone.track)
         lost = found.status is Status.OK and not undone.settled
-        contacts = (replace(c, time=written_time(self.model, float(track.times[0]), c.time)) for c in found.contacts)
-        return replace(
+        contacts = (replace(c, time=written_time(self.model, 0.0, c.time)) for c in found.contacts)
+        result = replace(
             found,
             times=track.times,
             contacts=tuple(contacts),
             world=self.world,
             status=Status.NOT_CONVERGED if lost else found.status,
         )
+        return result.dated(written.times)
 
     def undo(self, track: Track) -> Undone:
         """The track as it happened, and what the smoother makes of it; of shifts that do not settle, the steadiest."""

@@ -54,7 +54,7 @@ def estimate_position_noise(tracks: Iterable[Track]) -> Array:
     blocks: list[Array] = []
     count = 0
     for track in tracks:
-        block = _window_residuals(track.times, track.positions)
+        block = _window_residuals(track.seconds, track.positions)
         blocks.append(block)
         count += len(block)
         if count >= ENOUGH:
@@ -71,7 +71,7 @@ def noise_doubts(track: Track, settings: Settings) -> tuple[str, ...]:
     `LOOKED_AT` samples tell it; rough positions, and tracks of fewer than `LEAST_WINDOWS` windows, do not.
     """
     first = slice(0, LOOKED_AT)
-    times, positions = track.times[first], track.positions[first]
+    times, positions = track.seconds[first], track.positions[first]
     if track.rough or len(times) < LEAST_WINDOWS + 2 * HALF_WINDOW:
         return ()
     residuals = _window_residuals(times, positions)

@@ -169,6 +169,7 @@ def linearised(
         jobs: processes.
     """
     plain = replace(settings, memory=(0.0, 0.0, 0.0), stamp_jitter=0.0)
+    tracks = [track.since_first() for track in tracks]
     if not model.measures_plainly:  # of measured positions as they happened
         inverse = InvertMeasurement(Smoother, model, surfaces, plain)
         undone = map_tracks(inverse.undo, tracks, len(tracks), jobs)
@@ -189,7 +190,7 @@ def spread_over(tracks: Iterable[T], count: int, most: int = MOST_TRACKS) -> lis
 
 
 def _first_part(track: Track) -> Track:
-    return track.until(float(track.times[0]) + LONGEST_PART) if track.duration > LONGEST_PART else track
+    return track.opening(LONGEST_PART)
 
 
 def _forecaster(linear: LinearTracks, parts: Sequence[Track], settings: Settings, biased: bool) -> Forecaster:

@@ -19,6 +19,7 @@ from torch import Tensor
 from ballfg.estimation.noise.linear_filter import Filtered, LinearFilter, Noise
 from ballfg.estimation.noise.linear_tracks import LinearTracks
 from ballfg.state import POSITION, STATE_DIM
+from ballfg.tracks.stamps import STAMP_TOLERANCE
 
 HORIZONS: Final = (0.02, 0.05, 0.1, 0.15, 0.2, 0.3)
 """s ahead of a start; the first good sample at or after each is scored."""
@@ -26,8 +27,6 @@ START_EVERY: Final = 0.05
 """s between two starts of forecasts in a track."""
 EARLIEST_START: Final = 0.2
 """s after the first sample. Before that the start of the track decides, and no robot acts on it yet."""
-ROUNDING: Final = 1e-9
-"""s. A sample this little before a horizon is at it."""
 MARGINAL_WEIGHT: Final = 0.1
 TAIL: Final = 3.0
 """Standard deviations of a coordinate beyond which its score grows linearly; a missed hit must not decide the noise."""
@@ -87,8 +86,8 @@ class Forecaster:
         found = []
         for track, (times, used) in enumerate(zip(self.tracks.times.numpy(), self.tracks.used.numpy(), strict=True)):
             last = times[used][-1] if used.any() else 0.0
-            moments = np.arange(earliest, last - HORIZONS[0], every)
-            found += [(track, k) for k in np.unique(np.searchsorted(times, moments)).tolist()]
+            moments = np.arange(earliest, last - HORIZONS[0] + STAMP_TOLERANCE, every)
+            found += [(track, k) for k in np.unique(np.searchsorted(times, moments - STAMP_TOLERANCE)).tolist()]
         return torch.tensor(found, dtype=torch.int64).reshape(-1, 2)
 
     def score(self, noise: Noise) -> Score:
@@ -158,9 +157,9 @@ class _Ahead:
             sample = (start + ahead).clamp(max=samples - 1)
             elapsed = tracks.times[track, sample] - begin
             fresh = (start + ahead < samples) & tracks.used[track, sample]
-            due = ((horizons > reached[:, None]) & (horizons <= elapsed[:, None] + ROUNDING)).any(dim=1)
+            due = ((horizons > reached[:, None]) & (horizons <= elapsed[:, None] + STAMP_TOLERANCE)).any(dim=1)
             rows = torch.nonzero(fresh & due)[:, 0]
-            reached = torch.where(fresh, elapsed + ROUNDING, reached)
+            reached = torch.where(fresh, elapsed + STAMP_TOLERANCE, reached)
             gathered = torch.diagonal(kicks[rows][..., POSITION, POSITION], dim1=-2, dim2=-1).mT
             found.append((rows, sample[rows], elapsed[rows], way[rows, POSITION], gathered, departed[rows, POSITION]))
             if bool((reached >= HORIZONS[-1]).all()):

@@ -21,6 +21,7 @@ from ballfg.factors.batch import FactorBatch
 from ballfg.factors.loss import Loss
 from ballfg.state import SPIN, VELOCITY
 from ballfg.tracks import Track
+from ballfg.tracks.stamps import elapsed
 from ballfg.tracks.track import FASTEST_BALL, FASTEST_SPIN
 
 FARTHEST: Final = 0.05
@@ -107,10 +108,11 @@ class Reading(Observation):
             raise ValueError(f"times of '{cls.name}' must be finite; leave out readings without a time")
         order = np.argsort(when, kind="stable")
         when, given = when[order], given[order]
-        after = np.clip(np.searchsorted(track.times, when), 1 if len(track) > 1 else 0, len(track) - 1)
+        times, since = track.seconds, elapsed(when, float(track.times[0]))
+        after = np.clip(np.searchsorted(times, since), 1 if len(track) > 1 else 0, len(track) - 1)
         before = np.maximum(after - 1, 0)
-        state = np.where(when - track.times[before] < track.times[after] - when, before, after)
-        delay = when - track.times[state]
+        state = np.where(since - times[before] < times[after] - since, before, after)
+        delay = since - times[state]
         if len(delay) and np.abs(delay).max() > FARTHEST:
             worst = int(np.abs(delay).argmax())
             raise ValueError(

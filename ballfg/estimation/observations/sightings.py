@@ -18,6 +18,7 @@ from ballfg.estimation.settings import Settings
 from ballfg.factors.camera import FIXED, CameraFactors
 from ballfg.state import STANDARD_GRAVITY, Z
 from ballfg.tracks.sightings import Sightings
+from ballfg.tracks.stamps import elapsed, written
 from ballfg.tracks.track import Label, Track
 from ballfg.vision.camera import Camera
 from ballfg.vision.projection import CameraBank
@@ -180,7 +181,8 @@ def sighted_track(
         two cameras within a few frames.
     """
     rig = cameras_of(sightings, cameras)
-    times = true_times_of(sightings, rig)
+    origin = float(sightings.times[0]) if len(sightings) else 0.0
+    times = true_times_of(replace(sightings, times=elapsed(sightings.times, origin)), rig)
     if (np.diff(times) < 0.0).any():
         row = int(np.argmax(np.diff(times) < 0.0)) + 1
         raise ValueError(
@@ -193,7 +195,8 @@ def sighted_track(
     state = np.cumsum(first) - 1
     path = filled(moments, rough_path(Rays.of(sightings, times, rig), moments), name)
     seen = CameraSightings(sightings, rig, state, times - moments[state], np.zeros(len(rig)))
-    return Track(moments, path.positions, path.sigmas, dict(labels or {}), observations=(seen,), rough=True, name=name)
+    stamps = written(moments, origin)
+    return Track(stamps, path.positions, path.sigmas, dict(labels or {}), observations=(seen,), rough=True, name=name)
 
 
 def cameras_of(sightings: Sightings, cameras: Sequence[Camera]) -> tuple[Camera, ...]:

@@ -2,6 +2,7 @@
 
 import copy
 import gc
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Final, Literal
@@ -46,6 +47,7 @@ from ballfg.factors.batch import FactorBatch
 from ballfg.factors.linear.definite import definite, variances_positive
 from ballfg.state import STATE_DIM
 from ballfg.tracks import Ball, Track
+from ballfg.tracks.stamps import elapsed, written
 from ballfg.vision.camera import Camera
 
 LAG = 128
@@ -108,6 +110,7 @@ class Online(Estimator):
         self._stream = SightingStream(self.cameras, self.settings.sighting_loss) if self.cameras else None
         self._frozen: list[Frozen] | None = None  # states that left the window, where someone asks for them
         self._counts = np.zeros(2, dtype=np.int64)
+        self._origin: float | None = None  # s, the stream's first stamp: all others are counted from it
 
     def copy(self) -> "Online":
         """An estimator that has taken in the same observations; what either takes in from now on is its own.
@@ -165,14 +168,28 @@ class Online(Estimator):
         stamp = as_float("time", time) if is_number(time) else float(check_array("time", time, (), "Give it in s."))
         if self._samples and not self._samples[-1].measured:
             raise ValueError("push must not follow push_sighting in one stream; call reset in between.")
-        sample = Sample(stamp, point, spread)
+        since = self._since_first(stamp)
+        if self._samples and not since > self._samples[-1].time:
+            last = self.stamp_of(self._samples[-1].time)
+            raise ValueError(f"time must be finite and increase; got {stamp} s after {last} s. Sort the samples.")
+        sample = Sample(since, point, spread)
         check_iterable("observations", observations)
         others = tuple(observations)
         if others:
             moment = Track(np.array([sample.time]), point[None], spread[None], name="stream", observations=others)
             beside = measurements_beside(moment, self.model, self.settings, spread[None])
             sample.measurements += [measurement for found in beside.values() for _, measurement in found]
-        return self._observe(sample)
+        return replace(self._observe(sample), time=stamp)
+
+    def _since_first(self, stamp: float) -> float:
+        """S since the stream's first stamp."""
+        if self._origin is None and math.isfinite(stamp):
+            self._origin = stamp
+        return stamp if self._origin is None else float(elapsed(stamp, self._origin))
+
+    def stamp_of(self, seconds: float) -> float:
+        """The stamp on the clock of the stream, s, of a moment that the window counts from its first sample."""
+        return float(written(seconds, self._origin or 0.0))
 
     def push_sighting(self, time: float, camera: str, pixel: ArrayLike, covariance: ArrayLike) -> OnlineState | None:
         """Take in what one camera saw, at its own stamp.
@@ -190,13 +207,15 @@ class Online(Estimator):
             raise ValueError("cameras must be given to use push_sighting; got none. Pass them to Online.")
         if self._samples and self._samples[-1].measured:
             raise ValueError("push_sighting must not follow push in one stream; call reset in between.")
-        samples, joined = self._stream.take(as_float("time", time, "s"), camera, pixel, covariance)
+        since = self._since_first(as_float("time", time, "s"))
+        samples, joined = self._stream.take(since, camera, pixel, covariance)
         if joined is not None:
-            return self._join(joined)
-        state = None
-        for sample in samples:
-            state = self._observe(sample)
-        return state
+            state: OnlineState | None = self._join(joined)
+        else:
+            state = None
+            for sample in samples:
+                state = self._observe(sample)
+        return state and replace(state, time=self.stamp_of(state.time))
 
     @np.errstate(over="ignore", invalid="ignore")  # samples that no ball flew end in a status, not in warnings
     def _observe(self, sample: Sample) -> OnlineState:
@@ -322,7 +341,7 @@ class Online(Estimator):
         States that left the window before the end are as they were when they left it. The innovations are those of the
         pushes. Events are found in the positions, also where these are rough.
         """
-        track = self.prepared(track, factors)
+        stamps, track = track.times, self.prepared(track, factors).since_first()
         self.reset()
         self._frozen = []
         label = self.settings.spin_label(track)
@@ -349,4 +368,5 @@ class Online(Estimator):
         lost = any(state.status is Status.FAILED for state in states)
         status = Status.NOT_CONVERGED if lost and not result.status.failed else result.status
         result = replace(result, innovations=innovations, status=status)
-        return plausible(result, track, sigma, self.settings) if first else result
+        result = plausible(result, track, sigma, self.settings) if first else result
+        return result.dated(stamps)

@@ -125,13 +125,14 @@ class Smoother(Estimator):
         if self.is_long(track):
             from ballfg.estimation.smoother.pieces.whole import in_pieces  # which needs this file
 
-            joined = in_pieces(self, track)
+            joined = in_pieces(self, track.since_first())
             if joined is not None:
-                return joined
+                return joined.dated(track.times)
         smoother = self.first_look() if moving else self
         for _ in range(OFFSET_ROUNDS):
-            problem = smoother.problem(track)
-            estimate = smoother.result(problem, (yield from smoother.search(problem)))
+            problem = smoother.problem(track.since_first())
+            found = smoother.result(problem, (yield from smoother.search(problem)))
+            estimate = found.dated(track.times)
             if not moving or estimate.status.failed:
                 return estimate
             retimed = [later for one in problem.observations if (later := one.retimed(track, estimate)) is not None]
@@ -149,9 +150,12 @@ class Smoother(Estimator):
         if self.is_long(track):
             from ballfg.estimation.smoother.pieces.whole import sections  # which needs this file
 
-            found = sections(self, self.prepared(track))
+            found = sections(self, self.prepared(track).since_first())
             if found is not None:
-                yield from found
+                begin = 0
+                for part in found:
+                    yield part.dated(track.times[begin : begin + len(part)], float(track.times[0]))
+                    begin += len(part)
                 return
         yield self.estimate(track)
 

@@ -9,6 +9,7 @@ from time import perf_counter
 from ballfg.live.sources.lines import Sample
 from ballfg.live.sources.source import Arrival
 from ballfg.tracks import Dataset, Track
+from ballfg.tracks.stamps import written
 
 PAUSE = 1.0
 """s between two tracks: longer than a ball may stay unseen."""
@@ -48,15 +49,17 @@ def dataset_samples(dataset: Dataset) -> Iterator[Sample]:
 
     Their tags tell the trajectory and the stamp on its own clock.
     """
-    later = 0.0
-    for number, track in enumerate(dataset):
-        begins = float(track.times[0])
-        shift = 0.0 if number == 0 else later + PAUSE - begins
-        yield from _track_samples(track, shift)
-        later = float(track.times[-1]) + shift
+    origin: float | None = None
+    begins = 0.0  # s, the track's first sample since that of the first track
+    for track in dataset:
+        origin = float(track.times[0]) if origin is None else origin
+        yield from _track_samples(track, origin, begins)
+        begins += track.duration + PAUSE
 
 
-def _track_samples(track: Track, shift: float) -> Iterator[Sample]:
-    for k, (time, position) in enumerate(zip(track.times.tolist(), track.positions.tolist(), strict=True)):
+def _track_samples(track: Track, origin: float, begins: float) -> Iterator[Sample]:
+    moments = zip(track.times.tolist(), track.seconds.tolist(), track.positions.tolist(), strict=True)
+    for k, (time, since, position) in enumerate(moments):
         sigmas = None if track.sigmas is None else [track.sigmas[k].tolist()]
-        yield Sample(time + shift, [position], sigmas, (("trajectory", track.name), ("t_track", time)))
+        stamp = float(written(begins + since, origin))
+        yield Sample(stamp, [position], sigmas, (("trajectory", track.name), ("t_track", time)))

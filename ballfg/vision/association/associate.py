@@ -13,6 +13,7 @@ import numpy as np
 from ballfg.arrays import Index
 from ballfg.checks import check_count, check_range
 from ballfg.tracks.sightings import Sightings
+from ballfg.tracks.stamps import elapsed, written
 from ballfg.vision.association.completing import complete
 from ballfg.vision.association.flights import is_ball, successions
 from ballfg.vision.association.gathering import SAME_SHUTTER, Footage, Gathered, SeenBall, gather, shared_stamps
@@ -83,9 +84,12 @@ def _footage(detections: Sequence[Detections], cameras: Sequence[Camera], settin
             "Leave out cameras without detections, or rename."
         )
     ordered = [by_name[name] for name in names]
-    chosen = [seen.select(seen.scores >= settings.least_score) for seen in ordered]
+    stamps = [seen.frames for seen in ordered]
+    origin = min((float(frames[0]) for frames in stamps if len(frames)), default=0.0)
+    counted = [replace(seen, frames=elapsed(seen.frames, origin)) for seen in ordered]
+    chosen = [seen.select(seen.scores >= settings.least_score) for seen in counted]
     frames = [seen.frames - camera.time_offset for seen, camera in zip(chosen, cameras, strict=True)]
-    return Footage(list(cameras), chosen, shared_stamps(frames, SAME_SHUTTER))
+    return Footage(list(cameras), chosen, shared_stamps(frames, SAME_SHUTTER), origin, stamps)
 
 
 def _pieces(footage: Footage) -> list[Piece]:
@@ -140,8 +144,10 @@ def _undisputed(seen: Detections, rows: Index) -> Index:
 def _seen_ball(footage: Footage, ball: Gathered) -> SeenBall:
     camera = np.repeat(np.arange(len(ball.rows)), [len(rows) for rows in ball.rows])
     pairs = list(zip(footage.detections, ball.rows, strict=True))
-    stamps = np.concatenate([seen.times[rows] for seen, rows in pairs])
-    order = np.argsort(stamps - np.array([c.time_offset for c in footage.cameras])[camera], kind="stable")
+    since = np.concatenate([seen.times[rows] for seen, rows in pairs])
+    order = np.argsort(since - np.array([c.time_offset for c in footage.cameras])[camera], kind="stable")
+    frames = [seen.frame[rows] for seen, rows in pairs]
+    stamps = np.concatenate([own[frame] for own, frame in zip(footage.stamps, frames, strict=True)])
     sightings = Sightings(
         tuple(c.name for c in footage.cameras),
         camera[order],
@@ -149,4 +155,5 @@ def _seen_ball(footage: Footage, ball: Gathered) -> SeenBall:
         np.concatenate([seen.pixels[rows] for seen, rows in pairs])[order],
         np.concatenate([seen.covariances[rows] for seen, rows in pairs])[order],
     )
-    return SeenBall(ball.track.times, ball.track.values, ball.covariances, sightings, ball.views)
+    times = written(ball.track.times, footage.origin)
+    return SeenBall(times, ball.track.values, ball.covariances, sightings, ball.views)

@@ -20,13 +20,17 @@ SAME_SHUTTER: Final = 2e-4
 
 @dataclass(frozen=True, eq=False)
 class Footage:
-    """A recording: what its cameras saw, on one clock."""
+    """A recording: what its cameras saw, on one clock that begins with the first frame of all."""
 
     cameras: Sequence[Camera]
     detections: Sequence[Detections]
     """One for each camera, in the cameras' order."""
     shared: Array | None
     """(k,) s, true time of the stamps if the cameras share a shutter."""
+    origin: float = 0.0
+    """s, stamp of the first frame of all; the detections' stamps are counted from it."""
+    stamps: Sequence[Array] = ()
+    """For each camera (f,) s, the stamps of its frames as the camera wrote them."""
     offset: float = 0.0
     """px, error of the calibration, added to every pixel's noise."""
 

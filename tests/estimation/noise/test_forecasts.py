@@ -8,11 +8,12 @@ import torch
 
 from ballfg.estimation import Smoother, predict_tracks
 from ballfg.estimation.noise.estimate import _Search
-from ballfg.estimation.noise.forecasts import HORIZONS, ROUNDING, Forecaster
+from ballfg.estimation.noise.forecasts import HORIZONS, Forecaster
 from ballfg.estimation.noise.linear_tracks import linearise
 from ballfg.estimation.noise.parameters import parameters_of, tensors_of
 from ballfg.simulation import MeasurementNoise
 from ballfg.state import POSITION, STATE_DIM
+from ballfg.tracks.stamps import STAMP_TOLERANCE
 from tests.estimation.noise import in_torch
 
 
@@ -65,9 +66,9 @@ def test_score_is_that_of_the_joint_gaussian(case):
         for start in forecaster.starts[forecaster.starts[:, 0] == track, 1].tolist():
             seen = np.flatnonzero(np.repeat(used[: start + 1], 3))
             ahead = {
-                int(np.flatnonzero(used & (times >= times[start] + h - ROUNDING))[0])
+                int(np.flatnonzero(used & (times >= times[start] + h - STAMP_TOLERANCE))[0])
                 for h in horizons
-                if (used & (times >= times[start] + h - ROUNDING)).any()
+                if (used & (times >= times[start] + h - STAMP_TOLERANCE)).any()
             } - {start}
             gain = np.linalg.solve(cov[np.ix_(seen, seen)], cov[seen]).T
             known = mean + gain @ (errors.reshape(-1)[seen] - mean[seen])

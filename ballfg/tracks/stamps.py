@@ -1,0 +1,45 @@
+"""Stamps as time since a first one, so that nothing depends on where a clock began to count."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ballfg.arrays import Array
+
+TICKS = 1e6
+"""1/s. Files state stamps in whole microseconds as a rule."""
+SUMMED = 1e-12
+"""s. By so little sums of whole microseconds miss them."""
+STAMP_TOLERANCE = 1.5e-6
+"""s. A stamp this little after the end of a time belongs to it: stamps are rounded to a microsecond, if not to doubles
+0.24 us apart, and their differences by up to one."""
+
+
+def elapsed(times: ArrayLike, origin: float) -> Array:
+    """Time since an origin on the same clock.
+
+    Seconds since 1970 are doubles 0.24 us apart, so that differences of whole microseconds come out broken. Where all
+    stamps are the doubles of whole microseconds, those are subtracted.
+
+    Args: times: (...) s.  origin: s.
+    Returns: (...) s; for stamps of whole microseconds the same bits wherever the clock began.
+    """
+    stamps = np.asarray(times, dtype=np.float64)
+    ticks, first = np.rint(stamps * TICKS), np.rint(origin * TICKS)
+    if (ticks / TICKS == stamps).all() and first / TICKS == origin:
+        return np.asarray((ticks - first) / TICKS)
+    return np.asarray(stamps - origin)
+
+
+def written(seconds: ArrayLike, origin: float) -> Array:
+    """The stamps on the data's clock that `elapsed` has counted from an origin.
+
+    Args: seconds: (...) s since the origin.  origin: s.
+    Returns: (...) s; the doubles of whole microseconds where those were counted.
+    """
+    since = np.asarray(seconds, dtype=np.float64)
+    ticks, first = np.rint(since * TICKS), np.rint(origin * TICKS)
+    with np.errstate(invalid="ignore"):  # a stamp that is not finite stays as it is
+        whole = (np.abs(ticks / TICKS - since) < SUMMED).all() and first / TICKS == origin
+    if whole:
+        return np.asarray((first + ticks) / TICKS)
+    return np.asarray(origin + since)
