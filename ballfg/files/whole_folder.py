@@ -169,11 +169,12 @@ def _put(place: Path, target: Path) -> Path:
     try:
         exchange(place / NEW, target)
     except OSError:
-        os.rename(target, place / OLD)
         try:
+            os.rename(target, place / OLD)
             os.rename(place / NEW, target)
-        except BaseException:
-            os.rename(place / OLD, target)
+        except BaseException:  # Ctrl-C between them too
+            if not os.path.lexists(target):
+                os.rename(place / OLD, target)
             raise
         return place / OLD
     return place / NEW
