@@ -15,9 +15,9 @@ from ballfg.dynamics.model import THIN_SHELL, BallModel
 from ballfg.dynamics.networks.learned import LearnedModel
 from ballfg.dynamics.networks.learned_file import BASE, has_learned_part, read_learned, write_learned
 from ballfg.dynamics.variation import Variation
-from ballfg.files.one_state import of_one_state
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.whole_file import write_text
+from ballfg.files.whole_folder import of_one_state
 from ballfg.tracks import TrackNoise
 
 KINDS: Final[tuple[Kind, ...]] = ("flight", "bounce", "measurement")

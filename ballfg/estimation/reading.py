@@ -7,8 +7,8 @@ from ballfg.checks import check_path
 from ballfg.dynamics import model_to_dict, nominal_model
 from ballfg.estimation.observations.files import read_readings
 from ballfg.estimation.observations.sighted_dataset import SightedDataset, read_sighted
-from ballfg.files.one_state import of_one_state
 from ballfg.files.strict_yaml import read_mapping
+from ballfg.files.whole_folder import of_one_state
 from ballfg.tracks import Ball, Dataset, read_dataset
 from ballfg.tracks.dataset import has_positions as has_positions
 

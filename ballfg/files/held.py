@@ -1,8 +1,7 @@
 """Where results are made: in a hidden folder of a random name, while a lock in the user's own state folder is held.
 
 The kernel frees the lock when its process ends, however it ends. What a killed process left is cleared by the next
-writer of the same result, as the lock's file tells, which this user alone can write: what lies beside a result is never
-believed.
+writer of the same result, as the lock's file tells, which this user alone can write: what lies beside is not believed.
 """
 
 import errno
@@ -27,13 +26,8 @@ NEW, OLD = "new", "old"
 PATIENCE: Final = 0.3
 """s after which a lock counts as that of a writer."""
 _DISK: Final = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
-
-_mine: ContextVar[frozenset[Path]] = ContextVar("mine", default=frozenset())
-"""Results and hidden folders that this line of work holds. Another thread has none, and is refused."""
-
-
-class BeingWrittenError(ValueError):
-    """Another process, or another thread, is writing the same result."""
+_records: ContextVar[dict[Path, Path]] = ContextVar("records")
+"""Of what this line of work holds, results and hidden folders: the files of the locks. Another thread has none."""
 
 
 @contextmanager
@@ -43,81 +37,73 @@ def held(target: Path, argument: str = "out") -> Iterator[None]:
     Where the state folder has no locks or no room, nothing is locked, and nothing cleared.
 
     Args: target: the file or folder, without links.  argument: its name, for the message.
-    Raises: BeingWrittenError: another process writes it.
+    Raises: ValueError: another process, or another thread, writes it.
     """
-    if target in _mine.get():
+    if target in _records.get({}):
         yield
         return
     from filelock import FileLock, Timeout
 
-    record = _record(target)
+    record = state_folder("locks") / hashlib.sha256(os.fsencode(target)).hexdigest()[:32]
     lock = FileLock(record, fallback_to_soft=False)
     try:
         lock.acquire(timeout=PATIENCE, poll_interval=0.01)
     except Timeout:
         process = next(iter(_read(record)), "(just starting)")
-        raise BeingWrittenError(
+        raise ValueError(
             f"{argument} must not be written twice at the same time; {target} is being written by process {process}. "
             "Wait for it, or choose another name."
         ) from None
     except OSError:
-        pass
+        pass  # no locks or no room there
     try:
         if lock.is_locked:
             _clear_after(record, target)
         _write(record, os.getpid(), "w")
-        with _as_mine(target):
+        with _holding(target, record):
             yield
     finally:
-        if not any(_left(record)):
+        if not _left(record):
             record.unlink(missing_ok=True)  # while it is locked: whoever waits for it then makes a new one
         lock.release()
 
 
 @contextmanager
-def hidden(parent: Path, target: Path) -> Iterator[Path]:
-    """A new folder for this user alone, removed at the end. parent: where it is made.  target: the result, held."""
-    place = parent / f"{MARK}{secrets.token_hex(8)}"
-    _write(_record(target), str(place))
-    place.mkdir(PRIVATE)
+def hidden(parent: Path, target: Path, path: Path) -> Iterator[Path]:
+    """A new folder for this user alone, removed at the end.
+
+    Args: parent: where it is made.  target: the result, held.  path: its name, which errors of the disk get.
+    """
+    place, record = parent / f"{MARK}{secrets.token_hex(8)}", _records.get()[target]
+    _write(record, str(place))
     try:
-        with _as_mine(place):
+        place.mkdir(PRIVATE)
+        with _holding(place, record):
             yield place
+    except OSError as error:
+        if error.errno is None or not (MARK in str(error.filename) or (not error.filename and error.errno in _DISK)):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error
     finally:
         _remove(place)
 
 
 def is_hidden(path: Path) -> bool:
     """Whether a path lies in a hidden folder of this line of work: what is written there is no result yet."""
-    return any(each.name.startswith(MARK) for each in _mine.get() & set(path.parents))
+    return any(each.name.startswith(MARK) for each in _records.get({}).keys() & {*path.parents})
 
 
 @contextmanager
-def named(path: Path) -> Iterator[None]:
-    """Gives an error of the disk the name of what was to be written, in place of none or a hidden one."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno is None or not (MARK in str(error.filename) or (not error.filename and error.errno in _DISK)):
-            raise
-        raise OSError(error.errno, error.strerror, str(path)) from error
-
-
-@contextmanager
-def _as_mine(path: Path) -> Iterator[None]:
-    _mine.set(_mine.get() | {path})
+def _holding(path: Path, record: Path) -> Iterator[None]:
+    _records.set(_records.get({}) | {path: record})
     try:
         yield
     finally:
-        _mine.set(_mine.get() - {path})
-
-
-def _record(target: Path) -> Path:
-    """The file that is locked for a result. Its lines: the process, and each hidden folder before it is made."""
-    return state_folder("locks") / hashlib.sha256(os.fsencode(target)).hexdigest()[:32]
+        _records.set({each: its for each, its in _records.get().items() if each != path})
 
 
 def _write(record: Path, line: int | str, mode: str = "a") -> None:
+    """Adds a line: the process, then each hidden folder before it is made."""
     with suppress(OSError), record.open(mode, encoding="utf-8") as file:  # without room, nothing will be cleared
         file.write(json.dumps(line) + "\n")
 
@@ -130,12 +116,9 @@ def _read(record: Path) -> Iterator[Any]:
 
 def _left(record: Path) -> list[Path]:
     """The hidden folders that are still there, and are this user's."""
-    places = [Path(line) for line in _read(record) if isinstance(line, str)]
-    return [place for place in places if os.path.lexists(place) and _is_own(place.lstat())]
-
-
-def _is_own(found: os.stat_result) -> bool:
-    return stat.S_ISDIR(found.st_mode) and found.st_uid == os.geteuid()
+    places = [Path(line) for line in _read(record) if isinstance(line, str) and os.path.lexists(line)]
+    found = ((place, place.lstat()) for place in places)
+    return [place for place, one in found if stat.S_ISDIR(one.st_mode) and one.st_uid == os.geteuid()]
 
 
 def _clear_after(record: Path, target: Path) -> None:

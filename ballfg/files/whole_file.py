@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
-from ballfg.files.held import held, hidden, is_hidden, named
+from ballfg.files.held import held, hidden, is_hidden
 
 
 @contextmanager
@@ -25,13 +25,13 @@ def whole_file(path: Path, argument: str = "out") -> Iterator[Path]:
     if is_hidden(target):
         yield path
         return
-    with named(path), held(target, argument), hidden(target.parent, target) as place:
+    with held(target, argument), hidden(target.parent, target, path) as place:
         temporary = place / path.name
         yield temporary
         _as_before(temporary, target)
         flush(temporary)
         os.replace(temporary, target)
-        flush_folder(target.parent)
+        flush(target.parent)
 
 
 def _as_before(temporary: Path, target: Path) -> None:
@@ -50,21 +50,15 @@ def write_text(path: Path, text: str) -> None:
 
 
 def flush(path: Path) -> None:
-    """Brings a file to the disk, so that a power cut does not leave a name without content."""
+    """Brings a file, or the names in a folder, to the disk: else a power cut leaves a name without content."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
-def flush_folder(path: Path) -> None:
-    """Brings the names in a folder to the disk; a filesystem that has no such call (EINVAL) does it in its own way."""
-    try:
-        flush(path)
-    except OSError as error:
+    except OSError as error:  # some disks have no such call for folders, and do it in their own way
         if error.errno not in (errno.EINVAL, errno.ENOTSUP):
             raise
+    finally:
+        os.close(handle)
 
 
 def check_file(path: Path, argument: str = "out") -> None:

@@ -1,4 +1,4 @@
-"""Writing a folder as a whole: its files have their names only when all of them are complete."""
+"""Folders as a whole: their files have their names only when all of them are complete, and are read together."""
 
 import ctypes
 import errno
@@ -7,12 +7,18 @@ import shutil
 from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
+from functools import wraps
 from pathlib import Path
-from typing import Final
+from typing import Final, ParamSpec, TypeVar
 
-from ballfg.files.held import MARK, NEW, OLD, held, hidden, is_hidden, named
-from ballfg.files.whole_file import check_parent, flush, flush_folder
+from ballfg.files.held import MARK, NEW, OLD, held, hidden, is_hidden
+from ballfg.files.whole_file import check_parent, flush
 
+P = ParamSpec("P")
+T = TypeVar("T")
+
+_TRIES: Final = 20
+_OPEN: Final = os.O_DIRECTORY | getattr(os, "O_PATH", os.O_RDONLY)
 DEEPEST: Final = 100
 """Folders in folders of a result."""
 
@@ -37,24 +43,29 @@ def whole_folder(folder: Path, *, earlier: Iterable[str] = (), argument: str = "
         target.mkdir(exist_ok=True)
         yield target
         return
-    with named(folder), held(target, argument), hidden(target.parent, target) as place:
+    with held(target, argument), hidden(target.parent, target, folder) as place:
         stage = place / NEW
         stage.mkdir()
         yield stage
         ours = {str(path.relative_to(stage)) for path in stage.rglob("*")}
         for name in (*ours, ""):
-            (flush if (stage / name).is_file() else flush_folder)(stage / name)
+            flush(stage / name)
         if not target.exists():
             os.rename(stage, target)
         else:
             for path, there, _ in _staying(target, stage, patterns):
                 if not os.path.lexists(there):
-                    _link(path, there)
+                    try:
+                        os.link(path, there, follow_symlinks=False)
+                    except OSError:  # a disk on which each file has one name
+                        shutil.copy2(path, there, follow_symlinks=False)
             for path, there, name in _staying(_put(place, target), target, patterns):
-                if name not in ours and _stamp(path) != _stamp(there):
+                if name not in ours and not (
+                    os.path.lexists(there) and path.lstat().st_mtime_ns == there.lstat().st_mtime_ns
+                ):
                     os.replace(path, there)  # somebody has written it meanwhile
             os.utime(target)
-        flush_folder(target.parent)
+        flush(target.parent)
 
 
 @contextmanager
@@ -68,7 +79,7 @@ def reserved(folder: Path, argument: str = "out") -> Iterator[None]:
     """
     target = check_folder(folder, argument)
     with held(target, argument):
-        with named(folder), hidden(target if target.exists() else target.parent, target):
+        with hidden(target if target.exists() else target.parent, target, folder):
             pass
         yield
 
@@ -105,7 +116,7 @@ def check_replaceable(
     Raises: ValueError: other content, or an earlier result and no `force`; else as `whole_folder`.
     """
     target = _exchangeable(folder, "out")
-    with held(target), named(folder), hidden(target.parent, target):  # what was left between two steps is put back
+    with held(target), hidden(target.parent, target, folder):  # what was left between two steps is put back
         present = {entry.name for entry in target.iterdir()} if target.exists() else set()
     present = {name for name in present if not name.startswith(MARK)}
     if not present:
@@ -153,29 +164,17 @@ def _staying(old: Path, new: Path, patterns: Collection[str]) -> Iterator[tuple[
         shutil.copystat(old / within, new / within)
 
 
-def _link(path: Path, there: Path) -> None:
-    """Gives a file another name, or makes a copy where a disk has one name for each file."""
-    try:
-        os.link(path, there, follow_symlinks=False)
-    except OSError:
-        shutil.copy2(path, there, follow_symlinks=False)
-
-
-def _stamp(path: Path) -> tuple[int, int] | None:
-    found = path.lstat() if os.path.lexists(path) else None
-    return None if found is None else (found.st_size, found.st_mtime_ns)
-
-
 def _put(place: Path, target: Path) -> Path:
     """Puts the new folder in the place of the old one. Returns: where the old one is then."""
     try:
         exchange(place / NEW, target)
     except OSError:
-        os.rename(target, place / OLD)
         try:
+            os.rename(target, place / OLD)
             os.rename(place / NEW, target)
-        except BaseException:
-            os.rename(place / OLD, target)
+        except BaseException:  # Ctrl-C between them too
+            if not os.path.lexists(target):
+                os.rename(place / OLD, target)
             raise
         return place / OLD
     return place / NEW
@@ -191,3 +190,38 @@ def exchange(one: Path, other: Path) -> None:
         failed = not hasattr(system, "renamex_np") or system.renamex_np(first, second, swap)  # macOS
     if failed:
         raise OSError(ctypes.get_errno(), "folders cannot be exchanged", str(other))
+
+
+def of_one_state(read: Callable[P, T]) -> Callable[P, T]:
+    """A reader that reads again where its folder was exchanged meanwhile, so that all files are of one result.
+
+    Args: read: its first argument is the folder, or a file in it.
+    """
+
+    @wraps(read)
+    def steady(*args: P.args, **kwargs: P.kwargs) -> T:
+        path = next(iter((*args, *kwargs.values())), None)
+        if not isinstance(path, str | os.PathLike) or not os.path.exists(path):
+            return read(*args, **kwargs)
+        folder = Path(path) if os.path.isdir(path) else Path(path).parent
+        for _ in range(_TRIES):
+            opened = os.open(folder, _OPEN)  # while it is open, no other folder gets its number
+            try:
+                result = read(*args, **kwargs)
+            except (OSError, ValueError):
+                if _is_at(folder, opened):
+                    raise
+            else:
+                if _is_at(folder, opened):
+                    return result
+            finally:
+                os.close(opened)
+        raise ValueError(
+            f"{folder} must stay the same while it is read; it was replaced {_TRIES} times. Read it again."
+        )
+
+    return steady
+
+
+def _is_at(folder: Path, opened: int) -> bool:
+    return folder.is_dir() and os.path.samestat(os.fstat(opened), folder.stat())

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from ballfg.checks import shown
-from ballfg.files.one_state import of_one_state
+from ballfg.files.whole_folder import of_one_state
 from ballfg.tracks.checks import Findings, check_scale, tidy
 from ballfg.tracks.detections_file import DETECTIONS_FILE
 from ballfg.tracks.grouping import Index, RowGroup, groups, scan

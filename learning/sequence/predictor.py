@@ -15,10 +15,9 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ballfg.checks import short_text, shown
-from ballfg.files.one_state import of_one_state
 from ballfg.files.strict_yaml import read_yaml
 from ballfg.files.weights import read_tensors
-from ballfg.files.whole_folder import whole_folder
+from ballfg.files.whole_folder import of_one_state, whole_folder
 from ballfg.learning.sequence.architecture import SequenceArchitecture
 from ballfg.learning.sequence.data import LauncherSettings, collate, example
 from ballfg.learning.sequence.model import SequenceModel

@@ -41,6 +41,7 @@ class Scenario:
         refused: words of a refusal that is right where the new result stands already; the command has no --force.
         steps: the command leaves whole steps in between, so that a folder need be neither old nor new.
         varying: names of files whose bytes differ from run to run, because they hold times.
+        companions: names of files that tell of the result; they may be missing, and never tell of another one.
     """
 
     name: str
@@ -51,6 +52,7 @@ class Scenario:
     refused: str = ""
     steps: bool = False
     varying: tuple[str, ...] = ()
+    companions: tuple[str, ...] = ()
 
 
 @dataclass
@@ -189,7 +191,7 @@ def _judge(scenario: Scenario, folder: Path, said: Path, old: State, new: State,
     if not scenario.steps:
         if half:
             tally.add("half files", f"{where}: {half}")
-        elif found not in (old, new):
+        elif not any(_is_one(found, whole, scenario.companions) for whole in (old, new)):
             tally.add("mixed folders", f"{where}: {sorted(set(found.items()) ^ set(new.items()))[:4]}")
     if status == 2 and found == new:
         tally.add("reader refuses the new", f"{where}: {said.read_text()[-300:]}")
@@ -203,6 +205,12 @@ def _judge(scenario: Scenario, folder: Path, said: Path, old: State, new: State,
     left = [str(path.relative_to(folder)) for path in folder.rglob("*") if path.name.startswith(".")]
     if left:
         tally.add("left over", f"{where}: {left}")
+
+
+def _is_one(found: State, result: State, companions: tuple[str, ...]) -> bool:
+    """Whether a folder holds a result, with or without the files that tell of it."""
+    missing = result.keys() - found.keys()
+    return found.items() <= result.items() and all(Path(name).name in companions for name in missing)
 
 
 def _spread(count: int, most: int) -> Iterator[int]:

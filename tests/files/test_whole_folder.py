@@ -323,13 +323,29 @@ def test_a_kill_between_two_steps_leaves_the_old_folder_to_the_next_writer(tmp_p
     assert contents(tmp_path) == {"d/mark": "old" if renames == 1 else "new", "d/mine": "mine"}
 
 
-def test_a_failure_between_two_steps_is_taken_back(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("error", [OSError(errno.EIO, "Input/output error"), KeyboardInterrupt()])
+@pytest.mark.parametrize("at", [1, 2])
+def test_a_failure_between_two_steps_is_taken_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, at: int
+) -> None:
     fill(tmp_path, d__a="old")
-    real = os.rename
+    real, count = os.rename, [0]
+
+    def rename(*paths: Any) -> None:
+        count[0] += 1
+        if not at == count[0] == 2:
+            real(*paths)
+        if count[0] == at:  # after the first of them, and in place of the second
+            raise error
+
+    def broken() -> None:
+        with whole_folder(tmp_path / "d") as stage:
+            fill(stage, a="new")
+
     monkeypatch.setattr(module, "exchange", cannot)
-    monkeypatch.setattr("os.rename", lambda one, other: cannot() if one.name == "new" else real(one, other))
-    with pytest.raises(OSError, match="not supported"), whole_folder(tmp_path / "d") as stage:
-        fill(stage, a="new")
+    monkeypatch.setattr("os.rename", rename)
+    with pytest.raises(type(error)):
+        broken()
     assert contents(tmp_path) == {"d/a": "old"}
 
 

@@ -8,7 +8,7 @@ from typing import Final
 
 from ballfg.checks import shown
 from ballfg.estimation.observations.sightings import NeverSeenByTwoError, sighted_track
-from ballfg.files.one_state import of_one_state
+from ballfg.files.whole_folder import of_one_state
 from ballfg.tracks.dataset import TrackFolder
 from ballfg.tracks.detections_file import DETECTIONS_FILE, read_sightings
 from ballfg.tracks.info import INFO_FILE, DatasetInfo, read_info

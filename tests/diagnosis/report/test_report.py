@@ -141,8 +141,11 @@ def test_an_earlier_report_is_replaced_and_other_files_stay(tmp_path: Path) -> N
     (out / "notes.txt").write_text("mine")
     write_report(with_learned_fallback(), out)
     assert [path.name for path in out.glob("model.learned-*")] == learned
+    (out / "best.yaml").write_bytes((out / "model.yaml").read_bytes())
     write_report(silent(), out)
-    assert sorted(p.name for p in out.iterdir()) == ["model.yaml", "notes.txt", "report.html", "report.json"]
+    others = ["best.yaml", "model.yaml", "notes.txt", "report.html", "report.json"]
+    assert sorted(p.name for p in out.iterdir()) == sorted([*others, *learned])
+    assert isinstance(load_model(out / "best.yaml"), LearnedModel)
     assert silent().sentence in (out / "report.html").read_text(encoding="utf-8")
     assert [path.name for path in tmp_path.iterdir()] == ["diagnosis"]
 

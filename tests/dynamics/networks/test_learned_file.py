@@ -113,7 +113,7 @@ def test_a_tuned_analytic_model(trained, tmp_path):
     model.trained = Trained({"acceleration": 0.2})
     save_model(model, tmp_path / "m.yaml")
     assert load_model(tmp_path / "m.yaml").trained == Trained({"acceleration": 0.2})
-    assert len(list(tmp_path.iterdir())) == 2
+    assert len(list(tmp_path.iterdir())) == 3  # the weights of both
 
 
 def test_radius_and_inertia_are_the_balls(tmp_path):
@@ -128,7 +128,34 @@ def test_saving_again_replaces(tmp_path):
         save_model(model, tmp_path / "m.yaml")
         save_model(small(seed=7), tmp_path / "other.yaml")
         same(model, load_model(tmp_path / "m.yaml"))
-    assert len(list(tmp_path.iterdir())) == 4
+    assert len(list(tmp_path.iterdir())) == 5  # two files, and weights of three contents
+
+
+@pytest.mark.parametrize("name", ["model[1].yaml", "*.yaml", "model?.yaml", "model1.yml", "[!x]odel1.yaml"])
+def test_saving_one_model_leaves_the_weights_of_all_others(name, tmp_path):
+    first = small(seed=1)
+    save_model(first, tmp_path / "model1.yaml")
+    for other in (small(seed=2), nominal_model()):
+        save_model(other, tmp_path / name)
+        same(first, load_model(tmp_path / "model1.yaml"))
+
+
+def test_a_copy_keeps_its_weights_when_the_file_is_saved_again(tmp_path):
+    first = small(seed=1)
+    save_model(first, tmp_path / "model.yaml")
+    shutil.copy(tmp_path / "model.yaml", tmp_path / "best.yaml")
+    save_model(small(seed=2), tmp_path / "model.yaml")
+    save_model(nominal_model(), tmp_path / "model.yaml")
+    same(first, load_model(tmp_path / "best.yaml"))
+
+
+def test_saving_again_mends_weights_that_were_damaged(saved, learned):
+    path, folder = saved
+    (folder / "weights.safetensors").write_bytes(b"damaged")
+    (folder / "notes.txt").write_text("mine")
+    save_model(learned, path)
+    same(learned, load_model(path))
+    assert (folder / "notes.txt").read_text() == "mine"
 
 
 @pytest.mark.parametrize("step", ["mkdir", "rename", "replace"])

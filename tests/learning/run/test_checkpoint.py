@@ -97,17 +97,6 @@ def test_a_flipped_bit_is_found(tmp_path: Path) -> None:
         read_checkpoint(tmp_path)
 
 
-def test_what_a_killed_writer_left_is_gone_when_the_run_goes_on(tmp_path: Path) -> None:
-    """A kill after the last move leaves hidden folders; a run that has ended writes no checkpoint that clears them."""
-    write_checkpoint(tmp_path, made(1))
-    left = tmp_path / "checkpoint" / ".ballfg-writing"
-    (left / "old").mkdir(parents=True)
-    (left / "old" / "weights.safetensors").write_bytes(b"x")
-    (left / "lock").touch()
-    assert same(read_checkpoint(tmp_path), made(1))
-    assert not left.exists()
-
-
 def test_a_table_of_epochs_with_a_cell_without_end_is_refused(tmp_path: Path) -> None:
     (tmp_path / "metrics.csv").write_text("epoch,loss\n1," + "2" * 200_000 + "\n", encoding="utf-8")
     with pytest.raises(ValueError, match=r"not a table of epochs \(field larger than field limit"):

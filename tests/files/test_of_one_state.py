@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ballfg.files.one_state import of_one_state
-from ballfg.files.whole_folder import whole_folder
+from ballfg.files.whole_folder import of_one_state, whole_folder
 from ballfg.tracks import Ball, DatasetInfo, Track, read_dataset, write_dataset
 
 
