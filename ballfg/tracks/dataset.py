@@ -9,7 +9,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Final
 
-from ballfg.checks import shown
+from ballfg.checks import check_path, shown
 from ballfg.files.moving import settle
 from ballfg.tracks.checks import Findings, check_scale, tidy
 from ballfg.tracks.detections_file import DETECTIONS_FILE
@@ -139,7 +139,7 @@ def read_dataset(folder: str | PathLike[str]) -> Dataset:
         FileNotFoundError: the folder or one of its files is missing.
         ValueError: the content breaks a rule; the message names file, line, column and remedy.
     """
-    path = Path(folder)
+    path = check_path("folder", folder)
     settle(path)
     source = _open_source(path)
     info, notes = read_info(path / INFO_FILE)
