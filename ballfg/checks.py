@@ -319,11 +319,14 @@ def check_choice(label: str, value: object, known: Collection[str]) -> None:
 def check_path(label: str, value: object) -> Path:
     """The place of a file or folder.
 
-    Raises: TypeError: neither text nor a path.
+    Raises: TypeError: neither text nor a path. ValueError: one with a NUL, which no system has.
     """
     if not isinstance(value, str | PathLike):
         raise TypeError(f"{label} must be a path; got {type_name(value)} {shown(value)}. Give it as text or Path.")
-    return Path(value)
+    path = Path(value)
+    if "\0" in str(path):
+        raise ValueError(f"{label} must be a path without a NUL; got {shown(str(path))}. Correct it.")
+    return path
 
 
 def check_array(

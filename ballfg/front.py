@@ -9,7 +9,7 @@ from typing import TypeAlias, TypedDict, Unpack, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ballfg.checks import as_float, check_instance
+from ballfg.checks import check_count, check_instance, type_name
 from ballfg.diagnosis import Diagnosis
 from ballfg.diagnosis import diagnose as diagnose_dataset
 from ballfg.dynamics import BallModel, Surfaces, inertia_factor, load_model, nominal_model
@@ -21,6 +21,7 @@ from ballfg.estimation import (
     SightedDataset,
     TrackPrediction,
     check_calibration_tracks,
+    check_observe,
     dataset_surfaces,
     estimate_tracks,
     fitted_settings,
@@ -30,6 +31,7 @@ from ballfg.estimation import (
     read,
 )
 from ballfg.estimation.batch import check_device, estimate_together
+from ballfg.parallel.executor import MOST_JOBS
 from ballfg.parallel.work import on_one_thread
 from ballfg.prediction import Ahead, BallState
 from ballfg.tracks import TABLE_TENNIS, Ball, Dataset, Track
@@ -96,6 +98,7 @@ def estimate(
         FileNotFoundError: a folder or model file that is not there.
     """
     check_device(method, device)
+    check_count("jobs", jobs, 1, MOST_JOBS)
     data = _opened(measured)
     estimator = estimator_for(data, method, model, surfaces, settings)
     if isinstance(data, Track):
@@ -141,16 +144,18 @@ def predict(
         ValueError: a horizon that is not positive, calibration tracks that are too few or of another kind, or what
             `estimate` raises.
     """
+    check_device(method, device)
+    check_count("jobs", jobs, 1, MOST_JOBS)
     if isinstance(known, Estimate | BallState):
         _refuse(conformal)
         return known.predict(horizon)
-    check_device(method, device)
     data = _opened(known)
     if isinstance(data, Track):
         _refuse(conformal)
         estimator = estimator_for(data, method, model, surfaces, settings)
         return estimate_together(estimator, [data], device)[0].predict(horizon)
-    observe = as_float("observe", observe, "s")
+    check_observe(observe)
+    observe = float(observe)
     estimator = estimator_for(data, method, model, surfaces, settings, observe)
     predicted = partial(predict_tracks, estimator, observe=observe, horizon=horizon, jobs=jobs, device=device)
     scales = _scales(conformal, data, predicted, method, observe)
@@ -196,13 +201,20 @@ def diagnose(measured: Dataset | Folder, model: Model = None, *, jobs: int = 1) 
         jobs: processes.
     Returns: the effects found, how sure that is, and the corrected model.
     Raises:
-        TypeError: if the model is a learned one, or none.
-        ValueError: if there are too few tracks, or none with a flight that is long enough.
+        TypeError: for anything else in place of a dataset, or if the model is a learned one, or none.
+        ValueError: a dataset without a table of positions, too few tracks, or none with a flight that is long enough.
         FileNotFoundError: a folder or model file that is not there.
     """
+    check_count("jobs", jobs, 1, MOST_JOBS)
     data = read(measured) if isinstance(measured, str | PathLike) else measured
-    if not isinstance(data, Dataset):
+    if isinstance(data, SightedDataset):
         raise ValueError("measured must have a table of positions; a diagnosis of detections alone is not possible")
+    if not isinstance(data, Dataset):
+        what = "one Track; effects show in many of them" if isinstance(data, Track) else type_name(data)
+        raise TypeError(
+            f"measured must be a dataset or its folder; got {what}. Read one with bf.read, or make one of tracks with "
+            "bf.import_tracks or ballfg.tracks.dataset_in_memory."
+        )
     # as the commands do: threads gain nothing with such small batches, and beside other work wait for each other
     return on_one_thread(partial(diagnose_dataset, data, jobs=jobs), _model(model, data))
 

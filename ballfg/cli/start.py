@@ -1,8 +1,9 @@
 """The start of each program: its words, an option --quiet for all commands, signs of life, an exit status."""
 
+import os
 import sys
-from collections.abc import Iterator, Sequence
-from functools import cache
+from collections.abc import Callable, Iterator, Sequence
+from functools import cache, partial
 from typing import Annotated, Any, NoReturn
 
 import typer
@@ -10,12 +11,16 @@ import typer
 from ballfg.cli.errors import check_words, guarded
 from ballfg.progress import alive, be_quiet
 
+UNREAD = 141
+"""Exit status where the reader of stdout has left, as `head` does: what shells show of a program that SIGPIPE ends."""
+
 
 def start(app: typer.Typer, name: str, arguments: Sequence[str] | None) -> NoReturn:
     """Runs a program with the given arguments, by default the command line's, and exits.
 
     Args: app: the program.  name: its name, as users type it.  arguments: its words.
-    Raises: SystemExit: always; status 0, 2 on bad input, 130 after Ctrl-C, or what the command returns.
+    Raises: SystemExit: always; status 0, 2 on bad input, 130 after Ctrl-C, 141 where nobody reads on, or what the
+        command returns.
     """
     command = _command(app)
     given = sys.argv[1:] if arguments is None else list(arguments)
@@ -25,7 +30,22 @@ def start(app: typer.Typer, name: str, arguments: Sequence[str] | None) -> NoRet
         with alive(" ".join([name, *given[:1]])):
             return command.main(given, prog_name=name, standalone_mode=False)
 
-    sys.exit(guarded(work))
+    sys.exit(_while_read(partial(guarded, work)))
+
+
+def _while_read(run: Callable[[], int]) -> int:
+    """The exit status of a program, or `UNREAD` without a word where nobody reads what it prints any more."""
+    try:
+        status = run()
+        sys.stdout.flush()
+        return status
+    except BrokenPipeError:
+        pass
+    except SystemExit as leaving:  # click's way, with status 1
+        if not isinstance(leaving.__context__, BrokenPipeError):
+            raise
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # else the interpreter complains when it flushes the rest
+    return UNREAD
 
 
 @cache

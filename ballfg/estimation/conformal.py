@@ -18,7 +18,7 @@ import numpy as np
 import yaml
 
 from ballfg.arrays import Array, Index
-from ballfg.checks import check_keys, one_line, short_text, shown
+from ballfg.checks import check_keys, check_path, one_line, short_text, shown
 from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.files.whole_file import write_text
 from ballfg.tracks.stamps import elapsed
@@ -176,7 +176,7 @@ def load_conformal(path: str | Path) -> ConformalScales:
         FileNotFoundError: no such file.
         ValueError: another content; the message names file and field.
     """
-    path = Path(path)
+    path = check_path("path", path)
     content = mapping(f"{path}: section '{FILE_SECTION}'", read_mapping(path).get(FILE_SECTION))
     known = (*_FIELDS, "level", "bin")
     check_keys(str(path), content, known, known)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -110,11 +111,12 @@ def check_observe(observe: float) -> None:
     """Checks the length of the observed part.
 
     Args: observe: s.
-    Raises: ValueError: if it is not positive.
+    Raises: ValueError: if it is not positive and finite. TypeError: no number.
     """
-    if not as_float("observe", observe, "s") > 0.0:
+    seconds = as_float("observe", observe, "s")
+    if not 0.0 < seconds < math.inf:
         raise ValueError(
-            f"observe must be a positive number of seconds; got {observe:g}. A quarter of a second is 0.25."
+            f"observe must be a positive number of seconds; got {seconds:g}. A quarter of a second is 0.25."
         )
 
 

@@ -22,6 +22,8 @@ MAX_TEXT: Final = 250_000_000
 """Bytes of a file of text that is held whole."""
 MAX_LINE: Final = 1 << 18
 """Characters of a line of a table. Those of a result have some 400."""
+MAX_COLUMNS: Final = 10_000
+"""Of a table. Marker systems write some hundred."""
 MAX_PIXELS: Final = 64_000_000
 """Of an image or a frame: 192 MB of three colours. A frame in 4K has 8 million."""
 _SAID: Final = 160

@@ -6,10 +6,11 @@ from typing import Any, Final
 
 from ballfg.files.damaged import whole_content
 
-MAX_VALUES: Final = 5_500_000
-"""Names, values, lists and mappings of a text; a capture of 30 MB has 3 to 5 million. They are read in 2 s."""
-_SIGNS: Final = ",:[{"
-"""One of them comes with each name, each further value, each list and each mapping."""
+MAX_VALUES: Final = 8_000_000
+"""Of a text, as `_COSTS` counts them: some 300 MB in memory. A capture of 30 MB has 5 to 7 million."""
+_COSTS: Final = {",": 1, ":": 2, "[": 4, "{": 4}
+"""What a value, a name, a list and a mapping count, by the sign that comes with each; so much memory do they take."""
+TOO_MANY: Final = f"it must hold at most {MAX_VALUES} values, a name counted as 2, a list or mapping as 4"
 
 
 def read_json(path: Path) -> Any:
@@ -27,13 +28,13 @@ def read_json(path: Path) -> Any:
 
 def has_too_many(text: str) -> bool:
     """Whether JSON holds more than `MAX_VALUES`; it is not parsed for that."""
-    return len(text) > MAX_VALUES and sum(map(text.count, _SIGNS)) > MAX_VALUES
+    return 4 * len(text) > MAX_VALUES and sum(text.count(sign) * cost for sign, cost in _COSTS.items()) > MAX_VALUES
 
 
 def parse_json(text: str) -> Any:
     """The content of JSON. Raises: JSONDecodeError: it is none, or beyond what can be read."""
     if has_too_many(text):
-        raise json.JSONDecodeError(f"it must hold at most {MAX_VALUES} names and values", text, 0)
+        raise json.JSONDecodeError(TOO_MANY, text, 0)
     try:
         return json.loads(text)
     except json.JSONDecodeError:

@@ -9,7 +9,8 @@ from typing import Any, Final
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from ballfg.files.damaged import NUMBER, check_count, check_unpacked, library_reads
+from ballfg.checks import MAX_TEXT
+from ballfg.files.damaged import MAX_COLUMNS, NUMBER, check_count, check_unpacked, library_reads
 
 MAX_FOOTER: Final = 16_000_000
 """Bytes of the metadata at the end of a file: some 100,000 pieces of columns."""
@@ -34,6 +35,7 @@ def open_parquet(path: Path) -> pq.ParquetFile:
         if end == b"PAR1" and footer < size:
             check_count(path, "bytes of metadata", footer, MAX_FOOTER)
         about = pq.read_metadata(path)
+        check_count(path, "columns", about.num_columns, MAX_COLUMNS)
         check_count(path, "pieces of columns", about.num_row_groups * max(about.num_columns, 1), MAX_PIECES)
         check_unpacked(path, _unpacked(about))
         schema = about.schema
@@ -42,14 +44,17 @@ def open_parquet(path: Path) -> pq.ParquetFile:
 
 
 def texts_of(column: pa.Array | pa.ChunkedArray) -> list[Any]:
-    """The values of a column of texts, (n,); rows of the same text share it."""
+    """The values of a column of texts, (n,), cut behind `MAX_TEXT`; rows of the same text share it."""
     chunks = column.chunks if isinstance(column, pa.ChunkedArray) else [column]
     found: list[Any] = []
     for chunk in chunks:
         if not pa.types.is_dictionary(chunk.type):
             found += chunk.to_pylist()
             continue
-        words = chunk.dictionary.to_pylist()
+        words = [
+            word.decode("utf-8", "replace")[:MAX_TEXT] if isinstance(word, bytes) else word[:MAX_TEXT]
+            for word in chunk.dictionary.to_pylist()
+        ]
         found += [None if code is None else words[code] for code in chunk.indices.to_pylist()]
     return found
 

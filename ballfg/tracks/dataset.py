@@ -9,7 +9,7 @@ from os import PathLike
 from pathlib import Path
 from typing import Final
 
-from ballfg.checks import shown
+from ballfg.checks import check_path, shown
 from ballfg.files.whole_folder import of_one_state
 from ballfg.tracks.checks import Findings, check_scale, tidy
 from ballfg.tracks.detections_file import DETECTIONS_FILE
@@ -140,7 +140,7 @@ def read_dataset(folder: str | PathLike[str]) -> Dataset:
         FileNotFoundError: the folder or one of its files is missing.
         ValueError: the content breaks a rule; the message names file, line, column and remedy.
     """
-    path = Path(folder)
+    path = check_path("folder", folder)
     source = _open_source(path)
     info, notes = read_info(path / INFO_FILE)
     notes += [f"{source.path.name}: column {shown(name)} ignored" for name in source.ignored]

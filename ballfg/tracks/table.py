@@ -5,7 +5,6 @@ import io
 import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -15,7 +14,7 @@ import pyarrow.csv as pa_csv
 import pyarrow.parquet as pq
 from numpy.typing import ArrayLike
 
-from ballfg.checks import shown
+from ballfg.checks import check_path, shown
 from ballfg.files.spreadsheet import NUMBER, QUOTED, guarded
 from ballfg.files.whole_file import check_file, whole_file
 
@@ -40,7 +39,7 @@ class TableWriter:
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
-        self.path = Path(path)
+        self.path = check_path("path", path)
         if self.path.suffix.lower() not in ENDINGS:
             raise ValueError(
                 f"path must end in {' or '.join(ENDINGS)}; got {str(path)!r}. Choose the format by the ending."

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import yaml
 
-from ballfg.checks import check_keys, did_you_mean, is_number, listed, shown
+from ballfg.checks import check_keys, check_path, did_you_mean, is_number, listed, shown
 from ballfg.files.file_storage import ENDINGS, Tree, number, numbers, read_storage
 from ballfg.files.strict_yaml import mapping, read_mapping
 from ballfg.files.whole_file import whole_file, write_text
@@ -45,7 +45,7 @@ def read_cameras(path: str | PathLike[str], *, posed: bool = True) -> list[Camer
         FileNotFoundError: there is no such file.
         ValueError, TypeError: a field that is missing, not known or wrong; the message names file, camera and field.
     """
-    path = Path(path)
+    path = check_path("path", path)
     if not path.is_file():
         raise FileNotFoundError(f"{path}: must be a file with cameras; there is none. Correct the path.")
     try:

@@ -1,5 +1,6 @@
 """Images of files: their size is read from the header, and bounded, before anything is decoded."""
 
+import warnings
 from pathlib import Path
 from typing import Final
 
@@ -34,18 +35,17 @@ def read_image(path: Path, flags: int) -> Image:
 
 def _check_size(path: Path) -> None:
     try:
-        with Header.open(path, formats=FORMATS) as header:
-            sizes = [header.size]
-            tags = getattr(header, "tag_v2", {})
-            if all(tag in tags for tag in _TILES):
-                sizes.append(tuple(int(tags[tag]) for tag in _TILES))
-    except Header.DecompressionBombError as error:
-        raise ValueError(f"image {path} must be smaller; {one_line(error)}. Scale it down.") from None
-    except OSError as error:
-        if error.errno is not None:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Header.DecompressionBombWarning)  # our own bound is lower
+            with Header.open(path, formats=FORMATS) as header:
+                sizes = [header.size]
+                tags = getattr(header, "tag_v2", {})
+                if all(tag in tags for tag in _TILES):
+                    sizes.append((int(tags[_TILES[0]]), int(tags[_TILES[1]])))
+    except Exception as error:  # of any class: the header is damaged, or of a size that Pillow refuses
+        if isinstance(error, OSError) and error.errno is not None:
             raise
-        raise ValueError(f"image {path} must be readable; its header is not. Write it again or remove it.") from None
-    except Exception as error:  # of any class: the header is damaged
-        raise ValueError(f"image {path} must be readable; {one_line(error)}. Write it again or remove it.") from None
+        why = one_line(error) if isinstance(error, Header.DecompressionBombError) else "its header is not"
+        raise ValueError(f"image {path} must be readable; {why}. Write it again or remove it.") from None
     for width, height in sizes:
         check_pixels(path, width, height)

@@ -47,13 +47,13 @@ def _watch(command: subprocess.Popen[bytes]) -> tuple[float, float]:
     """Peak memory in MB of a running command and of the largest of its children."""
     parent = worker = 0.0
     while command.poll() is None:
-        parent = max(parent, _peak(command.pid))
-        worker = max([worker, *(_peak(child) for child in _children(command.pid))])
+        parent = max(parent, peak_of(command.pid))
+        worker = max([worker, *(peak_of(child) for child in children_of(command.pid))])
         time.sleep(LOOK_EVERY)
     return parent, worker
 
 
-def _peak(pid: int) -> float:
+def peak_of(pid: int) -> float:
     """VmHWM in MB; 0 for a process that has ended."""
     try:
         found = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text(encoding="ascii"))
@@ -62,7 +62,8 @@ def _peak(pid: int) -> float:
     return int(found[1]) / 1024 if found else 0.0
 
 
-def _children(pid: int) -> list[int]:
+def children_of(pid: int) -> list[int]:
+    """The processes that a process has started and that live; none of one that has ended."""
     try:
         return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text(encoding="ascii").split()]
     except (FileNotFoundError, ProcessLookupError):

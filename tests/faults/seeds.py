@@ -47,13 +47,18 @@ noise: {position: [0.003, 0.004, 0.005], memory: [0.001, 0, 0.002], coefficients
 def write_seeds(folder: Path) -> None:
     """Writes `folder/<reader>/...` for every reader of `tests.faults.readers`."""
     shots = [one.track for one in simulate(SimulationConfig(2, rate=120.0, seed=3))]
-    for name, write in _WRITERS.items():
-        (folder / name).mkdir(parents=True)
-        write(folder / name)
+    for name in _WRITERS:
+        write_reader(folder, name)
     for form in FORMS:
         place = folder / f"import_{form.__name__}"
         place.mkdir()
         form(place, shots)
+
+
+def write_reader(folder: Path, name: str) -> None:
+    """Writes the good files of one reader. Args: folder: of all readers.  name: of a reader."""
+    (folder / name).mkdir(parents=True)
+    _WRITERS[name](folder / name)
 
 
 def _dataset(folder: Path) -> None:

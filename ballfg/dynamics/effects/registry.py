@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import Final
 
+from ballfg.checks import check_path
 from ballfg.dynamics.effect import Effect, Kind
 from ballfg.dynamics.effects import bounce, flight, generic, measurement
 from ballfg.dynamics.effects.checks import BASES, REMEDY, check_effect
@@ -87,7 +88,7 @@ def load_effects(path: str | Path) -> tuple[type[Effect], ...]:
         FileNotFoundError: if there is no such file.
         ValueError: if it is no Python, does not run, defines no effect, or one that `register` refuses.
     """
-    path = Path(path).resolve()
+    path = check_path("path", path).resolve()
     if not path.is_file():
         raise FileNotFoundError(f"effects file {path} does not exist; effects of one's own are one Python file.")
     module = run_file(path, "effects")

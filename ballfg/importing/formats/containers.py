@@ -12,7 +12,7 @@ import numpy as np
 from ballfg.checks import listed, shown
 from ballfg.files.damaged import FREE, NUMBER, check_count, check_unpacked, library_reads
 from ballfg.importing.formats.nested import nested_tables
-from ballfg.importing.formats.raw import MAX_COLUMNS, RawTable, table_of
+from ballfg.importing.formats.raw import RawTable, table_of
 from ballfg.importing.formats.text_files import text_table
 
 MAX_DEPTH: Final = 40
@@ -31,7 +31,6 @@ def read_parquet(path: Path) -> list[RawTable]:
     from ballfg.files.parquet import open_parquet
 
     with library_reads(path, "Parquet"), open_parquet(path) as file:
-        check_count(path, "columns", file.metadata.num_columns, MAX_COLUMNS)
         table = file.read(use_threads=False).flatten()
         check_unpacked(path, sum(_copied(chunk) for column in table.columns for chunk in column.chunks))
         columns = _columns(pa, table)
@@ -192,7 +191,7 @@ class _Group:
     def __init__(self, h5py: Any, path: Path) -> None:
         self._h5py, self._path = h5py, path
         self._size = 0
-        self._seen: set[int] = set()
+        self._seen: set[int | None] = set()
 
     def content(self, group: Any, depth: int) -> dict[str, Any]:
         """Arrays and numbers of a group, by name."""
@@ -202,13 +201,11 @@ class _Group:
                 content[key] = value
         if depth > MAX_DEPTH:
             raise ValueError(f"{self._path}: groups must be nested at most {MAX_DEPTH} deep. Write it flatter.")
+        check_count(self._path, "groups and datasets", len(self._seen) + len(group), MAX_MEMBERS)
         for key in group:
-            link = group.get(key, getlink=True)
-            if isinstance(link, self._h5py.ExternalLink):
-                raise ValueError(f"{self._path} must hold its data itself; {shown(key)} is a link to another file.")
-            value = group.get(key)  # None where a link leads nowhere
-            if value is None or self._is_known(value):
+            if self._is_known(group, key):
                 continue
+            value = group.get(key)  # None where a link leads nowhere
             if isinstance(value, self._h5py.Group):
                 if not key.startswith("#"):  # MATLAB keeps the parts of cells there
                     content[key] = self.content(value, depth + 1)
@@ -216,12 +213,20 @@ class _Group:
                 content[key] = self._data(key, value)
         return content
 
-    def _is_known(self, value: Any) -> bool:
-        """Whether another link has led there: two links in each of 40 groups would be 2^40 ways."""
-        place = self._h5py.h5o.get_info(value.id).addr
+    def _is_known(self, group: Any, key: str) -> bool:
+        """Whether another link has led there: two links in each of 40 groups would be 2^40 ways.
+
+        Raises: ValueError: a link to another file.
+        """
+        link = group.id.links.get_info(key.encode("utf-8", "surrogateescape"))
+        if link.type not in (self._h5py.h5l.TYPE_HARD, self._h5py.h5l.TYPE_SOFT):
+            raise ValueError(f"{self._path} must hold its data itself; {shown(key)} is a link to another file.")
+        place = link.u
+        if link.type == self._h5py.h5l.TYPE_SOFT:
+            value = group.get(key)
+            place = None if value is None else self._h5py.h5o.get_info(value.id).addr
         known = place in self._seen
         self._seen.add(place)
-        check_count(self._path, "groups and datasets", len(self._seen), MAX_MEMBERS)
         return known
 
     def _data(self, key: str, value: Any) -> Any:

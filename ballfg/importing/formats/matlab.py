@@ -3,24 +3,53 @@
 import pickle
 import subprocess
 import sys
+import zlib
 from pathlib import Path
-from typing import Any
+from struct import unpack
+from typing import Any, Final
 
 from ballfg.files.damaged import check_unpacked, library_reads, most_unpacked
 from ballfg.importing.formats.containers import read_hdf5
 from ballfg.importing.formats.nested import nested_tables
 from ballfg.importing.formats.raw import RawTable
 
+_HEADER: Final = 128
+"""Bytes before the first variable; the last two tell the order of bytes."""
+_COMPRESSED: Final = 15
+"""The kind of a variable that is packed."""
+_BLOCK: Final = 1 << 20
+
 
 def read_matlab(path: Path) -> list[RawTable]:
     """The tables of a MATLAB file of any version. Raises: ValueError: not one, or version 7.3 without h5py."""
     with library_reads(path, "MATLAB"):
+        _check_packed(path)
         outcome, content = _in_a_process(path)
         if outcome == "error":
             raise ValueError(content)
     if outcome == "too large":
         check_unpacked(path, content)
     return read_hdf5(path) if outcome == "hdf5" else nested_tables(content, path.stem, str(path))
+
+
+def _check_packed(path: Path) -> None:
+    """Counts what the variables of a file of version 5 unpack to, which its structures do not say.
+
+    Source: MathWorks, MAT-File Format, level 5. Raises: ValueError: more than the file may.
+    """
+    with path.open("rb") as file:
+        order = {b"IM": "<II", b"MI": ">II"}.get(file.read(_HEADER)[-2:])
+        size = 0
+        while order and len(tag := file.read(8)) == 8:
+            kind, length = unpack(order, tag)
+            if kind != _COMPRESSED:
+                file.seek(length, 1)
+                continue
+            packed, inflate = file.read(length), zlib.decompressobj()
+            while packed and not inflate.eof:
+                size += len(inflate.decompress(packed, _BLOCK))
+                check_unpacked(path, size)
+                packed = inflate.unconsumed_tail
 
 
 def _in_a_process(path: Path) -> tuple[str, Any]:

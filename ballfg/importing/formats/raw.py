@@ -8,7 +8,8 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from ballfg.checks import shown
+from ballfg.checks import MAX_TEXT, shown
+from ballfg.files.damaged import MAX_COLUMNS
 
 Column = NDArray[Any]
 """(n,) int64, float64 or object (text)."""
@@ -33,8 +34,6 @@ MISSING: Final = (
 """What files write, in lower case, where a number is missing."""
 WITH_UNIT: Final = re.compile(r"^\s*([-+]?(?:\d++\.?\d*+|\.\d++)(?:[eE][-+]?\d++)?)\s*([^\W\d_]{1,3})\s*$")
 """A number with its unit, such as 12.5 mm."""
-MAX_COLUMNS: Final = 10_000
-"""Of a table. Marker systems write some hundred."""
 _MOSTLY: Final = 0.5
 """Share of a column's cells that must be numbers, where it is taken for one of numbers."""
 
@@ -139,7 +138,8 @@ def _cell(value: Any) -> str:
         return ""
     if isinstance(value, bytes):
         return value.decode("utf-8", "replace").strip()
-    return value.isoformat() if hasattr(value, "isoformat") else str(value).strip()
+    text = value if isinstance(value, str) else value.isoformat() if hasattr(value, "isoformat") else str(value)
+    return (text if len(text) <= MAX_TEXT else text[:MAX_TEXT]).strip()
 
 
 def _from_text(label: str, cells: list[str]) -> tuple[Column, str, Column | None]:

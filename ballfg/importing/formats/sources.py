@@ -7,8 +7,8 @@ from os import PathLike
 from pathlib import Path
 from typing import Any, Final
 
-from ballfg.checks import shown
-from ballfg.files.json_file import MAX_VALUES, has_too_many, parse_json
+from ballfg.checks import check_path, shown
+from ballfg.files.json_file import TOO_MANY, has_too_many, parse_json
 from ballfg.importing.formats.containers import read_bag, read_excel, read_hdf5, read_npz, read_parquet
 from ballfg.importing.formats.matlab import read_matlab
 from ballfg.importing.formats.nested import nested_tables
@@ -40,7 +40,7 @@ def tables_of(data: Any, topic: str | None = None, key: str | None = None) -> li
     if isinstance(data, str | PathLike):
         data = [data]
     if isinstance(data, list | tuple) and data and all(isinstance(one, str | PathLike) for one in data):
-        found = [table for path in data for table in _of_path(Path(path), topic)]
+        found = [table for path in data for table in _of_path(check_path("source", path), topic)]
         name = ", ".join(str(path) for path in data)
     else:
         found, name = nested_tables(data, "", "data"), "data"
@@ -114,7 +114,7 @@ def _of_file(path: Path, topic: str | None) -> list[RawTable]:
 def _json(path: Path, text: str) -> list[RawTable]:
     """The tables of a JSON file, or of one with a JSON value on each line."""
     if has_too_many(text):
-        raise ValueError(f"{path} must hold at most {MAX_VALUES} names and values. Split it, or write CSV or Parquet.")
+        raise ValueError(f"{path} is too large for JSON: {TOO_MANY}. Split it, or write CSV or Parquet.")
     try:
         content = parse_json(text)
     except json.JSONDecodeError as error:

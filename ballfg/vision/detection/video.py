@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from ballfg.arrays import Array
-from ballfg.checks import listed, shown
+from ballfg.checks import check_path, listed, shown
 from ballfg.files.damaged import check_pixels
 from ballfg.tracks import csv_files
 from ballfg.tracks.checks import check_step
@@ -163,10 +163,10 @@ def open_video(path: str | PathLike[str], stamps: str | PathLike[str] | None = N
     Raises:
         FileNotFoundError: nothing is there. ValueError: it cannot be decoded, is empty, or the stamps do not fit.
     """
-    place = Path(path)
+    place = check_path("video", path)
     if not place.exists():
         raise FileNotFoundError(f"video {place} does not exist. Check the path.")
-    times = None if stamps is None else read_stamps(Path(stamps))
+    times = None if stamps is None else read_stamps(check_path("stamps", stamps))
     if place.is_file():
         return VideoFile(place, times)
     if times is None:

@@ -1,0 +1,187 @@
+"""Files that are small and unpack to much, or have no end: each must be refused within 2 s and 300 MB.
+
+    python -m tests.faults.bombs              every bomb; --only parquet: those whose name begins so
+
+Each bomb is read as the commands read it, in a process of its own that has imported the program and read good files.
+Time is that of the reading alone, on the wall. Memory is the largest that the process took beyond what it had before,
+and all that processes took which it started. The exit status is 1 where a bomb was read, or cost more.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import select
+import shutil
+import signal
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ballfg.benchmarks.speed.memory import children_of, peak_of
+from ballfg.collector import collect_rarely
+from ballfg.files.weights import read_tensors
+from ballfg.importing import Choices, propose
+from ballfg.vision.calibration.boards import read_grey
+from tests.faults.bombs_of_arrays import ARRAYS
+from tests.faults.bombs_of_others import OTHERS
+from tests.faults.bombs_of_tables import TABLES
+from tests.faults.readers import reader_of
+from tests.faults.seeds import write_reader
+from tests.faults.worker import verdict
+
+SECONDS = 2.0
+MEMORY = 300e6
+"""Bytes."""
+LOOK_EVERY = 0.01
+"""s between looks at the processes that a reader starts."""
+GIVEN_UP = 60
+"""s after which a reading is ended."""
+BOMBS = TABLES | ARRAYS | OTHERS
+"""By name, which begins with the format: the reader, the file in the folder of that reader, and what writes it."""
+FREE_STANDING: dict[str, Callable[[Path], object]] = {
+    "import": lambda file: propose(file, Choices()),
+    "boards": read_grey,
+    "weights": read_tensors,
+}
+"""Readers of one file, which need no other files beside it."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a reading ended.
+
+    Attributes:
+        outcome: read, refused or fault.  words: of the refusal.
+        seconds: on the wall.  memory: bytes, at most, beyond those before.
+    """
+
+    outcome: str
+    words: str
+    seconds: float
+    memory: float
+
+    @property
+    def good(self) -> bool:
+        """Whether the bomb was refused in time and within its memory."""
+        return self.outcome == "refused" and self.seconds <= SECONDS and self.memory <= MEMORY
+
+
+def run(names: Iterable[str], folder: Path) -> dict[str, Outcome]:
+    """Writes and reads bombs. Args: names: of `BOMBS`.  folder: to write to. Returns: outcomes by name."""
+    names = list(names)
+    readers = sorted({BOMBS[name][0] for name in names} - set(FREE_STANDING))
+    seeds = folder / "seeds"
+    in_a_process(lambda: [write_reader(seeds, reader) for reader in readers])
+    warnings.simplefilter("ignore")
+    collect_rarely()  # as the program does
+    _warm(seeds, readers)
+    found = {}
+    for name in names:
+        place = folder / "case"
+        if BOMBS[name][0] in FREE_STANDING:
+            place.mkdir()
+        else:
+            shutil.copytree(seeds / BOMBS[name][0], place, symlinks=True)
+        file = place / BOMBS[name][1]
+        file.parent.mkdir(exist_ok=True)
+        in_a_process(lambda file=file, name=name: BOMBS[name][2](file))  # type: ignore[misc]
+        found[name] = measured(lambda place=place, file=file, name=name: _read(name, place, file), str(place))  # type: ignore[misc]
+        shutil.rmtree(place)
+    return found
+
+
+def measured(read: Callable[[], object], place: str) -> Outcome:
+    """How a reading ends in a process of its own. Args: place: a path that messages must name."""
+    ours, theirs = os.pipe()
+    child = os.fork()
+    if not child:
+        os.close(ours)
+        signal.alarm(GIVEN_UP)
+        nowhere = os.open(os.devnull, os.O_RDWR)
+        for stream in (0, 1, 2):
+            os.dup2(nowhere, stream)
+        before, begun = _resident(), time.perf_counter()
+        outcome, words = verdict(read, (place,))
+        seconds = time.perf_counter() - begun
+        peak = 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        os.write(theirs, json.dumps([outcome, words[:1000], seconds, peak - before]).encode())
+        os._exit(0)
+    os.close(theirs)
+    started = 0.0
+    with os.fdopen(ours, "rb") as answer:
+        while not select.select([answer], [], [], LOOK_EVERY)[0]:
+            started = max([started, *map(peak_of, children_of(child))])
+        said = answer.read()
+    status = os.waitpid(child, 0)[1]
+    if said:
+        outcome, words, seconds, memory = json.loads(said)
+        return Outcome(outcome, words, seconds, memory + 1e6 * started)
+    return Outcome("fault", f"ended by signal {os.WTERMSIG(status)}", float(GIVEN_UP), 0.0)
+
+
+def in_a_process(work: Callable[[], object]) -> None:
+    """Runs something whose memory and threads must not be there when this process forks. Raises: RuntimeError."""
+    child = os.fork()
+    if not child:
+        status = 1
+        try:
+            work()
+            status = 0
+        finally:
+            sys.stderr.flush()
+            os._exit(status) if status == 0 else None
+    if os.waitpid(child, 0)[1]:
+        raise RuntimeError("a file could not be written")
+
+
+def _read(name: str, place: Path, file: Path) -> object:
+    reader = BOMBS[name][0]
+    if reader in FREE_STANDING:
+        return FREE_STANDING[reader](place / file.relative_to(place).parts[0])
+    return reader_of(reader).read(place, file)
+
+
+def _warm(seeds: Path, readers: Iterable[str]) -> None:
+    """What readers import on their first call is no part of a bomb."""
+    for library in ("openpyxl", "h5py", "rosbags.highlevel", "PIL.ImageFile", "scipy.io", "sqlite3", "lz4.frame"):
+        __import__(library)
+    for reader in readers:
+        for file in sorted(one for one in (seeds / reader).rglob("*") if one.is_file())[:1]:
+            reader_of(reader).read(seeds / reader, file)
+
+
+def _resident() -> int:
+    """Bytes of memory that this process has."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize()
+
+
+def main() -> int:
+    """Runs from the command line. Returns: 1 where a bomb went off."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="", help="names of bombs begin so")
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        found = run([name for name in BOMBS if name.startswith(options.only)], Path(folder))
+    for name, one in found.items():
+        mark = "" if one.good else "  <- not refused in time"
+        print(f"{name:<44} {one.outcome:<8} {one.seconds:6.2f} s {one.memory / 1e6:6.0f} MB  {one.words[:90]}{mark}")
+    good = sum(one.good for one in found.values())
+    formats = len({name.split("/")[0] for name in found})
+    worst = max(found.values(), key=lambda one: one.seconds), max(found.values(), key=lambda one: one.memory)
+    print(
+        f"{good} of {len(found)} bombs of {formats} formats refused within {SECONDS:g} s and {MEMORY / 1e6:g} MB; "
+        f"the slowest took {worst[0].seconds:.2f} s, the largest {worst[1].memory / 1e6:.0f} MB"
+    )
+    return 0 if good == len(found) else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
