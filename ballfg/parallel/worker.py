@@ -61,6 +61,8 @@ def _answer(name: str, content: bytes, chunk: bytes, versions: dict[str, str]) -
 def _packed(error: BaseException) -> bytes:
     """An exception that can be raised elsewhere, with the lines in which it was raised here."""
     lines = "".join(traceback.format_exception(error))
+    if not isinstance(error, Exception):  # raised elsewhere it would end more than this work
+        error = ChildProcessError(f"work must return or raise; it left by {type(error).__name__}. Mend its code.")
     error.add_note(f"raised in another process:\n{lines}")
     try:
         content = packed(error)

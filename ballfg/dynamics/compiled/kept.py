@@ -127,7 +127,7 @@ class _Trusted:
         return found if found is not None and _is_trusted(Path(found.get_cache_path())) else None
 
 
-WRITTEN: Final = [_Trusted(locator) for locator in (*CompileResultCacheImpl._locator_classes, _Temporary)]
+WRITTEN: Final[list[Any]] = [_Trusted(locator) for locator in (*CompileResultCacheImpl._locator_classes, _Temporary)]
 READ: Final[list[Any]] = [_Beside]
 
 
@@ -199,7 +199,8 @@ def _stamp(file: str) -> str:
         path = waiting.pop()
         if path not in found:
             found[path], imported = _read(path)
-            waiting += [path for name in imported if (path := getattr(sys.modules.get(name), "__file__", None))]
+            files = (getattr(sys.modules.get(name), "__file__", None) for name in imported)
+            waiting += [each for each in files if each is not None]
     return _digest(b"".join(found[path] for path in sorted(found))).hex()
 
 
