@@ -15,6 +15,8 @@ from ballfg.prediction import Crossing
 from ballfg.state import POSITION, SPIN, VELOCITY
 
 Fields = dict[str, Any]
+KINDS = ("state", "newcomer", "lost", "refused", "continued")
+"""Of lines; the last one stands where a command went on with the recording of an earlier one."""
 
 
 def answer(update: BallUpdate, outlook: Outlook | None, tag: tuple[tuple[str, Any], ...]) -> Fields:

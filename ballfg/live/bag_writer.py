@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +10,9 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.online.state import OnlineState
-from ballfg.files.whole_file import whole_file
+from ballfg.live.mcap import Chunk, Message, Topic, chunk_of, ending, opening, whole_chunks
 from ballfg.live.outlook import Outlook, unusable
+from ballfg.live.recording import Recording, refuse_repeated, refused, say_continued
 from ballfg.live.sources.bag import need_rosbags
 from ballfg.live.tracker import BallUpdate
 from ballfg.state import POSITION, SPIN, VELOCITY
@@ -21,57 +20,93 @@ from ballfg.state import POSITION, SPIN, VELOCITY
 FRAME = "world"
 STATES = "/ball/odometry"
 PATHS = "/ball/path"
+TOPICS = ((STATES, "nav_msgs/msg/Odometry"), (PATHS, "nav_msgs/msg/Path"))
+LATEST = 2.1e9
+"""s; later stamps have no place in a message of ROS, whose seconds have 32 bits."""
 UNKNOWN = 1e6
 """rad^2, variance of an orientation: a ball's is not estimated."""
 
 
-@contextmanager
-def bag_writer(out: Path, horizon: float) -> Iterator[BagWriter]:
-    """A writer to an MCAP file, which gets its name when the block ends well.
-
-    Args: out: the file.  horizon: s, of the paths.
-    Raises: ValueError: the package `rosbags` is missing, or `out` is a folder. FileNotFoundError: no such folder.
-    """
-    need_rosbags()
-    from rosbags.rosbag2 import StoragePlugin, Writer
-
-    with whole_file(out) as temporary:
-        bag = temporary.with_name("bag")
-        with Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
-            yield BagWriter(writer, horizon)
-        (written,) = bag.glob("*.mcap")
-        os.replace(written, temporary)
-
-
 class BagWriter:
-    """Writes `nav_msgs/Odometry` for each state and `nav_msgs/Path` for its prediction.
+    """Appends `nav_msgs/Odometry` for each state and `nav_msgs/Path` for its prediction to an MCAP file.
 
-    Args: writer: of rosbags, open.  horizon: s, of the paths.
+    What was written within a second is one chunk, which is in the file then; the end of the file is written when the
+    context ends. A file without it, which a kill leaves, is continued like one with it.
+
+    Args:
+        out: the file.  horizon: s, of the paths.
+        repeats: the input begins at its beginning again, so that it continues nothing.
+    Raises: ValueError: the package `rosbags` is missing, or the file is no bag to continue; and as `Recording`.
     """
 
-    def __init__(self, writer: Any, horizon: float) -> None:
+    def __init__(self, out: Path, horizon: float, repeats: bool = True) -> None:
+        need_rosbags()
         from rosbags.typesys import Stores, get_typestore
 
         self.store = get_typestore(Stores.ROS2_HUMBLE)
-        self.writer = writer
         self.horizon = horizon
-        self._states = writer.add_connection(STATES, "nav_msgs/msg/Odometry", typestore=self.store)
-        self._paths = writer.add_connection(PATHS, "nav_msgs/msg/Path", typestore=self.store)
+        self._opening = opening([Topic(name, kind, self.store.generate_msgdef(kind)[0]) for name, kind in TOPICS])
+        self._chunks: list[Chunk] = []
+        self._messages: list[Message] = []
+        self._turn = threading.Lock()
+        self._recording = Recording(out, self._flush)
+        try:
+            self._continue(repeats)
+        except BaseException:
+            self._recording.__exit__()
+            raise
+
+    def __enter__(self) -> BagWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        with self._recording:
+            self._flush()
+            self._recording.append(ending(self._opening, self._chunks, len(TOPICS)))
+
+    def _continue(self, repeats: bool) -> None:
+        """Make the file end with its last whole chunk."""
+        recording, begin = self._recording, len(self._opening)
+        if recording.size:
+            refuse_repeated(recording.path, repeats)
+        found = recording.read(0, begin)
+        if not self._opening.startswith(found):
+            raise refused(recording.path)
+        if len(found) < begin:
+            recording.cut(0)
+            recording.append(self._opening)
+            return
+        self._chunks = whole_chunks(recording.read, begin, recording.size, len(TOPICS))
+        end, size = self._chunks[-1].end if self._chunks else begin, recording.size
+        ended = recording.read(end, size - end) == ending(self._opening, self._chunks, len(TOPICS))
+        recording.cut(end)
+        say_continued(recording.path, end, 0 if ended else size - end)
+
+    def _flush(self) -> None:
+        """Append what has come since the last chunk."""
+        with self._turn:
+            if self._messages:
+                content, chunk = chunk_of(self._messages, len(TOPICS), self._recording.size)
+                self._messages = []
+                self._recording.append(content)
+                self._chunks.append(chunk)
 
     def see(self, update: BallUpdate, outlook: Outlook | None) -> None:
         """Write a state and its prediction."""
         state = update.state
-        if update.kind != "state" or state is None:
+        if update.kind != "state" or state is None or abs(state.time) > LATEST:
             return
-        self._write(self._states, self._odometry(state, f"ball_{update.ball}"), state.time)
+        self._write(1, self._odometry(state, f"ball_{update.ball}"), state.time)
         if outlook is not None and not outlook.note and not unusable(state):
             ahead = state.predict(self.horizon)
             times = np.concatenate(([state.time], ahead.times))
-            self._write(self._paths, self._path(times, np.vstack((state.position, ahead.positions))), state.time)
+            self._write(2, self._path(times, np.vstack((state.position, ahead.positions))), state.time)
+        self._recording.check()
 
-    def _write(self, connection: Any, message: Any, time: float) -> None:
-        data = self.store.serialize_cdr(message, message.__msgtype__)
-        self.writer.write(connection, max(round(1e9 * time), 0), data)
+    def _write(self, channel: int, message: Any, time: float) -> None:
+        data = bytes(self.store.serialize_cdr(message, message.__msgtype__))
+        with self._turn:
+            self._messages.append(Message(channel, max(round(1e9 * time), 0), data))
 
     def _odometry(self, state: OnlineState, name: str) -> Any:
         types = self.store.types

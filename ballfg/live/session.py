@@ -121,7 +121,8 @@ class Session:
         yield str(self.latencies)
         yield (
             f"{counts.positions} positions, {counts.balls} balls; {counts.late} late, {counts.old} too old, "
-            f"{counts.repeated} repeated, {counts.malformed + self.malformed} malformed, {self.inbox.dropped} dropped"
+            f"{counts.repeated} repeated, {counts.malformed + self.malformed} malformed, "
+            f"{self.inbox.dropped + self.inbox.source.lost} dropped"
         )
         rare = {
             "stamps astray": counts.stray,

@@ -161,6 +161,8 @@ def test_a_closed_pipe_ends_it_cleanly(dataset: Path) -> None:
         (["--noise", "3"], "noise must be in m, at most 1; got 3. It is probably in mm"),
         (["--topic", "/ball"], "topic must come with a bag to replay"),
         (["--out", "nowhere/states.jsonl"], "out must be in an existing folder"),
+        (["--out", "states.db3"], "out must be JSON lines or a bag in MCAP; got states.db3"),
+        (["--idle", "0"], "idle must be finite and above 0"),
         (["--model", "nowhere.yaml"], "model file nowhere.yaml does not exist"),
     ],
 )

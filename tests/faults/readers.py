@@ -21,7 +21,7 @@ from ballfg.learning.config.config_file import read_config
 from ballfg.learning.run.checkpoint import read_checkpoint
 from ballfg.learning.run.metrics import read_metrics
 from ballfg.learning.sequence.predictor import SequencePredictor
-from ballfg.live.sources.source import LineBuffer
+from ballfg.live.sources.sender import Sender
 from ballfg.pages import collect, recognise, show_page
 from ballfg.simulation.balls import ball_kind
 from ballfg.simulation.scene.writing import earlier_files
@@ -74,8 +74,10 @@ def _detections(folder: Path, file: Path) -> object:
 
 def _live(folder: Path, file: Path) -> object:
     """A line that cannot be used is reported, never raised."""
-    buffer = LineBuffer()
-    arrivals = [*buffer.feed(file.read_bytes()), *buffer.end()]
+    sender, arrivals = Sender(), []
+    sender.waiting.extend((line.read, line.content) for line in sender.cut(file.read_bytes(), last=True))
+    while sender.busy:
+        arrivals += sender.take()
     wrong = [one.problem for one in arrivals if one.sample is None and not (one.problem and one.problem.isprintable())]
     if wrong:
         raise RuntimeError(f"a problem must be one line: {wrong[0]!r}")

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ballfg.live import BallUpdate, Tracker
-from ballfg.live.bag_writer import PATHS, STATES, bag_writer
+from ballfg.live import BallUpdate, Tracker, recording
+from ballfg.live.bag_writer import PATHS, STATES, BagWriter
 from ballfg.live.outlook import Outlook
 from ballfg.live.sources.bag import bag_samples
 from tests.live.shots import SURFACES, ball_model, ball_settings, rows, shots
@@ -25,7 +27,7 @@ def updates() -> list[BallUpdate]:
 @pytest.fixture(scope="module")
 def bag(updates: list[BallUpdate], tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("bags") / "states.mcap"
-    with bag_writer(out, horizon=0.1) as writer:
+    with BagWriter(out, horizon=0.1) as writer:
         for update in updates:
             writer.see(update, Outlook() if update is updates[-1] else Outlook(note="not wanted"))
     assert [path.name for path in out.parent.iterdir()] == ["states.mcap"]
@@ -60,6 +62,84 @@ def test_velocity_spin_and_the_path_are_in_the_messages(bag: Path, updates: list
     ahead = state.predict(0.1)
     assert len(path.poses) == len(ahead.times) + 1
     assert path.poses[-1].pose.position.x == pytest.approx(ahead.positions[-1, 0], abs=1e-9)
+
+
+def positions_of(bag: Path) -> list[list[list[float]]]:
+    return [sample.positions for sample in bag_samples(bag, STATES)]
+
+
+def test_a_bag_cut_anywhere_is_read_and_continued(
+    updates: list[BallUpdate], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Chunks of one, two, ... states, cut at each of many places: what was whole is read, and stays for ever."""
+    states = [update for update in updates if update.state is not None]
+    whole, ends = tmp_path / "whole.mcap", []
+    with BagWriter(whole, horizon=0.1) as writer:
+        begin = whole.stat().st_size
+        for k in range(1, 5):
+            for update in states[k * (k - 1) // 2 : k * (k + 1) // 2]:
+                writer.see(update, Outlook())
+            writer._flush()
+            ends.append(whole.stat().st_size)
+    content, expected = whole.read_bytes(), positions_of(whole)
+    assert len(expected) == 10
+    places = [*range(0, begin, 997), *range(begin, len(content), 701), *ends, ends[-1] - 1, len(content) - 1]
+    for place in places:
+        cut = tmp_path / "cut.mcap"
+        cut.write_bytes(content[:place])
+        chunks = sum(place >= end for end in ends)
+        kept = expected[: chunks * (chunks + 1) // 2]
+        if place >= begin:
+            assert positions_of(cut) == kept
+            assert cut.stat().st_size == place, "a reader must not write"
+        with BagWriter(cut, horizon=0.1, repeats=False) as writer:
+            writer.see(states[10], None)
+        assert positions_of(cut) == [*kept, [states[10].state.position.tolist()]]
+    with BagWriter(whole, horizon=0.1, repeats=False) as writer:
+        capsys.readouterr()
+        writer.see(states[10], None)
+    assert positions_of(whole) == [*expected, [states[10].state.position.tolist()]]
+    assert whole.read_bytes().startswith(content[: ends[-1]])
+
+
+def test_a_bag_is_continued_only_if_it_is_one_of_this_command(bag: Path, tmp_path: Path) -> None:
+    from rosbags.rosbag2 import StoragePlugin, Writer
+
+    with Writer(tmp_path / "other", version=9, storage_plugin=StoragePlugin.MCAP):
+        pass
+    other = tmp_path / "other" / "other.mcap"
+    before = other.read_bytes()
+    with pytest.raises(ValueError, match="out must be a new file or a recording of ballfg live"):
+        BagWriter(other, 0.1, repeats=False)
+    assert other.read_bytes() == before
+    before = bag.read_bytes()
+    with pytest.raises(ValueError, match="out must be a new file for a replay"):
+        BagWriter(bag, 0.1)
+    assert bag.read_bytes() == before
+
+
+def test_states_reach_a_bag_while_nothing_more_comes(
+    updates: list[BallUpdate], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out = tmp_path / "states.mcap"
+    monkeypatch.setattr(recording, "EVERY", 0.05)
+    with BagWriter(out, horizon=0.1) as writer:
+        writer.see(updates[-1], None)
+        deadline = time.monotonic() + 20.0
+        while not positions_of(out):
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+        assert len(positions_of(out)) == 1
+    assert len(positions_of(out)) == 1
+
+
+def test_a_stamp_that_no_message_holds_is_left_out(updates: list[BallUpdate], tmp_path: Path) -> None:
+    state = updates[-1].state
+    assert state is not None
+    with BagWriter(tmp_path / "states.mcap", horizon=0.1) as writer:
+        for time_ in (1e18, 2.0**31, -1e300):
+            writer.see(replace(updates[-1], state=replace(state, time=time_)), None)
+    assert positions_of(tmp_path / "states.mcap") == []
 
 
 def test_bags_and_topics_that_are_not_there_are_named(bag: Path, tmp_path: Path) -> None:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from ballfg import progress
 from ballfg.cli import inputs
-from ballfg.progress import idle
 
 if TYPE_CHECKING:
     from ballfg.dynamics import BallModel, Surfaces
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from ballfg.live.sources.source import Inbox, Source
     from ballfg.tracks import Dataset
 
-BAG_ENDINGS = (".mcap", ".db3")
+MCAP, SQLITE = ".mcap", ".db3"
 
 
 def live(
@@ -34,8 +34,12 @@ def live(
         Path | None, typer.Option(help="Dataset, or rosbag2 / MCAP, to replay in place of standard input.")
     ] = None,
     listen: Annotated[
-        str | None, typer.Option(help="Take lines from tcp://HOST:PORT or udp://HOST:PORT, not from standard input.")
+        str | None,
+        typer.Option(help="Take lines from tcp://HOST:PORT or udp://HOST:PORT; without HOST of this machine."),
     ] = None,
+    idle: Annotated[
+        float, typer.Option(help="A TCP sender that has sent no line for so long is dropped, s.", show_default="300")
+    ] = 300.0,
     speed: Annotated[float, typer.Option(help="Speed of a replay: 1 is real time, 0 as fast as possible.")] = 1.0,
     topic: Annotated[str | None, typer.Option(help="Topic of positions in a bag.")] = None,
     plane: Annotated[str | None, typer.Option(help="Plane whose crossing is predicted, such as x=2.0 (m).")] = None,
@@ -53,7 +57,9 @@ def live(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option(help="JSON lines, or .mcap for ROS 2 messages.", show_default="standard output"),
+        typer.Option(
+            help="Recording to begin or continue: JSON lines, or .mcap for ROS 2.", show_default="standard output"
+        ),
     ] = None,
     viewer: Annotated[bool, typer.Option("--viewer", help="Show it live in rerun (extra: viewer).")] = False,
     effects_file: inputs.EffectsFiles = None,
@@ -79,24 +85,39 @@ def live(
     )
     if replay is not None and listen is not None:
         raise ValueError(f"listen must stand alone; got it with --replay {replay}. Leave one of them out.")
+    if out is not None:
+        _check_out(out)
     inputs.know_effects(effects_file)
     bag = replay is not None and _is_bag(replay)
     data = _dataset(like if bag or replay is None else replay)
     tracker = Tracker(*_scene(data, model, ball, table, noise), lag=lag)
-    with _output(out) as write, _watchers(out, viewer, wanted.horizon) as watchers:
-        source = _source(replay, bag, listen, speed, topic, data)
+    with (
+        contextlib.closing(_source(replay, bag, listen, idle, speed, topic, data)) as source,
+        _output(out, source) as write,
+        _watchers(out, source, viewer, wanted.horizon) as watchers,
+    ):
         warm_up(tracker, wanted)
-        print(f"ballfg live: reading {source.name}", file=sys.stderr, flush=True)
+        trust = f"; {source.trust}" if source.trust else ""
+        print(f"ballfg live: reading {source.name}{trust}", file=sys.stderr, flush=True)
         inbox = Inbox(source)
         session = Session(tracker, inbox, write, wanted, watchers)
-        with idle():  # it waits for lines, and answers them
+        with progress.idle():  # it waits for lines, and answers them
             _run(session, inbox)
     for line in session.summary():
         print(f"ballfg live: {line}", file=sys.stderr)
 
 
+def _check_out(out: Path) -> None:
+    """Refuse what cannot become a recording, before any work. Raises: ValueError; FileNotFoundError: no such folder."""
+    from ballfg.files.whole_file import check_file
+
+    check_file(out)
+    if out.suffix == SQLITE:
+        raise ValueError(f"out must be JSON lines or a bag in MCAP; got {out}. Let its name end in .jsonl or .mcap.")
+
+
 def _is_bag(path: Path) -> bool:
-    return path.suffix in BAG_ENDINGS or (path / "metadata.yaml").is_file()
+    return path.suffix in (MCAP, SQLITE) or (path / "metadata.yaml").is_file()
 
 
 def _dataset(folder: Path | None) -> Dataset | None:
@@ -151,48 +172,58 @@ def _settings(ball: BallModel) -> Settings:
 
 
 def _source(
-    replay: Path | None, bag: bool, listen: str | None, speed: float, topic: str | None, data: Dataset | None
+    replay: Path | None,
+    bag: bool,
+    listen: str | None,
+    idle: float,
+    speed: float,
+    topic: str | None,
+    data: Dataset | None,
 ) -> Source:
+    from ballfg.checks import check_number
     from ballfg.live.sources.bag import bag_samples
     from ballfg.live.sources.replay import Replay, dataset_samples
     from ballfg.live.sources.sockets import listen as listened
     from ballfg.live.sources.source import Pipe
 
+    check_number("idle", idle, "s", above=0.0, limit=1e9)
     if replay is not None and bag:
         return Replay(bag_samples(replay, topic), speed, str(replay))
     if topic is not None:
         raise ValueError(f"topic must come with a bag to replay; got {topic!r} without one. Add --replay BAG.mcap.")
     if replay is not None and data is not None:
         return Replay(dataset_samples(data), speed, str(replay))
-    return Pipe() if listen is None else listened(listen)
+    return Pipe() if listen is None else listened(listen, idle)
 
 
 @contextlib.contextmanager
-def _output(out: Path | None) -> Iterator[Callable[[bytes], None]]:
-    """Where lines are written; a file gets its name when the stream ends."""
-    if out is None or out.suffix == ".mcap":
+def _output(out: Path | None, source: Source) -> Iterator[Callable[[bytes], None]]:
+    """Where lines are written: standard output, a recording, or nowhere beside a bag."""
+    if out is None:
         stream = sys.stdout.buffer
 
         def write(line: bytes) -> None:
             stream.write(line)
             stream.flush()
 
-        yield write if out is None else lambda line: None
-        return
-    from ballfg.files.whole_file import whole_file
+        yield write
+    elif out.suffix == MCAP:
+        yield lambda line: None
+    else:
+        from ballfg.live.recording import lines_recording
 
-    with whole_file(out) as temporary, temporary.open("wb", buffering=0) as file:
-        yield file.write  # type: ignore[misc]
+        with lines_recording(out, source.repeats) as recording:
+            yield recording.append
 
 
 @contextlib.contextmanager
-def _watchers(out: Path | None, viewer: bool, horizon: float) -> Iterator[list[Watcher]]:
+def _watchers(out: Path | None, source: Source, viewer: bool, horizon: float) -> Iterator[list[Watcher]]:
     with contextlib.ExitStack() as stack:
         found: list[Watcher] = []
-        if out is not None and out.suffix == ".mcap":
-            from ballfg.live.bag_writer import bag_writer
+        if out is not None and out.suffix == MCAP:
+            from ballfg.live.bag_writer import BagWriter
 
-            found.append(stack.enter_context(bag_writer(out, horizon)))
+            found.append(stack.enter_context(BagWriter(out, horizon, source.repeats)))
         if viewer:
             from ballfg.live.viewer import Viewer
 

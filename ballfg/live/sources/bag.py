@@ -10,6 +10,7 @@ import numpy as np
 
 from ballfg.checks import listed
 from ballfg.files.damaged import library_reads
+from ballfg.live.mcap import readable
 from ballfg.live.sources.bag_limits import check_bag
 from ballfg.live.sources.lines import Sample
 
@@ -56,7 +57,8 @@ def _opened(bag: Path) -> Any:
     from rosbags.highlevel import AnyReader
     from rosbags.typesys import Stores, get_typestore
 
-    return AnyReader([bag], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+    path = readable(bag) if bag.suffix == ".mcap" else bag
+    return AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
 
 
 def _topic(bag: Path, topic: str | None) -> str:

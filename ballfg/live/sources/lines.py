@@ -11,6 +11,8 @@ from ballfg.files.json_file import parse_json
 
 LONGEST = 65536
 """Bytes of a line; of a longer one the rest is skipped."""
+MOST_POSITIONS = 64
+"""Positions of one stamp: more than are followed. Thousands would keep everybody waiting."""
 COLUMNS = ("t", "x", "y", "z")
 SIGMAS = ("sigma_x", "sigma_y", "sigma_z")
 
@@ -109,6 +111,8 @@ def _of_json(text: str) -> Sample:
     positions = _triples("positions", given)
     if not positions:
         raise ValueError("positions must hold at least one; got none")
+    if len(positions) > MOST_POSITIONS:
+        raise ValueError(f"positions must be at most {MOST_POSITIONS}; got {len(positions)}")
     (time,) = _numbers([content["t"]])
     return Sample(time, positions, _spreads(content.get("sigma"), len(positions)))
 

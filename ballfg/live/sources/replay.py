@@ -7,7 +7,8 @@ from collections.abc import Iterable, Iterator
 from time import perf_counter
 
 from ballfg.live.sources.lines import Sample
-from ballfg.live.sources.source import Arrival
+from ballfg.live.sources.sender import Line, Sender
+from ballfg.live.sources.source import Source
 from ballfg.tracks import Dataset, Track
 from ballfg.tracks.stamps import written
 
@@ -15,13 +16,13 @@ PAUSE = 1.0
 """s between two tracks: longer than a ball may stay unseen."""
 
 
-class Replay:
+class Replay(Source):
     """Samples at their own pace, or a multiple of it.
 
     Args: samples: with their stamps, which the pace follows.  speed: 1 is real time; 0 as fast as they are taken.
     """
 
-    lossy = False
+    repeats = True
 
     def __init__(self, samples: Iterable[Sample], speed: float, name: str) -> None:
         self.samples = samples
@@ -29,19 +30,18 @@ class Replay:
         self.live = speed > 0.0
         self.name = name
 
-    def arrivals(self, stop: threading.Event) -> Iterator[Arrival]:
-        """As `Source.arrivals`."""
+    def lines(self, stop: threading.Event) -> Iterator[Line]:
+        """As `Source.lines`."""
+        sender = Sender()
         begun: tuple[float, float] | None = None
         for sample in self.samples:
+            sender.wait_for_room(stop)
             if self.live:
                 begun = begun or (perf_counter(), sample.time)
                 wait = begun[0] + (sample.time - begun[1]) / self.speed - perf_counter()
                 if wait > 0.0 and stop.wait(wait):
                     return
-            yield Arrival(perf_counter(), sample)
-
-    def close(self) -> None:
-        """Nothing is open."""
+            yield Line(sender, perf_counter(), sample)
 
 
 def dataset_samples(dataset: Dataset) -> Iterator[Sample]:

@@ -1,125 +1,78 @@
-"""Where samples come from: the interface of all sources, standard input, and the queue in which live lines wait."""
+"""Where samples come from: the interface of all sources, standard input, and the inbox in which live lines wait."""
 
 from __future__ import annotations
 
 import os
-import queue
 import stat
 import sys
 import threading
+from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import perf_counter
-from typing import Protocol
 
-from ballfg.live.sources.lines import LONGEST, LineReader, Sample
+from ballfg.live.sources.sender import WAITING, Arrival, Line, Sender
 
-WAITING = 1024
-"""Samples that may wait. Then a pipe or a TCP sender has to wait too, and of UDP packets the oldest are dropped."""
+LEAST = 16
+"""Lines of each sender that may wait, however many senders have lines waiting."""
 CHUNK = 65536
-"""Bytes read at once."""
+"""Bytes read at once from standard input, or of a packet."""
 
 
-@dataclass(frozen=True)
-class Arrival:
-    """One line of input.
+class Source:
+    """A stream of lines or samples.
 
     Attributes:
-        read: s, `time.perf_counter` when it was read.
-        sample: what it says; None of a line that cannot be used.
-        problem: why not.
+        name: for messages.
+        trust: a sentence on who may send to it; empty if nobody else can.
+        live: whether lines come at their own pace, so that they must be read at once. Other sources wait until asked.
+        repeats: whether the stream begins at its beginning again when it is opened again, as a file does.
+        lossy: whether the oldest lines of a full sender are dropped; else the source reads no more of it.
+        lost: lines or packets that the system dropped before they could be read.
     """
 
-    read: float
-    sample: Sample | None
-    problem: str = ""
+    name = ""
+    trust = ""
+    live = True
+    repeats = False
+    lossy = False
+    lost = 0
 
-
-class Source(Protocol):
-    """A stream of samples."""
-
-    name: str
-    """For messages."""
-    live: bool
-    """Whether lines come at their own pace, so that they must be read at once. Other sources wait until asked."""
-    lossy: bool
-    """Whether the oldest waiting lines are dropped where too many wait; else the sender waits."""
-
-    def arrivals(self, stop: threading.Event) -> Iterator[Arrival]:
+    def lines(self, stop: threading.Event) -> Iterator[Line]:
         """The lines as they are read, until the source ends or `stop` is set. Raises: OSError: it cannot be read."""
-        ...
+        raise NotImplementedError
 
     def close(self) -> None:
-        """Let go of files and sockets."""
-        ...
+        """Let go of sockets; by default there are none."""
 
 
-class LineBuffer:
-    """Bytes of one sender to lines; a line without end is cut."""
-
-    def __init__(self) -> None:
-        self._reader = LineReader()
-        self._rest = b""
-        self._skips = False
-        self._now = perf_counter()
-
-    def feed(self, chunk: bytes) -> Iterator[Arrival]:
-        """The lines that a chunk completes, which has just been read."""
-        self._now = perf_counter()
-        *lines, self._rest = (self._rest + chunk).split(b"\n")
-        for line in lines:
-            if self._skips:  # the end of a line that was cut
-                self._skips = False
-                continue
-            yield from self._read(line)
-        if len(self._rest) > LONGEST:
-            if not self._skips:
-                yield from self._read(self._rest)
-            self._rest, self._skips = b"", True
-
-    def end(self) -> Iterator[Arrival]:
-        """The last line, where no line feed ended it."""
-        if self._rest and not self._skips:
-            yield from self._read(self._rest)
-        self._rest, self._skips = b"", False
-
-    def _read(self, line: bytes) -> Iterator[Arrival]:
-        now = self._now
-        try:
-            sample = self._reader.read(line)
-        except ValueError as error:
-            yield Arrival(now, None, f"{error}: {line[:60].decode('utf-8', errors='replace')!r}")
-            return
-        if sample is not None:
-            yield Arrival(now, sample)
-
-
-class Pipe:
+class Pipe(Source):
     """Standard input: a pipe or terminal is live, a file is read as it is needed."""
 
     name = "standard input"
-    lossy = False
 
     def __init__(self, handle: int | None = None) -> None:
         self._handle = sys.stdin.fileno() if handle is None else handle
-        self.live = not stat.S_ISREG(os.fstat(self._handle).st_mode)
+        self.repeats = stat.S_ISREG(os.fstat(self._handle).st_mode)
+        self.live = not self.repeats
 
-    def arrivals(self, stop: threading.Event) -> Iterator[Arrival]:
-        """As `Source.arrivals`."""
-        buffer = LineBuffer()
-        while not stop.is_set() and (chunk := os.read(self._handle, CHUNK)):
-            yield from buffer.feed(chunk)
-        yield from buffer.end()
-
-    def close(self) -> None:
-        """Standard input stays open."""
+    def lines(self, stop: threading.Event) -> Iterator[Line]:
+        """As `Source.lines`."""
+        sender, chunk = Sender(), b"\n"
+        while chunk:
+            sender.wait_for_room(stop)
+            if stop.is_set():
+                return
+            chunk = os.read(self._handle, CHUNK)
+            yield from sender.cut(chunk, last=not chunk)
 
 
 class Inbox:
     """The samples of a source, those of one stamp together as far as they are there.
 
-    A live source is read by a thread of its own, so that the moment of reading is told truly. A source that waits is
-    read when a sample is wanted; that is the moment which counts.
+    A live source is read by a thread of its own, so that the moment of reading is told truly. Its senders take turns:
+    one that sends much delays another by the answers to one of its stamps at most. A source that waits is read when a
+    sample is wanted; that is the moment which counts.
 
     Attributes: dropped: lines of a lossy source that waited too long.
     """
@@ -128,80 +81,86 @@ class Inbox:
         self.source = source
         self.dropped = 0
         self._stop = threading.Event()
-        self._queue: queue.SimpleQueue[Arrival | BaseException | None] = queue.SimpleQueue()
-        self._free = threading.BoundedSemaphore(WAITING)
-        self._ahead: Arrival | None = None
+        self._changed = threading.Condition()
+        self._turns: deque[Sender] = deque()
         self._ended = False
-        self._pulled = None if source.live else source.arrivals(self._stop)
+        self._error: Exception | None = None
         if source.live:
             threading.Thread(target=self._fill, name="ballfg live input", daemon=True).start()
 
     def groups(self) -> Iterator[list[Arrival]]:
-        """Arrivals of one stamp at a time, in the order in which they came. Raises: OSError: from the source."""
-        while (first := self._next(wait=True)) is not None:
-            group = [first if self.source.live else replace(first, read=perf_counter())]
-            while first.sample is not None and (other := self._next(wait=not self.source.live)) is not None:
-                if other.sample is None or other.sample.time != first.sample.time:
-                    self._ahead = other
-                    break
-                group.append(other)
-            yield group
+        """Arrivals of one stamp at a time, those of a sender in the order in which they came.
+
+        Raises: OSError: from the source.
+        """
+        if not self.source.live:
+            yield from self._asked()
+            return
+        while (group := self._turn()) is not None:
+            if group:
+                yield group
+        if self._error is not None:
+            raise self._error
 
     @property
     def waiting(self) -> bool:
-        """Whether something newer of a live source waits."""
-        return self.source.live and (self._ahead is not None or not self._queue.empty())
+        """Whether something of a live source waits."""
+        return bool(self._turns)
 
     def interrupt(self) -> None:
         """End the samples as if the source had ended; a signal handler may call it."""
         self._stop.set()
-        self._ended = True
-        self._queue.put(None)
+        self._end()
 
     def close(self) -> None:
         """Stop reading."""
         self._stop.set()
         self.source.close()
 
-    def _next(self, wait: bool) -> Arrival | None:
-        """The next arrival; None at the end, or where none is there and nobody waits."""
-        if self._ahead is not None and not self._stop.is_set():
-            found, self._ahead = self._ahead, None
-            return found
-        if self._ended:
-            return None
-        if self._pulled is not None:
-            return next(self._pulled, None)
-        try:
-            arrival = self._queue.get(block=wait)
-        except queue.Empty:
-            return None
-        if isinstance(arrival, BaseException):
-            raise arrival
-        if arrival is None:
-            self._ended = True
-        else:
-            self._free.release()
-        return arrival
+    def _turn(self) -> list[Arrival] | None:
+        """What the next sender has waiting of one stamp; None at the end."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._turns or self._ended)
+            if self._stop.is_set() or not self._turns:
+                return None
+            sender = self._turns.popleft()
+            group = sender.take()
+            if sender.busy:
+                self._turns.append(sender)
+            return group
+
+    def _asked(self) -> Iterator[list[Arrival]]:
+        """The same of a source that waits. It has one sender."""
+        sender = Sender()
+        lines = ((line.read, line.content) for line in self.source.lines(self._stop))
+        now = perf_counter()
+        while not self._stop.is_set() and (group := sender.take_from(lines)):
+            yield [replace(arrival, read=max(arrival.read, now)) for arrival in group]
+            now = perf_counter()
 
     def _fill(self) -> None:
         """The reading thread."""
-        end: BaseException | None = None
         try:
-            for arrival in self.source.arrivals(self._stop):
-                if not self.source.lossy:
-                    self._free.acquire()
-                elif not self._free.acquire(blocking=False):
-                    self._drop_oldest()
-                self._queue.put(arrival)
+            for line in self.source.lines(self._stop):
+                self._put(line)
         except Exception as error:
-            end = None if self._stop.is_set() else error
-        self._queue.put(end)
+            self._error = None if self._stop.is_set() else error
+        self._end()
 
-    def _drop_oldest(self) -> None:
-        """Make room for one arrival, unless the room has just been made."""
-        try:
-            self._queue.get_nowait()
-            self.dropped += 1
-        except queue.Empty:
-            self._free.acquire()
+    def _end(self) -> None:
+        with self._changed:
+            self._ended = True
+            self._changed.notify_all()
+
+    def _put(self, line: Line) -> None:
+        sender = line.sender
+        with self._changed:
+            if not sender.busy:
+                self._turns.append(sender)
+            sender.most = max(LEAST, WAITING // len(self._turns))
+            while sender.full and self.source.lossy:
+                sender.waiting.popleft()
+                sender.dropped += 1
+                self.dropped += 1
+            sender.waiting.append((line.read, line.content))
+            self._changed.notify_all()

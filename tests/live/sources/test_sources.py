@@ -14,8 +14,9 @@ import pytest
 
 from ballfg.live.sources.lines import Sample
 from ballfg.live.sources.replay import Replay, dataset_samples
+from ballfg.live.sources.sender import WAITING, Arrival, Line, Sender
 from ballfg.live.sources.sockets import listen
-from ballfg.live.sources.source import WAITING, Arrival, Inbox, Pipe, Source
+from ballfg.live.sources.source import Inbox, Pipe, Source
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset
 
@@ -101,29 +102,40 @@ def test_udp_packets_hold_whole_lines() -> None:
     assert source.lossy
 
 
-class Burst:
-    """More samples than may wait, all at once; then a signal that they are there."""
+class Burst(Source):
+    """More samples than may wait, all at once, of two senders after one another; then a signal that they are there."""
 
-    name, live, lossy = "burst", True, True
+    name, lossy = "burst", True
 
-    def __init__(self) -> None:
+    def __init__(self, *counts: int) -> None:
+        self.counts = counts
         self.sent = threading.Event()
 
-    def arrivals(self, stop: threading.Event) -> Iterator[Arrival]:
-        for k in range(WAITING + 100):
-            yield Arrival(0.0, Sample(float(k), [[0.0, 0.0, 0.0]]))
+    def lines(self, stop: threading.Event) -> Iterator[Line]:
+        for number, count in enumerate(self.counts):
+            sender = Sender(str(number))
+            for k in range(count):
+                yield Line(sender, 0.0, Sample(float(k), [[0.0, 0.0, 0.0]], tag=(("sender", number),)))
         self.sent.set()
-
-    def close(self) -> None: ...
 
 
 def test_what_waits_is_bounded_and_the_oldest_goes_first() -> None:
-    source = Burst()
+    source = Burst(WAITING + 100)
     inbox = Inbox(source)
     assert source.sent.wait(20.0)
     found = [time for group in inbox.groups() for time in times(group)]
     assert inbox.dropped == 100
     assert found == [float(k) for k in range(100, WAITING + 100)]
+
+
+def test_senders_take_turns_and_the_surplus_of_one_costs_the_others_nothing() -> None:
+    source = Burst(3 * WAITING, 10)
+    inbox = Inbox(source)
+    assert source.sent.wait(20.0)
+    assert inbox.dropped == 2 * WAITING
+    first = [dict(group[0].sample.tag)["sender"] for group in inbox.groups() if group[0].sample is not None]
+    assert first[:20] == [0, 1] * 10
+    assert first[20:] == [0] * (WAITING - 10)
 
 
 def test_an_interrupt_ends_what_waits() -> None:
@@ -156,6 +168,6 @@ def test_a_dataset_plays_its_tracks_one_after_the_other(tmp_path: Path) -> None:
     assert stamps == sorted(stamps)
     assert stamps[len(first)] == pytest.approx(first.times[-1] + 1.0)
     assert dict(samples[-1].tag) == {"trajectory": "001", "t_track": second.times[-1]}
-    played = list(Replay(samples, 1e4, "shots").arrivals(threading.Event()))
-    assert [arrival.sample for arrival in played] == samples
+    played = list(Replay(samples, 1e4, "shots").lines(threading.Event()))
+    assert [line.content for line in played] == samples
     assert all(before.read <= after.read for before, after in pairwise(played))

@@ -1,0 +1,264 @@
+"""MCAP files that grow by whole chunks, so that what a killed writer left can be read and continued.
+
+Source: the MCAP format specification, version 0 (mcap.dev/spec). A file opens with schemas and channels. Chunks follow,
+each with an index of its messages for every channel. A summary ends the file: readers ask for it, though the chunks
+tell all that is in it.
+"""
+
+from __future__ import annotations
+
+import io
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PosixPath
+from typing import Any, NamedTuple
+
+MAGIC = b"\x89MCAP0\r\n"
+HEADER, FOOTER, SCHEMA, CHANNEL, MESSAGE, CHUNK, MESSAGE_INDEX, CHUNK_INDEX = 1, 2, 3, 4, 5, 6, 7, 8
+STATISTICS, DATA_END = 11, 15
+RECORD = struct.Struct("<BQ")
+"""Before each record: its kind and its number of bytes."""
+SPAN = struct.Struct("<QQQIIQ")
+"""At the begin of a chunk: first and last time (ns), bytes of the content, checksum (0: none), length of the name of
+the compression (0: none), bytes of the content again."""
+INDEX = struct.Struct("<HI")
+"""At the begin of an index: channel, bytes of the entries."""
+ENTRY = struct.Struct("<QQ")
+"""In an index: time of a message (ns) and its offset in the chunk."""
+WRITER = "ballfg"
+LONGEST_OPENING = 1 << 20
+"""Bytes; of the two topics of `ballfg live` it has 4,000."""
+
+Read = Callable[[int, int], bytes]
+"""Bytes of a file, from an offset on, at most as many as asked for."""
+
+
+class Topic(NamedTuple):
+    """A topic, with the name and the definition of its messages in ROS 2."""
+
+    name: str
+    kind: str
+    definition: str
+
+
+class Message(NamedTuple):
+    """A message of a channel, which is a number from 1 on, at a time in ns."""
+
+    channel: int
+    time: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Chunk:
+    """Where a chunk lies.
+
+    Attributes:
+        first, last: ns, times of its messages.
+        offset: bytes, of its record.  content: bytes of its messages.
+        counts: messages of each channel.
+    """
+
+    first: int
+    last: int
+    offset: int
+    content: int
+    counts: tuple[int, ...]
+
+    @property
+    def indexes(self) -> tuple[int, ...]:
+        """Offsets of the index of each channel, and of what follows the last."""
+        found = [self.offset + RECORD.size + SPAN.size + self.content]
+        for count in self.counts:
+            found.append(found[-1] + RECORD.size + INDEX.size + ENTRY.size * count)
+        return tuple(found)
+
+    @property
+    def end(self) -> int:
+        """Offset of what follows the chunk and its indexes."""
+        return self.indexes[-1]
+
+
+def opening(topics: Sequence[Topic]) -> bytes:
+    """How a file begins: its header, then the schema and the channel of each topic, numbered from 1 on."""
+    parts = [MAGIC, _record(HEADER, _text("ros2") + _text(WRITER))]
+    for number, topic in enumerate(topics, start=1):
+        schema = _text(topic.kind) + _text("ros2msg") + _text(topic.definition)
+        metadata = _text("offered_qos_profiles") + _text("[]")
+        channel = _text(topic.name) + _text("cdr") + struct.pack("<I", len(metadata)) + metadata
+        parts.append(_record(SCHEMA, struct.pack("<H", number) + schema))
+        parts.append(_record(CHANNEL, struct.pack("<HH", number, number) + channel))
+    return b"".join(parts)
+
+
+def chunk_of(messages: Sequence[Message], channels: int, offset: int) -> tuple[bytes, Chunk]:
+    """A chunk and its indexes as bytes, and where it lies.
+
+    Args: messages: at least one.  channels: their number.  offset: bytes, at which it will stand in the file.
+    """
+    content = bytearray()
+    entries = [bytearray() for _ in range(channels)]
+    for message in messages:
+        entries[message.channel - 1] += ENTRY.pack(message.time, len(content))
+        head = struct.pack("<HIQQ", message.channel, 0, message.time, message.time)
+        content += _record(MESSAGE, head + message.data)
+    times = [message.time for message in messages]
+    counts = tuple(len(own) // ENTRY.size for own in entries)
+    chunk = Chunk(min(times), max(times), offset, len(content), counts)
+    parts = [_record(CHUNK, SPAN.pack(chunk.first, chunk.last, len(content), 0, 0, len(content)) + content)]
+    parts += [_record(MESSAGE_INDEX, INDEX.pack(n, len(own)) + own) for n, own in enumerate(entries, start=1)]
+    return b"".join(parts), chunk
+
+
+def whole_chunks(read: Read, begin: int, size: int, channels: int) -> list[Chunk]:
+    """The chunks of a file that are whole, with their indexes.
+
+    Args: begin: bytes of the opening.  size: bytes of the file.  channels: their number.
+    """
+    found: list[Chunk] = []
+    while (chunk := _chunk_at(read, found[-1].end if found else begin, channels)) is not None and chunk.end <= size:
+        found.append(chunk)
+    return found
+
+
+def ending(begin: bytes, chunks: Sequence[Chunk], channels: int) -> bytes:
+    """How a file ends, after its last chunk.
+
+    Args: begin: the opening.  chunks: all of the file.  channels: their number.
+    """
+    end = _record(DATA_END, struct.pack("<I", 0))
+    offset = (chunks[-1].end if chunks else len(begin)) + len(end)
+    counts = [sum(chunk.counts[k] for chunk in chunks) for k in range(channels)]
+    first, last = min((c.first for c in chunks), default=0), max((c.last for c in chunks), default=0)
+    totals = struct.pack("<QHIIIIQQ", sum(counts), channels, channels, 0, 0, len(chunks), first, last)
+    each = b"".join(struct.pack("<HQ", number, count) for number, count in enumerate(counts, start=1))
+    declared = begin[len(opening(())) :]  # schemas and channels once more
+    parts = [end, declared, *map(_chunk_index, chunks)]
+    parts.append(_record(STATISTICS, totals + struct.pack("<I", len(each)) + each))
+    return b"".join([*parts, _record(FOOTER, struct.pack("<QQI", offset, 0, 0)), MAGIC])
+
+
+def readable(path: Path) -> Path:
+    """A path that readers can open: of a file that a killed `ballfg live` left, one that adds the missing end.
+
+    The file itself stays as it is. Args: path: of an MCAP file.
+    """
+    with path.open("rb") as file:
+
+        def read(offset: int, count: int) -> bytes:
+            file.seek(offset)
+            return file.read(count)
+
+        size = file.seek(0, io.SEEK_END)
+        if read(max(0, size - len(MAGIC)), len(MAGIC)) == MAGIC and size > len(MAGIC):
+            return path
+        found = _opening_of(read)
+        if found is None:
+            return path
+        begin, channels = found
+        chunks = whole_chunks(read, len(begin), size, channels)
+    unfinished = Unfinished(path)
+    unfinished.whole = chunks[-1].end if chunks else len(begin)
+    unfinished.ending = ending(begin, chunks, channels)
+    return unfinished
+
+
+class Unfinished(PosixPath):
+    """A path to a file without end: who opens it reads the whole chunks, and the end that is missing.
+
+    Attributes: whole: bytes of the file that count.  ending: what follows them.
+    """
+
+    whole: int
+    ending: bytes
+
+    def open(self, *_: Any, **__: Any) -> Any:
+        """The file, in binary, to read."""
+        return io.BufferedReader(_Joined(super().open("rb", buffering=0), self.whole, self.ending))
+
+
+class _Joined(io.RawIOBase):
+    """The first bytes of a file, and others after them. Args: whole: number of those bytes."""
+
+    def __init__(self, file: Any, whole: int, ending: bytes) -> None:
+        self._file, self._whole, self._ending = file, whole, ending
+        self._at = 0
+
+    def readable(self) -> bool:
+        return True
+
+    def seekable(self) -> bool:
+        return True
+
+    def seek(self, offset: int, whence: int = io.SEEK_SET) -> int:
+        ends = {io.SEEK_SET: 0, io.SEEK_CUR: self._at, io.SEEK_END: self._whole + len(self._ending)}
+        self._at = ends[whence] + offset
+        return self._at
+
+    def readinto(self, buffer: Any) -> int:
+        if self._at < self._whole:
+            self._file.seek(self._at)
+            found = self._file.read(min(len(buffer), self._whole - self._at))
+        else:
+            found = self._ending[self._at - self._whole :][: len(buffer)]
+        buffer[: len(found)] = found
+        self._at += len(found)
+        return len(found)
+
+    def close(self) -> None:
+        self._file.close()
+        super().close()
+
+
+def _opening_of(read: Read) -> tuple[bytes, int] | None:
+    """The opening of a file of `ballfg live`, and the number of its channels; None of another file."""
+    content = read(0, LONGEST_OPENING)
+    end, channels = len(opening(())), 0
+    if not content.startswith(opening(())):
+        return None
+    while len(content) >= end + RECORD.size:
+        kind, length = RECORD.unpack_from(content, end)
+        if kind not in (SCHEMA, CHANNEL) or end + RECORD.size + length > len(content):
+            break
+        end += RECORD.size + length
+        channels += kind == CHANNEL
+    return content[:end], channels
+
+
+def _chunk_at(read: Read, offset: int, channels: int) -> Chunk | None:
+    """The chunk at an offset; None if none of this writer's begins there, or its indexes are not there."""
+    head = read(offset, RECORD.size + SPAN.size)
+    if len(head) < RECORD.size + SPAN.size:
+        return None
+    kind, length = RECORD.unpack_from(head)
+    first, last, content, _, _, stored = SPAN.unpack_from(head, RECORD.size)
+    if kind != CHUNK or content != stored or length != SPAN.size + content:
+        return None
+    chunk = Chunk(first, last, offset, content, ())
+    for number in range(1, channels + 1):
+        head = read(chunk.end, RECORD.size + INDEX.size)
+        if len(head) < RECORD.size + INDEX.size:
+            return None
+        kind, length = RECORD.unpack_from(head)
+        channel, entries = INDEX.unpack_from(head, RECORD.size)
+        if (kind, channel, length) != (MESSAGE_INDEX, number, INDEX.size + entries):
+            return None
+        chunk = Chunk(first, last, offset, content, (*chunk.counts, entries // ENTRY.size))
+    return chunk
+
+
+def _chunk_index(chunk: Chunk) -> bytes:
+    places = b"".join(struct.pack("<HQ", n, place) for n, place in enumerate(chunk.indexes[:-1], start=1))
+    begin = chunk.indexes[0]
+    head = struct.pack("<QQQQI", chunk.first, chunk.last, chunk.offset, begin - chunk.offset, len(places))
+    tail = struct.pack("<QIQQ", chunk.end - begin, 0, chunk.content, chunk.content)
+    return _record(CHUNK_INDEX, head + places + tail)
+
+
+def _record(kind: int, content: bytes | bytearray) -> bytes:
+    return RECORD.pack(kind, len(content)) + content
+
+
+def _text(text: str) -> bytes:
+    return struct.pack("<I", len(text.encode())) + text.encode()
