@@ -7,6 +7,7 @@ from .joint import JointDiagnosis as JointDiagnosis
 from .joint import diagnose_jointly as diagnose_jointly
 from .remains.fallback import learned_residual as learned_residual
 from .remains.generic import generic_tests as generic_tests
+from .remains.label_check import check_labels as check_labels
 from .remains.residuals import residuals_of as residuals_of
 from .remains.sparse import sparse_terms as sparse_terms
 from .report.report import write_report as write_report

@@ -11,6 +11,7 @@ from ballfg.diagnosis.fit.holdout import Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.remains.fallback import fallback
 from ballfg.diagnosis.remains.generic import ALARM, generic_tests
+from ballfg.diagnosis.remains.label_check import LabelCheck, check_labels, label_test
 from ballfg.diagnosis.remains.residuals import residuals_of
 from ballfg.diagnosis.remains.tracker import look_at_tracker
 from ballfg.diagnosis.report.wording import refusal, sentence
@@ -63,7 +64,8 @@ def diagnose(
     search = SearchLoop(holdout, effects, Predicting(holdout, jobs), evaluate, tell, jobs=jobs).run(model)
     corrected, tracker, search = _with_own_noise(search, holdout, evaluate, tell, jobs)
     tell("looking at what is left")
-    tests = generic_tests(search.fit, search.first, tracker)
+    labels, of_labels = _labels(search, model, holdout, tracker, jobs)
+    tests = in_order(*generic_tests(search.fit, search.first, tracker), *of_labels)
     verdict = verdict_of(search, tests)
     helped = None
     if verdict is Verdict.UNEXPLAINED and any(t.name in DESCRIBABLE for t in alarms(tests)):
@@ -97,7 +99,23 @@ def diagnose(
         excluded=holdout.excluded,
         remarks=(*map(refusal, search.refused.values()), *strange(calibrated, model.radius)),
         floor_mm=floor,
+        labels=labels,
     )
+
+
+def _labels(
+    search: Search, model: AnalyticModel, holdout: Holdout, tracker: TrackNoise | None, jobs: int
+) -> tuple[LabelCheck | None, tuple[GenericTest, ...]]:
+    """What is said of the spin labels, and that as a test; neither where there are none."""
+
+    def checked(fit: Fit) -> LabelCheck | None:
+        return check_labels(calibrated_model(fit, holdout.launcher.embedding), model, holdout, tracker, jobs=jobs)
+
+    now = checked(search.whole)
+    if now is None:
+        return None, ()
+    before = checked(search.first) if now.contradicted and search.findings else None
+    return now, (label_test(now, before),)
 
 
 def _with_own_noise(
@@ -140,6 +158,11 @@ def strange(calibrated: Mapping[str, Value], radius: float) -> list[str]:
 def _errors(holdout: Holdout, jobs: int, model: BallModel) -> Errors:
     settings = dataset_settings(holdout.dataset, model)
     return prediction_errors(model, holdout.held_out_tracks, holdout.surfaces, settings, jobs)
+
+
+def in_order(*tests: GenericTest) -> tuple[GenericTest, ...]:
+    """Tests with the least probable first."""
+    return tuple(sorted(tests, key=lambda test: test.p_value))
 
 
 def alarms(tests: Sequence[GenericTest]) -> list[GenericTest]:

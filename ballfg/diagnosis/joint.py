@@ -6,7 +6,7 @@ each room by itself. What all rooms want is the ball's and predicts in a room th
 """
 
 import copy
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 from weakref import WeakKeyDictionary
@@ -15,13 +15,14 @@ import numpy as np
 import torch
 
 from ballfg.arrays import Array
-from ballfg.diagnosis.diagnosis import strange, verdict_of, what_is_left
+from ballfg.diagnosis.diagnosis import in_order, strange, verdict_of, what_is_left
 from ballfg.diagnosis.fit.fit import first_guess, fit_model, fit_problem, reachable, values_of
 from ballfg.diagnosis.fit.free import LOOSE, Deviation, declared_free
 from ballfg.diagnosis.fit.holdout import EvaluationTrack, Holdout, hold_out
 from ballfg.diagnosis.fit.problem import Fit, Noise, Problem
 from ballfg.diagnosis.fit.stretches import Stretches, joined
 from ballfg.diagnosis.remains.generic import generic_tests
+from ballfg.diagnosis.remains.label_check import LabelCheck, judged, label_evidence, label_test
 from ballfg.diagnosis.remains.patterns import DRIFT
 from ballfg.diagnosis.remains.residuals import residuals_of
 from ballfg.diagnosis.report.wording import joined as listed
@@ -106,12 +107,15 @@ def diagnose_jointly(
     )
     search = loop.run(model, first)
     tell("looking at what is left")
-    tests = tuple(test for test in generic_tests(search.fit, search.first) if test.name != DRIFT)
+    models = predicting.models(predicting(search.whole).model)
+    labels = _labels(rooms, models, model, jobs)
+    of_labels = () if labels is None else (label_test(labels),)
+    patterns = (test for test in generic_tests(search.fit, search.first) if test.name != DRIFT)
+    tests = in_order(*patterns, *of_labels)
     verdict = verdict_of(search, tests)
     unexplained = what_is_left(tests)
     declared = {name: float(value.detach()) for name, value in model.named_parameters()}
     calibrated = values_of(search.whole, [name for name in search.whole.problem.free if name in declared], declared)
-    models = predicting.models(predicting(search.whole).model)
     remarks = [*_of_whom(search.findings), *predicting.errors_by_room(search.declared.model, search.predictive.model)]
     whole = Diagnosis(
         dataset=", ".join(room.name for room in rooms),
@@ -131,8 +135,20 @@ def diagnose_jointly(
         residuals_after=residuals_of(search.fit),
         excluded=tuple(f"{room.name}: {line}" for room in rooms for line in room.holdout.excluded),
         remarks=(*remarks, *map(refusal, search.refused.values()), *strange(calibrated, model.radius)),
+        labels=labels,
     )
     return JointDiagnosis(whole, models)
+
+
+def _labels(
+    rooms: Sequence[Room], models: Mapping[str, AnalyticModel], declared: AnalyticModel, jobs: int
+) -> LabelCheck | None:
+    """What is said of the spin labels of all rooms; each is compared with its flight in its own room."""
+    found = []
+    for room in rooms:
+        flights = label_evidence(models[room.name], declared, room.holdout, jobs=jobs)
+        found += [replace(flight, name=f"{room.name}/{flight.name}") for flight in flights]
+    return judged(found)
 
 
 def _rooms(datasets: Sequence[Dataset], model: AnalyticModel, jobs: int, tell: Callable[[str], None]) -> list[Room]:

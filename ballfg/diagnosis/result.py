@@ -13,6 +13,8 @@ from ballfg.dynamics import BallModel
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from ballfg.diagnosis.remains.label_check import LabelCheck
+
 
 class Verdict(enum.Enum):
     """The answer of a diagnosis: whether the model lacks anything."""
@@ -174,7 +176,7 @@ class GenericTest:
         name: `flight`, `contact`, `measurement`, `recording` (coefficients from track to track), `label` (spin labels
             against flights) or `time` (whiteness along the tracks).
         where: place, dependence and size of the pattern in words.
-        p_value: probability of such a pattern by chance.
+        p_value: probability of such a pattern by chance; of `label`, that every label is right.
         share: part of the pattern at the start that is still there, 0 to 1.
     """
 
@@ -315,6 +317,7 @@ class Diagnosis:
         remarks: sentences on effects that fit better and are no names, and on fitted values that are not plausible.
         floor_mm: prediction error that the held-out tracks would have if nothing were wrong with the corrected model:
             what measurement noise and the unknown release alone leave; NaN where that is not known.
+        labels: what is said of each spin label; None where there is none.
     """
 
     dataset: str
@@ -335,6 +338,7 @@ class Diagnosis:
     excluded: tuple[str, ...] = field(default=())
     remarks: tuple[str, ...] = field(default=())
     floor_mm: float = float("nan")
+    labels: LabelCheck | None = None
 
     def __repr__(self) -> str:
         effects = ", ".join(finding.name for finding in self.findings) or "none"

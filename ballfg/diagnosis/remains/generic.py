@@ -12,7 +12,6 @@ import numpy as np
 from ballfg.arrays import Array
 from ballfg.diagnosis.fit.problem import Fit
 from ballfg.diagnosis.fit.system import System
-from ballfg.diagnosis.remains.label_check import LABEL, check_labels
 from ballfg.diagnosis.remains.patterns import (
     DRIFT,
     EVERYWHERE,
@@ -74,12 +73,10 @@ def generic_tests(fit: Fit, reference: Fit | None = None, tracker: TrackNoise | 
 
 def _tests_of(fit: Fit, tracker: TrackNoise | None) -> list[_Test]:
     system = fit.linearised()
-    drifting, labels = drift_block(fit, system), check_labels(fit, system)
+    drifting = drift_block(fit, system)
     drift = whiteness(fit, system, tracker)
     tests = _block_tests(fit, system, [*blocks_of(fit), *([] if drifting is None else [drifting])])
     tests.append(_Test("time", (), drift.where, drift.p_value, drift.drift**2))
-    if labels is not None:
-        tests.append(_Test(LABEL, (), labels.where, labels.p_value, float(len(labels.contradicted))))
     return tests
 
 

@@ -1,95 +1,186 @@
-"""A test for spin labels that contradict their flights.
+"""Which spin labels contradict their flights, and with what probability.
 
-A label is compared with the spin that the flight alone shows. The squared distance over both uncertainties is a
-chi-square with three degrees of freedom. Noise that is stated too small raises the distances of all tracks, which a
-common scale corrects. A label that stands out among the others belongs to another shot, or was measured wrongly. Where
-most labels are off by several times their noise, no misjudged noise explains that: labels and model disagree.
+A label is right, with the error that it states, or wrong, with a far larger one. Both are compared with what its flight
+tells of the spin, the scatter of flight and bounces included. The share of wrong labels, the size of their errors, and
+by how much right labels err more than stated are unknown; all labels of the recording tell them together, and they are
+integrated out. So a label is wrong with a probability, and a single doubtful one among many that are right is no case.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
-from scipy import stats
 
-from ballfg.arrays import Array, Index
-from ballfg.diagnosis.fit.problem import Fit
-from ballfg.diagnosis.fit.system import System
-from ballfg.state import SPIN, STATE_DIM
+from ballfg.arrays import Array
+from ballfg.diagnosis.fit.holdout import Holdout
+from ballfg.diagnosis.remains.generic import ALARM
+from ballfg.diagnosis.remains.label_flights import LabelledFlight, labelled_flights
+from ballfg.diagnosis.remains.label_model import scattering_model
+from ballfg.diagnosis.result import GenericTest
+from ballfg.dynamics import AnalyticModel
+from ballfg.tracks import TrackNoise
 
-LABEL = "label"
+LABEL: Final = "label"
 """Kind of the test."""
-LEAST_LABELS = 6
-"""With fewer labels none can be said to stand out."""
-OPEN_SPIN = 2000.0
-"""rad/s. Prior of each component of a spin that the flight does not show: twice the fastest strokes."""
-STANDS_OUT = 0.005
-"""Probability, corrected for the number of labels, below which a label is counted as contradicted."""
-FAR = 9.0
-"""Square of the distance, in multiples of its noise, beyond which a label counts where most are off: three times."""
-MISJUDGED = 1.3**2
-"""Square of the factor by which a stated noise may be wrong without anything else being wrong."""
+SURE: Final = 0.95
+"""Probability from which on a label is called wrong."""
+NONE_WRONG: Final = 0.5
+"""Probability beforehand that all labels are right; else every share of wrong ones is as probable as any other."""
+SHARES: Final = (np.arange(40) + 0.5) / 40
+"""Of wrong labels, each the middle of a fortieth."""
+RIGHT: Final = np.exp(np.linspace(0.0, 1.4, 8))
+"""Errors of right labels, as multiples of those stated: up to four times."""
+RIGHT_SPREAD: Final = 0.7
+"""Standard deviation of the logarithm of such a multiple: stated noise is known to a factor of two."""
+WRONG: Final = np.exp(np.linspace(-1.1, 1.1, 9))
+"""Errors of wrong labels beside those of right ones, as multiples of `wrong_error`: a third to three times."""
+
+
+@dataclass(frozen=True)
+class LabelVerdict:
+    """What is said of one spin label.
+
+    Attributes:
+        track: its name.
+        probability: that the label is wrong.
+        off: rad/s, its distance from the spin that the flight shows.
+        sigma: rad/s, standard deviation of that spin along this distance, by noise and by the scatter of flight and
+            bounces.
+    """
+
+    track: str
+    probability: float
+    off: float
+    sigma: float
 
 
 @dataclass(frozen=True)
 class LabelCheck:
-    """The test.
+    """What is said of all spin labels.
 
     Attributes:
-        p_value: of the label that stands out most, corrected for the number of labels; or of so many far labels.
-        contradicted: tracks whose labels stand out or, where most labels are far off, all far ones; the worst first.
-        labels: how many there are.
-        typical: rad/s, median distance of a contradicted label from the spin that the flight shows.
+        p_all_right: probability that every label is right.
+        verdicts: on each label, the least probable first.
     """
 
-    p_value: float
-    contradicted: tuple[str, ...]
-    labels: int
-    typical: float
+    p_all_right: float
+    verdicts: tuple[LabelVerdict, ...]
+
+    @property
+    def contradicted(self) -> tuple[LabelVerdict, ...]:
+        """Verdicts on labels that are wrong as good as surely; none where all of them may well be right."""
+        if not self.p_all_right < ALARM:
+            return ()
+        return tuple(verdict for verdict in self.verdicts if verdict.probability >= SURE)
 
     @property
     def where(self) -> str:
         """In words, which labels contradict their flights."""
-        if not self.contradicted:
-            return f"label: none of {self.labels} spin labels contradicts its flight"
-        shown = ", ".join(self.contradicted[:4]) + (", ..." if len(self.contradicted) > 4 else "")
+        wrong, labels = self.contradicted, len(self.verdicts)
+        if not wrong:
+            return (
+                f"label: none of {labels} spin labels contradicts its flight beyond the scatter of flight and bounces"
+            )
+        shown = ", ".join(verdict.track for verdict in wrong[:4]) + (", ..." if len(wrong) > 4 else "")
+        off, sigma = (np.median([getattr(verdict, name) for verdict in wrong]) for name in ("off", "sigma"))
         return (
-            f"label: {len(self.contradicted)} of {self.labels} spin labels contradict their flights, "
-            f"typically by {self.typical:.0f} rad/s (tracks {shown})"
+            f"label: {len(wrong)} of {labels} spin labels contradict their flights, typically by {off:.0f} rad/s where "
+            f"flight and bounces leave the spin open by {sigma:.0f} rad/s (tracks {shown}; each of these is "
+            f"wrong with a probability of at least {percent(wrong[-1].probability)})"
         )
 
 
-def check_labels(fit: Fit, system: System) -> LabelCheck | None:
-    """The test of a fit; None where there are too few labels; system: of the fit, linearised at its minimum."""
-    rows = np.flatnonzero(fit.problem.stretches.labelled)
-    if len(rows) < LEAST_LABELS:
+def percent(probability: float) -> str:
+    """For instance `97 %`, `99.9 %`: rounded towards doubt, and never to certainty."""
+    for digits in (0, 1):
+        least = np.floor(100.0 * 10.0**digits * probability) / 10.0**digits
+        if least < 99.0:
+            break
+    return f"{min(least, 99.9):.{digits}f} %"
+
+
+def check_labels(
+    model: AnalyticModel,
+    declared: AnalyticModel,
+    holdout: Holdout,
+    tracker: TrackNoise | None = None,
+    *,
+    jobs: int = 1,
+) -> LabelCheck | None:
+    """Judge all spin labels of a dataset.
+
+    Args:
+        model: corrected by the diagnosis, fitted to the tracks.
+        declared: before.
+        holdout: the tracks, those of both halves.
+        tracker: memory of the tracker and jitter of the stamps, if they were found.
+        jobs: processes.
+    Returns: None where there is no label.
+    """
+    return judged(label_evidence(model, declared, holdout, tracker, jobs=jobs))
+
+
+def label_evidence(
+    model: AnalyticModel,
+    declared: AnalyticModel,
+    holdout: Holdout,
+    tracker: TrackNoise | None = None,
+    *,
+    jobs: int = 1,
+) -> list[LabelledFlight]:
+    """The labels beside what their flights tell of the spin. Args: as `check_labels`."""
+    parts = (*holdout.search_tracks, *holdout.held_out_tracks)
+    tracks = sorted((p for p in parts if p.track.spin_label is not None), key=lambda p: p.track.name)
+    if not tracks:
+        return []
+    ball, settings = scattering_model(model, declared, tracks, holdout, tracker, jobs=jobs)
+    return labelled_flights(ball, holdout.surfaces, settings, tracks, jobs)
+
+
+def judged(flights: Sequence[LabelledFlight]) -> LabelCheck | None:
+    """What is said of labels beside their flights; None where there are none."""
+    if not flights:
         return None
-    distance, off = _distances(fit, system, rows)
-    usual = stats.chi2.median(3)
-    scale = max(1.0, float(np.median(distance)) / usual)
-    # the scale is itself estimated: F in place of chi-square
-    alone = len(rows) * stats.f.sf(distance / (3.0 * scale), 3, len(rows) - 1)
-    far = distance > FAR * usual
-    most = float(stats.binom.sf(far.sum() - 1, len(rows), stats.chi2.sf(FAR * usual / MISJUDGED, 3)))
-    out = np.flatnonzero(far if scale > FAR else alone < STANDS_OUT)
-    out = out[np.argsort(-distance[out], kind="stable")]
-    return LabelCheck(
-        p_value=min(1.0, float(alone.min()), most if scale > FAR else 1.0),
-        contradicted=tuple(fit.problem.stretches.names[rows[i]] for i in out),
-        labels=len(rows),
-        typical=float(np.median(off[out])) if len(out) else float("nan"),
-    )
+    right = np.stack([f.right.log_densities(RIGHT * f.right.error) for f in flights])
+    wrong = np.stack([f.wrong.log_densities(_errors_of_wrong(f)) for f in flights])
+    probability, p_all_right = _mixture(right, wrong)
+    verdicts = [
+        LabelVerdict(f.name, p, f.wrong.off, f.wrong.off_sigma)
+        for f, p in zip(flights, probability.tolist(), strict=True)
+    ]
+    return LabelCheck(p_all_right, tuple(sorted(verdicts, key=lambda v: (-v.probability, -v.off))))
 
 
-def _distances(fit: Fit, system: System, rows: Index) -> tuple[Array, Array]:
-    """Squared distance (m,) of each label from the spin that its flight shows, over their noise; and in rad/s."""
-    labels = system.by_start[rows, -3:] / np.sqrt(fit.robust.spins[rows])[:, None, None]
-    flight, residual = system.by_start[rows, :-3], system.residual[rows, :-3]
-    information = flight.swapaxes(-1, -2) @ flight
-    spin = np.arange(STATE_DIM)[SPIN]
-    information[:, spin, spin] += OPEN_SPIN**-2
-    pulled = np.concatenate((flight.swapaxes(-1, -2) @ residual[..., None], labels.swapaxes(-1, -2)), axis=-1)
-    solved = np.linalg.solve(information, pulled)
-    left = fit.whitened_spins[rows] - (labels @ solved[..., :1])[..., 0]
-    covariance = np.eye(3) + labels @ solved[..., 1:]
-    distance = (left * np.linalg.solve(covariance, left[..., None])[..., 0]).sum(axis=-1)
-    return distance, fit.noise.label * np.linalg.norm(left, axis=-1)
+def label_test(check: LabelCheck, before: LabelCheck | None = None) -> GenericTest:
+    """The check as a test; before: of the declared model, to which the share of contradicted labels refers."""
+    now = len(check.contradicted)
+    whole = now if before is None else max(now, len(before.contradicted))
+    return GenericTest(LABEL, check.where, check.p_all_right, now / whole if whole else 0.0)
+
+
+def _errors_of_wrong(flight: LabelledFlight) -> Array:
+    """(r w,) rad/s, errors of a label that is wrong, for each error of right ones."""
+    total = np.hypot(RIGHT[:, None] * flight.right.error, WRONG * flight.wrong.error)
+    return np.asarray(total.ravel())
+
+
+def _mixture(right: Array, wrong: Array) -> tuple[Array, float]:
+    """Probability (n,) that each label is wrong, and that none is.
+
+    Args: right: (n, r) log densities of labels that err by `RIGHT`.  wrong: (n, r w) of wrong ones.
+    """
+    wrong = wrong.reshape(*right.shape, -1)
+    stated = np.exp(-0.5 * (np.log(RIGHT) / RIGHT_SPREAD) ** 2)
+    prior = np.log(stated / stated.sum())
+    least = np.maximum(right.max(axis=1), wrong.max(axis=(1, 2)))[:, None]
+    as_right, as_wrong = right - least, wrong - least[..., None]
+    one, other = np.log1p(-SHARES), np.log(SHARES)
+    each_wrong = other + as_wrong[..., None]  # (n, r, w, shares)
+    either = np.logaddexp(one + as_right[:, :, None, None], each_wrong)
+    some = either.sum(axis=0) + prior[:, None, None] - np.log(len(WRONG) * len(SHARES)) + np.log1p(-NONE_WRONG)
+    none = as_right.sum(axis=0) + prior + np.log(NONE_WRONG)
+    top = max(some.max(), none.max())
+    weights, sure = np.exp(some - top), np.exp(none - top).sum()
+    total = weights.sum() + sure
+    return (np.exp(each_wrong - either) * weights).sum(axis=(1, 2, 3)) / total, float(sure / total)

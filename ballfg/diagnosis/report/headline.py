@@ -9,6 +9,8 @@ from typing import Final
 
 import numpy as np
 
+from ballfg.diagnosis.remains.generic import ALARM
+from ballfg.diagnosis.remains.label_check import LABEL
 from ballfg.diagnosis.remains.patterns import EVERYWHERE
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.plain_effects import BY_GROUP, DRIFT, in_plain_words, plain_name
@@ -128,9 +130,15 @@ def certainty(diagnosis: Diagnosis) -> Iterator[str]:
     if unseen:
         yield f"These tracks say nothing about {unseen} more effect{'s' * (unseen > 1)}, which may be there or not."
     if diagnosis.verdict is Verdict.UNEXPLAINED and diagnosis.unexplained.tests:
-        least = min(test.p_value for test in diagnosis.unexplained.tests)
-        word = next((word for limit, word in SURE if least < limit), "possible")
-        yield f"That something is left: {word}. Chance makes such a pattern with probability {probability(least)}."
+        tests = diagnosis.unexplained.tests
+        of_labels = [test.p_value for test in tests if test.name == LABEL and test.p_value < ALARM]
+        least = min((test.p_value for test in tests if test.name != LABEL), default=1.0)
+        if least < ALARM or not of_labels:
+            said = f"Chance makes such a pattern with probability {probability(least)}."
+            yield f"That something is left: {_sure_word(least)}. {said}"
+        for all_right in of_labels:
+            said = f"All of them are right with probability {probability(all_right)}."
+            yield f"That some spin labels are wrong: {_sure_word(all_right)}. {said}"
 
 
 def advice(diagnosis: Diagnosis, origin: Origin) -> Iterator[tuple[str, str]]:
@@ -207,8 +215,7 @@ def where(words: str) -> str:
 
 def _sure(finding: Finding) -> str:
     worst = max(p for p in (finding.p_value, finding.held_out_p, 0.0) if math.isfinite(p))
-    word = next((word for limit, word in SURE if worst < limit), "possible")
-    sure = f"{word}. Chance makes a trace so strong with probability {probability(finding.p_value)}"
+    sure = f"{_sure_word(worst)}. Chance makes a trace so strong with probability {probability(finding.p_value)}"
     if math.isfinite(finding.held_out_p):
         by_chance = probability(finding.held_out_p)
         sure += f"; its strength, fitted to half of the tracks, helps on the other half (by chance: {by_chance})"
@@ -217,6 +224,10 @@ def _sure(finding: Finding) -> str:
             f". That something like it is there is sure; but it may be {_or(finding.indistinguishable_from)} as well"
         )
     return f"{sure}."
+
+
+def _sure_word(p: float) -> str:
+    return next((word for limit, word in SURE if p < limit), "possible")
 
 
 def _what(diagnosis: Diagnosis, effects: int) -> str:

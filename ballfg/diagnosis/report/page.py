@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping
 from matplotlib.figure import Figure
 
 from ballfg.diagnosis.remains.generic import ALARM
+from ballfg.diagnosis.remains.label_check import percent
 from ballfg.diagnosis.report import pictures
 from ballfg.diagnosis.report.candidates import invisible, noticed_from, rankings
 from ballfg.diagnosis.report.glossary import glossary, term
@@ -158,7 +159,22 @@ def _left_over(diagnosis: Diagnosis) -> Html:
             tag("p", f"{purpose} {without} mm without, {within} mm with it."),
             kind="card",
         )
-    return section("What is left unexplained", tag("p", words), tag("p", share) if share else "", tests, quietly, rest)
+    counted = tag("p", share) if share else ""
+    return section("What is left unexplained", tag("p", words), counted, tests, quietly, _labels(diagnosis), rest)
+
+
+def _labels(diagnosis: Diagnosis) -> Html:
+    """The spin labels that contradict their flights, each with the probability that it is wrong."""
+    wrong = () if diagnosis.labels is None else diagnosis.labels.contradicted
+    if not wrong:
+        return Html()
+    words = (
+        "Spin labels that contradict their flights. The spin that a flight shows is uncertain because measurements are "
+        "noisy, and because flights and bounces scatter about the model."
+    )
+    rows = ((v.track, f"{v.off:.0f} rad/s", f"{v.sigma:.0f} rad/s", percent(v.probability)) for v in wrong)
+    head = ("track", "label less the flight's spin", "standard deviation of that spin", "the label is wrong")
+    return tag("article", tag("p", words), table(head, rows), kind="card")
 
 
 def _share(test: GenericTest) -> str:

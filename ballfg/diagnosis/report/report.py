@@ -11,6 +11,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from ballfg.diagnosis.remains.label_check import LabelCheck
 from ballfg.diagnosis.report.headline import headline
 from ballfg.diagnosis.report.origin import Origin
 from ballfg.diagnosis.report.page import page
@@ -142,9 +143,16 @@ def content(diagnosis: Diagnosis) -> dict[str, Any]:
             "rounds": [[_candidate(candidate) for candidate in row] for row in diagnosis.rounds],
             "excluded": diagnosis.excluded,
             "remarks": diagnosis.remarks,
+            "labels": None if diagnosis.labels is None else _labels(diagnosis.labels),
         }
     )
     return plain
+
+
+def _labels(check: LabelCheck) -> dict[str, Any]:
+    verdicts = [vars(verdict) for verdict in check.verdicts]
+    contradicted = [verdict.track for verdict in check.contradicted]
+    return {"p_all_right": check.p_all_right, "contradicted": contradicted, "verdicts": verdicts}
 
 
 def _candidate(candidate: Candidate) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ballfg.diagnosis.remains.label_check import LabelCheck
+from ballfg.diagnosis.remains.label_check import LabelCheck, LabelVerdict, label_test
 from ballfg.diagnosis.report.glossary import OUTCOMES, TERMS
 from ballfg.diagnosis.report.headline import advice, answer, certainty, further, headline, where
 from ballfg.diagnosis.report.origin import Origin
@@ -17,6 +17,7 @@ from ballfg.diagnosis.report.page import page
 from ballfg.diagnosis.report.pictures import beyond_histogram
 from ballfg.diagnosis.report.plain_effects import PLAIN, in_plain_words, plain_name
 from ballfg.diagnosis.report.predictions import meaning
+from ballfg.diagnosis.report.report import content
 from ballfg.diagnosis.report.shots import distances, error_map, median_shot
 from ballfg.diagnosis.result import Diagnosis, GenericTest, Outcome, Unexplained, Value, Verdict
 from ballfg.dynamics import EFFECTS
@@ -26,6 +27,7 @@ from tests.html_page import HtmlPage
 
 ORIGIN = Origin("ballfg diagnose 'my shots' --out out", ("my shots",), "", "out")
 WIND = replace(found().findings[0], indistinguishable_from=())
+WRONG_LABEL = LabelVerdict("a", 0.975, 120.0, 17.0)
 OWN = replace(WIND, name="tide", sentence="The sea pulls. It has two.", parameters={"a": Value(0.2, 0.01, "m")})
 
 
@@ -176,8 +178,30 @@ def test_tests_without_a_finding_show_no_share() -> None:
 
 
 def test_labels_that_all_fit_are_no_contradiction() -> None:
-    assert LabelCheck(0.8, (), 100, float("nan")).where == "label: none of 100 spin labels contradicts its flight"
-    assert "1 of 9 spin labels contradict" in LabelCheck(1e-9, ("a",), 9, 120.0).where
+    right = tuple(LabelVerdict(f"{i}", 0.01, 20.0, 15.0) for i in range(8))
+    assert LabelCheck(0.8, right).where.startswith("label: none of 8 spin labels contradicts its flight")
+    assert "1 of 9 spin labels contradict" in LabelCheck(1e-9, (WRONG_LABEL, *right)).where
+
+
+@pytest.mark.usefixtures("blank_pictures")
+def test_wrong_labels_are_told_with_their_probability() -> None:
+    check = LabelCheck(2e-7, (WRONG_LABEL, LabelVerdict("b", 0.4, 50.0, 20.0)))
+    tests = (label_test(check), GenericTest("time", "time: samples err alike", 0.4, 1.0))
+    left = Unexplained(check.where, 1.0, tests, None)
+    made = replace(unexplained(), unexplained=left, labels=check)
+    assert "each of these is wrong with a probability of at least 97 %" in headline(made)
+    sure = list(certainty(made))
+    assert "That some spin labels are wrong: practically certain. All of them are right with probability 2e-7." in sure
+    assert not any("something is left" in line for line in sure)
+    shown = page(made)
+    assert "the label is wrong" in shown
+    assert "<td>120 rad/s</td><td>17 rad/s</td><td>97 %</td>" in shown
+    assert "<td>50 rad/s</td>" not in shown
+    in_file = content(made)["labels"]
+    assert in_file["contradicted"] == ["a"]
+    assert in_file["p_all_right"] == 2e-7
+    assert in_file["verdicts"][1] == {"track": "b", "probability": 0.4, "off": 50.0, "sigma": 20.0}
+    assert content(unexplained())["labels"] is None
 
 
 def test_the_shot_shown_is_the_one_with_the_median_gain() -> None:
