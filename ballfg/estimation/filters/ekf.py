@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -27,7 +28,10 @@ from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact, Quality
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, stamp_covariance, total_sigmas
-from ballfg.estimation.smoother.near_contact import with_other_sides
+from ballfg.estimation.sides.covering import beside_its_contacts
+from ballfg.estimation.sides.passage import Seen, Ways
+from ballfg.estimation.sides.telling import on_both_sides
+from ballfg.estimation.sides.watch import Told, Watch
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.linear.definite import raised
@@ -106,7 +110,12 @@ class ExtendedKalmanFilter(Estimator):
         if record.start > 0 and (self.smooth or self.initialise == "prior"):
             fly_back(self.ball, record.start, track.times, run.flight_noise, run.fading, mean, covariance)
         whitened = record.innovations(run.H, mean, covariance, track.positions) if self.smooth else record.whitened
-        return self._result(track, run, mean, covariance, whitened).dated(written.times)
+        estimate = self._result(track, run, mean, covariance, whitened)
+        told = run.beside_contacts()
+        if self.smooth:  # later samples have shown the side, but for the last
+            estimate = beside_its_contacts(estimate, self.ball)
+            told = {k: one for k, one in told.items() if k == len(track) - 1}
+        return on_both_sides(estimate, told).dated(written.times)
 
     def _result(
         self,
@@ -136,8 +145,7 @@ class ExtendedKalmanFilter(Estimator):
             hits=np.array(run.record.hits, dtype=np.int64),
             quality=run.record.quality,
         )
-        estimate = plausible(estimate, track, run.sigma, self.settings)
-        return with_other_sides(estimate, self.model, self.surfaces)
+        return plausible(estimate, track, run.sigma, self.settings)
 
     def _failed(self, track: Track, run: _Run) -> Estimate:
         """Measured positions and priors."""
@@ -204,6 +212,33 @@ class _Run:
             covariance[POSITION, POSITION] += lasting
             covariance[POSITION, -3:] = covariance[-3:, POSITION] = -lasting
         return mean, covariance
+
+    def beside_contacts(self) -> dict[int, Told]:
+        """What is to be told of the ball at samples at which it may be on either side of a contact."""
+        record, times = self.record, self.track.times
+        ways = Ways(self.owner.ball, self.owner.surfaces, self.settings, len(self.bias_sigmas))
+        watch, told = Watch(ways), dict[int, Told]()
+        for k in range(record.start + 1, len(times)):
+            if k - 1 in record.hits:
+                watch.leave()
+                continue
+            before = record.mean[k - 1], record.covariance[k - 1]
+            held = partial(self._bounced_before, k)
+            one = watch.take(before, float(times[k] - times[k - 1]), self._seen(k), held)
+            if one is not None:
+                told[k] = one
+        return told
+
+    def _bounced_before(self, k: int, count: int) -> bool:
+        """Whether the filter's ball has bounced in the last `count` intervals before sample k."""
+        return any(i in self.record.contacts for i in range(k - count, k))
+
+    def _seen(self, k: int) -> Seen:
+        """What the filter took in at a sample."""
+        if self.record.quality[k] == Quality.OUTLIER:
+            return Seen()
+        rows = [(batch, row) for one, batch in self.beside for row in one.filter_rows(k)]
+        return Seen(self.track.positions[k], self.sigma[k], [batch.taken(np.array([row])) for batch, row in rows])
 
     def _least(self) -> Array:
         """(d,) standard deviations below which no number can be known, whatever rounding says of it."""

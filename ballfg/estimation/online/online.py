@@ -10,6 +10,7 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ballfg.arrays import Array
 from ballfg.checks import (
     as_float,
     check_array,
@@ -40,6 +41,8 @@ from ballfg.estimation.plausible import plausible, possible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import physics_of
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
+from ballfg.estimation.sides.passage import Seen, Ways
+from ballfg.estimation.sides.watch import Told, Watch
 from ballfg.estimation.smoother.motion import FLIGHT
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.estimation.smoother.smoother import Smoother
@@ -107,6 +110,7 @@ class Online(Estimator):
         self.window: StreamWindow | None = None
         self.events = EventTracker(self.surfaces, self.physics, self.settings.find_events)
         self._samples: list[Sample] = []  # of the window, also while iSAM2 is out of order
+        self._watch: Watch | None = None  # of the window's ball
         self._stream = SightingStream(self.cameras, self.settings.sighting_loss) if self.cameras else None
         self._frozen: list[Frozen] | None = None  # states that left the window, where someone asks for them
         self._counts = np.zeros(2, dtype=np.int64)
@@ -125,6 +129,7 @@ class Online(Estimator):
         if self.window is not None:
             other.window = self.window.copy(other._samples[: len(self.window)])
         other.events = self.events.copy()
+        other._watch = None if self._watch is None else self._watch.copy()
         other._stream = copy.deepcopy(self._stream)
         other._frozen = None if self._frozen is None else list(self._frozen)
         other._counts = self._counts.copy()
@@ -225,6 +230,7 @@ class Online(Estimator):
         if self.window is None:
             self.window = self._new_window(sample)
         self._counts[:] = 0
+        before = self.window.newest_in_order if len(self.window) else None
         self._samples.append(sample)
         status, rebuilt = Status.OK if len(self._samples) > 1 else Status.NO_VELOCITY, False
         try:
@@ -235,12 +241,34 @@ class Online(Estimator):
         newest = self._samples[-1]
         if status is Status.OK and not newest.motion.linked:  # a long gap before it
             status = Status.NO_VELOCITY
-        return self._state(self.window, newest, update, revised, rebuilt, status)
+        told = self._told(None if rebuilt else before, newest)
+        return self._state(self.window, newest, update, revised, rebuilt, status, told)
 
     def _new_window(self, sample: Sample) -> StreamWindow:
         """A window that begins with a sample; only measured positions have a tracker's bias."""
         biased = self.settings.has_memory and sample.measured
-        return WINDOWS[self.solver](self.ball, self.settings, float(sample.stated.min()), biased)
+        window = WINDOWS[self.solver](self.ball, self.settings, float(sample.stated.min()), biased)
+        self._watch = Watch(Ways(self.ball, self.surfaces, self.settings, window.width - STATE_DIM))
+        return window
+
+    def _told(self, before: tuple[Array, Array] | None, sample: Sample) -> Told | None:
+        """What is to be told of a ball that may be on either side of a contact; None far from one.
+
+        Args: before: what was known at the sample before.  sample: the newest one.
+        """
+        assert self._watch is not None
+        motion = sample.motion
+        if before is None or motion.hit or not motion.linked or motion.rest is not None:
+            self._watch.leave()
+            return None
+        dt = sample.time - self._samples[-2].time
+        factors = [measurement.batch for measurement in sample.measurements]
+        seen = Seen(sample.position if sample.measured else None, sample.sigma, factors)
+        return self._watch.take(before, dt, seen, self._has_bounced)
+
+    def _has_bounced(self, count: int) -> bool:
+        """Whether the window's ball has bounced in the last `count` intervals."""
+        return any(sample.motion.heights for sample in self._samples[-count:])
 
     def _tell_whole_error(self, sample: Sample) -> None:
         """Standard deviations of a new sample's whole error, and the rough velocity that its stamp's error needs."""
@@ -266,7 +294,9 @@ class Online(Estimator):
         except (RuntimeError, ValueError) as error:
             rebuilt = True
             status, update = self._repair(error, status)
-        return self._state(self.window, sample, update, 0, rebuilt, status)
+        assert self._watch is not None
+        told = None if rebuilt else self._watch.join(Seen(factors=[sighting.batch]), self._has_bounced)
+        return self._state(self.window, sample, update, 0, rebuilt, status, told)
 
     def _take_in(self, window: StreamWindow, sample: Sample, changed: bool) -> tuple[int, Update]:
         """Explain, go back to where the explanation changed, append, move contacts, keep the window's length."""
@@ -310,9 +340,18 @@ class Online(Estimator):
             raise error from None
 
     def _state(
-        self, window: StreamWindow, sample: Sample, update: Update, revised: int, rebuilt: bool, status: Status
+        self,
+        window: StreamWindow,
+        sample: Sample,
+        update: Update,
+        revised: int,
+        rebuilt: bool,
+        status: Status,
+        told: Told | None,
     ) -> OnlineState:
         mean, joint = window.newest_belief
+        if told is not None:
+            mean, joint = told.mean[: len(mean)], told.widened[: len(mean), : len(mean)]
         if possible(mean[:STATE_DIM]) and variances_positive(joint):
             joint = definite(joint)
         else:
@@ -326,6 +365,7 @@ class Online(Estimator):
             coefficient_names=tuple(self.settings.coefficients),
             world=self.world,
             name="stream",
+            other_side=None if told is None else told.other,
             innovation=update.innovation,
             motion=sample.motion,
             revised=revised,

@@ -17,9 +17,10 @@ from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Segmentation, physics_of, segment
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
+from ballfg.estimation.sides.covering import beside_its_contacts
+from ballfg.estimation.smoother.at_end import with_both_sides
 from ballfg.estimation.smoother.grip import rival_note, with_other_spins
 from ballfg.estimation.smoother.initial import initial_states, move_contacts
-from ballfg.estimation.smoother.near_contact import with_other_sides
 from ballfg.estimation.smoother.problem import Events, TrackProblem
 from ballfg.estimation.smoother.restart import label_let_go, minimise_with_restart
 from ballfg.estimation.smoother.solution import (
@@ -297,4 +298,4 @@ class Smoother(Estimator):
         )
         estimate = plausible(estimate, track, problem.sigma, self.settings)
         estimate = replace(estimate, notes=estimate.notes + rival_note(solution, estimate.covariances[0]))
-        return with_other_sides(estimate, self.model, self.surfaces)
+        return with_both_sides(self, problem, beside_its_contacts(estimate, problem.ball))

@@ -199,6 +199,12 @@ class StreamWindow(ABC):
         return mean, without_bias(self.newest_covariance, self.width)
 
     @property
+    def newest_in_order(self) -> tuple[Array, Array]:
+        """Mean (w + p,) and covariance of the newest state, the coefficients and the bias, in this order."""
+        order = np.r_[:STATE_DIM, self.width : self.width + self.p, STATE_DIM : self.width]
+        return np.concatenate((self.points[-1], self.coefficients))[order], self.newest_covariance[np.ix_(order, order)]
+
+    @property
     def coefficients(self) -> Array:
         """(p,) the present estimate."""
         return self.coefficient_theta + self.coefficient_delta

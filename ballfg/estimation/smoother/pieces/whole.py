@@ -16,8 +16,9 @@ from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact
 from ballfg.estimation.settings import sample_sigmas
+from ballfg.estimation.sides.covering import Shared, beside_contacts
+from ballfg.estimation.smoother.at_end import with_both_sides
 from ballfg.estimation.smoother.grip import rival_note
-from ballfg.estimation.smoother.near_contact import other_sides
 from ballfg.estimation.smoother.pieces.chain import Point
 from ballfg.estimation.smoother.pieces.joining import Joined, joined_minimum, watched
 from ballfg.estimation.smoother.pieces.reduction import Reduction
@@ -92,11 +93,12 @@ def smoothed(smoother: Smoother, task: tuple[State, Array, Point]) -> Smoothed:
     covariances = np.ascontiguousarray(known.states[:, :STATE_DIM, :STATE_DIM])
     contacts = _contacts(problem, state, values)
     times = section.inside(section.track.times)
-    world = smoother.model, smoother.surfaces
-    sides = other_sides(times, values.states, covariances, contacts, *world, at_end=section.ends)
+    own = slice(problem.width)
+    cross = np.ascontiguousarray(known.cross[:, :STATE_DIM, own])
+    shared = Shared(values.coefficients[own], known.coefficients[own, own], cross)
+    sides = beside_contacts(times, values.states, covariances, contacts, problem.ball, shared)
     near = np.flatnonzero(sides.any(axis=(1, 2)))
     innovations = _innovations(problem, state, values, known)
-    cross = np.ascontiguousarray(known.cross[:, :STATE_DIM, : problem.width])
     return Smoothed(values, covariances, cross, {int(k): sides[k] for k in near}, innovations, contacts)
 
 
@@ -136,7 +138,11 @@ def _sections(smoother: Smoother, track: Track, found: Joined) -> Iterator[Estim
             others[k] += part.others[k]
         before = part.others.get(count, np.zeros((STATE_DIM, STATE_DIM)))
         notes = (*doubts, *_rival_note(found, part)) if first == 0 else ()
-        yield _section(smoother, track, problem, found, part, others, first, notes)
+        estimate = _section(smoother, track, problem, found, part, others, first, notes)
+        if last == len(track) - 1:
+            ending = track.between(float(track.times[first]), float(track.times[last]))
+            estimate = with_both_sides(smoother, smoother.problem(ending), estimate)
+        yield estimate
 
 
 def _section(

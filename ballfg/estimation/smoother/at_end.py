@@ -1,0 +1,90 @@
+"""The last state of a track that ends beside a contact: no later sample shows on which side of it the ball is."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from ballfg.arrays import Array
+from ballfg.estimation.result import Estimate
+from ballfg.estimation.sides.passage import Seen, Ways
+from ballfg.estimation.sides.telling import on_both_sides
+from ballfg.estimation.sides.watch import Watch
+from ballfg.estimation.smoother.problem import TrackProblem
+from ballfg.factors.linear.covariance import marginal_covariances
+from ballfg.factors.linear.definite import definite
+from ballfg.state import STATE_DIM
+from ballfg.tracks import Track
+
+if TYPE_CHECKING:
+    from ballfg.estimation.smoother.smoother import Smoother
+
+REACH: Final = 3
+"""Intervals at the end in which a contact may still be in doubt."""
+LEAST: Final = 3
+"""Samples that must come before them."""
+MEMORY: Final = 256
+"""Samples that say all about a state at their end."""
+
+
+def with_both_sides(smoother: Smoother, problem: TrackProblem, estimate: Estimate) -> Estimate:
+    """The estimate, its last state that of the more probable side where the track ends beside a contact.
+
+    What is known of the ball before the contact is estimated from the samples up to there; from then on both sides are
+    followed (`ballfg.estimation.sides`).
+
+    Args: smoother: of the track.  problem: of it.  estimate: without.
+    """
+    track, n = problem.track, len(problem.track)
+    disturbed = np.concatenate((estimate.hits, problem.segmentation.restarts))
+    first = _before_contact(estimate, Ways(problem.ball, smoother.surfaces, problem.settings), track)
+    if estimate.status.failed or first is None or first + 1 < LEAST or (disturbed >= first).any():
+        return estimate
+    before = _filtered(smoother, track.between(track.times[max(first + 1 - MEMORY, 0)], track.times[first]))
+    if before is None:
+        return estimate
+    ways = Ways(problem.ball, smoother.surfaces, problem.settings, len(before[0]) - STATE_DIM - problem.width)
+    steps = [(float(track.times[k] - track.times[k - 1]), _seen(problem, k)) for k in range(first + 1, n)]
+    told = Watch(ways).follow(before, steps, lambda count: any(c.interval >= n - 1 - count for c in estimate.contacts))
+    return estimate if told is None else on_both_sides(estimate, {n - 1: told})
+
+
+def _before_contact(estimate: Estimate, ways: Ways, track: Track) -> int | None:
+    """The last sample that is certainly before a contact near the track's end; None where there is no such contact."""
+    n = len(track)
+    near = [contact.interval for contact in estimate.contacts if contact.interval >= n - 1 - REACH]
+    if near:
+        return near[0] - 1
+    for k in range(max(n - 1 - REACH, 0), n - 1):
+        state = estimate[k]
+        if ways.may_touch(state.mean, state.joint, float(track.times[k + 1] - track.times[k])):
+            return k
+    return None
+
+
+def _filtered(smoother: Smoother, track: Track) -> tuple[Array, Array] | None:
+    """Mean and covariance of state, coefficients and bias at the end of a track; None where they are not known."""
+    problem = smoother.problem(track)
+    minimum = smoother.solve(problem).minimum
+    if minimum.step is None:
+        return None
+    known, values, p = marginal_covariances(minimum.step.root).definite(), minimum.values, problem.width
+    biases = np.zeros(0) if values.biases is None else values.biases[-1]
+    mean = np.concatenate((values.states[-1], values.coefficients[:p], biases))
+    width = STATE_DIM + len(biases)
+    covariance = np.zeros((width + p,) * 2)
+    own = np.append(np.arange(STATE_DIM), np.arange(STATE_DIM + p, width + p))
+    shared = np.arange(STATE_DIM, STATE_DIM + p)
+    covariance[np.ix_(own, own)] = known.states[-1]
+    covariance[np.ix_(own, shared)], covariance[np.ix_(shared, own)] = known.cross[-1][:, :p], known.cross[-1][:, :p].T
+    covariance[np.ix_(shared, shared)] = known.coefficients[:p, :p]
+    return mean, definite(covariance)
+
+
+def _seen(problem: TrackProblem, sample: int) -> Seen:
+    """What was measured at a sample of a track; rough positions stand for pixels."""
+    beside = [one for one in problem.observations if not one.locates]
+    rows = [(problem.observed[one.name], row) for one in beside for row in one.filter_rows(sample)]
+    factors = [batch.taken(np.array([row])) for batch, row in rows]
+    return Seen(problem.track.positions[sample], problem.sigma[sample], factors)

@@ -1,0 +1,119 @@
+"""A ball that passes a surface, against integrals over all possible balls and against draws of them."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+from scipy.stats import norm
+
+from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
+from ballfg.dynamics.motion.rollout import advance
+from ballfg.estimation.settings import Settings
+from ballfg.estimation.sides.mixture import Mixture
+from ballfg.estimation.sides.passage import Passage, Seen, Ways
+from ballfg.estimation.sides.watch import Watch
+from ballfg.factors.noise import ProcessNoise
+from ballfg.simulation import table_tennis
+
+QUIET = Settings(process=ProcessNoise(1e-9, 1e-6, 1e-9, 0.0, 1e-6))
+FALLING = np.array([0.0, 0.0, 0.034, 4.0, 0.3, -2.5, 10.0, 30.0, 5.0])
+SIGMAS = np.array([1e-3, 1e-3, 2e-3, 0.03, 0.03, 0.03, 40.0, 40.0, 40.0])
+DT = 0.006
+
+
+def ways(model=None) -> Ways:
+    return Ways(model or table_tennis().model, Surfaces(0.0), QUIET)
+
+
+def test_a_gaussian_is_cut_as_an_integral_over_it_says() -> None:
+    """Two numbers, the gap their difference: mean, covariance and weight of the part above, by sums over a grid."""
+    covariance = np.array([[2.0, 0.5], [0.5, 1.0]])
+    cut = Mixture.one(np.array([0.3, 0.8]), covariance).above(np.array([-0.5]), np.array([[1.0, -1.0]]))
+    x, y = np.meshgrid(np.linspace(-9, 9, 401), np.linspace(-7, 8, 401), indexing="ij")
+    points = np.stack((x, y), axis=-1)
+    apart = points - np.array([0.3, 0.8])
+    weight = np.exp(-0.5 * np.einsum("abi,ij,abj->ab", apart, np.linalg.inv(covariance), apart)) * (x > y)
+    weight /= weight.sum()
+    mean = np.einsum("ab,abi->i", weight, points)
+    spread = np.einsum("ab,abi,abj->ij", weight, points - mean, points - mean)
+    np.testing.assert_allclose(cut.means[0], mean, atol=0.01)
+    np.testing.assert_allclose(cut.covariances[0], spread, atol=0.02)
+    assert np.exp(cut.log) == pytest.approx(norm.cdf(-0.5 / np.sqrt(2.0)), rel=1e-9)
+
+
+def test_merged_gaussians_have_the_moments_of_all() -> None:
+    rng = np.random.default_rng(1)
+    roots = rng.normal(size=(3, 4, 4))
+    mixture = Mixture(np.log([0.2, 0.5, 1.3]), rng.normal(size=(3, 4)), roots @ roots.swapaxes(1, 2))
+    shares = np.array([0.1, 0.25, 0.65])
+    mean = shares @ mixture.means
+    second = sum(w * (c + np.outer(m, m)) for w, m, c in zip(shares, mixture.means, mixture.covariances, strict=True))
+    merged = mixture.merged()
+    np.testing.assert_allclose(merged.means[0], mean)
+    np.testing.assert_allclose(merged.covariances[0], second - np.outer(mean, mean), atol=1e-12)
+    assert np.exp(merged.log) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("dt", [0.0062, 0.0068, 0.0074])
+def test_both_sides_against_draws(dt: float) -> None:
+    """30,000 balls rolled out and weighed by how well they fit the sample: chance, mean and sigmas of each side."""
+    noise = 0.003
+    position = np.array([4.0 * dt, 0.3 * dt, 0.019])
+    passage = Passage.begun(ways(), FALLING, np.diag(SIGMAS**2)).after(dt, Seen(position, np.full(3, noise)))
+    flying, risen = passage.sides()
+    rng = np.random.default_rng(3)
+    drawn = torch.from_numpy(FALLING + SIGMAS * rng.standard_normal((30_000, 9)))
+    with torch.no_grad():
+        after = advance(table_tennis().model, drawn, torch.full((len(drawn),), dt, dtype=torch.float64), Surfaces(0.0))
+    states = after.numpy()
+    weights = np.exp(-0.5 * ((states[:, :3] - position) ** 2).sum(axis=1) / noise**2)
+    up = states[:, 5] > 0.0
+    chance = weights[up].sum() / weights.sum()
+    assert 0.1 < chance < 0.9
+    assert np.exp(risen.logs[0]) == pytest.approx(chance, abs=0.02)
+    assert np.exp(flying.logs[0]) == pytest.approx(1.0 - chance, abs=0.02)
+    for side, rows in ((flying, ~up), (risen, up)):
+        own = weights[rows] / weights[rows].sum()
+        mean = own @ states[rows]
+        sigmas = np.sqrt(own @ (states[rows] - mean) ** 2)
+        assert np.abs((side.means[0] - mean) / sigmas).max() < 0.15
+        np.testing.assert_allclose(np.sqrt(np.diagonal(side.covariances[0])), sigmas, rtol=0.15)
+
+
+def test_a_ball_far_from_the_surface_is_left_to_its_estimator() -> None:
+    watch = Watch(ways())
+    high = FALLING + np.array([0, 0, 0.1, 0, 0, 0, 0, 0, 0])
+    assert watch.take((high, np.diag(SIGMAS**2)), DT, Seen(), lambda count: False) is None
+
+
+def test_a_sample_that_nothing_explains_is_not_believed_and_two_end_the_passage() -> None:
+    """A position 0.3 m off moves nothing; a second one means that something else has happened."""
+    watch, off = Watch(ways()), Seen(np.array([0.024, 0.0018, 0.33]), np.full(3, 0.002))
+    before = (FALLING, np.diag(SIGMAS**2))
+    told = watch.take(before, DT, off, lambda count: False)
+    expected = Watch(ways()).take(before, DT, Seen(), lambda count: False)
+    assert told is not None
+    assert expected is not None
+    np.testing.assert_array_equal(told.mean, expected.mean)
+    assert watch.take(before, DT, off, lambda count: False) is None
+
+
+def test_a_side_is_told_as_long_as_the_estimator_takes_the_other() -> None:
+    """Clearly bounced two samples ago: told while the estimator knows of no bounce, left to it once it does."""
+    model = AnalyticModel([EFFECTS["gravity"](), EFFECTS["restitution"](e=0.9)])
+    states, now = [FALLING], torch.from_numpy(FALLING)[None]
+    for _ in range(3):
+        with torch.no_grad():
+            now = advance(model, now, torch.full((1,), 0.01, dtype=torch.float64), Surfaces(0.0))
+        states.append(now[0].numpy().copy())
+    for held in (False, True):
+        watch, told, covariance = Watch(ways(model)), [], np.diag((0.1 * SIGMAS) ** 2)
+        for before, after in pairwise(states):
+            seen = Seen(after[:3], np.full(3, 1e-4))
+            told.append(watch.take((before, covariance), 0.01, seen, lambda count, held=held: held))
+        assert told[0] is not None
+        assert told[0].risen
+        assert (told[2] is None) == held
