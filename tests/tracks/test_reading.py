@@ -333,7 +333,10 @@ def test_parquet_types_that_mean_the_same_are_read(make_folder, change):
         ({"x": ["0", "1"]}, "tracks.parquet, column 'x': must hold numbers; got type string. Convert it to float64"),
         ({"t": pa.array([0, 1], pa.timestamp("ms"))}, "column 't': must hold numbers; got type timestamp[ms]."),
         ({"x": [0.0, None]}, "tracks.parquet, row 2, column 'x': must be finite; got nan."),
-        ({"trajectory": ["a", None]}, "tracks.parquet, row 2, column 'trajectory': must be printable text of one line, "),
+        (
+            {"trajectory": ["a", None]},
+            "tracks.parquet, row 2, column 'trajectory': must be printable text of one line, ",
+        ),
         ({"trajectory": [b"\xff", b"a"]}, "tracks.parquet: cannot be read as a table of tracks; Invalid UTF8"),
         ({"t": [0.0, 0.0], "x": [0.0, 1.0]}, "tracks.parquet, rows 1 and 2: trajectory 'a' must have one position"),
     ],
