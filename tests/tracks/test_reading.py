@@ -162,6 +162,13 @@ CELLS = "must be a number with a decimal point"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("a" * 65_537, "tracks.csv, line 1: the line of column names must have at most 65536 bytes; it has more."),
+        (HEAD + A + "b,0,1,2," + "3" * 262_144 + "\n", "tracks.csv, line 4: must have at most 262144 characters"),
+        (
+            HEAD + A + "b" * 201 + ",0,1,2,3\n",
+            "line 4, column 'trajectory': must be printable text of one line, 1 to 200",
+        ),
+        (HEAD + A + "b\u202ec,0,1,2,3\n", r"got 'b\u202ec'. Fill in a name."),
         ("", "tracks.csv: must begin with a line of column names; got an empty file or line. Add the header."),
         (HEAD.strip(), "tracks.csv: must hold tracks; got a header without rows. Add the measurements."),
         (HEAD, "tracks.csv: must hold tracks; got a header without rows. Add the measurements."),
