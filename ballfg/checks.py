@@ -41,6 +41,8 @@ MAX_NAME = 200
 """Characters of the name of a track, dataset, camera, label or group: they go to files, pages and terminals."""
 MAX_TEXT = 2000
 """Characters of other text that a file states, such as where data come from."""
+MAX_PATH, MAX_PART = 4095, 255
+"""Characters of a path, and of a name in it: no file system has longer ones."""
 _JOINERS = "\u200c\u200d"
 """Invisible letters that Persian, Indian scripts and emoji are written with."""
 _MAX_COMPARED = 200
@@ -319,13 +321,18 @@ def check_choice(label: str, value: object, known: Collection[str]) -> None:
 def check_path(label: str, value: object) -> Path:
     """The place of a file or folder.
 
-    Raises: TypeError: neither text nor a path. ValueError: one with a NUL, which no system has.
+    Raises: TypeError: neither text nor a path. ValueError: one that no system can have: with a NUL, or too long.
     """
     if not isinstance(value, str | PathLike):
         raise TypeError(f"{label} must be a path; got {type_name(value)} {shown(value)}. Give it as text or Path.")
     path = Path(value)
     if "\0" in str(path):
         raise ValueError(f"{label} must be a path without a NUL; got {shown(str(path))}. Correct it.")
+    if len(str(path)) > MAX_PATH or any(len(part) > MAX_PART for part in path.parts):
+        raise ValueError(
+            f"{label} must be a path of at most {MAX_PATH} characters, each name in it of at most {MAX_PART}; got "
+            f"{shown(str(path))}. Shorten it."
+        )
     return path
 
 

@@ -9,7 +9,7 @@ from typing import TypeAlias, TypedDict, Unpack, overload
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ballfg.checks import check_count, check_instance, type_name
+from ballfg.checks import check_count, check_instance, check_path, type_name
 from ballfg.diagnosis import Diagnosis
 from ballfg.diagnosis import diagnose as diagnose_dataset
 from ballfg.dynamics import BallModel, Surfaces, inertia_factor, load_model, nominal_model
@@ -179,7 +179,7 @@ def _scales(
     observe: float,
 ) -> ConformalScales | None:
     """The scales of predictions of `data`: those given, or from the calibration tracks that are given."""
-    if isinstance(conformal, str | PathLike) and Path(conformal).is_file():
+    if isinstance(conformal, str | PathLike) and check_path("conformal", conformal).is_file():
         conformal = load_conformal(Path(conformal))
     if isinstance(conformal, ConformalScales):
         conformal.check_fits(observe, method)

@@ -20,14 +20,17 @@ from ballfg.checks import (
     check_flag,
     check_instance,
     check_keys,
+    check_name,
     check_number,
     check_path,
     check_range,
     check_text,
     did_you_mean,
     is_number,
+    one_line,
     short_text,
     shown,
+    visible,
 )
 
 
@@ -163,3 +166,55 @@ def test_misspelt_names() -> None:
     assert did_you_mean("Timestamp", ["x", "t"]) == " Did you mean 't'?"
     assert did_you_mean("license", ["licence"]) == " Did you mean 'licence'?"
     assert did_you_mean("zzz", ["licence"]) == ""
+
+
+@pytest.mark.parametrize(
+    "name", ["a", "001", "-1", "=x", "Wurf 3", "été", "球", "👩\u200d🚀", "نمونه\u200cها", "a" * 200, "<script>"]
+)
+def test_names(name):
+    assert check_name("name", name) == name
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "",
+        " ",
+        "a" * 201,
+        "a\nb",
+        "a\tb",
+        "\x1b[2J",
+        "a\0",
+        "a\u202eb",
+        "a\u2066b",
+        "\ufeffa",
+        "a\u200bb",
+        "a\u2028b",
+        "\ud800",
+    ],
+)
+def test_what_is_no_name(name):
+    with pytest.raises(
+        ValueError, match=r"name must be printable text of one line, 1 to 200 characters .*; got "
+    ) as caught:
+        check_name("name", name)
+    assert str(caught.value).isprintable()
+
+
+def test_text_may_have_lines_but_nothing_that_a_terminal_obeys():
+    check_text("source", "one\n  two\tthree")
+    for text in ("\x1b[2J", "a\u202eb", "a" * 2001):
+        with pytest.raises(ValueError, match="source must be text of at most 2000 characters"):
+            check_text("source", text)
+
+
+def test_what_messages_print_is_visible():
+    assert one_line(ValueError("a\x1b[2J\n\u202eb.")) == r"a\x1b[2J \u202eb"
+    assert short_text("a\x07b") == r"a\x07b"
+    assert visible("plain é 球") == "plain é 球"
+
+
+@pytest.mark.parametrize("path", ["a\0b", "a" * 256, "/".join(["a"] * 3000)])
+def test_a_path_that_no_system_has(path):
+    with pytest.raises(ValueError, match="out must be a path "):
+        check_path("out", path)

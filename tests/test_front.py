@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import subprocess
 import sys
 from dataclasses import replace
@@ -20,7 +21,7 @@ from ballfg.estimation.segmentation import Contact
 from ballfg.factors.loss import Loss
 from ballfg.prediction import Belief, Propagator, apex, next_contact, plane_crossing
 from ballfg.simulation import MeasurementNoise, SimulationConfig, tennis, write_simulation
-from ballfg.tracks import write_dataset
+from ballfg.tracks import DatasetInfo, write_dataset
 
 PANDAS = importlib.util.find_spec("pandas") is not None
 
@@ -418,3 +419,31 @@ def test_the_door_itself_is_light() -> None:
     assert said.stdout == "set()\n"
     for name in ("read", "estimate", "predict", "diagnose", "Online", "BallState", "RadarSpeed", "SpinReading"):
         assert name in dir(bf)
+
+
+@pytest.mark.parametrize("jobs", [0, -1, 10_001])
+def test_fewer_processes_than_one_are_refused_everywhere(jobs: int, tmp_path: Path) -> None:
+    """Before anything is read: the folder is not there."""
+    for call in (bf.estimate, bf.predict, bf.diagnose):
+        with pytest.raises(ValueError, match=rf"jobs must lie in 1 .. 10000; got {jobs}"):
+            call(tmp_path / "nowhere", jobs=jobs)
+
+
+@pytest.mark.parametrize("observe", [math.inf, -math.inf, math.nan, 0.0, -1.0])
+def test_an_observed_part_is_a_positive_time(observe: float, tmp_path: Path) -> None:
+    write_dataset(tmp_path, DatasetInfo("d", 0.0, bf.Ball(0.02, 0.0027), position_noise=0.003), [_fall()])
+    with pytest.raises(ValueError, match="observe must be a positive number of seconds; got"):
+        bf.predict(tmp_path, observe=observe)
+
+
+@pytest.mark.parametrize(("measured", "got"), [(None, "nothing"), (3, "int"), ([], "list")])
+def test_what_cannot_be_diagnosed_is_told_as_what_it_is(measured: object, got: str) -> None:
+    with pytest.raises(TypeError, match=f"measured must be a dataset or its folder; got {got}. Read one with bf.read"):
+        bf.diagnose(measured)  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match="got one Track; effects show in many of them"):
+        bf.diagnose(_fall())  # type: ignore[arg-type]
+
+
+def _fall() -> bf.Track:
+    t = np.arange(20) / 100.0
+    return bf.Track(t, np.column_stack([t, 0.0 * t, 1.2 - 4.9 * t**2]))

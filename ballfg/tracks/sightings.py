@@ -55,7 +55,7 @@ class Sightings:
         camera = np.asarray(self.camera)
         if camera.shape != (m,) or camera.dtype.kind not in "iu" or not ((camera >= 0) & (camera < len(names))).all():
             raise ValueError(
-                f"camera must be ({m},) whole numbers from 0 to {len(names) - 1}; got {camera.tolist()}. "
+                f"camera must be ({m},) whole numbers from 0 to {len(names) - 1}; got {shown(camera.tolist())}. "
                 "Number the cameras in the order of their names."
             )
         object.__setattr__(self, "camera", camera.astype(np.int64))

@@ -103,3 +103,29 @@ def test_a_fault_of_the_program_keeps_its_traceback():
 
     with pytest.raises(KeyError):
         guarded(command)
+
+
+@pytest.mark.parametrize("words", ["--help", "estimate --help", "info", "simulate --out x --tracks 2"])
+def test_a_reader_of_stdout_that_leaves_is_no_error(words, tmp_path):
+    """As `| head`: no word, and the status that shells show of a program which SIGPIPE ends; results stay."""
+    code = "from ballfg.cli.main import run; run()"
+    there, here = os.pipe()
+    os.close(there)
+    command = [sys.executable, "-c", code, *words.split(), *(["--quiet"] if "simulate" in words else [])]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, stdout=here, stderr=subprocess.PIPE, cwd=tmp_path, env=environment, timeout=120)
+    os.close(here)
+    assert done.returncode == 141
+    assert b"Error" not in done.stderr
+    assert b"error" not in done.stderr
+    assert (tmp_path / "x" / "tracks.csv").is_file() == ("simulate" in words)
+
+
+def test_a_broken_pipe_to_another_place_is_told(capsys):
+    """Only what was printed for a reader that left ends without a word."""
+
+    def command() -> None:
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe", "a.fifo")
+
+    assert guarded(command) == BAD_INPUT
+    assert "a.fifo: Broken pipe" in capsys.readouterr().err

@@ -1,6 +1,7 @@
 """Files that are small and unpack to much, or have no end: each must be refused within 2 s and 300 MB.
 
     python -m tests.faults.bombs              every bomb; --only parquet: those whose name begins so
+    python -m tests.faults.bombs --large      large files that are good, which must be read
 
 Each bomb is read as the commands read it, in a process of its own that has imported the program and read good files.
 Time is that of the reading alone, on the wall. Memory is the largest that the process took beyond what it had before,
@@ -32,6 +33,7 @@ from ballfg.vision.calibration.boards import read_grey
 from tests.faults.bombs_of_arrays import ARRAYS
 from tests.faults.bombs_of_others import OTHERS
 from tests.faults.bombs_of_tables import TABLES
+from tests.faults.large_files import LARGE
 from tests.faults.readers import reader_of
 from tests.faults.seeds import write_reader
 from tests.faults.worker import verdict
@@ -93,6 +95,19 @@ def run(names: Iterable[str], folder: Path) -> dict[str, Outcome]:
         file.parent.mkdir(exist_ok=True)
         in_a_process(lambda file=file, name=name: BOMBS[name][2](file))  # type: ignore[misc]
         found[name] = measured(lambda place=place, file=file, name=name: _read(name, place, file), str(place))  # type: ignore[misc]
+        shutil.rmtree(place)
+    return found
+
+
+def read_large(folder: Path) -> dict[str, Outcome]:
+    """Reads large files that are good. Args: folder: to write to. Returns: outcomes by name."""
+    _warm(folder, ())
+    found = {}
+    for name, (file, write, read) in LARGE.items():
+        place = folder / "large"
+        place.mkdir()
+        in_a_process(lambda place=place, file=file, write=write: write(place / file))  # type: ignore[misc]
+        found[name] = measured(lambda place=place, file=file, read=read: read(place / file), str(place))  # type: ignore[misc]
         shutil.rmtree(place)
     return found
 
@@ -167,8 +182,14 @@ def main() -> int:
     """Runs from the command line. Returns: 1 where a bomb went off."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", default="", help="names of bombs begin so")
+    parser.add_argument("--large", action="store_true", help="read large good files in place of bombs")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
+        if options.large:
+            found = read_large(Path(folder))
+            for name, one in found.items():
+                print(f"{name:<44} {one.outcome:<8} {one.seconds:6.2f} s {one.memory / 1e6:6.0f} MB  {one.words[:90]}")
+            return 0 if all(one.outcome == "read" for one in found.values()) else 1
         found = run([name for name in BOMBS if name.startswith(options.only)], Path(folder))
     for name, one in found.items():
         mark = "" if one.good else "  <- not refused in time"

@@ -82,21 +82,28 @@ def _string(text: str) -> bytes:
     return struct.pack("<I", len(text)) + text.encode()
 
 
-def _mcap(compression: str, says: int | None = None) -> Write:
-    """A bag with one chunk of a gigabyte. Args: says: bytes of it, where that is another number."""
+def mcap(compression: str, says: int | None = None, size: int = 1_000_000_000) -> Write:
+    """A bag with one chunk of zeros.
+
+    Args: says: bytes of it, where that is another number.  size: bytes.
+    """
 
     def write(path: Path) -> None:
         from lz4.frame import compress as lz4
 
-        raw = bytes(1_000_000_000)
+        raw = bytes(size)
         if compression == "zstd":
             from backports import zstd
 
             packed = zstd.compress(raw)
         else:
             packed = lz4(raw)
-        size = len(raw) if says is None else says
-        chunk = struct.pack("<QQQI", 0, 1, size, 0) + _string(compression) + struct.pack("<Q", len(packed)) + packed
+        chunk = (
+            struct.pack("<QQQI", 0, 1, size if says is None else says, 0)
+            + _string(compression)
+            + struct.pack("<Q", len(packed))
+            + packed
+        )
         head, magic = _record(1, _string("ros2") + _string("made")), b"\x89MCAP0\r\n"
         path.write_bytes(magic + head + _record(6, chunk) + _record(2, bytes(20)) + magic)
 
@@ -156,9 +163,9 @@ OTHERS: dict[str, Bomb] = {
     "ppm/a header alone": ("boards", "x.ppm", _netpbm),
     "avi/14,000 by 14,000": ("video", "a.avi", _video(14_000, 14_000)),
     "avi/a header that says less": ("video", "a.avi", _video(48, 32)),
-    "mcap/zstd": ("import", "x.mcap", _mcap("zstd")),
-    "mcap/lz4": ("import", "x.mcap", _mcap("lz4")),
-    "mcap/a size that is none": ("import", "x.mcap", _mcap("zstd", 100)),
+    "mcap/zstd": ("import", "x.mcap", mcap("zstd")),
+    "mcap/lz4": ("import", "x.mcap", mcap("lz4")),
+    "mcap/a size that is none": ("import", "x.mcap", mcap("zstd", 100)),
     "db3/a view": ("import", "x.db3", _database(
         f"CREATE VIEW messages AS SELECT i AS id, 1 AS topic_id, i AS timestamp, zeroblob(1000000) AS data FROM {_ROWS}"
     )),

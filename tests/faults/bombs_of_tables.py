@@ -9,6 +9,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from ballfg.state import SIGMA_NAMES, STATE_NAMES
+
 Write = Callable[[Path], object]
 Bomb = tuple[str, str, Write]
 LONG = 1_000_000
@@ -30,39 +32,28 @@ def _parquet(columns: Mapping[str, object], **options: object) -> Write:
     return write
 
 
-def _named(name: str | list[str], rows: int = ROWS, extra: Mapping[str, object] | None = None) -> Write:
-    """A table of tracks with a name in every row, or names in turn."""
-
-    def write(path: Path) -> None:
-        names = [name] * rows if isinstance(name, str) else name
-        numbers = {key: np.arange(float(len(names))) / 100.0 for key in ("t", "x", "y", "z")}
-        _parquet({"trajectory": names, **numbers, **(extra or {})})(path)
-
-    return write
+def _words(words: list[str], rows: int = ROWS) -> pa.Array:
+    """A column of texts in turn, which takes no more memory than the words."""
+    return pa.DictionaryArray.from_arrays(pa.array(np.arange(rows, dtype=np.int32) % len(words)), pa.array(words))
 
 
-def _states(path: Path) -> None:
-    from ballfg.state import SIGMA_NAMES, STATE_NAMES
-
-    numbers = dict.fromkeys(("t", *STATE_NAMES, *SIGMA_NAMES), np.arange(float(ROWS)))
-    _parquet({"trajectory": ["a" * LONG] * ROWS, **numbers})(path)
+def _named(words: list[str], columns: tuple[str, ...] = ("t", "x", "y", "z")) -> Write:
+    """A table whose rows have long names; the file says that they are plain texts."""
+    numbers = dict.fromkeys(columns, np.arange(float(ROWS)) / 100.0)
+    return lambda path: _parquet({"trajectory": _words(words), **numbers}, store_schema=False)(path)
 
 
 def _zeros(path: Path) -> None:
     many = pa.array(np.zeros(ZEROS))
-    _parquet(
-        dict.fromkeys(("t", "x", "y", "z"), many)
-        | {"trajectory": pa.array(["a"]).take(pa.array(np.zeros(ZEROS, np.int32)))}
-    )(path)
+    columns = {"trajectory": _words(["a"], ZEROS), **dict.fromkeys(("t", "x", "y", "z"), many)}
+    _parquet(columns, store_schema=False)(path)
 
 
 def _repeated_list(path: Path) -> None:
     """Lists of one long word, again and again."""
-    words = pa.DictionaryArray.from_arrays(pa.array(np.zeros(20_000, np.int32)), pa.array(["a" * LONG]))
-    lists = pa.ListArray.from_arrays(pa.array(np.arange(0, 20_001, 10, dtype=np.int32)), words)
-    _parquet(
-        {"t": np.arange(2000.0), "x": np.arange(2000.0), "y": np.arange(2000.0), "z": np.arange(2000.0), "l": lists}
-    )(path)
+    lists = pa.ListArray.from_arrays(pa.array(np.arange(0, 20_001, 10, dtype=np.int32)), _words(["a" * LONG], 20_000))
+    numbers = dict.fromkeys(("t", "x", "y", "z"), np.arange(2000.0))
+    _parquet({**numbers, "l": lists}, store_schema=False)(path)
 
 
 def _many_groups(path: Path) -> None:
@@ -101,15 +92,16 @@ def _wide_csv(path: Path) -> None:
     path.write_text(",".join(f"c{k}" for k in range(20_000)) + "\n" + ("1," * 20_000)[:-1] + "\n")
 
 
+STATES = ("t", *STATE_NAMES, *SIGMA_NAMES)
 TRACKS = "trajectory,t,x,y,z\n"
 ALIASES = "a: &a [x, x, x, x, x, x, x, x, x]\n" + "".join(
     f"{two}: &{two} [{', '.join([f'*{one}'] * 9)}]\n" for one, two in zip("abcdefgh", "bcdefghi", strict=True)
 )
 
 TABLES: dict[str, Bomb] = {
-    "parquet/one long name, tracks": ("parquet_dataset", "tracks.parquet", _named("a" * LONG)),
-    "parquet/one long name, import": ("import", "x.parquet", _named("a" * LONG)),
-    "parquet/one long name, states": ("results", "states.parquet", _states),
+    "parquet/one long name, tracks": ("parquet_dataset", "tracks.parquet", _named(["a" * LONG])),
+    "parquet/one long name, import": ("import", "x.parquet", _named(["a" * LONG])),
+    "parquet/one long name, states": ("results", "states.parquet", _named(["a" * LONG], STATES)),
     "parquet/names of 10 kB": (
         "parquet_dataset",
         "tracks.parquet",

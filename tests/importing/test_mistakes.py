@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ballfg.importing.formats.sources import tables_of
 from ballfg.simulation import SimulationConfig, simulate
 from ballfg.tracks import Track, read_dataset
 from tests.commands import status
@@ -309,3 +310,31 @@ def test_the_truth_of_other_tracks_goes_with_them(shots: list[Track], tmp_path: 
     assert status("import", source, "--out", out, "--force") == 0
     left = {"dataset.yaml", "import.html", "tracks.csv"} | (set() if simulated else {"model.yaml"})
     assert {file.name for file in out.iterdir()} == left
+
+
+def test_a_name_that_no_file_can_have_is_told_with_its_row(
+    shots: list[Track], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    columns = columns_of(shots)
+    columns["shot"] = np.where(columns["shot"] == shots[1].name, "b\x1b[2J", columns["shot"])
+    source = written(tmp_path / "a.csv", columns)
+    assert status("import", source, "--out", tmp_path / "out") == 2
+    row = len(shots[0]) + 1
+    said = capsys.readouterr().err
+    assert f"row {row}, column 'shot': must be printable text of one line" in said
+    assert "\x1b" not in said
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.json", "[" + "0," * 8_000_000 + "0]", "is too large for JSON: it must hold at most 8000000 values"),
+        ("a.json", "[" + "[[0]]," * 150_000 + "0]", "must have at most 100000 lists of samples"),
+        ("a.csv", "1," * 200_000, "must have lines of at most 262144 characters; one has 400000"),
+        ("a.csv", "1," * 10_001 + "\n" + "1," * 10_001, "must have at most 10000 columns"),
+    ],
+)
+def test_text_without_end_is_refused(name: str, text: str, words: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(ValueError, match=words):
+        tables_of(tmp_path / name)

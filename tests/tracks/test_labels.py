@@ -34,7 +34,10 @@ def test_tracks_without_a_label_row_are_noted(make_folder):
             "trajectory,speed,speed\nb,3,3\n",
             "labels.csv: column 'speed' must appear once; got 'trajectory,speed,speed'.",
         ),
-        ("trajectory,speed,\nb,3,3\n", "labels.csv, line 1: the name of each column must be printable text of one line, "),
+        (
+            "trajectory,speed,\nb,3,3\n",
+            "labels.csv, line 1: the name of each column must be printable text of one line, ",
+        ),
         ("trajectory,speed\nb\n", "labels.csv, line 2: must have 2 cells, one for each column of the header; got 1."),
         ("trajectory,speed\nb,3\nc,3\n", "labels.csv, line 3: trajectory 'c' must have a track; there is none of that"),
         ("trajectory,speed\n00,3\n", "Names are compared as text, zeros included. Did you mean '000'?"),

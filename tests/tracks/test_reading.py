@@ -162,6 +162,13 @@ CELLS = "must be a number with a decimal point"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
+        ("a" * 65_537, "tracks.csv, line 1: the line of column names must have at most 65536 bytes; it has more."),
+        (HEAD + A + "b,0,1,2," + "3" * 262_144 + "\n", "tracks.csv, line 4: must have at most 262144 characters"),
+        (
+            HEAD + A + "b" * 201 + ",0,1,2,3\n",
+            "line 4, column 'trajectory': must be printable text of one line, 1 to 200",
+        ),
+        (HEAD + A + "b\u202ec,0,1,2,3\n", r"got 'b\u202ec'. Fill in a name."),
         ("", "tracks.csv: must begin with a line of column names; got an empty file or line. Add the header."),
         (HEAD.strip(), "tracks.csv: must hold tracks; got a header without rows. Add the measurements."),
         (HEAD, "tracks.csv: must hold tracks; got a header without rows. Add the measurements."),
@@ -333,7 +340,10 @@ def test_parquet_types_that_mean_the_same_are_read(make_folder, change):
         ({"x": ["0", "1"]}, "tracks.parquet, column 'x': must hold numbers; got type string. Convert it to float64"),
         ({"t": pa.array([0, 1], pa.timestamp("ms"))}, "column 't': must hold numbers; got type timestamp[ms]."),
         ({"x": [0.0, None]}, "tracks.parquet, row 2, column 'x': must be finite; got nan."),
-        ({"trajectory": ["a", None]}, "tracks.parquet, row 2, column 'trajectory': must be printable text of one line, "),
+        (
+            {"trajectory": ["a", None]},
+            "tracks.parquet, row 2, column 'trajectory': must be printable text of one line, ",
+        ),
         ({"trajectory": [b"\xff", b"a"]}, "tracks.parquet: cannot be read as a table of tracks; Invalid UTF8"),
         ({"t": [0.0, 0.0], "x": [0.0, 1.0]}, "tracks.parquet, rows 1 and 2: trajectory 'a' must have one position"),
     ],
