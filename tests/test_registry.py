@@ -174,15 +174,32 @@ def test_packages_are_loaded_when_something_is_missing_and_not_before(installed:
         ("bad = nowhere:Oval", "ModuleNotFoundError: No module named 'nowhere'"),
         ("bad = ovals:Round", "AttributeError: module 'ovals' has no attribute 'Round'"),
         ("bad = ovals:__doc__", "TypeError: 'NoneType' object is not callable"),
+        ("bad = leaving", "SystemExit: 0"),
+        ("bad = interrupting", "KeyboardInterrupt: none came"),
+        ("bad = odd", "Odd: of no known class"),
         ("bad = fractions:Fraction", "TypeError: shape must be a subclass of Shape; got <class 'fractions.Fraction'>."),
     ],
 )
 def test_an_entry_point_that_cannot_be_used_is_named(installed: Path, line: str, reason: str) -> None:
     offer(installed, line)
-    code = "for _ in range(2):\n    try:\n        list(shapes)\n    except ValueError as error:\n        print(error)"
+    (installed / "leaving.py").write_text("import sys\nsys.exit(0)\n")
+    (installed / "interrupting.py").write_text("raise KeyboardInterrupt('none came')\n")
+    (installed / "odd.py").write_text("class Odd(BaseException): ...\nraise Odd('of no known class')\n")
+    code = "from ballfg import interrupts\ninterrupts.listen()\n"
+    code += "for _ in range(2):\n    try:\n        list(shapes)\n    except ValueError as error:\n        print(error)"
     first, second = run(installed, code).stdout.splitlines()
     value = line.removeprefix("bad = ")
     start = f"entry point 'bad' = '{value}' of package ovals 2.1 (group ballfg.shapes) cannot be used ({reason}"
     assert first == second
     assert first.startswith(start)
     assert first.endswith("). Mend or uninstall that package.")
+
+
+def test_an_interrupt_while_a_package_is_loaded_is_one(installed: Path) -> None:
+    (installed / "slow.py").write_text(
+        "import os, signal, time\nos.kill(os.getpid(), signal.SIGTERM)\ntime.sleep(60)\n"
+    )
+    offer(installed, "slow = slow")
+    done = run(installed, "from ballfg import interrupts\ninterrupts.listen()\nlist(shapes)")
+    assert done.stderr.endswith("\nKeyboardInterrupt\n")
+    assert "Mend or uninstall" not in done.stderr

@@ -39,11 +39,24 @@ def guarded(command: Callable[[], object]) -> int:
         return request.exit_code
     except (KeyboardInterrupt, typer.Abort):
         return say_so()
+    except SystemExit as error:
+        return _left(error)
     except Exception as error:
         return say_so() if interrupted() else _refused(error)  # libraries make other exceptions of an interrupt
     if result == INTERRUPTED:
         return say_so()
     return result if isinstance(result, int) else 0
+
+
+def _left(error: SystemExit) -> int:
+    """The exit status of a command that ends itself; code of somebody else that does it is named."""
+    where = error.__traceback__
+    while where is not None and where.tb_next is not None:
+        where = where.tb_next
+    if where is None or str(where.tb_frame.f_globals.get("__name__")).partition(".")[0] == __name__.partition(".")[0]:
+        raise error
+    file = f"{where.tb_frame.f_code.co_filename}, line {where.tb_lineno}"
+    return _bad_input(f"code must return or raise; that in {file} has left with status {error.code}. Mend it there.")
 
 
 def _refused(error: Exception) -> int:

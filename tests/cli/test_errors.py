@@ -42,6 +42,14 @@ def test_what_a_user_can_mend_is_one_line(capsys, error, message):
     assert said.count("\n") == 1
 
 
+def test_code_that_leaves_is_named(capsys):
+    """Else a command would end well without a result, and without a word."""
+    assert guarded(lambda: sys.exit(0)) == BAD_INPUT
+    assert f"that in {__file__}, line" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        guarded(sys.exit)  # from a frame of ballfg's own
+
+
 def test_torch_is_refused_more_memory_than_there_is():
     """What it says has changed between versions."""
     with pytest.raises(RuntimeError, match=NO_MEMORY):

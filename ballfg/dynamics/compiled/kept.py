@@ -214,7 +214,8 @@ def _read(path: str) -> tuple[bytes, tuple[str, ...]]:
 class _Cache(FunctionCache):
     def __init__(self, function: Any) -> None:
         super().__init__(function)
-        stamp = _stamp(function.__code__.co_filename)
+        file = function.__code__.co_filename
+        stamp = _stamp(file) if os.path.exists(file) else str(self._impl.locator.get_source_stamp())  # or a notebook's
         self._cache_file = _Checked(self.cache_path, self._impl.filename_base, stamp)
 
 

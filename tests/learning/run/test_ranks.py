@@ -28,6 +28,8 @@ from ballfg.progress import progress
 from tests.faults.kills import in_fork
 from tests.learning.run import falling_ball
 from tests.learning.run.talking_ranks import die, talk
+from tests.parallel.test_processes import gone
+from tests.places import ROOT
 
 BALL = Path(__file__).parent / "falling_ball.py"
 TORCHRUN = (sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2")
@@ -180,6 +182,22 @@ def test_trainings_at_the_same_time_meet_at_ports_of_their_own(monkeypatch: pyte
 def test_a_killed_process_is_told() -> None:
     with pytest.raises(ChildProcessError, match=r"training process \d was ended from outside \(SIGKILL\)\. Memory may"):
         launch(1, die)
+
+
+def test_processes_end_with_the_one_that_started_them(tmp_path: Path) -> None:
+    (tmp_path / "waits.py").write_text(
+        "import os, time\ndef wait():\n    print(os.getpid(), flush=True)\n    time.sleep(60)\n"
+    )
+    code = "from ballfg.learning.run.launch import launch\nfrom waits import wait\nlaunch(2, wait)"
+    path = os.pathsep.join((str(tmp_path), str(ROOT)))
+    process = subprocess.Popen(
+        [sys.executable, "-c", code], env=os.environ | {"PYTHONPATH": path}, stdout=subprocess.PIPE, text=True
+    )
+    with process:
+        assert process.stdout is not None
+        others = [int(process.stdout.readline()) for _ in range(2)]
+        process.kill()
+    assert gone(others)
 
 
 def test_a_single_rank_needs_no_group() -> None:
