@@ -49,6 +49,14 @@ def test_what_both_rooms_want_is_the_balls_and_what_one_wants_is_its_own(joint):
     )
 
 
+def test_labels_of_all_rooms_are_judged_each_in_its_own(joint):
+    judged = joint.whole.labels
+    assert {verdict.track.partition("/")[0] for verdict in judged.verdicts} == {"level", "leaning"}
+    assert len(judged.verdicts) == 20
+    assert judged.contradicted == ()
+    assert judged.p_all_right > 0.5
+
+
 def test_the_balls_model_has_nothing_of_a_room_and_each_room_has_its_own(joint):
     assert "drag_spin" in joint.whole.model.flight
     assert "frame_tilt" not in joint.whole.model.measurement
