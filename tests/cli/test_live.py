@@ -18,9 +18,11 @@ import pytest
 
 from ballfg.dynamics import nominal_model
 from ballfg.estimation import Online, dataset_settings, dataset_surfaces
+from ballfg.live.session import Session
 from ballfg.simulation import SimulationConfig, write_simulation
 from ballfg.tracks import read_dataset, write_dataset
 from tests.commands import status
+from tests.live.test_recording import disk_of
 
 SAMPLES = 14
 COMMAND = [sys.executable, "-c", "from ballfg.cli.main import run; run()", "live"]
@@ -147,6 +149,44 @@ def test_a_closed_pipe_ends_it_cleanly(dataset: Path) -> None:
     assert "Traceback" not in said
     assert "Exception" not in said
     assert "balls; " in said
+
+
+def test_a_full_disk_ends_it_with_one_line_and_the_recording_stays(
+    dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "states.jsonl"
+    with disk_of(20_000):
+        assert status("live", "--replay", dataset, "--speed", 0, "--out", out) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert (
+        said[-1] == f"ballfg: error: {out}: File too large. Check the path, its permissions and the space on the disk."
+    )
+    content = out.read_bytes()
+    assert content.endswith(b"}\n")
+    assert 15_000 < len(content) <= 20_000
+    assert [line["kind"] for line in lines_of(content)][:3] == ["newcomer", "newcomer", "state"]
+    assert status("live", "--replay", dataset, "--speed", 0, "--out", out) == 2
+    assert "out must be a new file for a replay" in capsys.readouterr().err
+    assert out.read_bytes() == content
+
+
+def test_an_interrupt_in_the_middle_of_a_sample_keeps_the_recording(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A second Ctrl-C raises wherever the program is."""
+    tell, told = Session._tell, []
+
+    def interrupted(self: Session, *arguments: object) -> None:
+        told.append(arguments)
+        if len(told) == 6:
+            raise KeyboardInterrupt
+        tell(self, *arguments)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Session, "_tell", interrupted)
+    out = tmp_path / "states.jsonl"
+    assert status("live", "--replay", dataset, "--speed", 0, "--out", out) == 130
+    assert len(lines_of(out.read_bytes())) == 5
+    assert capsys.readouterr().err.endswith("ballfg: interrupted\n")
 
 
 @pytest.mark.parametrize(
