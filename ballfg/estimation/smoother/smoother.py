@@ -21,6 +21,7 @@ from ballfg.estimation.sides.covering import beside_its_contacts
 from ballfg.estimation.smoother.at_end import with_both_sides
 from ballfg.estimation.smoother.grip import rival_note, with_other_spins
 from ballfg.estimation.smoother.initial import initial_states, move_contacts
+from ballfg.estimation.smoother.low_hops import LowHops, counted, low_hops, uncounted_note, with_low_hops
 from ballfg.estimation.smoother.problem import Events, TrackProblem
 from ballfg.estimation.smoother.restart import label_let_go, minimise_with_restart
 from ballfg.estimation.smoother.solution import (
@@ -176,7 +177,12 @@ class Smoother(Estimator):
         sigma = total_sigmas(settings, white, window_velocities(track.times, track.positions))
         physics = physics_of(self.model)
         found = segment(track.times, track.positions, sigma, surfaces=self.surfaces, physics=physics)
-        return found if self.settings.find_events else found.only_contacts()
+        found = found if self.settings.find_events else found.only_contacts()
+        return counted(found, self.low_hops(track, found), track.times)
+
+    def low_hops(self, track: Track, events: Segmentation) -> tuple[LowHops, ...]:
+        """The stretches in which the ball hops too low for its bounces to be told one by one."""
+        return low_hops(track, events, self.model, self.surfaces, self.settings)
 
     def problem(
         self, track: Track, segmentation: Segmentation | None = None, sigma: Array | None = None
@@ -298,4 +304,7 @@ class Smoother(Estimator):
         )
         estimate = plausible(estimate, track, problem.sigma, self.settings)
         estimate = replace(estimate, notes=estimate.notes + rival_note(solution, estimate.covariances[0]))
-        return with_both_sides(self, problem, beside_its_contacts(estimate, problem.ball))
+        estimate = with_both_sides(self, problem, beside_its_contacts(estimate, problem.ball))
+        hops = self.low_hops(track, segmentation)
+        estimate = replace(estimate, notes=estimate.notes + uncounted_note(hops, track.times))
+        return with_low_hops(estimate, hops, self.model)

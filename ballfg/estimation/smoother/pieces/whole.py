@@ -19,6 +19,7 @@ from ballfg.estimation.settings import sample_sigmas
 from ballfg.estimation.sides.covering import Shared, beside_contacts
 from ballfg.estimation.smoother.at_end import with_both_sides
 from ballfg.estimation.smoother.grip import rival_note
+from ballfg.estimation.smoother.low_hops import uncounted_note, with_low_hops
 from ballfg.estimation.smoother.pieces.chain import Point
 from ballfg.estimation.smoother.pieces.joining import Joined, joined_minimum, watched
 from ballfg.estimation.smoother.pieces.reduction import Reduction
@@ -121,7 +122,8 @@ def _innovations(problem: TrackProblem, state: State, values: Values, known: Cov
 
 def _sections(smoother: Smoother, track: Track, found: Joined) -> Iterator[Estimate]:
     """The estimates of the sections, in order. The last state of each is told by the next one."""
-    end, doubts = found.found, smoother.doubts(track)
+    end, hops = found.found, smoother.low_hops(track, found.segmentation)
+    doubts = (*smoother.doubts(track), *uncounted_note(hops, track.times))
     beginning = end.states[0].section
     problem = smoother.problem(beginning.track, beginning.segmentation)  # its unknowns are those of all sections
     tasks = [
@@ -138,11 +140,11 @@ def _sections(smoother: Smoother, track: Track, found: Joined) -> Iterator[Estim
             others[k] += part.others[k]
         before = part.others.get(count, np.zeros((STATE_DIM, STATE_DIM)))
         notes = (*doubts, *_rival_note(found, part)) if first == 0 else ()
-        estimate = _section(smoother, track, problem, found, part, others, first, notes)
+        section = _section(smoother, track, problem, found, part, others, first, notes)
         if last == len(track) - 1:
             ending = track.between(float(track.times[first]), float(track.times[last]))
-            estimate = with_both_sides(smoother, smoother.problem(ending), estimate)
-        yield estimate
+            section = with_both_sides(smoother, smoother.problem(ending), section)
+        yield with_low_hops(section, [one for h in hops if (one := h.taken(first, first + count))], smoother.model)
 
 
 def _section(

@@ -1,0 +1,254 @@
+"""The vertical motion of a ball that hops low, followed on a grid of all hops that are possible.
+
+Hops as low as the noise can be told by no single sample, and a search for one arrangement of bounces finds one of many
+that explain the samples about as well. So all of them are followed at once: a hop is the speed with which the ball
+left the surface and the share of the hop that is over, and a hidden Markov model on a grid of both is filtered forwards
+and smoothed backwards. What comes out is an average over all arrangements of bounces.
+
+Source: L. R. Rabiner, "A tutorial on hidden Markov models", Proceedings of the IEEE 77, 1989;
+docs/derivations/smoother.md, "Low hops".
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from ballfg.arrays import Array, Index
+from ballfg.dynamics.motion.limits import REST_SPEED
+
+SPEEDS: Final = 64
+"""Take-off speeds of the grid."""
+POINTS: Final = ((-np.sqrt(3.0), 1.0 / 6.0), (0.0, 2.0 / 3.0), (np.sqrt(3.0), 1.0 / 6.0))
+"""Places and weights of the Gauss-Hermite rule with three points."""
+STRAY_SHARE: Final = 0.01
+"""Prior share of samples that are not of the ball."""
+STRAY_SPREAD: Final = 0.3
+"""m, of their heights."""
+RESTS: Final = 0.1
+"""Prior probability that the ball lies still at the first sample."""
+FAR_BEHIND: Final = 15.0
+"""nats. A height of the surface that is so much less likely than another is given up."""
+MILLIONTH: Final = 1e-6
+"""Probability of anything but rest below which a ball is taken to lie still from there on."""
+
+
+@dataclass(frozen=True)
+class HopLaw:
+    """What a hop hangs on.
+
+    Attributes:
+        gravity: m/s^2.
+        fastest: m/s, take-off speed of the highest hop.
+        rebound: (`SPEEDS`,) m/s, speed after an impact at each of the speeds of the grid.
+        scatter: (`SPEEDS`,) m/s, standard deviation of that.
+        acceleration: m/s^2/sqrt(Hz), density of the acceleration that the model lacks.
+    """
+
+    gravity: float
+    fastest: float
+    rebound: Array
+    scatter: Array
+    acceleration: float
+
+    @staticmethod
+    def speeds(fastest: float) -> Array:
+        """(`SPEEDS`,) m/s, the take-off speeds of a grid."""
+        return np.linspace(REST_SPEED, fastest, SPEEDS)
+
+
+@dataclass(frozen=True)
+class HopMoments:
+    """What is known of the ball at n samples, over all arrangements of bounces.
+
+    Attributes:
+        mean: (n, 2) m and m/s, height above the surface and vertical velocity.
+        second: (n, 2, 2) their second moments about zero.
+        higher: (n, 2) third and fourth moment of the vertical velocity about zero.
+        speed: (n,) m/s, take-off speed of the hop that the ball is in.
+        resting: (n,) probability that it lies still.
+        bounces: (n - 1,) expected number of bounces in each interval.
+    """
+
+    mean: Array
+    second: Array
+    higher: Array
+    speed: Array
+    resting: Array
+    bounces: Array
+
+    def spread(self, point: Array) -> Array:
+        """(n, 2, 2) second moments about points (n, 2), the velocity's raised to what its fourth moment asks for."""
+        cross = self.mean[:, :, None] * point[:, None, :]
+        found = self.second - cross - cross.swapaxes(1, 2) + point[:, :, None] * point[:, None, :]
+        v, (third, fourth) = point[:, 1], self.higher.T
+        about = fourth - 4.0 * v * third + 6.0 * v**2 * self.second[:, 1, 1] - 4.0 * v**3 * self.mean[:, 1] + v**4
+        found[:, 1, 1] = np.maximum(found[:, 1, 1], np.sqrt(np.maximum(about, 0.0) / 3.0))
+        return np.asarray(found)
+
+    def taken(self, inside: slice) -> HopMoments:
+        """Those of some of the samples."""
+        between = slice(inside.start, inside.stop - 1)
+        own = (self.mean, self.second, self.higher, self.speed, self.resting)
+        return HopMoments(*(part[inside] for part in own), self.bounces[between])
+
+
+class HopGrid:
+    """A hidden Markov model of hops.
+
+    Args:
+        law: of the hops.
+        phases: cells into which the duration of each hop is cut.
+        tick: s, to which stamps are rounded, so that few transition matrices are needed.
+    """
+
+    def __init__(self, law: HopLaw, phases: int, tick: float) -> None:
+        self.law, self.phases, self.tick = law, phases, tick
+        self.grid = HopLaw.speeds(law.fastest)
+        share = np.tile((np.arange(phases) + 0.5) / phases, SPEEDS)
+        self.speed = np.append(np.repeat(self.grid, phases), 0.0)
+        """(k,) m/s, of each cell; the last one is rest."""
+        since = np.append(share, 0.0) * 2.0 * self.speed / law.gravity
+        self.height = self.speed * since - 0.5 * law.gravity * since**2
+        self.rise = self.speed - law.gravity * since
+        z, v, rests = self.height, self.rise, self.speed == 0.0
+        self._features = np.stack((z, v, z * z, z * v, v * v, v**3, v**4, self.speed, rests), axis=1)
+        self._steps: dict[int, tuple[csr_array, csr_array]] = {}
+
+    def ticks(self, times: Array) -> Index:
+        """(n - 1,) intervals between stamps (n,) s, in ticks."""
+        return np.diff(np.round((times - times[0]) / self.tick)).astype(np.int64)
+
+    def evidence(self, times: Array, heights: Array, sigma: Array, levels: Array) -> Array:
+        """(k,) log likelihoods of samples if the surface is higher by each of k levels; -inf where it falls far behind.
+
+        Args: times, heights, sigma: as for `moments`.  levels: (k,) m.
+        """
+        found, alive = np.full(len(levels), -np.inf), np.arange(len(levels))
+        said, before = np.zeros(len(levels)), np.tile(self._first(), (len(levels), 1))
+        for k, ticks in enumerate([*self.ticks(times).tolist(), None]):
+            now = before * self._likelihood(heights[k] - levels[alive], sigma[k])
+            total = now.sum(axis=1)
+            said, now = said + np.log(total), now / total[:, None]
+            kept = said > said.max() - FAR_BEHIND
+            alive, said, now = alive[kept], said[kept], now[kept]
+            if ticks is None or (now[:, -1] > 1.0 - MILLIONTH).all():
+                break
+            before = now @ self._step(ticks)[0]
+        left = [
+            np.log(self._likelihood(heights[j] - levels[alive], sigma[j])[:, -1]) for j in range(k + 1, len(heights))
+        ]
+        found[alive] = said + np.sum(left, axis=0)  # while it lies still
+        return found
+
+    def moments(self, times: Array, heights: Array, sigma: Array) -> HopMoments:
+        """What samples tell of the ball, by the forward-backward algorithm.
+
+        Args: times: (n,) s.  heights: (n,) m, measured above the surface.  sigma: (n,) m, their noise.
+        """
+        steps = self.ticks(times)
+        filtered = self._filtered(steps, heights, sigma)
+        known, bounces = np.zeros((len(times), self._features.shape[1])), np.zeros(len(times) - 1)
+        known[len(filtered) :, -1] = 1.0  # it lies still
+        later = np.ones(len(self.speed))
+        known[len(filtered) - 1] = filtered[-1] @ self._features
+        for k in range(len(filtered) - 2, -1, -1):
+            follow, counted = self._step(int(steps[k]))
+            said = self._likelihood(heights[k + 1], sigma[k + 1]) * later
+            before = follow @ said
+            scale = filtered[k] @ before
+            bounces[k] = filtered[k] @ (counted @ said) / scale
+            later = before / scale
+            known[k] = (filtered[k] * later) @ self._features
+        z, v, zz, zv, vv, _, _, speed, resting = known.T
+        second = np.stack((np.stack((zz, zv), axis=-1), np.stack((zv, vv), axis=-1)), axis=-2)
+        return HopMoments(np.stack((z, v), axis=-1), second, known[:, 5:7], speed, resting, bounces)
+
+    def _likelihood(self, heights: Array | float, sigma: float) -> Array:
+        """(..., k) density of samples at heights (...) m in each cell."""
+        off = (np.asarray(heights)[..., None] - self.height) / sigma
+        good = (1.0 - STRAY_SHARE) * np.exp(-0.5 * off**2) / sigma
+        return np.asarray(good + STRAY_SHARE / STRAY_SPREAD)
+
+    def _first(self) -> Array:
+        """(k,) probabilities of the cells before the first sample."""
+        shares = np.full(len(self.speed), (1.0 - RESTS) / (len(self.speed) - 1))
+        shares[-1] = RESTS
+        return shares
+
+    def _filtered(self, steps: Index, heights: Array, sigma: Array) -> list[Array]:
+        """(k,) probabilities of the cells after each sample, up to where the ball surely lies still."""
+        before, found = self._first(), list[Array]()
+        for k in range(len(heights)):
+            now = before * self._likelihood(heights[k], sigma[k])
+            found.append(now / now.sum())
+            if k == len(steps) or found[-1][-1] > 1.0 - MILLIONTH:
+                break
+            before = found[-1] @ self._step(int(steps[k]))[0]
+        return found
+
+    def _step(self, ticks: int) -> tuple[csr_array, csr_array]:
+        """(k, k) probabilities of the cells some ticks later, by the cell before; and these times the bounces between.
+
+        The velocity is disturbed at the start of the step, and the first bounce scatters.
+        """
+        if ticks not in self._steps:
+            parts = [
+                self._moved(ticks * self.tick, push, kick, a * b)
+                for (push, a), (kick, b) in itertools.product(POINTS, POINTS)
+            ]
+            target, weight, bounces = (np.concatenate(column) for column in zip(*parts, strict=True))
+            shape = (len(self.speed), len(self.speed))
+            source = np.tile(np.arange(len(self.speed)), len(target) // len(self.speed))
+            follow, counted = (csr_array((w, (source, target)), shape=shape) for w in (weight, weight * bounces))
+            self._steps[ticks] = follow, counted
+        return self._steps[ticks]
+
+    def _moved(self, dt: float, push: float, kick: float, share: float) -> tuple[Index, Array, Array]:
+        """Cells that all cells go to over dt s, four each, their probabilities and the bounces on the way.
+
+        Args: push, kick: standard deviations by which the velocity and the first bounce are off.  share: of both.
+        """
+        law, rests = self.law, self.speed == 0.0
+        rise = self.rise + push * law.acceleration * np.sqrt(dt)
+        speed = np.sqrt(rise**2 + 2.0 * law.gravity * self.height)
+        since, bounces = (speed - rise) / law.gravity + dt, np.zeros(len(rise))
+        while (lands := ~rests & (since >= 2.0 * speed / law.gravity)).any():
+            since = np.where(lands, since - 2.0 * speed / law.gravity, since)
+            scatter = np.where(bounces == 0.0, kick, 0.0) * np.interp(speed, self.grid, law.scatter)
+            speed = np.where(lands, np.interp(speed, self.grid, law.rebound) + scatter, speed)
+            bounces += lands
+            rests |= lands & (speed < REST_SPEED)
+        row = np.clip((speed - self.grid[0]) / (self.grid[1] - self.grid[0]), 0.0, SPEEDS - 1.0)
+        over = np.clip(since * law.gravity / (2.0 * np.maximum(speed, REST_SPEED)), 0.0, 1.0)
+        column = np.clip(over * self.phases - 0.5, 0.0, self.phases - 1.0)  # a cell holds nothing of the next hop
+        first, low = np.minimum(row.astype(int), SPEEDS - 2), np.minimum(column.astype(int), self.phases - 2)
+        upper, right = row - first, column - low
+        corner = first * self.phases + low
+        targets = [corner, corner + 1, corner + self.phases, corner + self.phases + 1]
+        weights = [(1 - upper) * (1 - right), (1 - upper) * right, upper * (1 - right), upper * right]
+        target = np.where(rests, len(rests) - 1, np.stack(targets))
+        return target.ravel(), share * np.stack(weights).ravel(), np.tile(bounces, 4)
+
+
+def averaged(known: Sequence[HopMoments], levels: Array, weights: Array) -> HopMoments:
+    """What is known where the height of the surface is uncertain.
+
+    Args:
+        known: for each height.
+        levels: (k,) m, the heights, above the one from which the result counts.
+        weights: (k,) their probabilities.
+    """
+    shift = np.zeros((len(levels), 1, 2))
+    shift[:, 0, 0] = levels
+    mean = np.stack([one.mean for one in known])
+    cross = mean[..., :, None] * shift[..., None, :]
+    second = np.stack([one.second for one in known]) + cross + cross.swapaxes(-1, -2)
+    second += shift[..., :, None] * shift[..., None, :]
+    rest = (np.stack([getattr(one, name) for one in known]) for name in ("higher", "speed", "resting", "bounces"))
+    return HopMoments(*(np.tensordot(weights, part, axes=1) for part in (mean + shift, second, *rest)))

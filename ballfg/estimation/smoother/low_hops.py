@@ -1,0 +1,301 @@
+"""Stretches of a track in which the ball hops too low for its bounces to be told one by one, and what is known there.
+
+The segmentation takes the height of every surface to be uncertain by millimetres, and one arrangement of bounces for
+certain. Where hops are as low as that, `HopGrid` follows all arrangements at once. It says how many bounces there were
+and in which intervals, and how far the ball may be from where the estimate, which holds one arrangement, has it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from ballfg.arrays import Array
+from ballfg.dynamics.augmented import AugmentedModel
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.limits import REST_SPEED
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.result import Estimate
+from ballfg.estimation.segmentation import Contact, Rest, Segmentation, SegmentationSettings
+from ballfg.estimation.settings import Settings, sample_sigmas
+from ballfg.estimation.smoother.hop_grid import HopGrid, HopLaw, HopMoments, averaged
+from ballfg.state import POSITION, STATE_DIM, VZ, Z
+from ballfg.tracks import Track
+
+LOW: Final = 10.0
+"""Standard deviations of the noise. The segmentation tells the bounces of hops that are higher."""
+LOWEST: Final = 0.02
+"""m. Of hops that are lower it does not, whatever the noise: it takes surfaces to be off by 4 mm."""
+LEAST_PHASES, MOST_PHASES = 48, 192
+"""Cells into which a hop is cut: so many that the ball moves by no more than its noise within one, if that can be."""
+UNLIKELY: Final = 1e-2
+"""Of the likelihood of the best height of the surface; others that are less likely are left out."""
+WIDEST: Final = 2.5
+"""Standard deviations of the surface's height within which it is looked for."""
+SURE: Final = 0.95
+"""Probability of rest from which on nothing is said about bounces that may have been missed."""
+UNCOUNTED: Final = (
+    "from {:.2f} s on the ball may hop lower than the noise: bounces there are not counted, covariances allow for them"
+)
+VERTICAL: Final = [Z, VZ]
+
+
+@dataclass(frozen=True)
+class LowHops:
+    """A stretch of low hops.
+
+    Attributes:
+        first: sample with which it begins.
+        height: m, declared height of the surface.
+        level: m, height of the ball's centre when it touches, as the model has it.
+        least: m/s, take-off speed of a hop that is as high as the noise; bounces of lower ones are not counted.
+        known: of the ball, heights counted from `level`.
+    """
+
+    first: int
+    height: float
+    level: Array
+    least: float
+    known: HopMoments
+
+    @property
+    def last(self) -> int:
+        """Its last sample."""
+        return self.first + len(self.known.speed) - 1
+
+    def taken(self, begin: int, end: int) -> LowHops | None:
+        """Its part among the samples begin to end - 1 of the track, the first of which gets the number 0, if any."""
+        first, last = max(self.first, begin), min(self.last, end - 1)
+        inside = slice(first - self.first, last + 1 - self.first)
+        if first > last:
+            return None
+        return replace(self, first=first - begin, level=self.level[inside], known=self.known.taken(inside))
+
+    def events(self, times: Array) -> tuple[list[Contact], list[Rest]]:
+        """The bounces that can be counted, and the rest that takes the place of lower hops.
+
+        The number of bounces is the expected one, rounded; the k-th is where k - 1/2 are expected so far.
+
+        Args: times: (n,) s, of the whole track.
+        """
+        lower = np.flatnonzero(self.known.speed < self.least)
+        down = self.first + (int(lower[0]) if len(lower) else len(self.known.speed))
+        so_far, contacts = np.cumsum(self.known.bounces), list[Contact]()
+        for k in range(round(float(so_far[-1]))):
+            interval = self.first + int(np.searchsorted(so_far, k + 0.5))
+            if interval >= down:
+                break
+            contacts.append(Contact(interval, 0.5 * float(times[interval] + times[interval + 1]), self.height))
+        return contacts, [Rest(down, self.last - 1, self.height)] if down < self.last else []
+
+    def first_unclear(self) -> int | None:
+        """The first sample at which the ball may hop without its bounces being counted."""
+        unclear = np.flatnonzero((self.known.speed < self.least) & (self.known.resting < SURE))
+        return self.first + int(unclear[0]) if len(unclear) else None
+
+
+def low_hops(
+    track: Track, events: Segmentation, model: BallModel, surfaces: Surfaces, settings: Settings
+) -> tuple[LowHops, ...]:
+    """The stretches of a track in which the ball hops low.
+
+    A ball in flight stays below a height for no longer than a hop of that height takes: where samples stay there for
+    longer, it hops or lies.
+
+    Args:
+        track: the samples.
+        events: hits, gaps and the ends of rests, at which stretches end.
+        model: the ball, without the coefficients that are estimated with the track.
+        surfaces: that it may hop on.
+        settings: noise and priors.
+    """
+    if len(track) < 2:
+        return ()
+    sigma, ball, found = _height_sigmas(track, settings), _Ball(model, settings), list[LowHops]()
+    most = max(LOWEST, LOW * float(np.median(sigma)))
+    for number, height in enumerate(surfaces.heights()):
+        gap = ball.gap(track.positions, height)
+        low = np.abs(gap) < most
+        if number == 0:
+            low &= surfaces.over_table(torch.from_numpy(track.positions)).numpy()
+        for first, last in _runs(low, events):
+            law, inside = ball.law(track.positions[first], most), slice(first, last + 1)
+            if law.gravity <= 0.0 or track.times[last] - track.times[first] <= 2.0 * np.sqrt(2.0 * most / law.gravity):
+                continue
+            phases = int(np.clip(4.0 * most / np.median(sigma[inside]), LEAST_PHASES, MOST_PHASES))
+            noise = np.maximum(sigma[inside], 4.0 * most / phases)
+            grid = HopGrid(law, phases, tick=0.25 * float(noise.min()) / law.fastest)
+            spread = max(ball.level_sigma(track.positions[first], height), SegmentationSettings().surface_sigma)
+            known = _known(grid, track.times[inside], gap[inside], noise, spread)
+            least = float(np.sqrt(2.0 * law.gravity * np.median(sigma[inside])))
+            found.append(LowHops(first, height, track.positions[inside, Z] - gap[inside], least, known))
+    return tuple(found)
+
+
+def counted(events: Segmentation, hops: Sequence[LowHops], times: Array) -> Segmentation:
+    """The events of a track, those within stretches of low hops as all arrangements of bounces have them.
+
+    Args: events: as the segmentation has them.  hops: of the track.  times: (n,) s.
+    """
+    for one in hops:
+        contacts, rests = one.events(times)
+        contacts += [c for c in events.contacts if not one.first <= c.interval < one.last]
+        for rest in events.rests:
+            if rest.last < one.first or rest.first >= one.last:
+                rests.append(rest)
+        events = replace(
+            events,
+            contacts=tuple(sorted(contacts, key=lambda c: c.time)),
+            rests=tuple(sorted(rests, key=lambda r: r.first)),
+        )
+    return events
+
+
+def with_low_hops(estimate: Estimate, hops: Sequence[LowHops], model: BallModel) -> Estimate:
+    """An estimate whose covariances allow for the arrangements of bounces that it does not hold.
+
+    With that, height and vertical velocity vary about the estimate at least as much as over all arrangements. The
+    variance of the velocity is that of the normal distribution with the same fourth moment: a ball that with a
+    probability of 1 % is on the other side of a bounce would else be ten standard deviations away once in 100 times.
+    Where the vertical velocity may differ because a bounce came earlier or later, the other velocities and the spin may
+    differ by what friction does at that bounce.
+
+    Args: estimate: of the track.  hops: of the track.  model: the ball.
+    """
+    if estimate.status.failed or not hops:
+        return estimate
+    covariances = estimate.covariances.copy()
+    for one in hops:
+        inside = slice(one.first, one.last + 1)
+        states, own = estimate.states[inside], covariances[inside][:, VERTICAL][:, :, VERTICAL]
+        about = states[:, VERTICAL] - np.stack((one.level, np.zeros(len(states))), axis=-1)
+        spread = one.known.spread(about)
+        more, jump = _beyond(spread, own), _jumps(estimate, one, model)
+        jump[:, VERTICAL] = 0.0
+        added = more[:, 1, 1, None, None] * jump[:, :, None] * jump[:, None, :]
+        added[:, *np.ix_(VERTICAL, VERTICAL)] = more
+        covariances[inside] += added
+    return replace(estimate, covariances=covariances)
+
+
+def _jumps(estimate: Estimate, hops: LowHops, model: BallModel) -> Array:
+    """(n, 9) how a state differs, for each m/s of vertical velocity, because a bounce came earlier or later.
+
+    It is the jump of the nearest bounce that the estimate holds; where the ball rests, that of one more bounce.
+    """
+    states = estimate.states[hops.first : hops.last + 1]
+    before = states.copy()
+    before[:, VZ] = -np.maximum(hops.known.speed, REST_SPEED)
+    with torch.no_grad():
+        jumps = model.after_bounce(torch.from_numpy(before)).numpy() - before
+    at = np.array([c.interval for c in estimate.contacts if hops.first <= c.interval < hops.last], dtype=np.int64)
+    if len(at):
+        counted = estimate.states[at + 1] - estimate.states[at]
+        own, samples = counted[:, VZ] > REST_SPEED, np.arange(hops.first, hops.last + 1)
+        nearest = np.abs(samples[:, None] - 0.5 - at).argmin(axis=1)
+        used = own[nearest] & (hops.known.speed >= hops.least)
+        jumps[used] = counted[nearest][used]
+    return np.asarray(jumps / jumps[:, [VZ]])
+
+
+def uncounted_note(hops: Sequence[LowHops], times: Array) -> tuple[str, ...]:
+    """Says from when on bounces are too low to be counted. Args: hops: of the track.  times: (n,) s."""
+    unclear = [sample for one in hops if (sample := one.first_unclear()) is not None]
+    return (UNCOUNTED.format(float(times[min(unclear)])),) if unclear else ()
+
+
+class _Ball:
+    """A ball that hops, asked for what a hop hangs on, and for how well that is known."""
+
+    def __init__(self, model: BallModel, settings: Settings) -> None:
+        names = tuple(settings.coefficients)
+        self.model = AugmentedModel(model, names) if names else model
+        self.means = self.model.means().detach().numpy() if isinstance(self.model, AugmentedModel) else np.zeros(0)
+        self.sigmas, self.process = np.array(list(settings.coefficients.values())), settings.process
+
+    def gap(self, positions: Array, height: float) -> Array:
+        """(n,) m, from the surface up to the ball, at positions (n, 3) m."""
+        with torch.no_grad():
+            return np.asarray(self.model.gap(self._still(positions, self.means), height).numpy())
+
+    def level_sigma(self, position: Array, height: float) -> float:
+        """m, standard deviation of the surface's height. Args: position: (3,) m.  height: m, as declared."""
+        with torch.no_grad():
+            gaps = self.model.gap(self._varied(position), height).numpy()
+        return float(np.linalg.norm(gaps[1:] - gaps[0]))
+
+    def law(self, position: Array, most: float) -> HopLaw:
+        """What hops up to a height `most` m above a surface hang on, at a position (3,) m."""
+        varied = self._varied(position)
+        with torch.no_grad():
+            gravity = -float(self.model.rates(varied[:1])[0][0, Z])
+            fall = float(np.sqrt(2.0 * max(gravity, 0.0) * most))
+            known = self._rebound(varied[:1], torch.tensor([max(fall, 2.0 * REST_SPEED)], dtype=torch.float64))[0, 0]
+            speeds = HopLaw.speeds(max(fall * fall / max(float(known), 0.5 * fall), 2.0 * REST_SPEED))
+            rebound = self._rebound(varied, torch.from_numpy(speeds)).numpy()
+        scatter = np.sqrt(self.process.contact_velocity**2 + ((rebound[1:] - rebound[0]) ** 2).sum(axis=0))
+        slower = np.clip(rebound[0], 0.0, speeds)
+        return HopLaw(gravity, float(speeds[-1]), slower, scatter, self.process.acceleration)
+
+    def _rebound(self, states: Tensor, speeds: Tensor) -> Tensor:
+        """(m, k) m/s, vertical speeds after impacts with each of k speeds, of balls as in m states."""
+        falling = states[:, None].repeat(1, len(speeds), 1)
+        falling[..., VZ] = -speeds
+        return self.model.after_bounce(falling.reshape(-1, falling.shape[-1]))[:, VZ].reshape(len(states), -1)
+
+    def _varied(self, position: Array) -> Tensor:
+        """(1 + p, 9 + p) a ball that hangs still: as is, then with each coefficient a standard deviation larger."""
+        rows = np.concatenate((np.zeros((1, len(self.means))), np.diag(self.sigmas)))
+        return self._still(np.tile(position, (len(rows), 1)), self.means + rows)
+
+    @staticmethod
+    def _still(positions: Array, coefficients: Array) -> Tensor:
+        states = np.zeros((len(positions), STATE_DIM + coefficients.shape[-1]))
+        states[:, POSITION], states[:, STATE_DIM:] = positions, coefficients
+        return torch.from_numpy(states)
+
+
+def _height_sigmas(track: Track, settings: Settings) -> Array:
+    """(n,) m, noise of the heights. Errors that last are taken for fresh ones that tell as little of a mean."""
+    settings = settings.for_track(track)
+    white = sample_sigmas(settings, len(track), track.sigmas)[:, 2]
+    fading = np.exp(-float(np.median(np.diff(track.times))) / settings.memory_time)
+    return np.asarray(np.sqrt(white**2 + settings.memory[2] ** 2 * (1.0 + fading) / (1.0 - fading)))
+
+
+def _runs(low: NDArray[np.bool_], events: Segmentation) -> list[tuple[int, int]]:
+    """First and last samples of runs of low ones that no hit, gap or end of a rest interrupts."""
+    ends = [rest.last + 1 for rest in events.rests]
+    broken = np.zeros(len(low) + 1, dtype=bool)
+    broken[np.array([*events.hits.tolist(), *events.restarts.tolist(), *ends], dtype=np.int64) + 1] = True
+    starts = low & ~np.concatenate(([False], low[:-1])) | low & broken[:-1]
+    stops = low & ~np.concatenate((low[1:], [False])) | low & broken[1:]
+    return list(zip(np.flatnonzero(starts).tolist(), np.flatnonzero(stops).tolist(), strict=True))
+
+
+def _known(grid: HopGrid, times: Array, gap: Array, sigma: Array, spread: float) -> HopMoments:
+    """What samples tell of the ball, averaged over the heights that the surface may have.
+
+    Args: times: (n,) s.  gap: (n,) m.  sigma: (n,) m.  spread: m, standard deviation of the surface's height.
+    """
+    count = int(np.ceil(WIDEST * spread / (0.5 * float(np.median(sigma)))))
+    levels = np.linspace(-WIDEST * spread, WIDEST * spread, 2 * count + 1)
+    said = grid.evidence(times, gap, sigma, levels) - 0.5 * (levels / spread) ** 2
+    weights = np.exp(said - said.max())
+    levels, weights = levels[weights > UNLIKELY], weights[weights > UNLIKELY]
+    return averaged([grid.moments(times, gap - level, sigma) for level in levels], levels, weights / weights.sum())
+
+
+def _beyond(larger: Array, own: Array) -> Array:
+    """(n, 2, 2) the part of some matrices that exceeds others, which are covariances."""
+    root = np.linalg.cholesky(own)
+    inverse = np.linalg.inv(root)
+    values, vectors = np.linalg.eigh(inverse @ (larger - own) @ inverse.swapaxes(1, 2))
+    turned = root @ vectors
+    return np.asarray((turned * np.maximum(values, 0.0)[:, None, :]) @ turned.swapaxes(1, 2))
