@@ -70,10 +70,9 @@ def check_file(path: Path, argument: str = "out") -> None:
     check_parent(path, argument)
     if path.is_dir():
         raise ValueError(f"{argument} must be a file; {path} is a folder. Give the name of a file in it.")
-    if path.exists() and not path.is_file():
-        raise ValueError(f"{argument} must be a file; {path} is a device or a pipe. Give the name of a file.")
-    if path.is_symlink() and not path.exists():
-        raise ValueError(f"{argument} must be a file; {path} is a link that leads nowhere. Remove it first.")
+    if os.path.lexists(path) and not path.is_file():
+        what = "a device or a pipe" if path.exists() else "a link that leads nowhere"
+        raise ValueError(f"{argument} must be a file; {path} is {what}. Give the name of a file.")
 
 
 def check_parent(path: Path, argument: str) -> None:

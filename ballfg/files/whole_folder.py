@@ -17,8 +17,6 @@ from ballfg.files.whole_file import check_parent, flush
 P = ParamSpec("P")
 T = TypeVar("T")
 
-_TRIES: Final = 20
-_OPEN: Final = os.O_DIRECTORY | getattr(os, "O_PATH", os.O_RDONLY)
 DEEPEST: Final = 100
 """Folders in folders of a result."""
 
@@ -203,25 +201,22 @@ def of_one_state(read: Callable[P, T]) -> Callable[P, T]:
         path = next(iter((*args, *kwargs.values())), None)
         if not isinstance(path, str | os.PathLike) or not os.path.exists(path):
             return read(*args, **kwargs)
-        folder = Path(path) if os.path.isdir(path) else Path(path).parent
-        for _ in range(_TRIES):
-            opened = os.open(folder, _OPEN)  # while it is open, no other folder gets its number
-            try:
-                result = read(*args, **kwargs)
-            except (OSError, ValueError):
-                if _is_at(folder, opened):
-                    raise
-            else:
-                if _is_at(folder, opened):
-                    return result
-            finally:
-                os.close(opened)
-        raise ValueError(
-            f"{folder} must stay the same while it is read; it was replaced {_TRIES} times. Read it again."
-        )
+        folder = path if os.path.isdir(path) else os.path.dirname(path) or "."
+        opened = os.open(folder, os.O_DIRECTORY | getattr(os, "O_PATH", os.O_RDONLY))
+        try:  # while it is open, no other folder gets its number
+            result = read(*args, **kwargs)
+        except (OSError, ValueError):
+            if _is_at(folder, opened):
+                raise
+        else:
+            if _is_at(folder, opened):
+                return result
+        finally:
+            os.close(opened)
+        return steady(*args, **kwargs)
 
     return steady
 
 
-def _is_at(folder: Path, opened: int) -> bool:
-    return folder.is_dir() and os.path.samestat(os.fstat(opened), folder.stat())
+def _is_at(folder: str | os.PathLike[str], opened: int) -> bool:
+    return os.path.isdir(folder) and os.path.samestat(os.fstat(opened), os.stat(folder))

@@ -104,7 +104,7 @@ def test_a_link_stays_and_the_file_that_it_leads_to_is_replaced(tmp_path: Path) 
     assert (tmp_path / "disk" / "states.csv").read_text() == "new"
     assert sorted(os.listdir(tmp_path)) == ["disk", "latest.csv"]
     (tmp_path / "disk" / "states.csv").unlink()
-    with pytest.raises(ValueError, match=r"out must be a file; .*latest\.csv is a link that leads nowhere\. Remove it"):
+    with pytest.raises(ValueError, match=r"out must be a file; .*latest\.csv is a link that leads nowhere\. Give the"):
         write_text(tmp_path / "latest.csv", "new")
     assert not (tmp_path / "disk" / "states.csv").exists()
 

@@ -19,11 +19,9 @@ TEST = "tests/files/test_whole_folder.py::test_an_earlier_result_is_replaced_and
 
 @pytest.fixture(scope="module")
 def change() -> Mutation:
-    """Other files do not stay."""
+    """The new folder does not take the place of the old one."""
     return next(
-        m
-        for m in mutations_of(FILE, (ROOT / FILE).read_bytes())
-        if m.before == "os.link(path, there, follow_symlinks=False)"
+        m for m in mutations_of(FILE, (ROOT / FILE).read_bytes()) if m.before == "exchange(place / NEW, target)"
     )
 
 

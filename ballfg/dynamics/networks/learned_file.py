@@ -128,16 +128,14 @@ def _check_digest(folder: Path) -> None:
 
 
 def _config(model: BallModel) -> _Config:
-    architecture = model.architecture if isinstance(model, LearnedModel) else None
-    fading = _fading(model)
     trained = model.trained
-    if trained is None:
-        return _Config(architecture=architecture, trained=None, fading=fading)
-    launcher = trained.launcher
+    launcher = None if trained is None else trained.launcher
     return _Config(
-        architecture=architecture,
-        fading=fading,
-        trained=_TrainedConfig(
+        architecture=model.architecture if isinstance(model, LearnedModel) else None,
+        fading=_fading(model),
+        trained=None
+        if trained is None
+        else _TrainedConfig(
             process_noise=dict(trained.process_noise),
             position_scale=trained.position_scale,
             spin_noise=trained.spin_noise,
