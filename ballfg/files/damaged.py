@@ -46,21 +46,24 @@ def library_reads(path: Path, kind: str, remedy: str = "Copy or export it again.
         raise ValueError(f"{path} must be a whole {kind} file; {said}. {remedy}") from None
 
 
-def most_unpacked(path: Path) -> int:
+def most_unpacked(path: Path, free: int = FREE) -> int:
     """Bytes that a file may unpack to."""
-    return FREE + RATIO * path.stat().st_size
+    return free + RATIO * path.stat().st_size
 
 
-def check_unpacked(path: Path, size: int) -> None:
+def check_unpacked(path: Path, size: int, free: int = FREE) -> None:
     """Refuses a file that says it holds far more than its own size can tell; call it before anything is unpacked.
 
-    Args: path: of the file.  size: bytes that its content would take in memory, `NUMBER` for each cell of a table.
-    Raises: ValueError: more than 32 MB and 20 times the size of the file.
+    Args:
+        path: of the file.
+        size: bytes that its content would take in memory, `NUMBER` for each cell of a table.
+        free: bytes that any file may unpack to; fewer for a format that takes long.
+    Raises: ValueError: more than that and 20 times the size of the file.
     """
-    most = most_unpacked(path)
+    most = most_unpacked(path, free)
     if size > most:
         raise ValueError(
-            f"{path} must unpack to at most {most / 1e6:.0f} MB, which is {FREE / 1e6:.0f} MB and {RATIO} times its "
+            f"{path} must unpack to at most {most / 1e6:.0f} MB, which is {free / 1e6:.0f} MB and {RATIO} times its "
             f"size; it says {short_text(f'{size / 1e6:.0f}')} MB. Write it again without rows that say nothing."
         )
 

@@ -11,6 +11,7 @@ import torch
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from ballfg.dynamics import model_to_dict, save_model
+from ballfg.files.damaged import whole_content
 from ballfg.learning.calibration.calibrate import (
     Problem,
     Step,
@@ -130,7 +131,7 @@ def read_checkpoint(folder: Path, problem: Problem) -> list[Step]:
     if not path.is_file():
         return []
     try:
-        checkpoint = Checkpoint.model_validate_json(path.read_bytes())
+        checkpoint = Checkpoint.model_validate_json(whole_content(path))
     except ValidationError as error:
         first = error.errors()[0]
         raise ValueError(f"{path}: not a checkpoint ({first['msg']}). Start a new run.") from None

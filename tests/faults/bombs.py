@@ -4,7 +4,8 @@
     python -m tests.faults.bombs --large      large files that are good, which must be read
 
 Each bomb is read as the commands read it, in a process of its own that has imported the program and read good files.
-Time is that of the reading alone, on the wall. Memory is the largest that the process took beyond what it had before,
+Time is that of the processor for the reading alone, so that other programs do not count; the wall's stands in brackets.
+Memory is the largest that the process took beyond what it had before,
 and all that processes took which it started. The exit status is 1 where a bomb was read, or cost more.
 """
 
@@ -61,12 +62,13 @@ class Outcome:
 
     Attributes:
         outcome: read, refused or fault.  words: of the refusal.
-        seconds: on the wall.  memory: bytes, at most, beyond those before.
+        seconds: of the processor.  wall: s.  memory: bytes, at most, beyond those before.
     """
 
     outcome: str
     words: str
     seconds: float
+    wall: float
     memory: float
 
     @property
@@ -122,11 +124,11 @@ def measured(read: Callable[[], object], place: str) -> Outcome:
         nowhere = os.open(os.devnull, os.O_RDWR)
         for stream in (0, 1, 2):
             os.dup2(nowhere, stream)
-        before, begun = _resident(), time.perf_counter()
+        before, begun, worked = _resident(), time.perf_counter(), _processor()
         outcome, words = verdict(read, (place,))
-        seconds = time.perf_counter() - begun
+        seconds, wall = _processor() - worked, time.perf_counter() - begun
         peak = 1024.0 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        os.write(theirs, json.dumps([outcome, words[:1000], seconds, peak - before]).encode())
+        os.write(theirs, json.dumps([outcome, words[:1000], seconds, wall, peak - before]).encode())
         os._exit(0)
     os.close(theirs)
     started = 0.0
@@ -136,9 +138,9 @@ def measured(read: Callable[[], object], place: str) -> Outcome:
         said = answer.read()
     status = os.waitpid(child, 0)[1]
     if said:
-        outcome, words, seconds, memory = json.loads(said)
-        return Outcome(outcome, words, seconds, memory + 1e6 * started)
-    return Outcome("fault", f"ended by signal {os.WTERMSIG(status)}", float(GIVEN_UP), 0.0)
+        *found, memory = json.loads(said)
+        return Outcome(*found, memory + 1e6 * started)
+    return Outcome("fault", f"ended by signal {os.WTERMSIG(status)}", float(GIVEN_UP), float(GIVEN_UP), 0.0)
 
 
 def in_a_process(work: Callable[[], object]) -> None:
@@ -172,6 +174,17 @@ def _warm(seeds: Path, readers: Iterable[str]) -> None:
             reader_of(reader).read(seeds / reader, file)
 
 
+def _processor() -> float:
+    """s that this process and those which it started and that have ended have worked."""
+    return sum(os.times()[:4])
+
+
+def _line(name: str, one: Outcome) -> str:
+    """An outcome as a line of the table."""
+    times = f"{one.seconds:6.2f} s ({one.wall:6.2f} s)"
+    return f"{name:<36} {one.outcome:<8} {times} {one.memory / 1e6:5.0f} MB  {one.words[:80]}"
+
+
 def _resident() -> int:
     """Bytes of memory that this process has."""
     pages = int(Path("/proc/self/statm").read_text().split()[1])
@@ -188,12 +201,11 @@ def main() -> int:
         if options.large:
             found = read_large(Path(folder))
             for name, one in found.items():
-                print(f"{name:<44} {one.outcome:<8} {one.seconds:6.2f} s {one.memory / 1e6:6.0f} MB  {one.words[:90]}")
+                print(_line(name, one))
             return 0 if all(one.outcome == "read" for one in found.values()) else 1
         found = run([name for name in BOMBS if name.startswith(options.only)], Path(folder))
     for name, one in found.items():
-        mark = "" if one.good else "  <- not refused in time"
-        print(f"{name:<44} {one.outcome:<8} {one.seconds:6.2f} s {one.memory / 1e6:6.0f} MB  {one.words[:90]}{mark}")
+        print(_line(name, one) + ("" if one.good else "  <- not refused in time"))
     good = sum(one.good for one in found.values())
     formats = len({name.split("/")[0] for name in found})
     worst = max(found.values(), key=lambda one: one.seconds), max(found.values(), key=lambda one: one.memory)

@@ -149,6 +149,7 @@ ARRAYS: dict[str, Bomb] = {
     "h5/another file": ("import", "x.h5", _hdf5(_elsewhere)),
     "xlsx/cells": ("import", "x.xlsx", _sheet(f"<row>{CELL * 20}</row>", 1_000_000)),
     "xlsx/cells of a small file": ("import", "x.xlsx", _sheet(f"<row>{CELL * 4}</row>", 300_000)),
+    "xlsx/cells within the size": ("import", "x.xlsx", _sheet(f"<row>{CELL * 4}</row>", 10_000)),
     "xlsx/a long word": ("import", "x.xlsx", _sheet("a" * 1000, 200_000)),
     "safetensors/header": ("weights", "x.safetensors", lambda path: _header(path, 1_000_000)),
     "safetensors/a length alone": ("weights", "x.safetensors", _length_alone),

@@ -17,18 +17,18 @@ QUICK = (
     "parquet/lists of one long word", "csv/endless line, tracks", "csv/endless header", "csv/endless line, import",
     "json/numbers on one line", "json/small lists", "json/report", "yaml/aliases", "yaml/values", "npy/a header alone",
     "h5/nothing written", "h5/links that double", "h5/another file", "xlsx/cells of a small file",
-    "safetensors/a length alone", "tiff/one huge tile", "bmp/a header alone", "ppm/a header alone",
-    "avi/a header that says less", "db3/a view", "opencv/nodes",
+    "xlsx/cells within the size", "safetensors/a length alone", "tiff/one huge tile", "bmp/a header alone",
+    "ppm/a header alone", "avi/a header that says less", "db3/a view", "opencv/nodes",
 )  # fmt: skip
 """Those that are written in a moment."""
 
 
 def test_bombs_are_refused(tmp_path: Path) -> None:
-    """In a process that has no threads yet; each reading gets five times its time, for tests run beside each other."""
+    """In a process that has no threads yet; each gets twice its time, for processors that others use too are slower."""
     code = (
         "import json, sys; from pathlib import Path; from tests.faults.bombs import run; "
         "found = run(json.loads(sys.argv[1]), Path(sys.argv[2])); "
-        "print(json.dumps({name: [one.outcome, one.words, one.seconds, one.memory] for name, one in found.items()}))"
+        "print(json.dumps({name: list(vars(one).values()) for name, one in found.items()}))"
     )
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))}
     command = [sys.executable, "-c", code, json.dumps(QUICK), str(tmp_path)]
@@ -39,7 +39,7 @@ def test_bombs_are_refused(tmp_path: Path) -> None:
     wrong = {
         name: one
         for name, one in found.items()
-        if one.outcome != "refused" or one.memory > MEMORY or one.seconds > 5.0 * SECONDS
+        if one.outcome != "refused" or one.memory > MEMORY or one.seconds > 2.0 * SECONDS
     }
     assert not wrong
 
@@ -47,9 +47,9 @@ def test_bombs_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("good", "outcome"),
     [
-        (False, Outcome("read", "", 0.1, 1e6)), (False, Outcome("fault", "a", 0.1, 1e6)),
-        (False, Outcome("refused", "a", 2.1, 1e6)), (False, Outcome("refused", "a", 0.1, 301e6)),
-        (True, Outcome("refused", "a", 1.9, 299e6)),
+        (False, Outcome("read", "", 0.1, 9.0, 1e6)), (False, Outcome("fault", "a", 0.1, 9.0, 1e6)),
+        (False, Outcome("refused", "a", 2.1, 9.0, 1e6)), (False, Outcome("refused", "a", 0.1, 9.0, 301e6)),
+        (True, Outcome("refused", "a", 1.9, 9.0, 299e6)),
     ],
 )  # fmt: skip
 def test_what_is_good(good: bool, outcome: Outcome) -> None:
@@ -70,7 +70,8 @@ def test_time_and_memory_are_those_of_the_reading() -> None:
 
     found = measured(reads, "a.csv")
     assert found.outcome == "refused"
-    assert 0.5 < found.seconds < 10.0
+    assert found.seconds < found.wall
+    assert found.wall > 0.5
     assert 160e6 < found.memory < 260e6
     assert len(held) == 200_000_000
 

@@ -3,7 +3,7 @@
 import math
 import sys
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -19,8 +19,10 @@ MAX_DEPTH: Final = 40
 """Groups within groups."""
 MAX_MEMBERS: Final = 20_000
 """Files within an archive, and datasets and groups within an HDF5 file: four for each of 5,000 shots."""
-EXCEL_COST: Final = 4
-"""Bytes of memory for each byte of the XML of which an Excel file is a zip."""
+EXCEL_FREE: Final = 1_000_000
+"""Bytes of XML that any Excel file may hold, before its size counts: openpyxl reads some 2 MB a second."""
+EXCEL_CELLS: Final = 25_000
+"""Cells that any Excel file may have, and one more for each two bytes of its size: a number takes three or more."""
 _PLAIN: Final = "Save plain arrays of numbers with numpy.savez."
 
 
@@ -89,13 +91,15 @@ def read_excel(path: Path) -> list[RawTable]:
     with library_reads(path, "Excel"), zipfile.ZipFile(path) as archive:
         members = archive.infolist()
         check_count(path, "files within it", len(members), MAX_MEMBERS)
-        check_unpacked(path, EXCEL_COST * sum(member.file_size for member in members))
+        check_unpacked(path, sum(member.file_size for member in members), EXCEL_FREE)
     sheets: dict[str, str] = {}
+    left = EXCEL_CELLS + path.stat().st_size // 2
     with library_reads(path, "Excel"):
         book = openpyxl.load_workbook(io.BytesIO(path.read_bytes()), read_only=True, data_only=True)
         for sheet in book.worksheets:
             sheet.reset_dimensions()  # rows end at their last cell, whatever size the sheet says it has
-            rows = [row for row in map(_cells, sheet.iter_rows(values_only=True)) if any(row)]
+            rows = list(_rows(path, sheet, left))
+            left -= sum(map(len, rows))
             width = max(map(len, rows), default=0)
             check_unpacked(path, sum(len(cell) for row in rows for cell in row) + width * len(rows))
             text = io.StringIO()
@@ -111,6 +115,17 @@ def read_excel(path: Path) -> list[RawTable]:
     if not found:
         raise ValueError(f"{path} must have a sheet with rows of numbers; got {listed(sheets)}. Add one.")
     return found
+
+
+def _rows(path: Path, sheet: Any, most: int) -> Iterator[list[str]]:
+    """The rows of a sheet that have a cell, as text. Raises: ValueError: more cells than `most`."""
+    count = 0
+    for row in sheet.iter_rows(values_only=True):
+        count += len(row)
+        check_count(path, "cells", count, most)
+        cells = _cells(row)
+        if any(cells):
+            yield cells
 
 
 def _cells(row: Iterable[Any]) -> list[str]:
