@@ -30,8 +30,8 @@ UNKNOWN = 1e6
 class BagWriter:
     """Appends `nav_msgs/Odometry` for each state and `nav_msgs/Path` for its prediction to an MCAP file.
 
-    What was written within a second is one chunk, which is in the file then; the end of the file is written when the
-    context ends. A file without it, which a kill leaves, is continued like one with it.
+    The messages of half a second are one chunk, which is appended then. The end of the file is written when the context
+    ends. A file without it, which a kill leaves, is continued like one with it.
 
     Args:
         out: the file.  horizon: s, of the paths.
@@ -76,7 +76,10 @@ class BagWriter:
             recording.cut(0)
             recording.append(self._opening)
             return
-        self._chunks = whole_chunks(recording.read, begin, recording.size, len(TOPICS))
+        try:
+            self._chunks = whole_chunks(recording.read, begin, recording.size, len(TOPICS))
+        except ValueError:  # damaged: what follows the damage must not be cut off
+            raise refused(recording.path) from None
         end, size = self._chunks[-1].end if self._chunks else begin, recording.size
         ended = recording.read(end, size - end) == ending(self._opening, self._chunks, len(TOPICS))
         recording.cut(end)

@@ -112,9 +112,10 @@ def chunk_of(messages: Sequence[Message], channels: int, offset: int) -> tuple[b
 
 
 def whole_chunks(read: Read, begin: int, size: int, channels: int) -> list[Chunk]:
-    """The chunks of a file that are whole, with their indexes.
+    """The chunks of a file that are whole, with their indexes, up to its ending or to a chunk that is cut off.
 
     Args: begin: bytes of the opening.  size: bytes of the file.  channels: their number.
+    Raises: ValueError: something else is among them.
     """
     found: list[Chunk] = []
     while (chunk := _chunk_at(read, found[-1].end if found else begin, channels)) is not None and chunk.end <= size:
@@ -142,7 +143,10 @@ def ending(begin: bytes, chunks: Sequence[Chunk], channels: int) -> bytes:
 def readable(path: Path) -> Path:
     """A path that readers can open: of a file that a killed `ballfg live` left, one that adds the missing end.
 
-    The file itself stays as it is. Args: path: of an MCAP file.
+    The file itself stays as it is.
+
+    Args: path: of an MCAP file.
+    Raises: ValueError: such a file, in which something else is among the chunks.
     """
     with path.open("rb") as file:
 
@@ -227,14 +231,18 @@ def _opening_of(read: Read) -> tuple[bytes, int] | None:
 
 
 def _chunk_at(read: Read, offset: int, channels: int) -> Chunk | None:
-    """The chunk at an offset; None if none of this writer's begins there, or its indexes are not there."""
+    """The chunk at an offset; None if the file ends before its indexes do, or the ending stands there.
+
+    Raises: ValueError: something else stands there.
+    """
     head = read(offset, RECORD.size + SPAN.size)
-    if len(head) < RECORD.size + SPAN.size:
+    if head[:1] in (b"", bytes([DATA_END])) or (head[0] == CHUNK and len(head) < RECORD.size + SPAN.size):
         return None
+    head = head.ljust(RECORD.size + SPAN.size)
     kind, length = RECORD.unpack_from(head)
     first, last, content, _, _, stored = SPAN.unpack_from(head, RECORD.size)
     if kind != CHUNK or content != stored or length != SPAN.size + content:
-        return None
+        raise ValueError(f"no chunk of ballfg live at byte {offset}")
     chunk = Chunk(first, last, offset, content, ())
     for number in range(1, channels + 1):
         head = read(chunk.end, RECORD.size + INDEX.size)
@@ -243,7 +251,7 @@ def _chunk_at(read: Read, offset: int, channels: int) -> Chunk | None:
         kind, length = RECORD.unpack_from(head)
         channel, entries = INDEX.unpack_from(head, RECORD.size)
         if (kind, channel, length) != (MESSAGE_INDEX, number, INDEX.size + entries):
-            return None
+            raise ValueError(f"no index of channel {number} at byte {chunk.end}")
         chunk = Chunk(first, last, offset, content, (*chunk.counts, entries // ENTRY.size))
     return chunk
 

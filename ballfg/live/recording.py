@@ -1,4 +1,4 @@
-"""Recordings: files that grow under their own name, reach the disk every second, and are never replaced or removed."""
+"""Recordings: files that grow under their own name, are soon on the disk, and are never replaced or removed."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from ballfg.files.json_file import parse_json
 from ballfg.files.whole_file import check_file
 from ballfg.live.answers import KINDS, encoded
 
-EVERY = 1.0
-"""s between two times at which what was recorded is brought to the disk."""
+EVERY = 0.5
+"""s between two times at which what was recorded is brought to the disk: what was read a second ago is there."""
 BLOCK = 65536
 """Bytes read at once of what an earlier command has recorded; the first line is shorter."""
 OPENING = b'{"kind":"'
@@ -25,11 +25,11 @@ OPENING = b'{"kind":"'
 class Recording:
     """A file to which this process appends, and no other one meanwhile. Use it as a context.
 
-    What was appended survives a kill at once, and a power cut after a second. A link is written to where it leads.
+    What was appended survives a kill at once, and a power cut after half a second. A link is written to where it leads.
 
     Args:
         path: of the file; it is made if it does not exist.
-        flush: appends what is held back; a thread calls it every second.
+        flush: appends what is held back; a thread calls it twice a second.
     Attributes:
         size: bytes that are whole.
     Raises: FileNotFoundError: no such folder. ValueError: it is a folder or a device, or another process records to it.
@@ -92,7 +92,7 @@ class Recording:
             os.close(self._handle)
 
     def _keep(self) -> None:
-        """The thread that brings everything to the disk every second."""
+        """The thread that brings everything to the disk."""
         while not self._stop.wait(EVERY):
             try:
                 self._bring_out()

@@ -1,6 +1,7 @@
-"""A sender of 100 lines a second, or --rate of them, beside one that floods: how late its answers are, and how many are missing.
+"""A sender of 100 lines a second beside one that floods: how late its answers are, and how many are missing.
 
-`python -m tests.live.flooded --seconds 20 --seed 1` starts `ballfg live` as a process, on this machine's own address.
+`python -m tests.live.flooded --seconds 20 --seed 1` starts `ballfg live` as a process, on this machine's own address;
+`--rate` is for busy machines, which cannot answer 100 lines a second.
 """
 
 from __future__ import annotations

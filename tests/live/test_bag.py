@@ -83,7 +83,7 @@ def test_a_bag_cut_anywhere_is_read_and_continued(
             ends.append(whole.stat().st_size)
     content, expected = whole.read_bytes(), positions_of(whole)
     assert len(expected) == 10
-    places = [*range(0, begin, 997), *range(begin, len(content), 701), *ends, ends[-1] - 1, len(content) - 1]
+    places = [*range(0, begin, 2003), *range(begin, len(content), 3001), *ends, ends[-1] - 1, len(content) - 1]
     for place in places:
         cut = tmp_path / "cut.mcap"
         cut.write_bytes(content[:place])
@@ -100,6 +100,14 @@ def test_a_bag_cut_anywhere_is_read_and_continued(
         writer.see(states[10], None)
     assert positions_of(whole) == [*expected, [states[10].state.position.tolist()]]
     assert whole.read_bytes().startswith(content[: ends[-1]])
+    for place, damage in ((ends[0], b"\0"), (ends[-1], b"\0" * 9), (ends[-1], b"\x06" + b"\0" * 100)):
+        damaged = content[:place] + damage + content[place + len(damage) : ends[-1] + len(damage)]
+        cut.write_bytes(damaged)
+        with pytest.raises(ValueError, match="out must be a new file or a recording of ballfg live"):
+            BagWriter(cut, horizon=0.1, repeats=False)
+        assert cut.read_bytes() == damaged
+        with pytest.raises(ValueError, match=r"cut\.mcap must be a whole bag file"):
+            positions_of(cut)
 
 
 def test_a_bag_is_continued_only_if_it_is_one_of_this_command(bag: Path, tmp_path: Path) -> None:

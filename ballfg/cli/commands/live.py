@@ -35,7 +35,7 @@ def live(
     ] = None,
     listen: Annotated[
         str | None,
-        typer.Option(help="Take lines from tcp://HOST:PORT or udp://HOST:PORT; without HOST of this machine."),
+        typer.Option(help="Take lines from tcp://HOST:PORT or udp://HOST:PORT; without HOST, from this machine alone."),
     ] = None,
     idle: Annotated[
         float, typer.Option(help="A TCP sender that has sent no line for so long is dropped, s.", show_default="300")

@@ -98,8 +98,9 @@ class UdpServer(Listener):
 
     def _newcomer(self, address: Any) -> Correspondent | None:
         """A new sender, if there is room."""
-        silent = [s for s in self._senders.values() if not s.busy and perf_counter() - s.heard > SILENT]
         if len(self._senders) >= SENDERS:
+            now = perf_counter()
+            silent = [s for s in self._senders.values() if not s.busy and now - s.heard > SILENT]
             if not silent:
                 self._refuse(address)
                 return None
