@@ -28,10 +28,9 @@ from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact, Quality
 from ballfg.estimation.settings import Settings, sample_sigmas, spin_start, stamp_covariance, total_sigmas
-from ballfg.estimation.sides.covering import beside_its_contacts
-from ballfg.estimation.sides.passage import Seen, Ways
-from ballfg.estimation.sides.telling import on_both_sides
-from ballfg.estimation.sides.watch import Told, Watch
+from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
+from ballfg.estimation.sides.monitor import ContactMonitor, ContactState, with_contact_states
+from ballfg.estimation.sides.widening import widened_near_contacts
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.factors.batch import FactorBatch
 from ballfg.factors.linear.definite import raised
@@ -111,11 +110,11 @@ class ExtendedKalmanFilter(Estimator):
             fly_back(self.ball, record.start, track.times, run.flight_noise, run.fading, mean, covariance)
         whitened = record.innovations(run.H, mean, covariance, track.positions) if self.smooth else record.whitened
         estimate = self._result(track, run, mean, covariance, whitened)
-        told = run.beside_contacts()
+        found = run.states_near_contacts()
         if self.smooth:  # later samples have shown the side, but for the last
-            estimate = beside_its_contacts(estimate, self.ball)
-            told = {k: one for k, one in told.items() if k == len(track) - 1}
-        return on_both_sides(estimate, told).dated(written.times)
+            estimate = widened_near_contacts(estimate, self.ball)
+            found = {k: state for k, state in found.items() if k == len(track) - 1}
+        return with_contact_states(estimate, found).dated(written.times)
 
     def _result(
         self,
@@ -213,32 +212,33 @@ class _Run:
             covariance[POSITION, -3:] = covariance[-3:, POSITION] = -lasting
         return mean, covariance
 
-    def beside_contacts(self) -> dict[int, Told]:
-        """What is to be told of the ball at samples at which it may be on either side of a contact."""
+    def states_near_contacts(self) -> dict[int, ContactState]:
+        """The states to report at samples at which the ball may be on either side of a contact."""
         record, times = self.record, self.track.times
-        ways = Ways(self.owner.ball, self.owner.surfaces, self.settings, len(self.bias_sigmas))
-        watch, told = Watch(ways), dict[int, Told]()
+        model = HypothesisModel(self.owner.ball, self.owner.surfaces, self.settings, len(self.bias_sigmas))
+        monitor, found = ContactMonitor(model), dict[int, ContactState]()
         for k in range(record.start + 1, len(times)):
             if k - 1 in record.hits:
-                watch.leave()
+                monitor.reset()
                 continue
             before = record.mean[k - 1], record.covariance[k - 1]
             held = partial(self._bounced_before, k)
-            one = watch.take(before, float(times[k] - times[k - 1]), self._seen(k), held)
-            if one is not None:
-                told[k] = one
-        return told
+            state = monitor.step(before, float(times[k] - times[k - 1]), self._measured(k), held)
+            if state is not None:
+                found[k] = state
+        return found
 
     def _bounced_before(self, k: int, count: int) -> bool:
         """Whether the filter's ball has bounced in the last `count` intervals before sample k."""
         return any(i in self.record.contacts for i in range(k - count, k))
 
-    def _seen(self, k: int) -> Seen:
+    def _measured(self, k: int) -> SampleMeasurement:
         """What the filter took in at a sample."""
         if self.record.quality[k] == Quality.OUTLIER:
-            return Seen()
+            return SampleMeasurement()
         rows = [(batch, row) for one, batch in self.beside for row in one.filter_rows(k)]
-        return Seen(self.track.positions[k], self.sigma[k], [batch.taken(np.array([row])) for batch, row in rows])
+        factors = [batch.taken(np.array([row])) for batch, row in rows]
+        return SampleMeasurement(self.track.positions[k], self.sigma[k], factors)
 
     def _least(self) -> Array:
         """(d,) standard deviations below which no number can be known, whatever rounding says of it."""

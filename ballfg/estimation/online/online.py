@@ -41,8 +41,8 @@ from ballfg.estimation.plausible import plausible, possible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import physics_of
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
-from ballfg.estimation.sides.passage import Seen, Ways
-from ballfg.estimation.sides.watch import Told, Watch
+from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
+from ballfg.estimation.sides.monitor import ContactMonitor, ContactState
 from ballfg.estimation.smoother.motion import FLIGHT
 from ballfg.estimation.smoother.problem import coefficient_means, trackwise_model
 from ballfg.estimation.smoother.smoother import Smoother
@@ -110,7 +110,7 @@ class Online(Estimator):
         self.window: StreamWindow | None = None
         self.events = EventTracker(self.surfaces, self.physics, self.settings.find_events)
         self._samples: list[Sample] = []  # of the window, also while iSAM2 is out of order
-        self._watch: Watch | None = None  # of the window's ball
+        self._monitor: ContactMonitor | None = None  # of the window's ball
         self._stream = SightingStream(self.cameras, self.settings.sighting_loss) if self.cameras else None
         self._frozen: list[Frozen] | None = None  # states that left the window, where someone asks for them
         self._counts = np.zeros(2, dtype=np.int64)
@@ -129,7 +129,7 @@ class Online(Estimator):
         if self.window is not None:
             other.window = self.window.copy(other._samples[: len(self.window)])
         other.events = self.events.copy()
-        other._watch = None if self._watch is None else self._watch.copy()
+        other._monitor = None if self._monitor is None else self._monitor.copy()
         other._stream = copy.deepcopy(self._stream)
         other._frozen = None if self._frozen is None else list(self._frozen)
         other._counts = self._counts.copy()
@@ -241,30 +241,32 @@ class Online(Estimator):
         newest = self._samples[-1]
         if status is Status.OK and not newest.motion.linked:  # a long gap before it
             status = Status.NO_VELOCITY
-        told = self._told(None if rebuilt else before, newest)
-        return self._state(self.window, newest, update, revised, rebuilt, status, told)
+        contact = self._near_contact(None if rebuilt else before, newest)
+        return self._state(self.window, newest, update, revised, rebuilt, status, contact)
 
     def _new_window(self, sample: Sample) -> StreamWindow:
         """A window that begins with a sample; only measured positions have a tracker's bias."""
         biased = self.settings.has_memory and sample.measured
         window = WINDOWS[self.solver](self.ball, self.settings, float(sample.stated.min()), biased)
-        self._watch = Watch(Ways(self.ball, self.surfaces, self.settings, window.width - STATE_DIM))
+        self._monitor = ContactMonitor(
+            HypothesisModel(self.ball, self.surfaces, self.settings, window.width - STATE_DIM)
+        )
         return window
 
-    def _told(self, before: tuple[Array, Array] | None, sample: Sample) -> Told | None:
-        """What is to be told of a ball that may be on either side of a contact; None far from one.
+    def _near_contact(self, before: tuple[Array, Array] | None, sample: Sample) -> ContactState | None:
+        """The state to report of a ball that may be on either side of a contact; None far from one.
 
         Args: before: what was known at the sample before.  sample: the newest one.
         """
-        assert self._watch is not None
+        assert self._monitor is not None
         motion = sample.motion
         if before is None or motion.hit or not motion.linked or motion.rest is not None:
-            self._watch.leave()
+            self._monitor.reset()
             return None
         dt = sample.time - self._samples[-2].time
         factors = [measurement.batch for measurement in sample.measurements]
-        seen = Seen(sample.position if sample.measured else None, sample.sigma, factors)
-        return self._watch.take(before, dt, seen, self._has_bounced)
+        measured = SampleMeasurement(sample.position if sample.measured else None, sample.sigma, factors)
+        return self._monitor.step(before, dt, measured, self._has_bounced)
 
     def _has_bounced(self, count: int) -> bool:
         """Whether the window's ball has bounced in the last `count` intervals."""
@@ -294,9 +296,11 @@ class Online(Estimator):
         except (RuntimeError, ValueError) as error:
             rebuilt = True
             status, update = self._repair(error, status)
-        assert self._watch is not None
-        told = None if rebuilt else self._watch.join(Seen(factors=[sighting.batch]), self._has_bounced)
-        return self._state(self.window, sample, update, 0, rebuilt, status, told)
+        assert self._monitor is not None
+        contact = (
+            None if rebuilt else self._monitor.update(SampleMeasurement(factors=[sighting.batch]), self._has_bounced)
+        )
+        return self._state(self.window, sample, update, 0, rebuilt, status, contact)
 
     def _take_in(self, window: StreamWindow, sample: Sample, changed: bool) -> tuple[int, Update]:
         """Explain, go back to where the explanation changed, append, move contacts, keep the window's length."""
@@ -347,11 +351,11 @@ class Online(Estimator):
         revised: int,
         rebuilt: bool,
         status: Status,
-        told: Told | None,
+        contact: ContactState | None,
     ) -> OnlineState:
         mean, joint = window.newest_belief
-        if told is not None:
-            mean, joint = told.mean[: len(mean)], told.widened[: len(mean), : len(mean)]
+        if contact is not None:
+            mean, joint = contact.mean[: len(mean)], contact.widened[: len(mean), : len(mean)]
         if possible(mean[:STATE_DIM]) and variances_positive(joint):
             joint = definite(joint)
         else:
@@ -365,7 +369,7 @@ class Online(Estimator):
             coefficient_names=tuple(self.settings.coefficients),
             world=self.world,
             name="stream",
-            other_side=None if told is None else told.other,
+            other_side=None if contact is None else contact.other,
             innovation=update.innovation,
             motion=sample.motion,
             revised=revised,

@@ -1,4 +1,4 @@
-"""The last state of a track that ends beside a contact: no later sample shows on which side of it the ball is."""
+"""The last state of a track that ends near a contact: no later sample shows on which side of it the ball is."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ import numpy as np
 
 from ballfg.arrays import Array
 from ballfg.estimation.result import Estimate
-from ballfg.estimation.sides.passage import Seen, Ways
-from ballfg.estimation.sides.telling import on_both_sides
-from ballfg.estimation.sides.watch import Watch
+from ballfg.estimation.sides.hypotheses import HypothesisModel, SampleMeasurement
+from ballfg.estimation.sides.monitor import ContactMonitor, with_contact_states
 from ballfg.estimation.smoother.problem import TrackProblem
 from ballfg.factors.linear.covariance import marginal_covariances
 from ballfg.factors.linear.definite import definite
@@ -29,28 +28,30 @@ MEMORY: Final = 256
 
 
 def with_both_sides(smoother: Smoother, problem: TrackProblem, estimate: Estimate) -> Estimate:
-    """The estimate, its last state that of the more probable side where the track ends beside a contact.
+    """The estimate, its last state that of the more probable side where the track ends near a contact.
 
-    What is known of the ball before the contact is estimated from the samples up to there; from then on both sides are
-    followed (`ballfg.estimation.sides`).
+    The samples before the contact are estimated by themselves; from there on both hypotheses are followed
+    (`ballfg.estimation.sides`).
 
-    Args: smoother: of the track.  problem: of it.  estimate: without.
+    Args: smoother: of the track.  problem: of the track.  estimate: without regard to the other side.
     """
     track, n = problem.track, len(problem.track)
     disturbed = np.concatenate((estimate.hits, problem.segmentation.restarts))
-    first = _before_contact(estimate, Ways(problem.ball, smoother.surfaces, problem.settings), track)
+    first = _before_contact(estimate, HypothesisModel(problem.ball, smoother.surfaces, problem.settings), track)
     if estimate.status.failed or first is None or first + 1 < LEAST or (disturbed >= first).any():
         return estimate
     before = _filtered(smoother, track.between(track.times[max(first + 1 - MEMORY, 0)], track.times[first]))
     if before is None:
         return estimate
-    ways = Ways(problem.ball, smoother.surfaces, problem.settings, len(before[0]) - STATE_DIM - problem.width)
-    steps = [(float(track.times[k] - track.times[k - 1]), _seen(problem, k)) for k in range(first + 1, n)]
-    told = Watch(ways).follow(before, steps, lambda count: any(c.interval >= n - 1 - count for c in estimate.contacts))
-    return estimate if told is None else on_both_sides(estimate, {n - 1: told})
+    biases = len(before[0]) - STATE_DIM - problem.width
+    model = HypothesisModel(problem.ball, smoother.surfaces, problem.settings, biases)
+    steps = [(float(track.times[k] - track.times[k - 1]), _measured(problem, k)) for k in range(first + 1, n)]
+    latest = max((contact.interval for contact in estimate.contacts), default=-1)
+    state = ContactMonitor(model).run(before, steps, lambda count: latest >= n - 1 - count)
+    return estimate if state is None else with_contact_states(estimate, {n - 1: state})
 
 
-def _before_contact(estimate: Estimate, ways: Ways, track: Track) -> int | None:
+def _before_contact(estimate: Estimate, model: HypothesisModel, track: Track) -> int | None:
     """The last sample that is certainly before a contact near the track's end; None where there is no such contact."""
     n = len(track)
     near = [contact.interval for contact in estimate.contacts if contact.interval >= n - 1 - REACH]
@@ -58,7 +59,7 @@ def _before_contact(estimate: Estimate, ways: Ways, track: Track) -> int | None:
         return near[0] - 1
     for k in range(max(n - 1 - REACH, 0), n - 1):
         state = estimate[k]
-        if ways.may_touch(state.mean, state.joint, float(track.times[k + 1] - track.times[k])):
+        if model.may_touch(state.mean, state.joint, float(track.times[k + 1] - track.times[k])):
             return k
     return None
 
@@ -82,9 +83,9 @@ def _filtered(smoother: Smoother, track: Track) -> tuple[Array, Array] | None:
     return mean, definite(covariance)
 
 
-def _seen(problem: TrackProblem, sample: int) -> Seen:
+def _measured(problem: TrackProblem, sample: int) -> SampleMeasurement:
     """What was measured at a sample of a track; rough positions stand for pixels."""
     beside = [one for one in problem.observations if not one.locates]
     rows = [(problem.observed[one.name], row) for one in beside for row in one.filter_rows(sample)]
     factors = [batch.taken(np.array([row])) for batch, row in rows]
-    return Seen(problem.track.positions[sample], problem.sigma[sample], factors)
+    return SampleMeasurement(problem.track.positions[sample], problem.sigma[sample], factors)

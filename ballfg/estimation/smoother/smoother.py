@@ -17,7 +17,7 @@ from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Segmentation, physics_of, segment
 from ballfg.estimation.settings import Settings, sample_sigmas, total_sigmas
-from ballfg.estimation.sides.covering import beside_its_contacts
+from ballfg.estimation.sides.widening import widened_near_contacts
 from ballfg.estimation.smoother.at_end import with_both_sides
 from ballfg.estimation.smoother.grip import rival_note, with_other_spins
 from ballfg.estimation.smoother.initial import initial_states, move_contacts
@@ -304,7 +304,7 @@ class Smoother(Estimator):
         )
         estimate = plausible(estimate, track, problem.sigma, self.settings)
         estimate = replace(estimate, notes=estimate.notes + rival_note(solution, estimate.covariances[0]))
-        estimate = with_both_sides(self, problem, beside_its_contacts(estimate, problem.ball))
+        estimate = with_both_sides(self, problem, widened_near_contacts(estimate, problem.ball))
         hops = self.low_hops(track, segmentation)
         estimate = replace(estimate, notes=estimate.notes + uncounted_note(hops, track.times))
         return with_low_hops(estimate, hops, self.model)

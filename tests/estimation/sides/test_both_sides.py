@@ -79,7 +79,7 @@ def test_states_far_from_the_contact_are_those_of_the_window(
         return [online.push(t, p) for t, p in zip(doubtful.track.times, doubtful.track.positions, strict=True)]
 
     told = pushed()
-    monkeypatch.setattr("ballfg.estimation.sides.watch.Watch.take", lambda *given: None)
+    monkeypatch.setattr("ballfg.estimation.sides.monitor.ContactMonitor.step", lambda *given: None)
     alone = pushed()
     same = [
         np.array_equal(a.mean, b.mean) and np.array_equal(a.joint, b.joint) for a, b in zip(told, alone, strict=True)

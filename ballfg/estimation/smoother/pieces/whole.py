@@ -16,7 +16,7 @@ from ballfg.estimation.plausible import plausible
 from ballfg.estimation.result import Estimate, Status
 from ballfg.estimation.segmentation import Contact
 from ballfg.estimation.settings import sample_sigmas
-from ballfg.estimation.sides.covering import Shared, beside_contacts
+from ballfg.estimation.sides.widening import Shared, widening_near_contacts
 from ballfg.estimation.smoother.at_end import with_both_sides
 from ballfg.estimation.smoother.grip import rival_note
 from ballfg.estimation.smoother.low_hops import uncounted_note, with_low_hops
@@ -97,7 +97,7 @@ def smoothed(smoother: Smoother, task: tuple[State, Array, Point]) -> Smoothed:
     own = slice(problem.width)
     cross = np.ascontiguousarray(known.cross[:, :STATE_DIM, own])
     shared = Shared(values.coefficients[own], known.coefficients[own, own], cross)
-    sides = beside_contacts(times, values.states, covariances, contacts, problem.ball, shared)
+    sides = widening_near_contacts(times, values.states, covariances, contacts, problem.ball, shared)
     near = np.flatnonzero(sides.any(axis=(1, 2)))
     innovations = _innovations(problem, state, values, known)
     return Smoothed(values, covariances, cross, {int(k): sides[k] for k in near}, innovations, contacts)

@@ -10,7 +10,7 @@ from scipy.stats import norm
 from ballfg.dynamics import EFFECTS, AnalyticModel
 from ballfg.dynamics.augmented import AugmentedModel
 from ballfg.estimation.segmentation import Contact
-from ballfg.estimation.sides.covering import ENOUGH, MORE, SPREAD, Shared, beside_contacts, covering
+from ballfg.estimation.sides.widening import ENOUGH, MORE, SPREAD, Shared, widening, widening_near_contacts
 
 G, E = 9.81, 0.9
 MODEL = AnalyticModel([EFFECTS["gravity"](g=G), EFFECTS["restitution"](e=E), EFFECTS["table_height"](offset=0.0)])
@@ -34,7 +34,7 @@ def beside(height_sigma: float) -> tuple[np.ndarray, np.ndarray]:
     shared = Shared(np.zeros(1), np.array([[height_sigma**2]]), np.zeros((2, 9, 1)))
     model = AugmentedModel(MODEL, [name])
     contacts = (Contact(0, EARLY, 0.0),)
-    return made, beside_contacts(np.array([0.0, 0.01]), made, covariances, contacts, model, shared)
+    return made, widening_near_contacts(np.array([0.0, 0.01]), made, covariances, contacts, model, shared)
 
 
 @pytest.mark.parametrize("height_sigma", [1e-9, 4e-4])
@@ -61,10 +61,10 @@ def test_a_covariance_that_covers_is_never_less_than_either() -> None:
     for chance in (SPREAD, 0.1, 0.5):
         near, far = (a @ a.T for a in rng.normal(size=(2, 9, 9)))
         jump = rng.normal(size=9)
-        whole = near + covering(near, far, jump, chance)
+        whole = near + widening(near, far, jump, chance)
         for less in (near, far, near + chance * np.outer(jump, jump)):
             assert np.linalg.eigvalsh(whole - less).min() > -1e-9
-    assert np.abs(covering(near, far, jump, 1e-12)).max() < 1e-8
+    assert np.abs(widening(near, far, jump, 1e-12)).max() < 1e-8
 
 
 def test_the_jump_is_that_of_the_models_own_bounce() -> None:

@@ -1,4 +1,4 @@
-"""Covariances that hold both sides of a contact: at one stamp, and at the stamps of an estimate beside its contacts."""
+"""By how much covariances are widened to hold both sides of a contact: at one stamp, and in a whole estimate."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ a mixture's covariance has it, a share q of that spread, each of them would add 
 the less probable side after all."""
 
 
-def covering(near: Array, far: Array, jump: Array, chance: float) -> Array:
+def widening(near: Array, far: Array, jump: Array, chance: float) -> Array:
     """(9, 9) what a covariance of one side of a contact lacks to hold the other one too; positive semidefinite.
 
     Args: near, far: (9, 9) covariances on the two sides.  jump: (9,) from the one to the other.
@@ -67,7 +67,7 @@ class Shared:
     cross: Array
 
 
-def beside_its_contacts(estimate: Estimate, model: BallModel) -> Estimate:
+def widened_near_contacts(estimate: Estimate, model: BallModel) -> Estimate:
     """The estimate, its covariances with the chance that a ball is on the other side of a near contact.
 
     Args: estimate: without it.  model: the ball, its coefficients in columns behind the state.
@@ -75,11 +75,13 @@ def beside_its_contacts(estimate: Estimate, model: BallModel) -> Estimate:
     if estimate.status.failed:  # its states do not know of contacts
         return replace(estimate, other_sides=np.zeros_like(estimate.covariances))
     shared = Shared(estimate.coefficients, estimate.coefficient_covariance, estimate.cross_covariances)
-    others = beside_contacts(estimate.times, estimate.states, estimate.covariances, estimate.contacts, model, shared)
+    others = widening_near_contacts(
+        estimate.times, estimate.states, estimate.covariances, estimate.contacts, model, shared
+    )
     return replace(estimate, covariances=estimate.covariances + others, other_sides=others)
 
 
-def beside_contacts(
+def widening_near_contacts(
     times: Array,
     states: Array,
     covariances: Array,
@@ -115,7 +117,7 @@ def beside_contacts(
         there = _carried(model, np.append(states[other], shared.mean), times[k] - times[other])
         if possible(there):  # back over a long gap, drag would have been push
             chance = 0.5 * math.erfc(max(float(margins[i]), 0.0) / math.sqrt(2.0))
-            lacking[k] += covering(covariances[k], covariances[other], there - states[k], chance)
+            lacking[k] += widening(covariances[k], covariances[other], there - states[k], chance)
     return lacking
 
 

@@ -12,9 +12,9 @@ from scipy.stats import norm
 from ballfg.dynamics import EFFECTS, AnalyticModel, Surfaces
 from ballfg.dynamics.motion.rollout import advance
 from ballfg.estimation.settings import Settings
-from ballfg.estimation.sides.mixture import Mixture
-from ballfg.estimation.sides.passage import Passage, Seen, Ways
-from ballfg.estimation.sides.watch import Watch
+from ballfg.estimation.sides.gaussians import GaussianMixture
+from ballfg.estimation.sides.hypotheses import ContactHypotheses, HypothesisModel, SampleMeasurement
+from ballfg.estimation.sides.monitor import ContactMonitor
 from ballfg.factors.noise import ProcessNoise
 from ballfg.simulation import table_tennis
 
@@ -24,14 +24,14 @@ SIGMAS = np.array([1e-3, 1e-3, 2e-3, 0.03, 0.03, 0.03, 40.0, 40.0, 40.0])
 DT = 0.006
 
 
-def ways(model=None) -> Ways:
-    return Ways(model or table_tennis().model, Surfaces(0.0), QUIET)
+def hypothesis_model(model=None) -> HypothesisModel:
+    return HypothesisModel(model or table_tennis().model, Surfaces(0.0), QUIET)
 
 
 def test_a_gaussian_is_cut_as_an_integral_over_it_says() -> None:
     """Two numbers, the gap their difference: mean, covariance and weight of the part above, by sums over a grid."""
     covariance = np.array([[2.0, 0.5], [0.5, 1.0]])
-    cut = Mixture.one(np.array([0.3, 0.8]), covariance).above(np.array([-0.5]), np.array([[1.0, -1.0]]))
+    cut = GaussianMixture.single(np.array([0.3, 0.8]), covariance).truncated(np.array([-0.5]), np.array([[1.0, -1.0]]))
     x, y = np.meshgrid(np.linspace(-9, 9, 401), np.linspace(-7, 8, 401), indexing="ij")
     points = np.stack((x, y), axis=-1)
     apart = points - np.array([0.3, 0.8])
@@ -41,20 +41,20 @@ def test_a_gaussian_is_cut_as_an_integral_over_it_says() -> None:
     spread = np.einsum("ab,abi,abj->ij", weight, points - mean, points - mean)
     np.testing.assert_allclose(cut.means[0], mean, atol=0.01)
     np.testing.assert_allclose(cut.covariances[0], spread, atol=0.02)
-    assert np.exp(cut.log) == pytest.approx(norm.cdf(-0.5 / np.sqrt(2.0)), rel=1e-9)
+    assert np.exp(cut.log_weight) == pytest.approx(norm.cdf(-0.5 / np.sqrt(2.0)), rel=1e-9)
 
 
 def test_merged_gaussians_have_the_moments_of_all() -> None:
     rng = np.random.default_rng(1)
     roots = rng.normal(size=(3, 4, 4))
-    mixture = Mixture(np.log([0.2, 0.5, 1.3]), rng.normal(size=(3, 4)), roots @ roots.swapaxes(1, 2))
+    mixture = GaussianMixture(np.log([0.2, 0.5, 1.3]), rng.normal(size=(3, 4)), roots @ roots.swapaxes(1, 2))
     shares = np.array([0.1, 0.25, 0.65])
     mean = shares @ mixture.means
     second = sum(w * (c + np.outer(m, m)) for w, m, c in zip(shares, mixture.means, mixture.covariances, strict=True))
     merged = mixture.merged()
     np.testing.assert_allclose(merged.means[0], mean)
     np.testing.assert_allclose(merged.covariances[0], second - np.outer(mean, mean), atol=1e-12)
-    assert np.exp(merged.log) == pytest.approx(2.0)
+    assert np.exp(merged.log_weight) == pytest.approx(2.0)
 
 
 @pytest.mark.parametrize("dt", [0.0062, 0.0068, 0.0074])
@@ -62,8 +62,10 @@ def test_both_sides_against_draws(dt: float) -> None:
     """30,000 balls rolled out and weighed by how well they fit the sample: chance, mean and sigmas of each side."""
     noise = 0.003
     position = np.array([4.0 * dt, 0.3 * dt, 0.019])
-    passage = Passage.begun(ways(), FALLING, np.diag(SIGMAS**2)).after(dt, Seen(position, np.full(3, noise)))
-    flying, risen = passage.sides()
+    hypotheses = ContactHypotheses.start(hypothesis_model(), FALLING, np.diag(SIGMAS**2)).step(
+        dt, SampleMeasurement(position, np.full(3, noise))
+    )
+    flying, risen = hypotheses.sides()
     rng = np.random.default_rng(3)
     drawn = torch.from_numpy(FALLING + SIGMAS * rng.standard_normal((30_000, 9)))
     with torch.no_grad():
@@ -73,8 +75,8 @@ def test_both_sides_against_draws(dt: float) -> None:
     up = states[:, 5] > 0.0
     chance = weights[up].sum() / weights.sum()
     assert 0.1 < chance < 0.9
-    assert np.exp(risen.logs[0]) == pytest.approx(chance, abs=0.02)
-    assert np.exp(flying.logs[0]) == pytest.approx(1.0 - chance, abs=0.02)
+    assert np.exp(risen.log_weights[0]) == pytest.approx(chance, abs=0.02)
+    assert np.exp(flying.log_weights[0]) == pytest.approx(1.0 - chance, abs=0.02)
     for side, rows in ((flying, ~up), (risen, up)):
         own = weights[rows] / weights[rows].sum()
         mean = own @ states[rows]
@@ -84,21 +86,24 @@ def test_both_sides_against_draws(dt: float) -> None:
 
 
 def test_a_ball_far_from_the_surface_is_left_to_its_estimator() -> None:
-    watch = Watch(ways())
+    monitor = ContactMonitor(hypothesis_model())
     high = FALLING + np.array([0, 0, 0.1, 0, 0, 0, 0, 0, 0])
-    assert watch.take((high, np.diag(SIGMAS**2)), DT, Seen(), lambda count: False) is None
+    assert monitor.step((high, np.diag(SIGMAS**2)), DT, SampleMeasurement(), lambda count: False) is None
 
 
-def test_a_sample_that_nothing_explains_is_not_believed_and_two_end_the_passage() -> None:
+def test_a_sample_that_nothing_explains_is_not_believed_and_two_end_the_hypotheses() -> None:
     """A position 0.3 m off moves nothing; a second one means that something else has happened."""
-    watch, off = Watch(ways()), Seen(np.array([0.024, 0.0018, 0.33]), np.full(3, 0.002))
+    monitor, off = (
+        ContactMonitor(hypothesis_model()),
+        SampleMeasurement(np.array([0.024, 0.0018, 0.33]), np.full(3, 0.002)),
+    )
     before = (FALLING, np.diag(SIGMAS**2))
-    told = watch.take(before, DT, off, lambda count: False)
-    expected = Watch(ways()).take(before, DT, Seen(), lambda count: False)
+    told = monitor.step(before, DT, off, lambda count: False)
+    expected = ContactMonitor(hypothesis_model()).step(before, DT, SampleMeasurement(), lambda count: False)
     assert told is not None
     assert expected is not None
     np.testing.assert_array_equal(told.mean, expected.mean)
-    assert watch.take(before, DT, off, lambda count: False) is None
+    assert monitor.step(before, DT, off, lambda count: False) is None
 
 
 def test_a_side_is_told_as_long_as_the_estimator_takes_the_other() -> None:
@@ -110,10 +115,10 @@ def test_a_side_is_told_as_long_as_the_estimator_takes_the_other() -> None:
             now = advance(model, now, torch.full((1,), 0.01, dtype=torch.float64), Surfaces(0.0))
         states.append(now[0].numpy().copy())
     for held in (False, True):
-        watch, told, covariance = Watch(ways(model)), [], np.diag((0.1 * SIGMAS) ** 2)
+        monitor, told, covariance = ContactMonitor(hypothesis_model(model)), [], np.diag((0.1 * SIGMAS) ** 2)
         for before, after in pairwise(states):
-            seen = Seen(after[:3], np.full(3, 1e-4))
-            told.append(watch.take((before, covariance), 0.01, seen, lambda count, held=held: held))
+            measured = SampleMeasurement(after[:3], np.full(3, 1e-4))
+            told.append(monitor.step((before, covariance), 0.01, measured, lambda count, held=held: held))
         assert told[0] is not None
-        assert told[0].risen
+        assert told[0].bounced
         assert (told[2] is None) == held

@@ -1,0 +1,117 @@
+"""Gaussian mixtures over the state of one ball: measurement updates, truncation at a surface, moments."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import log_ndtr, logsumexp
+
+from ballfg.arrays import Array
+from ballfg.estimation.observations.innovation import FilterInnovation
+from ballfg.factors.batch import FactorBatch
+
+LEAST_SPREAD = 1e-9
+"""m, least standard deviation of a gap."""
+
+
+@dataclass(frozen=True)
+class GaussianMixture:
+    """Gaussians over the state of a ball, the model's coefficients and the tracker's bias, in this order.
+
+    Attributes:
+        log_weights: (n,), not normalised.
+        means: (n, d).
+        covariances: (n, d, d).
+    """
+
+    log_weights: Array
+    means: Array
+    covariances: Array
+
+    @classmethod
+    def single(cls, mean: Array, covariance: Array) -> GaussianMixture:
+        """One Gaussian (d,) and (d, d) with the weight one."""
+        return cls(np.zeros(1), mean[None], covariance[None])
+
+    @staticmethod
+    def concatenated(parts: Sequence[GaussianMixture]) -> GaussianMixture:
+        """All Gaussians of some mixtures."""
+        fields = ("log_weights", "means", "covariances")
+        return GaussianMixture(*(np.concatenate([getattr(part, field) for part in parts]) for field in fields))
+
+    def __len__(self) -> int:
+        return len(self.log_weights)
+
+    @property
+    def log_weight(self) -> float:
+        """The logarithm of the sum of all weights; -inf without Gaussians."""
+        return float(logsumexp(self.log_weights)) if len(self) else -np.inf
+
+    def selected(self, rows: NDArray[np.bool_]) -> GaussianMixture:
+        """Some of the Gaussians, by a mask (n,)."""
+        return GaussianMixture(self.log_weights[rows], self.means[rows], self.covariances[rows])
+
+    def updated_by_position(self, position: Array, noise: Array, H: Array) -> tuple[GaussianMixture, Array]:
+        """The Kalman update with a measured position; weights gain its likelihood.
+
+        Args: position: (3,) m.  noise: (n, 3, 3) m^2, for each Gaussian.  H: (3, d) of a measured position.
+        Returns: the mixture, and the squared whitened innovations (n,).
+        """
+        innovation = position - self.means @ H.T
+        rows = H @ self.covariances
+        spread = rows @ H.T + noise
+        gain = np.linalg.solve(spread, rows).swapaxes(1, 2)
+        squares = (innovation * np.linalg.solve(spread, innovation[..., None])[..., 0]).sum(axis=1)
+        log_weights = self.log_weights - 0.5 * (squares + np.linalg.slogdet(spread)[1])
+        rest = np.eye(H.shape[1]) - gain @ H
+        covariances = rest @ self.covariances @ rest.swapaxes(1, 2) + gain @ noise @ gain.swapaxes(1, 2)
+        means = self.means + (gain @ innovation[..., None])[..., 0]
+        return GaussianMixture(log_weights, means, covariances), squares
+
+    def updated_by_factor(self, factor: FactorBatch, biases: int) -> GaussianMixture:
+        """The same with another measurement, a batch of one factor; its robust loss bounds what an outlier does.
+
+        Args: biases: how many numbers at the end of the state are biases, which the factor does not look at.
+        """
+        log_weights, means, covariances = self.log_weights.copy(), self.means.copy(), self.covariances.copy()
+        for i, (mean, covariance) in enumerate(zip(self.means, self.covariances, strict=True)):
+            found = FilterInnovation.of(factor, mean, covariance, biases)
+            spread = found.spread + found.R
+            gain = np.linalg.solve(spread, found.H @ covariance).T
+            square = float(found.residual @ np.linalg.solve(spread, found.residual))
+            log_weights[i] -= 0.5 * (square + np.linalg.slogdet(spread)[1])
+            means[i] = mean - gain @ found.residual
+            rest = np.eye(len(mean)) - gain @ found.H
+            covariances[i] = rest @ covariance @ rest.T + gain @ found.R @ gain.T
+        return GaussianMixture(log_weights, means, covariances)
+
+    def truncated(self, gaps: Array, gradients: Array) -> GaussianMixture:
+        """The part above a surface: each Gaussian is cut where the gap is zero, and weighed by what is left of it.
+
+        Args: gaps: (n,) m, between ball and surface at the means.  gradients: (n, d) of the gap.
+        """
+        along = (self.covariances @ gradients[..., None])[..., 0]
+        sigma = np.sqrt(np.maximum((gradients * along).sum(axis=1), LEAST_SPREAD**2))
+        along, cut = along / sigma[:, None], -gaps / sigma
+        log_share = log_ndtr(-cut)
+        shift = np.exp(-0.5 * cut**2 - 0.5 * np.log(2.0 * np.pi) - log_share)  # mean of a standard normal above the cut
+        narrowing = shift * (cut - shift)
+        means = self.means + shift[:, None] * along
+        covariances = self.covariances + narrowing[:, None, None] * along[:, :, None] * along[:, None, :]
+        return GaussianMixture(self.log_weights + log_share, means, covariances)
+
+    def merged(self) -> GaussianMixture:
+        """One Gaussian with the mean, the covariance and the weight of the whole mixture."""
+        log_weight = self.log_weight
+        shares = np.exp(self.log_weights - log_weight)
+        mean = shares @ self.means
+        apart = self.means - mean
+        covariance = np.einsum("n,nij->ij", shares, self.covariances) + (shares * apart.T) @ apart
+        return GaussianMixture(np.array([log_weight]), mean[None], 0.5 * (covariance + covariance.T)[None])
+
+    def divided(self, log_weight: float) -> GaussianMixture:
+        """The same with all weights divided by one of that logarithm."""
+        return replace(self, log_weights=self.log_weights - log_weight)

@@ -1,0 +1,234 @@
+"""Two hypotheses of a ball near a surface: it has not bounced yet, or it has, each weighed by the measurements.
+
+A Kalman filter follows each of them from a sample on at which the ball had certainly not bounced. A bounce somewhat
+before or after a stamp is a smooth continuation of the motion (docs/derivations/contact.md). So one Gaussian a
+hypothesis is enough whatever the time of the contact; it is truncated where the ball would be below the surface.
+Friction is not smooth: it has a kink between sliding and rolling. So a bounce is computed at nine spins.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Final
+
+import numpy as np
+import torch
+
+from ballfg.arrays import Array
+from ballfg.dynamics.model import BallModel
+from ballfg.dynamics.motion.contact import fly_through_jacobian
+from ballfg.dynamics.motion.integrate import fly_jacobian
+from ballfg.dynamics.surfaces import Surfaces
+from ballfg.estimation.settings import Settings, stamp_covariance
+from ballfg.estimation.sides.gaussians import GaussianMixture
+from ballfg.factors.batch import FactorBatch
+from ballfg.factors.dynamics import model_width
+from ballfg.factors.tracker import bias_step
+from ballfg.state import POSITION, SPIN, STANDARD_GRAVITY, STATE_DIM, VELOCITY, VZ, Z
+
+FAR: Final = 4.5
+"""Standard deviations of the gap beyond which a ball has certainly not touched: one in 300,000."""
+MOST_OFFSET: Final = 0.05
+"""m. Coefficients and slopes raise a surface by less than that."""
+WIDE_VELOCITY: Final = 1.0
+"""m/s. Where the velocity is less well known, as at the start of a flight, no sample is certainly before a contact."""
+SLOWEST: Final = 0.3
+"""m/s. A ball that falls more slowly makes several small hops between samples, or comes to rest: two hypotheses do not
+describe it."""
+STEEPEST_FALL: Final = 2.0 * STANDARD_GRAVITY
+"""m/s^2, a bound on the downward acceleration; topspin adds to the weight."""
+NODES: Final = np.array([-(3.0**0.5), 0.0, 3.0**0.5])
+"""Standard deviations at which Gauss-Hermite quadrature of order three evaluates, and"""
+NODE_WEIGHTS: Final = np.array([1.0, 4.0, 1.0]) / 6.0
+"""its weights."""
+HORIZONTAL_SPIN: Final = slice(SPIN.start, SPIN.start + 2)
+"""The components of the spin that friction at a level surface depends on."""
+
+
+@dataclass(frozen=True)
+class SampleMeasurement:
+    """What was measured at one stamp.
+
+    Attributes:
+        position: (3,) m; None where none was measured, or it was rejected.
+        sigma: (3,) m, of its white error.
+        factors: all other measurements, batches of one factor each.
+    """
+
+    position: Array | None = None
+    sigma: Array = field(default_factory=lambda: np.zeros(3))
+    factors: Sequence[FactorBatch] = ()
+
+
+@dataclass(frozen=True)
+class HypothesisModel:
+    """How a ball moves and is measured.
+
+    Attributes:
+        ball: its model, with the estimated coefficients in columns behind the state.
+        surfaces: that it may bounce on.
+        settings: noise.
+        biases: how many numbers of the tracker's bias stand behind state and coefficients: 0 or 3.
+    """
+
+    ball: BallModel
+    surfaces: Surfaces
+    settings: Settings
+    biases: int = 0
+
+    @property
+    def width(self) -> int:
+        """How many numbers move with the ball: state and coefficients."""
+        return STATE_DIM + model_width(self.ball)
+
+    def level(self, mean: Array) -> float:
+        """m, height of the surface below a ball (d,); -inf where there is none."""
+        return float(self.surfaces.height_below(torch.from_numpy(mean[:STATE_DIM])))
+
+    def gaps(self, means: Array, level: float) -> tuple[Array, Array]:
+        """(n,) m between balls (n, d) and a surface, and its gradients (n, d)."""
+        leaf = torch.from_numpy(np.ascontiguousarray(means[:, : self.width])).requires_grad_(True)
+        with torch.enable_grad():
+            gaps = self.ball.gap(leaf, level)
+            (slopes,) = torch.autograd.grad(gaps.sum(), leaf)
+        gradients = np.zeros(means.shape)
+        gradients[:, : self.width] = slopes.numpy()
+        return gaps.detach().numpy(), gradients
+
+    def may_touch(self, mean: Array, covariance: Array, dt: float) -> bool:
+        """Whether a ball may come down to a surface within dt s.
+
+        Most samples are far from one: a coarse bound spares them the gap's gradient.
+        """
+        way = mean[VZ] * dt - 0.5 * STEEPEST_FALL * dt**2
+        reach = MOST_OFFSET + FAR * (np.sqrt(covariance[Z, Z]) + dt * np.sqrt(covariance[VZ, VZ]))
+        lowest = mean[Z] - self.ball.radius + way - reach
+        if all(lowest > height for height in self.surfaces.heights()):
+            return False
+        level = self.level(mean)
+        if not np.isfinite(level) or np.trace(covariance[VELOCITY, VELOCITY]) > WIDE_VELOCITY**2 or lowest > level:
+            return False
+        (gap,), (gradient,) = self.gaps(mean[None], level)
+        falling = min(float(mean[VZ]), 0.0)
+        if gap < 0.0 or falling**2 + 2.0 * STANDARD_GRAVITY * gap < SLOWEST**2:
+            return False
+        gradient[VZ] += dt
+        return bool(gap + way < FAR * np.sqrt(gradient @ covariance @ gradient))
+
+    def predict_flight(self, balls: GaussianMixture, dt: float) -> GaussianMixture:
+        """Balls after dt s of free flight, as if there were no surface."""
+        start = torch.from_numpy(np.ascontiguousarray(balls.means[:, : self.width]))
+        after, jacobian = fly_jacobian(self.ball, start, torch.full((len(start),), dt, dtype=torch.float64))
+        noise = np.repeat(self.settings.process.flight(np.array([dt])), len(start), axis=0)
+        return self._predicted(balls, after.numpy(), jacobian.numpy(), noise, dt)
+
+    def predict_bounce(self, balls: GaussianMixture, dt: float, level: float) -> GaussianMixture:
+        """Balls after dt s with one bounce on the way; those that never come down are left out."""
+        start = torch.from_numpy(np.ascontiguousarray(balls.means[:, : self.width]))
+        durations = torch.full((len(start),), dt, dtype=torch.float64)
+        after, times, jacobian = fly_through_jacobian(self.ball, start, durations, (level,))
+        found = torch.isfinite(after).all(dim=1).numpy()
+        spans = np.full(int(found.sum()), dt)
+        noise = self.settings.process.flight(spans) + self.settings.process.contact(spans, times[:, 0].numpy()[found])
+        return self._predicted(balls.selected(found), after.numpy()[found], jacobian.numpy()[found], noise, dt)
+
+    def _predicted(
+        self, balls: GaussianMixture, after: Array, jacobian: Array, noise: Array, dt: float
+    ) -> GaussianMixture:
+        w, d = self.width, balls.means.shape[1]
+        F, Q, means = np.zeros((len(after), d, d)), np.zeros((len(after), d, d)), balls.means.copy()
+        F[:, :w, :w], Q[:, :STATE_DIM, :STATE_DIM], means[:, :w] = jacobian, noise, after
+        if self.biases:
+            sigmas = self.settings.bias_sigmas[: self.biases]
+            (decay,), (renewed,) = bias_step(np.array([dt]), sigmas, self.settings.memory_time)
+            last = np.arange(w, d)
+            means[:, w:] *= decay
+            F[:, last, last], Q[:, last, last] = decay, renewed**2
+        return GaussianMixture(balls.log_weights, means, F @ balls.covariances @ F.swapaxes(1, 2) + Q)
+
+    def update(self, balls: GaussianMixture, measured: SampleMeasurement) -> tuple[GaussianMixture, float]:
+        """Balls after a measurement, and the least squared whitened innovation of the position; inf without balls."""
+        if not len(balls):
+            return balls, np.inf
+        nearest = 0.0
+        if measured.position is not None:
+            H = np.zeros((3, balls.means.shape[1]))
+            H[:, POSITION], H[:, self.width :] = np.eye(3), np.eye(3)[:, : self.biases]
+            noise = np.diag(measured.sigma**2) + stamp_covariance(self.settings, balls.means[:, VELOCITY])
+            balls, squares = balls.updated_by_position(measured.position, noise, H)
+            nearest = float(squares.min())
+        for factor in measured.factors:
+            balls = balls.updated_by_factor(factor, self.biases)
+        return balls, nearest
+
+
+def _at_nodes(balls: GaussianMixture) -> GaussianMixture:
+    """One Gaussian as nine that have no spread in the horizontal spin."""
+    (mean,), (covariance,) = balls.means, balls.covariances
+    spin = covariance[HORIZONTAL_SPIN, HORIZONTAL_SPIN]
+    slope = np.linalg.solve(spin, covariance[HORIZONTAL_SPIN]).T
+    nodes = np.stack(np.meshgrid(NODES, NODES), axis=-1).reshape(-1, 2)
+    means = mean + nodes @ np.linalg.cholesky(spin).T @ slope.T
+    conditional = covariance - slope @ spin @ slope.T
+    log_weights = balls.log_weights + np.log(np.outer(NODE_WEIGHTS, NODE_WEIGHTS)).ravel()
+    return GaussianMixture(log_weights, means, np.repeat(conditional[None], len(means), axis=0))
+
+
+@dataclass(frozen=True)
+class ContactHypotheses:
+    """A ball that has not bounced, and a ball that has.
+
+    Attributes:
+        model: of the ball.
+        flying: one Gaussian, as if there were no surface.
+        bounced: Gaussians; none before the first step.
+        level: m, height of the surface.
+        nearest: squared whitened innovation of the last position under the hypothesis that it fits best.
+    """
+
+    model: HypothesisModel
+    flying: GaussianMixture
+    bounced: GaussianMixture
+    level: float
+    nearest: float = 0.0
+
+    @classmethod
+    def start(cls, model: HypothesisModel, mean: Array, covariance: Array) -> ContactHypotheses:
+        """Of a ball that has not bounced, with mean (d,) and covariance (d, d)."""
+        flying = GaussianMixture.single(mean, covariance)
+        return cls(model, flying, flying.selected(np.zeros(1, dtype=bool)), model.level(mean))
+
+    def step(self, dt: float, measured: SampleMeasurement) -> ContactHypotheses:
+        """The hypotheses dt s later, after a measurement."""
+        weights = self._above.log_weights  # of the parts above the surface; not truncated, so that they stay Gaussian
+        still = replace(self.flying, log_weights=weights[:1])
+        bouncing = self.model.predict_bounce(_at_nodes(still), dt, self.level)
+        flying = [self.flying]
+        if len(self.bounced):
+            flying.append(replace(self.bounced, log_weights=weights[1:]).merged())
+        flown = self.model.predict_flight(GaussianMixture.concatenated(flying), dt)
+        first = np.arange(len(flown)) == 0
+        bounced = GaussianMixture.concatenated([bouncing, flown.selected(~first)])
+        return replace(self, flying=flown.selected(first), bounced=bounced).updated(measured)
+
+    def updated(self, measured: SampleMeasurement) -> ContactHypotheses:
+        """The hypotheses after a further measurement at the same stamp."""
+        flying, nearest = self.model.update(self.flying, measured)
+        bounced, other = self.model.update(self.bounced, measured)
+        return replace(self, flying=flying, bounced=bounced, nearest=min(nearest, other))
+
+    def sides(self) -> tuple[GaussianMixture, GaussianMixture]:
+        """One Gaussian of the ball that has not bounced, one of the ball that has; their weights are probabilities."""
+        first = np.arange(len(self._above)) == 0
+        flying, bounced = self._above.selected(first), self._above.selected(~first)
+        bounced = bounced.merged() if len(bounced) else flying.divided(np.inf)
+        both = float(np.logaddexp(flying.log_weight, bounced.log_weight))
+        return flying.divided(both), bounced.divided(both)
+
+    @cached_property
+    def _above(self) -> GaussianMixture:
+        """The parts of all Gaussians above the surface, that of the flying ball first."""
+        both = GaussianMixture.concatenated([self.flying, self.bounced])
+        return both.truncated(*self.model.gaps(both.means, self.level))
