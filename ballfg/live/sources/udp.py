@@ -12,7 +12,7 @@ from typing import Any
 
 from ballfg.live.answers import encoded, refusal
 from ballfg.live.sources.listener import SENDERS, WAIT, Listener, readable, written
-from ballfg.live.sources.sender import WAITING, Line, Sender
+from ballfg.live.sources.sender import PAUSE, WAITING, Line, Sender
 from ballfg.live.sources.source import CHUNK
 
 SILENT = 1.0
@@ -66,9 +66,15 @@ class UdpServer(Listener):
     def lines(self, stop: threading.Event) -> Iterator[Line]:
         """As `Source.lines`."""
         try:
+            look = 0.0
             while not stop.is_set():
-                own = [sender.socket for sender in self._senders.values() if sender.socket is not None]
-                for ready in readable([self._socket, *own], WAIT):
+                senders = [sender for sender in self._senders.values() if sender.socket is not None]
+                read = [sender for sender in senders if not sender.full]
+                timeout = WAIT if len(read) == len(senders) else PAUSE
+                if perf_counter() > look:  # now and then the full ones too: the system drops the rest at less cost
+                    read, look = senders, perf_counter() + PAUSE
+                own = [sender.socket for sender in read if sender.socket is not None]
+                for ready in readable([self._socket, *own], timeout):
                     most = WAITING if ready is self._socket else 1  # what came before a sender had its own goes first
                     for _ in range(most):
                         found = self._receive(ready)
