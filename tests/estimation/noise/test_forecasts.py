@@ -155,20 +155,23 @@ def test_what_is_known_of_a_start_is_told_as_a_deviation_from_the_estimate(case)
         np.testing.assert_allclose(own, known - found, rtol=1e-3, atol=1e-4)
 
 
-def test_error_bars_are_those_of_the_curvature_and_of_the_scatter_of_tracks(case):
-    """H^-1 (G + P) H^-1 with second differences of the objective itself in place of differences of its gradient."""
+def test_curvature_and_scatter_behind_the_error_bars(case):
+    """H and G of H^-1 (G + P) H^-1, by second differences of the objective itself and by the tracks one by one."""
     *_, settings, _, linear, forecaster = case
     known = parameters_of(settings, linear, position_known=True)
     search = _Search(forecaster, [p for p in known if p.name == "acceleration" or p.axis == 2], settings)
-    profile = search.profile(np.log([0.003, 0.1]))
-    logs, step = profile.best, 0.05
+    logs, step = np.log([0.003, 0.1]), 0.05
     moves = step * np.eye(2)
     hessian = np.empty((2, 2))
     for i, j in ((0, 0), (0, 1), (1, 1)):
         ends = ((a, b, search.value(logs + a * moves[i] + b * moves[j])[0]) for a in (-1, 1) for b in (-1, 1))
         hessian[i, j] = hessian[j, i] = sum(a * b * value for a, b, value in ends) / (4.0 * step**2)
     assert (np.linalg.eigvalsh(hessian) > 1.0 / search.spread.max() ** 2).all()
-    inverse = np.linalg.inv(hessian)
-    covariance = inverse @ (search._scatter(logs) + np.diag(search.spread**-2)) @ inverse
+    profile, inverse = search.profile(logs), np.linalg.inv(hessian)
     assert search.names == ["memory.z", "acceleration"]
-    np.testing.assert_allclose(np.diagonal(profile.covariance), np.diagonal(covariance), rtol=0.04)
+    np.testing.assert_allclose(profile._inverse(logs), inverse, rtol=0.02)
+    rows = torch.tensor(np.tile(logs, (forecaster.count, 1)), requires_grad=True)
+    scores = forecaster.score(tensors_of(search.parameters, rows, settings)).by_track
+    own = [torch.autograd.grad(score, rows, retain_graph=True)[0].sum(dim=0).numpy() for score in scores]
+    scatter = np.cov(np.array(own).T) * len(own) * search.weight**2
+    np.testing.assert_allclose(search._scatter(logs), scatter, rtol=1e-6)

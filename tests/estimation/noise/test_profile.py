@@ -45,7 +45,7 @@ def beside(n, m, scale):
 
 
 def test_a_noise_beside_a_larger_one_is_known_upwards_and_hardly_downwards():
-    value, spread = beside(400, 300, 0.35), np.full(2, 1.4)
+    value, spread = beside(150, 100, 0.35), np.full(2, 1.4)
     profile = Profile(value, lambda _: np.zeros((2, 2)), np.log([0.35, 1.0]), spread, -WIDE, WIDE)
 
     def risen(log):
@@ -57,4 +57,4 @@ def test_a_noise_beside_a_larger_one_is_known_upwards_and_hardly_downwards():
     assert below > 1.5 * above
     np.testing.assert_allclose(profile.sides()[0], [below, above], rtol=HONEST - 1.0)
     curvature = float(np.sqrt(profile.inverse[0, 0]))
-    assert abs(curvature - below) > 2.0 * abs(profile.sides()[0, 0] - below)
+    assert abs(curvature - above) > 2.0 * abs(profile.sides()[0, 1] - above)
